@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Shipped presets as TOML data: ``materials`` and ``qualities``."""

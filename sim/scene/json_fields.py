@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""Reading JSON by a dataclass: every complaint names the field's path, the value and what was expected.
+
+Only the shapes that the project's own formats use are understood: nested dataclasses, tuples, optional values,
+strings, numbers and booleans. Unknown keys are refused, so that a misspelt field is never silently ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import InputError
+
+T = TypeVar("T")
+
+MAX_JSON_BYTES = 16 * 2**20
+"""A larger file is refused unread: no scene, manifest or job comes near it."""
+
+
+def read_json(path: Path) -> Any:
+    """Parse the JSON file at ``path``; InputError when it is missing, too large, not UTF-8 or not JSON."""
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise InputError(f"{path}: larger than {MAX_JSON_BYTES >> 20} MiB, so this is not one of our files")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+
+
+def parse(kind: type[T], value: Any, path: str) -> T:
+    """Build the dataclass ``kind`` from parsed JSON ``value``; ``path`` names it in messages."""
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected an object with fields, found {_brief(value)}")
+    hints = typing.get_type_hints(kind)
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(value) - set(fields))
+    if unknown:
+        raise InputError(f"{path}.{unknown[0]}: unknown field; known are {', '.join(fields)}")
+    arguments = {}
+    for name, spec in fields.items():
+        if name in value:
+            arguments[name] = _convert(hints[name], value[name], f"{path}.{name}")
+        elif spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING:
+            raise InputError(f"{path}.{name}: missing")
+    try:
+        return kind(**arguments)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, path: str) -> Any:
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(next(a for a in arguments if a is not type(None)), value, path)
+    if origin is tuple:
+        return _convert_tuple(arguments, value, path)
+    if dataclasses.is_dataclass(hint):
+        return parse(typing.cast(type, hint), value, path)
+    if hint is Any:
+        return value
+    return _convert_scalar(hint, value, path)
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{path}: expected a list, found {_brief(value)}")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return tuple(_convert(arguments[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+    if len(value) != len(arguments):
+        raise InputError(f"{path}: expected {len(arguments)} entries, found {len(value)}")
+    return tuple(_convert(a, item, f"{path}[{i}]") for i, (a, item) in enumerate(zip(arguments, value, strict=True)))
+
+
+def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if math.isfinite(number):
+            return number
+        raise InputError(f"{path}: expected a finite number, found {_brief(value)}")
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if hint in (str, bool) and isinstance(value, hint):
+        return value
+    names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    raise InputError(f"{path}: expected {names.get(hint, hint)}, found {_brief(value)}")
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def to_json(value: Any) -> Any:
+    """The JSON form of a dataclass; ``parse`` gives the equal object back."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple | list):
+        return [to_json(item) for item in value]
+    return value
