@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""One writer a folder, held by a lock file that names its process, so that a crash never blocks the next run."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import InputError
+
+LOCK_FILE = ".lock"
+
+
+@contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Hold ``folder`` for this process.
+
+    Raises InputError when a living process on this machine, or any process of another machine, holds it. A lock
+    whose process is gone is taken over.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / LOCK_FILE
+        _acquire(path)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder") from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _acquire(path: Path) -> None:
+    owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode()
+    for _ in range(3):
+        try:
+            descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+        except FileExistsError:
+            _drop_if_dead(path)
+            continue
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(owner)
+        return
+    raise InputError(f"{path.parent}: another run took this folder just now; wait for it or choose another folder")
+
+
+def _drop_if_dead(path: Path) -> None:
+    """Remove the lock of a dead process; InputError for one that lives or cannot be asked."""
+    try:
+        owner = json.loads(path.read_text())
+        pid, host = int(owner["pid"]), str(owner["host"])
+    except FileNotFoundError:
+        return
+    except (ValueError, KeyError, TypeError):
+        path.unlink(missing_ok=True)
+        return
+    if host != socket.gethostname():
+        raise InputError(f"{path.parent}: in use by process {pid} on {host}; if that run is gone, delete {path}")
+    if pid != os.getpid() and process_alive(pid):
+        raise InputError(f"{path.parent}: in use by process {pid}; wait for it, stop it, or choose another folder")
+    path.unlink(missing_ok=True)
+
+
+def process_alive(pid: int) -> bool:
+    """Whether a process ``pid`` runs on this machine."""
+    if pid <= 0:
+        return False
+    if os.name == "nt":
+        import ctypes
+
+        handle = ctypes.windll.kernel32.OpenProcess(0x1000, False, pid)  # type: ignore[attr-defined]
+        if handle:
+            ctypes.windll.kernel32.CloseHandle(handle)  # type: ignore[attr-defined]
+        return bool(handle)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""PC2 point caches: one sample of all vertices a frame, float32, world metres.
+
+The format is the one that Blender's Mesh Cache modifier reads: a little-endian header of 32 bytes
+
+    char[12] "POINTCACHE2\\0" · int32 version 1 · int32 vertices · float32 start · float32 rate · int32 samples
+
+followed by samples × vertices × 3 float32.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+_HEADER = struct.Struct("<12siiffi")
+_SIGNATURE = b"POINTCACHE2\0"
+MAX_VERTICES = 50_000_000
+"""A header that claims more is taken for garbage; a sample of that size is 600 MB."""
+
+
+class Pc2Reader:
+    """A cache on disk, memory-mapped: opening costs nothing and samples are read when asked for.
+
+    Raises InputError when the file is missing, not PC2, or shorter than its header says.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            size = path.stat().st_size
+            with path.open("rb") as file:
+                header = file.read(_HEADER.size)
+        except FileNotFoundError:
+            raise InputError(f"{path}: there is no such point cache; bake the scene again") from None
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or error}") from None
+        if len(header) < _HEADER.size or header[:12] != _SIGNATURE:
+            raise InputError(f"{path}: not a PC2 point cache; bake the scene again")
+        _, version, vertices, start, rate, samples = _HEADER.unpack(header)
+        if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or rate <= 0:
+            raise InputError(
+                f"{path}: PC2 header with version {version}, {vertices} vertices, {samples} samples is not one that can be read"
+            )
+        if size < _HEADER.size + samples * vertices * 12:
+            raise InputError(f"{path}: cut off: {samples} samples of {vertices} vertices do not fit in {size} bytes; bake again")
+        self.vertex_count: int = vertices
+        self.sample_count: int = samples
+        self.start_frame: float = start
+        self.sample_rate: float = rate
+        self._data: NDArray[np.float32] | None = None
+        if samples:
+            self._data = np.memmap(path, dtype="<f4", mode="r", offset=_HEADER.size, shape=(samples, vertices, 3))
+
+    def sample(self, index: int) -> NDArray[np.float32]:
+        """Vertex positions (V, 3) of sample ``index`` from 0; InputError outside the cache."""
+        if self._data is None or not 0 <= index < self.sample_count:
+            raise InputError(f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames")
+        return np.array(self._data[index])
+
+
+class Pc2Writer:
+    """Appends samples; the header is brought up to date after each, so that a killed run leaves a readable file.
+
+    Opened on an existing cache with ``keep`` samples it drops everything after them and goes on from there.
+    """
+
+    def __init__(self, path: Path, *, vertex_count: int, start_frame: int = 1, keep: int = 0) -> None:
+        if not 0 < vertex_count <= MAX_VERTICES:
+            raise InputError(f"{path}: a cache of {vertex_count} vertices cannot be written")
+        self.path = path
+        self.vertex_count = vertex_count
+        self.sample_count = keep
+        self._start_frame = float(start_frame)
+        if keep:
+            existing = Pc2Reader(path)
+            if existing.vertex_count != vertex_count or existing.sample_count < keep:
+                raise InputError(f"{path}: does not hold the {keep} samples of {vertex_count} vertices to go on from")
+        self._file = path.open("r+b" if keep else "w+b")
+        self._file.truncate(_HEADER.size + keep * vertex_count * 12)
+        self._write_header()
+
+    def append(self, positions: NDArray[np.floating]) -> None:
+        """Write one sample of (V, 3) world positions in metres; they must be finite."""
+        sample = np.ascontiguousarray(positions, dtype="<f4")
+        if sample.shape != (self.vertex_count, 3):
+            raise InputError(f"{self.path}: a sample of shape {sample.shape} does not fit {self.vertex_count} vertices")
+        if not np.isfinite(sample).all():
+            raise InputError(f"{self.path}: sample {self.sample_count} has positions that are not finite")
+        self._file.seek(0, os.SEEK_END)
+        self._file.write(sample.tobytes())
+        self.sample_count += 1
+        self._write_header()
+
+    def _write_header(self) -> None:
+        self._file.seek(0)
+        self._file.write(_HEADER.pack(_SIGNATURE, 1, self.vertex_count, self._start_frame, 1.0, self.sample_count))
+        self._file.flush()
+
+    def close(self) -> None:
+        """Flush to the disk and close."""
+        if not self._file.closed:
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def __enter__(self) -> Pc2Writer:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

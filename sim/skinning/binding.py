@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Mesh vertices that follow particles, by weights and local deformation gradients.
+
+At rest a vertex at X is bound to its k nearest particles X_i with smooth, compact weights w_i. Later each of them
+predicts where the vertex went, p_i = x_i + F_i (X − X_i), and the vertex is their weighted mean. The prediction
+is exact for every affine motion, so texture and edges stay smooth, and at rest it gives X back to rounding.
+
+A particle that has flown off (a floater) or whose F is broken predicts something that its neighbours do not. Such
+predictions are faded out by Tukey's biweight about the neighbours' median, so they never drag a vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import InputError
+
+Array = NDArray[np.float64]
+
+OUTLIER_SPACINGS = 1.5
+"""Predictions farther than this many local particle spacings from the median of their neighbours count nothing.
+
+In a smooth deformation predictions differ by second-order terms, a small part of the spacing, whereas a particle
+that has lost its neighbours is at least one spacing away from where they say it is."""
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Which particles carry which vertex.
+
+    particles: (V, k) indices, nearest first.
+    weights: (V, k) non-negative, rows sum to 1.
+    offsets: (V, k, 3) rest offsets X − X_i in metres.
+    spacing: (V,) local particle spacing in metres.
+    rest: (V, 3) rest positions of the vertices in metres.
+    """
+
+    particles: NDArray[np.int64]
+    weights: Array
+    offsets: Array
+    spacing: Array
+    rest: Array
+
+
+def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, neighbours: int = 12) -> Binding:
+    """Bind rest ``vertices`` (V, 3) to rest ``particles`` (N, 3), both in world metres.
+
+    neighbours: how many particles carry a vertex, 4 to 64; more is smoother, fewer follows detail.
+    Raises InputError when there are fewer particles than 4 or anything is not finite.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    particles = np.asarray(particles, dtype=np.float64)
+    if len(particles) < 4:
+        raise InputError(f"skinning: {len(particles)} particles cannot carry a mesh; choose a finer quality")
+    if not (np.isfinite(vertices).all() and np.isfinite(particles).all()):
+        raise InputError("skinning: vertices or particles are not finite")
+    count = min(neighbours, len(particles) - 1)
+    distance, index = cKDTree(particles).query(vertices, k=count + 1)
+    # The first particle left out sets the support: weights vanish where the set of neighbours changes, which
+    # keeps them continuous along the surface.
+    support = np.maximum(distance[:, -1:], 1e-12)
+    weights = (1.0 - np.minimum(distance[:, :-1] / support, 1.0) ** 2) ** 3 + 1e-9
+    weights /= weights.sum(axis=1, keepdims=True)
+    index = index[:, :-1].astype(np.int64)
+    # k particles fill about a ball of radius ``support``.
+    spacing = support[:, 0] * (4.0 / 3.0 * np.pi / count) ** (1.0 / 3.0)
+    return Binding(
+        particles=index, weights=weights, offsets=vertices[:, None, :] - particles[index], spacing=spacing, rest=vertices.copy()
+    )
+
+
+def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> Array:
+    """Vertex positions (V, 3) for particle ``positions`` (N, 3) and deformation ``gradients`` (N, 3, 3), metres.
+
+    Particles that are not finite count as floaters. A vertex all of whose particles are lost keeps its rest place.
+    """
+    x = np.asarray(positions, dtype=np.float64)[binding.particles]
+    f = np.asarray(gradients, dtype=np.float64)[binding.particles]
+    predicted = x + np.einsum("vkij,vkj->vki", f, binding.offsets)
+    valid = np.isfinite(predicted).all(axis=2)
+    weights = np.where(valid, binding.weights, 0.0)
+    predicted = np.where(valid[..., None], predicted, binding.rest[:, None, :])
+    centre = _median(predicted, valid)
+    distance = np.linalg.norm(predicted - centre[:, None, :], axis=2) / (OUTLIER_SPACINGS * binding.spacing[:, None])
+    robust = weights * np.where(distance < 1.0, (1.0 - np.minimum(distance, 1.0) ** 2) ** 2, 0.0)
+    total = robust.sum(axis=1, keepdims=True)
+    # Where predictions disagree wholly (torn matter) the median itself is the best that can be said.
+    torn = total[:, 0] < 1e-6
+    mean = np.einsum("vk,vki->vi", robust / np.maximum(total, 1e-6), predicted)
+    mean[torn] = centre[torn]
+    lost = ~valid.any(axis=1)
+    mean[lost] = binding.rest[lost]
+    return mean
+
+
+def _median(values: Array, valid: NDArray[np.bool_]) -> Array:
+    """Median over axis 1 of the ``valid`` (V, k) entries of ``values`` (V, k, 3), one coordinate at a time.
+
+    It is not weighted, because a floater that happens to be a vertex's nearest particle would outvote the rest.
+    """
+    ordered = np.sort(np.where(valid[..., None], values, np.inf), axis=1)
+    middle = np.maximum(valid.sum(axis=1) - 1, 0) // 2
+    median = np.take_along_axis(ordered, middle[:, None, None], axis=1)[:, 0, :]
+    return np.where(np.isfinite(median), median, 0.0)
