@@ -50,7 +50,9 @@ class BakeManifest:
         if self.state not in STATES:
             raise InputError(f"state is {self.state!r}: choose one of {', '.join(STATES)}")
         if self.fps <= 0 or self.frames < 1 or not 0 <= self.frames_done <= self.frames:
-            raise InputError(f"{self.frames_done} of {self.frames} frames at {self.fps} fps is no frame range; bake again")
+            raise InputError(
+                f"{self.frames_done} of {self.frames} frames at {self.fps} fps is no frame range; bake again"
+            )
 
 
 def load_manifest(folder: Path) -> BakeManifest:

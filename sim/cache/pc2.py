@@ -47,10 +47,12 @@ class Pc2Reader:
         _, version, vertices, start, rate, samples = _HEADER.unpack(header)
         if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or rate <= 0:
             raise InputError(
-                f"{path}: PC2 header with version {version}, {vertices} vertices, {samples} samples is not one that can be read"
+                f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is garbage; bake again"
             )
         if size < _HEADER.size + samples * vertices * 12:
-            raise InputError(f"{path}: cut off: {samples} samples of {vertices} vertices do not fit in {size} bytes; bake again")
+            raise InputError(
+                f"{path}: cut off: {samples} samples of {vertices} vertices do not fit in {size} bytes; bake again"
+            )
         self.vertex_count: int = vertices
         self.sample_count: int = samples
         self.start_frame: float = start
@@ -62,7 +64,9 @@ class Pc2Reader:
     def sample(self, index: int) -> NDArray[np.float32]:
         """Vertex positions (V, 3) of sample ``index`` from 0; InputError outside the cache."""
         if self._data is None or not 0 <= index < self.sample_count:
-            raise InputError(f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames")
+            raise InputError(
+                f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames"
+            )
         return np.array(self._data[index])
 
 
@@ -113,5 +117,7 @@ class Pc2Writer:
     def __enter__(self) -> Pc2Writer:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()

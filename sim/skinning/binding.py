@@ -69,7 +69,11 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
     # k particles fill about a ball of radius ``support``.
     spacing = support[:, 0] * (4.0 / 3.0 * np.pi / count) ** (1.0 / 3.0)
     return Binding(
-        particles=index, weights=weights, offsets=vertices[:, None, :] - particles[index], spacing=spacing, rest=vertices.copy()
+        particles=index,
+        weights=weights,
+        offsets=vertices[:, None, :] - particles[index],
+        spacing=spacing,
+        rest=vertices.copy(),
     )
 
 

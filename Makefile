@@ -1,0 +1,36 @@
+# make demo | test | test-all | lint | benchmark | clean     (make setup is part of each)
+# PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what `make test` runs.
+SHELL := /bin/sh
+VENV ?= .venv
+TESTS ?= tests
+DEMO_OUT ?= demo_out
+PYTHON ?= $(shell setup/pick_python.sh)
+BIN := $(VENV)/bin
+
+.PHONY: setup demo test test-all lint benchmark clean
+
+setup:
+	@test -n "$(PYTHON)" || exit 1
+	@setup/system_libraries.sh
+	@setup/venv.sh "$(PYTHON)" "$(VENV)"
+
+demo: setup
+	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT)
+
+test: setup
+	$(BIN)/python -m pytest -m "not slow" $(TESTS)
+
+test-all: setup
+	$(BIN)/python -m pytest $(TESTS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy -p physgen.sim -p physgen.batch
+
+benchmark: setup
+	$(BIN)/python benchmarks/mpm.py
+	$(BIN)/python benchmarks/demo.py
+
+clean:
+	rm -rf .venv .venv-* demo_out .pytest_cache .mypy_cache .ruff_cache

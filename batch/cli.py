@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ``physgen`` command: every stage alone, or all of them (docs/cli.md)."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import re
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ..sim.app.bake_inputs import BakeOptions
+from ..sim.app.events import IsCancelled
+from ..sim.app.reconstruct import reconstruct_scene, set_physics
+from ..sim.errors import Cancelled, InputError, PhysGenError
+from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.scene.materials import preset_names
+from ..sim.scene.model import Vector
+from ..sim.version import VERSION
+from . import doctor, pipeline
+from .terminal import Terminal
+
+Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
+
+
+def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(math.isfinite(n) for n in numbers):
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not {what}")
+    return numbers
+
+
+def _box(text: str) -> tuple[float, float, float, float]:
+    a, b, c, d = _numbers(text, 4, "a box x0,y0,x1,y1 in pixels")
+    return a, b, c, d
+
+
+def _vector(text: str) -> Vector:
+    x, y, z = _numbers(text, 3, "a vector x,y,z")
+    return x, y, z
+
+
+def _add_photo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    box = "x0,y0,x1,y1 in pixels of the upright photo, one an object"
+    parser.add_argument("--box", type=_box, nargs="+", action="extend", required=True, metavar="BOX", help=box)
+    parser.add_argument(
+        "--name", nargs="+", action="extend", default=[], help="names of the objects, in the order of the boxes"
+    )
+    size = "largest extent in metres, one an object; the first sets the scale of the scene"
+    parser.add_argument("--size", type=float, nargs="+", action="extend", default=[], metavar="METRES", help=size)
+    horizon = (
+        "height of the horizon as a fraction of the photo's, 0 top, 1 bottom; may lie outside (default: estimated)"
+    )
+    parser.add_argument("--horizon", type=float, metavar="Y", help=horizon)
+    parser.add_argument(
+        "--fov", type=float, metavar="DEGREES", help="field of view of the longer side (default: EXIF, else 50)"
+    )
+
+
+def _add_physics(parser: argparse.ArgumentParser) -> None:
+    names = preset_names()
+    parser.add_argument(
+        "--preset", nargs="+", action="extend", default=[], choices=names, help="material, one for all or one an object"
+    )
+    velocity = "initial velocity x,y,z in m/s: right, away from the camera, up; one an object"
+    parser.add_argument("--velocity", type=_vector, nargs="+", action="extend", default=[], metavar="V", help=velocity)
+    parser.add_argument(
+        "--spin", type=_vector, nargs="+", action="extend", default=[], metavar="W", help="initial spin x,y,z in rad/s"
+    )
+
+
+def _add_bake(parser: argparse.ArgumentParser) -> None:
+    defaults = BakeOptions()
+    parser.add_argument("--frames", type=int, default=defaults.frames, help=f"how many (default {defaults.frames})")
+    parser.add_argument("--fps", type=float, default=defaults.fps, help=f"frames a second (default {defaults.fps:g})")
+    parser.add_argument("--quality", default=defaults.quality, help="preset in presets/qualities (default standard)")
+    parser.add_argument(
+        "--arch", default=defaults.arch, choices=["cpu", "cuda", "vulkan", "metal"], help="where to simulate"
+    )
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--engine", default="cycles", choices=["cycles"], help="render engine")
+    parser.add_argument("--samples", type=int, metavar="N", help="samples a pixel")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the photo's resolution (default 1)")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = argparse.ArgumentParser(
+        prog="physgen",
+        description="One photo becomes a small physical world: reconstruct, simulate, render.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"physgen {VERSION}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Command, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        sub.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+        sub.set_defaults(run=run)
+        return sub
+
+    run = command("run", _run, "photo → video: all stages")
+    _add_photo(run)
+    _add_physics(run)
+    _add_bake(run)
+    _add_render(run)
+    run.add_argument("--out", type=Path, required=True, metavar="VIDEO.mp4", help="the video")
+    run.add_argument(
+        "--work", type=Path, metavar="DIR", help="keeps scene, bake and frames (default: beside the video)"
+    )
+
+    reconstruct = command("reconstruct", _reconstruct, "photo → scene folder")
+    _add_photo(reconstruct)
+    _add_physics(reconstruct)
+    reconstruct.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+
+    bake = command("bake", _bake, "scene folder → bake folder")
+    bake.add_argument("scene", type=Path, metavar="SCENE")
+    bake.add_argument("--out", type=Path, required=True, metavar="BAKE", help="the bake folder")
+    _add_physics(bake)
+    _add_bake(bake)
+
+    render = command("render", _render, "scene and bake → frames, video")
+    render.add_argument("scene", type=Path, metavar="SCENE")
+    render.add_argument("--bake", type=Path, required=True, metavar="BAKE")
+    render.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
+    render.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all)")
+    render.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    _add_render(render)
+
+    command("doctor", _doctor, "what is installed and what is missing")
+    return parser
+
+
+def _object_requests(options: argparse.Namespace) -> tuple[ObjectRequest, ...]:
+    boxes = options.box
+    for flag in ("name", "size"):
+        if len(getattr(options, flag)) > len(boxes):
+            raise InputError(
+                f"--{flag}: {len(getattr(options, flag))} given for {len(boxes)} boxes; give at most one a box"
+            )
+    return tuple(
+        ObjectRequest(
+            box=box,
+            name=options.name[i] if i < len(options.name) else None,
+            size_m=options.size[i] if i < len(options.size) else None,
+        )
+        for i, box in enumerate(boxes)
+    )
+
+
+def _reconstruct_options(options: argparse.Namespace) -> ReconstructOptions:
+    changes = {"horizon_y": options.horizon, "fov_deg": options.fov}
+    return dataclasses.replace(ReconstructOptions(), **{k: v for k, v in changes.items() if v is not None})
+
+
+def _bake_options(options: argparse.Namespace) -> BakeOptions:
+    return BakeOptions(frames=options.frames, fps=options.fps, quality=options.quality, arch=options.arch)
+
+
+def _render_request(options: argparse.Namespace, frames: str | None = None) -> pipeline.RenderRequest:
+    return pipeline.RenderRequest(engine=options.engine, samples=options.samples, scale=options.scale, frames=frames)
+
+
+def _run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    request = pipeline.RunRequest(
+        photo=options.photo,
+        objects=_object_requests(options),
+        video=options.out,
+        work=options.work or options.out.with_name(options.out.stem + "_work"),
+        presets=tuple(options.preset),
+        velocities=tuple(options.velocity),
+        spins=tuple(options.spin),
+        reconstruct=_reconstruct_options(options),
+        bake=_bake_options(options),
+        render=_render_request(options),
+    )
+    pipeline.run(request, terminal, cancelled)
+    terminal(
+        {"event": "done", "video": str(request.video), "scene": str(request.work / "scene"), "work": str(request.work)}
+    )
+    terminal.line(f"video: {request.video}\nscene: {request.work / 'scene'}")
+    return 0
+
+
+def _reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    requests, settings = _object_requests(options), _reconstruct_options(options)
+    reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
+    set_physics(options.out, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def _bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    set_physics(options.scene, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    done = pipeline.bake_stage(options.scene, options.out, _bake_options(options), terminal, cancelled)
+    terminal(done)
+    terminal.line(f"bake: {options.out}")
+    return 0
+
+
+def _render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    request = _render_request(options, options.frames)
+    terminal(
+        pipeline.render_stage(
+            options.scene, options.bake, options.out, request, terminal, cancelled, video=options.video
+        )
+    )
+    terminal.line(f"frames: {options.out}" + (f"\nvideo: {options.video}" if options.video else ""))
+    return 0
+
+
+def _doctor(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    report = doctor.examine()
+    terminal({"event": "done", "report": report})
+    terminal.line("\n".join(f"{'ok     ' if ok else 'MISSING'} {name}: {text}" for name, ok, text in report))
+    return 0 if all(ok for _, ok, _ in report) else InputError.exit_code
+
+
+def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
+    """``--velocity -1,0,2`` looks like a flag to argparse; a leading blank tells it otherwise."""
+    return [f" {a}" if re.match(r"-[\d.][\d.,eE+-]*$", a) else a for a in arguments]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry of ``physgen``; the exit code, as docs/cli.md lists them."""
+    options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    expected = pipeline.expected_seconds(options.frames) if options.command == "run" else None
+    terminal = Terminal(as_json=options.json, expected_s=expected)
+    try:
+        run: Command = options.run
+        return run(options, terminal, stop.is_set)
+    except Cancelled as error:
+        terminal.error("Cancelled", str(error))
+        return error.exit_code
+    except PhysGenError as error:
+        terminal.error(type(error).__name__, str(error))
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

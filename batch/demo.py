@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``make demo``: the coffee photo of scikit-image becomes a video, by the same path as any other photo."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..sim.app.bake_inputs import BakeOptions
+from ..sim.errors import InputError, PhysGenError
+from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.scene.json_fields import parse
+from ..sim.scene.model import Vector
+from . import pipeline
+from .terminal import Terminal
+
+CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoConfig:
+    """A photo that scikit-image ships and what happens in it; units as on the command line (docs/cli.md)."""
+
+    description: str
+    photo: str
+    boxes: tuple[tuple[float, float, float, float], ...]
+    names: tuple[str, ...]
+    sizes: tuple[float, ...]
+    presets: tuple[str, ...]
+    velocities: tuple[Vector, ...]
+    horizon: float | None = None
+    frames: int
+    fps: float
+    samples: int
+
+
+def load_config(path: Path = CONFIG) -> DemoConfig:
+    """Read the demo's configuration. Raises InputError when it is not readable."""
+    try:
+        return parse(DemoConfig, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def shipped_photo(name: str) -> Path:
+    """The file of a photo that scikit-image ships."""
+    import skimage.data
+
+    path = Path(skimage.data.__file__).with_name(f"{name}.png")
+    if not path.is_file():
+        raise InputError(f"{path}: scikit-image does not ship this photo; run `make setup` again")
+    return path
+
+
+def request(config: DemoConfig, out: Path) -> pipeline.RunRequest:
+    """The demo as a job like any other."""
+    objects = tuple(
+        ObjectRequest(box=box, name=name, size_m=size)
+        for box, name, size in zip(config.boxes, config.names, config.sizes, strict=True)
+    )
+    return pipeline.RunRequest(
+        photo=shipped_photo(config.photo),
+        objects=objects,
+        video=out / f"{config.photo}.mp4",
+        work=out,
+        presets=config.presets,
+        velocities=config.velocities,
+        reconstruct=ReconstructOptions(horizon_y=config.horizon),
+        bake=BakeOptions(frames=config.frames, fps=config.fps),
+        render=pipeline.RenderRequest(samples=config.samples),
+    )
+
+
+def main() -> int:
+    """Entry of ``python -m physgen.batch.demo``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("demo_out"))
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    started = time.monotonic()
+    config = load_config()
+    terminal = Terminal(as_json=options.json, expected_s=pipeline.expected_seconds(config.frames))
+    terminal.line(config.description)
+    try:
+        video = pipeline.run(request(config, options.out), terminal, stop.is_set)
+    except PhysGenError as error:
+        terminal.error(type(error).__name__, str(error))
+        return error.exit_code
+    terminal({"event": "done", "video": str(video), "scene": str(options.out / "scene")})
+    terminal.line(f"done in {time.monotonic() - started:.0f} s\nvideo: {video}\nscene: {options.out / 'scene'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

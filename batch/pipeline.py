@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The stages as processes, one after another: what ``physgen run`` and ``make demo`` do."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..sim.app import worker
+from ..sim.app.bake_inputs import BakeOptions
+from ..sim.app.events import Event, IsCancelled, OnEvent
+from ..sim.app.process import run_stage
+from ..sim.app.reconstruct import reconstruct_scene, set_physics
+from ..sim.errors import RenderError, SimulationError
+from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.scene.model import Vector
+
+RENDER_SCRIPT = Path(__file__).with_name("render.py")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderRequest:
+    """How frames are rendered.
+
+    samples: Cycles samples a pixel, None for the default.
+    scale: of the photo's resolution, above 0 to 1.
+    frames: range such as ``1-48``, ``1,5,9`` or ``1-48x2``; None for all that are baked.
+    """
+
+    engine: str = "cycles"
+    samples: int | None = None
+    scale: float = 1.0
+    frames: str | None = None
+
+
+def bake_stage(scene: Path, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+    """Bake in the worker process. Raises what ``sim.app.bake.bake`` raises."""
+    job = worker.BakeJob(scene=str(scene.resolve()), out=str(out.resolve()), options=options)
+    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+        path = Path(folder) / "job.json"
+        path.write_text(json.dumps(worker.job_to_json(job)), encoding="utf-8")
+        return run_stage([sys.executable, "-m", worker.MODULE, str(path)], on_event, cancelled, failure=SimulationError)
+
+
+def render_stage(
+    scene: Path,
+    bake: Path,
+    out: Path,
+    request: RenderRequest,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+    *,
+    video: Path | None = None,
+) -> Event:
+    """Render frames, and ``video`` from them, in a process that holds bpy."""
+    command = [
+        sys.executable,
+        str(RENDER_SCRIPT),
+        str(scene.resolve()),
+        "--bake",
+        str(bake.resolve()),
+        "--out",
+        str(out.resolve()),
+    ]
+    command += ["--engine", request.engine, "--scale", repr(request.scale), "--json"]
+    if request.samples is not None:
+        command += ["--samples", str(request.samples)]
+    if request.frames is not None:
+        command += ["--frames", request.frames]
+    if video is not None:
+        command += ["--video", str(video.resolve())]
+    return run_stage(command, on_event, cancelled, failure=RenderError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """A whole job. ``work`` keeps ``scene``, ``bake`` and ``frames``; ``video`` is the result.
+
+    presets, velocities, spins: by object, in the order of ``objects``; empty keeps the scene's own.
+    """
+
+    photo: Path
+    objects: tuple[ObjectRequest, ...]
+    video: Path
+    work: Path
+    presets: tuple[str, ...] = ()
+    velocities: tuple[Vector, ...] = ()
+    spins: tuple[Vector, ...] = ()
+    reconstruct: ReconstructOptions = dataclasses.field(default_factory=ReconstructOptions)
+    bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
+    render: RenderRequest = dataclasses.field(default_factory=RenderRequest)
+
+
+def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
+    """First guesses for stages that have not begun: the coffee demo on two cores; paces measured later replace them."""
+    guesses = {"reconstruct": 15.0, "bake": 8.0 + 0.6 * frames, "render": 8.0 + 2.5 * frames}
+    return {stage: guesses[stage] for stage in stages}
+
+
+def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
+    """Photo → video. Each stage does nothing when its inputs have not changed."""
+    scene, bake = request.work / "scene", request.work / "bake"
+    reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
+    set_physics(scene, presets=request.presets, velocities=request.velocities, spins=request.spins)
+    bake_stage(scene, bake, request.bake, on_event, cancelled)
+    render_stage(scene, bake, request.work / "frames", request.render, on_event, cancelled, video=request.video)
+    return request.video

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Progress on a terminal for people, or as JSON lines for machines."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import TextIO
+
+from ..sim.app.events import Event
+
+STAGES = ("reconstruct", "bake", "render", "encode")
+
+
+class Terminal:
+    """Shows events. One line that renews itself on a terminal, a line now and then in a log, JSON for machines."""
+
+    def __init__(self, *, as_json: bool, expected_s: dict[str, float] | None = None) -> None:
+        self._json = as_json
+        self._out: TextIO = sys.stdout
+        self._live = not as_json and self._out.isatty()
+        self._started = time.monotonic()
+        # Stages that have not begun yet count with a first guess, so that the time left is of the whole job.
+        self._left = dict(expected_s or {})
+        self._last_line = 0.0
+        self._open_line = False
+
+    def __call__(self, event: Event) -> None:
+        """Show ``event``."""
+        kind, stage = event.get("event"), str(event.get("stage", ""))
+        if kind == "progress":
+            done, total, eta = int(event["done"]), int(event["total"]), event.get("eta_s")
+            if eta is not None:
+                self._left[stage] = float(eta)
+            if done >= total:
+                self._left[stage] = 0.0
+            event = {**event, "job_eta_s": round(sum(self._left.values()), 1)}
+        if self._json:
+            self._out.write(json.dumps(event, ensure_ascii=False) + "\n")
+            self._out.flush()
+        elif kind == "progress":
+            self._progress(event, stage)
+        elif "message" in event:
+            self.line(f"{stage + ': ' if stage else ''}{event['message']}")
+
+    def _progress(self, event: Event, stage: str) -> None:
+        done, total = int(event["done"]), int(event["total"])
+        now = time.monotonic()
+        finished = done >= total
+        if not self._live and not finished and now - self._last_line < 5.0:
+            return
+        self._last_line = now
+        message = str(event.get("message") or event.get("step") or "")
+        left = _clock(float(event["job_eta_s"]))
+        text = f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} gone, about {left} left"
+        if self._live:
+            self._out.write("\r\x1b[K" + text + ("\n" if finished else ""))
+            self._open_line = not finished
+        else:
+            self._out.write(text + "\n")
+        self._out.flush()
+
+    def line(self, text: str) -> None:
+        """Print one line of text, below a progress line that is being renewed."""
+        if self._json:
+            return
+        self._out.write(("\n" if self._open_line else "") + text + "\n")
+        self._open_line = False
+        self._out.flush()
+
+    def error(self, kind: str, message: str) -> None:
+        """Report the error that ends the run."""
+        if self._json:
+            self._out.write(json.dumps({"event": "error", "kind": kind, "message": message}, ensure_ascii=False) + "\n")
+            self._out.flush()
+        else:
+            sys.stderr.write(("\n" if self._open_line else "") + f"error: {message}\n")
+
+
+def _clock(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole // 60}:{whole % 60:02d}"

@@ -1,0 +1,16 @@
+#!/bin/sh
+# venv.sh PYTHON VENV: a virtual environment with the project and everything it needs, made again when the
+# interpreter or the requirements changed.
+set -eu
+python=$1 venv=$2
+wanted="$("$python" -c 'import sys; print(sys.version)' | head -n 1) $(cksum <pyproject.toml)"
+[ -f "$venv/.ready" ] && [ "$(cat "$venv/.ready")" = "$wanted" ] && exit 0
+echo "setting up $venv with $("$python" --version) (downloads about 700 MB the first time)"
+rm -rf "$venv"
+"$python" -m venv "$venv" || {
+    echo "Python's venv module is missing; on Debian and Ubuntu: sudo apt-get install python3-venv" >&2
+    exit 1
+}
+"$venv/bin/pip" install -q --disable-pip-version-check -e '.[blender,dev]'
+"$venv/bin/python" -c 'import bpy' >/dev/null
+printf '%s\n' "$wanted" >"$venv/.ready"

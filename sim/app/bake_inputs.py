@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""What a bake depends on, as one hash: the same inputs never run twice, and any change runs again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..scene.folder import SceneFolder
+from ..scene.json_fields import to_json
+
+ENGINE_REVISION = 1
+"""Raised with every change of the engine or the skinning that changes what a scene does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeOptions:
+    """How a scene is simulated.
+
+    frames: samples to bake, 1 to 100000; the first is the scene at rest.
+    fps: frames a second, above 0 and up to 1000.
+    quality: name of a preset in ``presets/qualities``.
+    arch: ``cpu``, ``cuda``, ``vulkan`` or ``metal``; what is not there falls back to ``cpu`` with a notice.
+    seed: of the particle sampling.
+    """
+
+    frames: int = 48
+    fps: float = 24.0
+    quality: str = "standard"
+    arch: str = "cpu"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= 100_000:
+            raise InputError(f"frames is {self.frames}: give 1 to 100000")
+        if not 0 < self.fps <= 1000:
+            raise InputError(f"fps is {self.fps}: give frames a second above 0 and up to 1000")
+
+
+def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
+    """SHA-256 over everything that the motion depends on; photo, camera and light do not count."""
+    scene = folder.scene
+    objects = []
+    for item in scene.objects:
+        fields: dict[str, Any] = to_json(item)
+        for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
+            del fields[irrelevant]
+        fields["material"].pop("preset")
+        fields["mesh"] = file_hash(folder.file(item.mesh))
+        objects.append(fields)
+    content = {
+        "engine": ENGINE_REVISION,
+        "objects": objects,
+        "ground": to_json(scene.ground),
+        "gravity": scene.gravity,
+        "effects": to_json(scene.effects),
+        "options": to_json(options),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's bytes; InputError when it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error

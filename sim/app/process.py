@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""A stage in a process of its own: events come back as JSON lines, cancelling is asked for, then enforced.
+
+Taichi and bpy do not share a process (docs/design.md), and memory comes back when a stage ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from queue import Empty, Queue
+
+from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
+from .events import Event, IsCancelled, OnEvent
+
+CANCEL_GRACE_S = 10.0
+"""How long a stage may take to put things in order before it is killed."""
+
+_ERRORS: dict[str, type[PhysGenError]] = {e.__name__: e for e in (InputError, SimulationError, RenderError, Cancelled)}
+_STRIPPED = ("PYTHONHOME", "PYTHONPATH", "LD_PRELOAD", "LD_LIBRARY_PATH")
+
+
+def child_environment() -> dict[str, str]:
+    """This process's environment without what would make another interpreter load the wrong libraries."""
+    return {key: value for key, value in os.environ.items() if key not in _STRIPPED}
+
+
+def run_stage(
+    command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled, *, failure: type[PhysGenError] = SimulationError
+) -> Event:
+    """Run ``command`` to its end, pass its events on and return its final ``done`` event.
+
+    Raises the PhysGenError that the stage reported; Cancelled when ``cancelled()`` became true; ``failure`` with
+    the last lines of its output when it died without a word.
+    """
+    flags = 0x00000200 | 0x08000000 if os.name == "nt" else 0  # new process group, no console window
+    # Own session: Ctrl-C reaches this process alone, which then asks the stage to stop in good order.
+    process = subprocess.Popen(
+        list(command),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=child_environment(),
+        start_new_session=os.name != "nt",
+        creationflags=flags,
+    )
+    lines: Queue[bytes | None] = Queue()
+    tail: deque[str] = deque(maxlen=30)
+    readers = [
+        threading.Thread(target=_read_events, args=(process, lines), daemon=True),
+        threading.Thread(target=_read_errors, args=(process, tail), daemon=True),
+    ]
+    for reader in readers:
+        reader.start()
+    try:
+        final = _relay(process, lines, tail, on_event, cancelled)
+    finally:
+        _stop(process)
+        for reader in readers:
+            reader.join(timeout=5)
+    if final is not None and final.get("event") == "error":
+        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
+    if process.returncode != 0 or final is None:
+        words = "\n".join(tail).strip() or "it said nothing"
+        raise failure(f"the {failure.__name__} stage ended with code {process.returncode}: {words}")
+    return final
+
+
+def _relay(
+    process: subprocess.Popen[bytes],
+    lines: Queue[bytes | None],
+    tail: deque[str],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> Event | None:
+    final: Event | None = None
+    asked_at: float | None = None
+    while True:
+        if asked_at is None and cancelled():
+            asked_at = time.monotonic()
+            _ask_to_stop(process)
+        if asked_at is not None and time.monotonic() - asked_at > CANCEL_GRACE_S:
+            process.kill()
+            raise Cancelled("cancelled; the stage did not stop by itself and was killed, complete frames are kept")
+        try:
+            line = lines.get(timeout=0.1)
+        except Empty:
+            continue
+        if line is None:
+            process.wait()
+            return final
+        event = _parse_event(line)
+        if event is None:
+            tail.append(line.decode("utf-8", "replace").rstrip())
+        elif event["event"] in ("done", "error"):
+            final = event
+        else:
+            on_event(event)
+
+
+def _parse_event(line: bytes) -> Event | None:
+    """The event on ``line``, or None for the chatter of a library."""
+    try:
+        value = json.loads(line)
+    except ValueError:
+        return None
+    return value if isinstance(value, dict) and "event" in value else None
+
+
+def _read_events(process: subprocess.Popen[bytes], lines: Queue[bytes | None]) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        lines.put(line)
+    lines.put(None)
+
+
+def _read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
+    assert process.stderr is not None
+    for line in process.stderr:
+        tail.append(line.decode("utf-8", "replace").rstrip())
+
+
+def _ask_to_stop(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.send_signal(signal.CTRL_BREAK_EVENT if os.name == "nt" else signal.SIGTERM)  # type: ignore[attr-defined]
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    """Leave no process behind, whatever went wrong on this side."""
+    if process.poll() is None:
+        process.kill()
+    process.wait()

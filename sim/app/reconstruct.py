@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: MIT
+"""Photo → scene folder, once: the same photo, boxes and options are not reconstructed twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..atomic import write_json
+from ..errors import InputError
+from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct
+from ..scene.folder import SceneFolder, load_scene, save_scene
+from ..scene.json_fields import read_json, to_json
+from ..scene.materials import load_preset
+from ..scene.model import Vector
+from .bake_inputs import file_hash
+from .events import IsCancelled, OnEvent, ignore, never
+
+STAMP_FILE = "reconstruct.json"
+RECONSTRUCT_REVISION = 1
+"""Raised with every change of reconstruction that changes what a photo becomes."""
+
+
+def reconstruct_scene(
+    photo: Path,
+    objects: Sequence[ObjectRequest],
+    out: Path,
+    options: ReconstructOptions | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> SceneFolder:
+    """Reconstruct ``photo`` into the scene folder ``out``, unless it is there already.
+
+    Physics (preset, velocity, spin) does not count: ``set_physics`` changes it in the finished scene.
+    Raises what ``sim.reconstruct.reconstruct`` raises.
+    """
+    options = options or ReconstructOptions()
+    stamp = {"inputs_hash": _inputs_hash(photo, objects, options)}
+    if _stamp(out) == stamp:
+        try:
+            folder = load_scene(out)
+        except InputError:
+            pass
+        else:
+            on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
+            return folder
+    if not photo.is_file():
+        raise InputError(f"{photo}: there is no such photo")
+    folder = reconstruct(photo, objects, out, options, on_event, cancelled)
+    write_json(out / STAMP_FILE, stamp)
+    return folder
+
+
+def _stamp(out: Path) -> object:
+    try:
+        return read_json(out / STAMP_FILE)
+    except InputError:
+        return None
+
+
+def _inputs_hash(photo: Path, objects: Sequence[ObjectRequest], options: ReconstructOptions) -> str:
+    shapes = []
+    for item in objects:
+        fields = to_json(item)
+        for physics in ("preset", "velocity", "spin"):
+            fields.pop(physics, None)
+        shapes.append(fields)
+    content = {
+        "revision": RECONSTRUCT_REVISION,
+        "photo": file_hash(photo),
+        "objects": shapes,
+        "options": to_json(options),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def set_physics(
+    root: Path, *, presets: Sequence[str] = (), velocities: Sequence[Vector] = (), spins: Sequence[Vector] = ()
+) -> SceneFolder:
+    """Give the scene's objects, in order, other materials and motions; objects beyond a list keep what they have.
+
+    A single preset goes to all objects. ``scene.json`` is only written when something changes.
+    Raises InputError for an unknown preset or more entries than objects.
+    """
+    folder = load_scene(root)
+    scene = folder.scene
+    for name, values in (("preset", presets), ("velocity", velocities), ("spin", spins)):
+        if len(values) > len(scene.objects):
+            raise InputError(
+                f"{name}: {len(values)} given for {len(scene.objects)} objects; give at most one an object"
+            )
+    if len(presets) == 1:
+        presets = [presets[0]] * len(scene.objects)
+    changed = list(scene.objects)
+    for index, preset in enumerate(presets):
+        if changed[index].material.preset != preset:
+            changed[index] = dataclasses.replace(changed[index], material=load_preset(preset))
+    for index, velocity in enumerate(velocities):
+        changed[index] = dataclasses.replace(changed[index], velocity=velocity)
+    for index, spin in enumerate(spins):
+        changed[index] = dataclasses.replace(changed[index], spin=spin)
+    if tuple(changed) == scene.objects:
+        return folder
+    return save_scene(root, dataclasses.replace(scene, objects=tuple(changed)))

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""Point caches, manifests and locks: whole or refused, whatever is on the disk."""
+
+import json
+import os
+import socket
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from physgen.sim.cache.lock import LOCK_FILE, folder_lock
+from physgen.sim.cache.manifest import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
+from physgen.sim.errors import InputError
+
+samples_of_points = hnp.arrays(
+    np.float32, st.tuples(st.integers(1, 5), st.integers(1, 9), st.just(3)), elements=st.floats(-1e3, 1e3, width=32)
+)
+keeps_tmp = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+
+
+@given(samples_of_points)
+@keeps_tmp
+def test_samples_come_back(tmp_path, samples):
+    path = tmp_path / "a.pc2"
+    with Pc2Writer(path, vertex_count=samples.shape[1]) as writer:
+        for index, sample in enumerate(samples):
+            writer.append(sample)
+            assert Pc2Reader(path).sample_count == index + 1
+    reader = Pc2Reader(path)
+    assert np.array_equal(np.stack([reader.sample(i) for i in range(len(samples))]), samples)
+
+
+def test_the_header_is_the_one_blender_reads(tmp_path):
+    path = tmp_path / "a.pc2"
+    with Pc2Writer(path, vertex_count=2, start_frame=5) as writer:
+        writer.append(np.zeros((2, 3)))
+    assert struct.unpack("<12siiffi", path.read_bytes()[:32]) == (b"POINTCACHE2\0", 1, 2, 5.0, 1.0, 1)
+
+
+def test_a_writer_goes_on_from_kept_samples(tmp_path):
+    path = tmp_path / "a.pc2"
+    with Pc2Writer(path, vertex_count=1) as writer:
+        for value in range(5):
+            writer.append(np.full((1, 3), value))
+    with Pc2Writer(path, vertex_count=1, keep=2) as writer:
+        writer.append(np.full((1, 3), 9))
+    assert [float(Pc2Reader(path).sample(i)[0, 0]) for i in range(3)] == [0.0, 1.0, 9.0]
+    assert Pc2Reader(path).sample_count == 3
+    with pytest.raises(InputError, match="sample 3"):
+        Pc2Reader(path).sample(3)
+    with pytest.raises(InputError, match="7 samples"):
+        Pc2Writer(path, vertex_count=1, keep=7)
+
+
+def test_bad_samples_are_refused(tmp_path):
+    with Pc2Writer(tmp_path / "a.pc2", vertex_count=2) as writer:
+        with pytest.raises(InputError, match="shape"):
+            writer.append(np.zeros((3, 3)))
+        with pytest.raises(InputError, match="finite"):
+            writer.append(np.full((2, 3), np.nan))
+
+
+@given(st.binary(max_size=80), st.booleans())
+@keeps_tmp
+def test_garbage_is_no_cache(tmp_path, content, signed):
+    path = tmp_path / "a.pc2"
+    path.write_bytes((b"POINTCACHE2\0" if signed else b"") + content)
+    try:
+        reader = Pc2Reader(path)
+    except InputError:
+        return
+    assert path.stat().st_size >= 32 + reader.sample_count * reader.vertex_count * 12
+
+
+def a_manifest(**changes):
+    fields = {
+        "inputs_hash": "0" * 64,
+        "fps": 24.0,
+        "frame_start": 1,
+        "frames": 3,
+        "frames_done": 3,
+        "state": "complete",
+        "engine": "test",
+        "version": "0",
+        "particles": 8,
+        "objects": (BakedObject(name="cup", file="cup.pc2", vertices=4),),
+    }
+    return BakeManifest(**{**fields, **changes})
+
+
+def test_a_manifest_comes_back(tmp_path):
+    save_manifest(tmp_path, a_manifest())
+    assert load_manifest(tmp_path) == a_manifest()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "other/1"}, "format"),
+        ({"state": "done"}, "state"),
+        ({"frames_done": 9}, "frame range"),
+        ({"fps": 0}, "frame range"),
+        ({"objects": [{"name": "a", "file": "../a.pc2", "vertices": 1}]}, "file name"),
+    ],
+)
+def test_bad_manifests_are_named(tmp_path, change, words):
+    save_manifest(tmp_path, a_manifest())
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(InputError, match=words):
+        load_manifest(tmp_path)
+
+
+def test_no_bake_says_what_to_run(tmp_path):
+    with pytest.raises(InputError, match="physgen bake"):
+        load_manifest(tmp_path)
+
+
+def test_a_living_process_keeps_its_folder(tmp_path):
+    other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        (tmp_path / LOCK_FILE).write_text(json.dumps({"pid": other.pid, "host": socket.gethostname()}))
+        with pytest.raises(InputError, match=f"in use by process {other.pid}"), folder_lock(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.wait()
+    with folder_lock(tmp_path):
+        assert json.loads((tmp_path / LOCK_FILE).read_text())["pid"] == os.getpid()
+    assert not (tmp_path / LOCK_FILE).exists()
+
+
+@pytest.mark.parametrize("content", ["", "garbage", "[]", '{"pid": "x"}'])
+def test_a_broken_lock_is_taken_over(tmp_path, content):
+    (tmp_path / LOCK_FILE).write_text(content)
+    with folder_lock(tmp_path):
+        pass

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""Who may import whom (docs/design.md), read from the sources; and what the tree says of itself in several places."""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from physgen.sim.version import VERSION
+
+ROOT = Path(__file__).resolve().parents[2]
+MAY_IMPORT_TAICHI = ("sim/mpm", "sim/effects", "sim/gaussians")
+FORBIDDEN = {"sim": ("physgen_addon", "batch"), "physgen_addon/bridge": ("batch",)}
+
+
+def sources(folder):
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def imports(path):
+    """Absolute names of everything that ``path`` imports, relative imports resolved against the tree."""
+    package = path.relative_to(ROOT).parent.parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            yield ".".join([*base, *([node.module] if node.module else [])])
+            if node.level and not node.module:
+                yield from (".".join([*base, alias.name]) for alias in node.names)
+
+
+@pytest.mark.parametrize("path", sources("sim"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_sim_needs_no_blender_and_never_looks_upward(path):
+    names = list(imports(path))
+    assert not [n for n in names if n.split(".")[0] in ("bpy", "mathutils", "bmesh", "physgen_addon", "batch")]
+    if not str(path.relative_to(ROOT).as_posix()).startswith(MAY_IMPORT_TAICHI):
+        assert not [n for n in names if n.split(".")[0] == "taichi"]
+
+
+@pytest.mark.parametrize("path", sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_addon_never_imports_taichi_or_batch(path):
+    assert not [n for n in imports(path) if n.split(".")[0] in ("taichi", "batch")]
+
+
+@pytest.mark.parametrize("path", sources("sim") + sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_inside_the_tree_are_relative(path):
+    # Installed as an extension the package is bl_ext.<repository>.physgen.
+    assert not [n for n in imports(path) if n.split(".")[0] == "physgen"]
+
+
+def test_rendering_and_opening_a_scene_never_pay_for_taichi():
+    code = "import sys, physgen.batch.pipeline, physgen.sim.app.bake as b; sys.exit(not {*sys.modules}.isdisjoint(['taichi', 'bpy']))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_package_list_is_the_tree():
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    found = {
+        ".".join(["physgen", *p.parent.relative_to(ROOT).parts])
+        for p in ROOT.rglob("__init__.py")
+        if not any(part.startswith(".") or part in ("tests", "build") for part in p.relative_to(ROOT).parts)
+    }
+    assert listed == found
+
+
+def test_one_version():
+    assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == VERSION
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text())
+    assert manifest["version"] == VERSION
+
+
+def test_every_source_names_its_licence():
+    for path in [p for folder in ("sim", "physgen_addon", "batch", "presets") for p in sources(folder)]:
+        licence = "MIT" if path.relative_to(ROOT).parts[0] in ("sim", "presets") else "GPL-3.0-or-later"
+        first = path.read_text(encoding="utf-8").splitlines()[0:2]
+        assert any(re.search(rf"SPDX-License-Identifier: {licence}$", line) for line in first), path
+
+
+def test_every_preset_says_where_its_numbers_come_from():
+    for path in (ROOT / "presets" / "materials").glob("*.toml"):
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        assert data["source"] and data["description"], path
