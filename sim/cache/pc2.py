@@ -47,7 +47,7 @@ class Pc2Reader:
         _, version, vertices, start, rate, samples = _HEADER.unpack(header)
         if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or rate <= 0:
             raise InputError(
-                f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is garbage; bake again"
+                f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is garbage; rebake"
             )
         if size < _HEADER.size + samples * vertices * 12:
             raise InputError(
