@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Taichi's process-wide state: start it once, reuse it for every world, fall back to the CPU where needed."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+
+import taichi as ti
+
+from ..errors import InputError
+from .options import SolverOptions
+
+logger = logging.getLogger(__name__)
+
+_GENERATION = 0
+_ACTIVE: tuple[str, int, str] | None = None
+
+
+def ensure_started(options: SolverOptions) -> tuple[str, int]:
+    """Start Taichi for ``options`` unless it already runs that way.
+
+    Returns the architecture in use ("cpu" after a fallback, which is logged) and the generation of the runtime. A
+    change of architecture, thread count or cache folder restarts Taichi, which loses the arrays of earlier worlds; a
+    world compares its generation before each use.
+    """
+    global _ACTIVE, _GENERATION
+    folder = "" if options.cache_folder is None else str(options.cache_folder)
+    wanted = (_available(options.arch), options.threads, folder)
+    if wanted == _ACTIVE and ti.lang.impl.get_runtime().prog is not None:
+        return wanted[0], _GENERATION
+    arguments: dict[str, object] = {
+        "arch": getattr(ti, wanted[0]),
+        "default_fp": ti.f32,
+        "fast_math": True,
+        "offline_cache": True,
+        "log_level": ti.ERROR,
+        "enable_fallback": False,
+    }
+    if wanted[1]:
+        arguments["cpu_max_num_threads"] = wanted[1]
+    if folder:
+        arguments["offline_cache_file_path"] = folder
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    try:
+        ti.init(**arguments)
+    except RuntimeError as error:
+        if wanted[0] == "cpu":
+            raise InputError(f"solver option cache_folder is {folder!r}: Taichi did not start ({error})") from error
+        logger.warning("Taichi could not start on %s (%s); computing on the CPU", wanted[0], error)
+        ti.init(**{**arguments, "arch": ti.cpu})
+        wanted = ("cpu", options.threads, folder)
+    _ACTIVE = wanted
+    _GENERATION += 1
+    return wanted[0], _GENERATION
+
+
+def generation() -> int:
+    """Number of times that Taichi was started in this process."""
+    return _GENERATION
+
+
+def _available(arch: str) -> str:
+    """``arch``, or "cpu" with a logged reason where this build or machine has none."""
+    if arch == "cpu":
+        return arch
+    probes = {
+        "cuda": ti.lang.misc.is_arch_supported,
+        "vulkan": ti.lang.misc.is_arch_supported,
+        "metal": ti.lang.misc.is_arch_supported,
+    }
+    if (arch == "metal" and sys.platform != "darwin") or not probes[arch](getattr(ti, arch)):
+        logger.warning("solver option arch %r: not available here; computing on the CPU", arch)
+        return "cpu"
+    return arch

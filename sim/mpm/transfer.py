@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201 (Taichi reads annotations; kernels and their functions cannot carry a return type of None or tuples)
+"""The two kernels of every substep: nodes, then particles (MLS-MPM, Hu et al. 2018; APIC, Jiang et al. 2015).
+
+Quadratic B-splines; lengths in cells (see ``layout``), seconds, kilograms. A substep is
+
+    advance_nodes      gather the windows, momentum -> velocity, gravity, walls
+    (contact kernels)  see ``contact``
+    advance_particles  grid -> particles -> grid in one pass over the particles, without atomics
+"""
+
+import taichi as ti
+
+from .constitutive import fixed_corotated
+from .layout import (
+    BLOCK_NODES,
+    FIXED_HIGH,
+    FIXED_LOW,
+    FIXED_ONE,
+    SCALARS_PER_BLOCK,
+    SPREAD,
+    WALL_NODES,
+    WINDOW_NODES,
+    Cells,
+    Integers,
+    Matrices,
+    Scalars,
+    Vectors3,
+    Vectors4,
+    ivec3,
+    mat3,
+    vec3,
+    vec4,
+)
+
+SUNK_LIMIT = 0.05
+"""Depth in cells from which a particle is lifted out of the ground, should the contact solve not have held it."""
+
+LIFT = 0.01
+"""Cells that a sunk particle is lifted by at most in a substep."""
+
+
+@ti.func
+def weights(fx: vec3):  # type: ignore[no-untyped-def]
+    """Quadratic B-spline weights (list of three vectors) at distance ``fx`` from the lowest node, 0.5 <= fx < 1.5."""
+    return [0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2]
+
+
+@ti.func
+def span(side: ti.i32):  # type: ignore[no-untyped-def]
+    """Window nodes [low, high) that fall in the block before (0), of (1) or after (2) the window's own block."""
+    low = ti.select(side == 0, 0, ti.select(side == 1, 1, 5))
+    high = ti.select(side == 0, 1, ti.select(side == 1, 5, 8))
+    return low, high
+
+
+@ti.func
+def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):  # type: ignore[no-untyped-def]
+    """Copy the nodes around particle block ``k`` into its private window."""
+    for d in range(27):
+        g = neighbours[k * 27 + d]
+        il, ih = span(d // 9)
+        jl, jh = span(d // 3 % 3)
+        ml, mh = span(d % 3)
+        for i in range(il, ih):
+            for j in range(jl, jh):
+                for m in range(ml, mh):
+                    node = ((i + 3) & 3) * 16 + ((j + 3) & 3) * 4 + ((m + 3) & 3)
+                    window[k * WINDOW_NODES + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
+
+
+@ti.func
+def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):  # type: ignore[no-untyped-def]
+    """Add the windows of the 27 particle blocks around grid block ``g`` to its nodes."""
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        if k >= 0:
+            di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
+            il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
+            jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
+            ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
+            shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
+            for i in range(il, ih):
+                for j in range(jl, jh):
+                    for m in range(ml, mh):
+                        n = g * BLOCK_NODES + i * 16 + j * 4 + m
+                        nodes[n] = nodes[n] + window[i * 64 + j * 8 + m + shift]
+
+
+@ti.kernel
+def advance_nodes(
+    blocks: ti.i32,
+    grid: ti.i32,
+    gravity_step: vec3,
+    block_cells: Cells,
+    neighbours: Integers,
+    scatter: Vectors4,
+    nodes: Vectors4,
+    masses: Scalars,
+):
+    """Nodes of all grid blocks: sum of the windows, velocity = momentum / mass, gravity, walls.
+
+    nodes: velocity in cells/s; the fourth number is left at 0 for the contact kernels, which find the mass in
+    ``masses`` (kg).
+    """
+    for gg in range(blocks * SPREAD):
+        if gg % SPREAD == 0:
+            g = gg // SPREAD
+            for i in range(BLOCK_NODES):
+                nodes[g * BLOCK_NODES + i] = vec4(0.0)
+            add_windows(g, neighbours, scatter, nodes)
+            first = block_cells[g] * 4
+            wall = (first < WALL_NODES + 1).any() or (first + 4 > grid - WALL_NODES - 1).any()
+            for i in range(BLOCK_NODES):
+                q = nodes[g * BLOCK_NODES + i]
+                masses[g * BLOCK_NODES + i] = q[3]
+                if q[3] > 0.0:
+                    inverse = 1.0 / q[3]
+                    u = vec3(q[0], q[1], q[2]) * inverse + gravity_step
+                    if wall:
+                        cell = first + ivec3(i // 16, i // 4 % 4, i % 4)
+                        for c in ti.static(range(3)):
+                            if cell[c] <= WALL_NODES and u[c] < 0.0:
+                                u[c] = 0.0
+                            if cell[c] >= grid - WALL_NODES - 1 and u[c] > 0.0:
+                                u[c] = 0.0
+                    nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
+
+
+@ti.kernel
+def advance_particles(
+    blocks: ti.i32,
+    gather: ti.i32,
+    scatter: ti.i32,
+    store: ti.i32,
+    dt_gather: ti.f32,
+    dt_scatter: ti.f32,
+    normal: vec3,
+    offset: ti.f32,
+    block_cells: Cells,
+    starts: Integers,
+    neighbours: Integers,
+    near_ground: Integers,
+    x: Cells,
+    v: Vectors3,
+    C: Matrices,
+    F: Matrices,
+    constants: Vectors4,
+    reaction: Vectors4,
+    window: Vectors4,
+    nodes: Vectors4,
+    scattered: Vectors4,
+    report: Scalars,
+):
+    """Grid to particles over ``dt_gather``, then particles to grid with the stress impulse of ``dt_scatter``.
+
+    gather, scatter: 0 leaves that half out (before and after a sort); store: 1 writes ``v`` and ``C``, which are
+    otherwise recomputed before anyone reads them.
+    x: window coordinates, fixed point; v: cells/s; C: 1/s; F: 1.
+    constants: mass kg, 2 mu V0, lambda V0 (kg cells^2/s^2), contact radius in cells.
+    reaction: contact acceleration of the last substep (cells/s^2) and the share of contacting mass at the particle.
+    report, 8 numbers a block: largest |v|^2, largest c^2, least distance to the window's limits in cells, least
+    distance to the ground, sum of |v|^2 (not finite when the simulation is lost), 3 spare.
+    """
+    for kk in range(blocks * SPREAD):
+        if kk % SPREAD == 0:
+            k = kk // SPREAD
+            if gather == 1:
+                load_window(k, neighbours, window, nodes)
+            if scatter == 1:
+                for i in range(WINDOW_NODES):
+                    scattered[k * WINDOW_NODES + i] = vec4(0.0)
+            ground = near_ground[k] >= 0
+            level = normal.dot(ti.cast(block_cells[k] * 4 - 1, ti.f32)) - offset
+            speed2 = 0.0
+            stiffness = 0.0
+            sum2 = 0.0
+            lowest = FIXED_HIGH
+            highest = FIXED_LOW
+            clearance = 1e9
+            for p in range(starts[k], starts[k + 1]):
+                xi = x[p]
+                fixed = constants[p]
+                vp = vec3(0.0)
+                Cp = mat3(0.0)
+                Fp = F[p]
+                if gather == 1:
+                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    base = ti.cast(gp - 0.5, ti.i32)
+                    fx = gp - ti.cast(base, ti.f32)
+                    w = weights(fx)
+                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    A = vec4(0.0)
+                    B0 = vec4(0.0)
+                    B1 = vec4(0.0)
+                    B2 = vec4(0.0)
+                    for i in ti.static(range(3)):
+                        Ai = vec4(0.0)
+                        B1i = vec4(0.0)
+                        B2i = vec4(0.0)
+                        for j in ti.static(range(3)):
+                            Aj = vec4(0.0)
+                            B2j = vec4(0.0)
+                            for m in ti.static(range(3)):
+                                u = window[first + (i * 64 + j * 8 + m)] * w[m][2]
+                                Aj += u
+                                if ti.static(m > 0):
+                                    B2j += float(m) * u
+                            Ai += w[j][1] * Aj
+                            B2i += w[j][1] * B2j
+                            if ti.static(j > 0):
+                                B1i += (float(j) * w[j][1]) * Aj
+                        A += w[i][0] * Ai
+                        B1 += w[i][0] * B1i
+                        B2 += w[i][0] * B2i
+                        if ti.static(i > 0):
+                            B0 += (float(i) * w[i][0]) * Ai
+                    B0 -= fx[0] * A
+                    B1 -= fx[1] * A
+                    B2 -= fx[2] * A
+                    for r in ti.static(range(3)):
+                        vp[r] = A[r]
+                        Cp[r, 0] = 4.0 * B0[r]
+                        Cp[r, 1] = 4.0 * B1[r]
+                        Cp[r, 2] = 4.0 * B2[r]
+                    Fp += dt_gather * Cp @ Fp
+                    F[p] = Fp
+                    step = vp * dt_gather
+                    if ground:
+                        phi = level + normal.dot(gp + step) - fixed[3]
+                        if phi < -SUNK_LIMIT:
+                            step += ti.min(-SUNK_LIMIT - phi, LIFT) * normal
+                        clearance = ti.min(clearance, phi)
+                        old = reaction[p]
+                        reaction[p] = vec4(old[0], old[1], old[2], A[3])
+                    # Never outside the window, whatever the velocity: this is what keeps memory safe.
+                    xi = ti.min(ti.max(xi + ti.floor(step * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH)
+                    x[p] = xi
+                    lowest = ti.min(lowest, xi.min())
+                    highest = ti.max(highest, xi.max())
+                    here2 = vp.dot(vp)
+                    sum2 += here2
+                    speed2 = ti.max(speed2, here2)
+                    if store == 1:
+                        v[p] = vp
+                        C[p] = Cp
+                else:
+                    vp = v[p]
+                    Cp = C[p]
+                if scatter == 1:
+                    mass = fixed[0]
+                    tau, modulus = fixed_corotated(Fp, fixed[1], fixed[2])
+                    stiffness = ti.max(stiffness, modulus / mass)
+                    Q = (-4.0 * dt_scatter) * tau + mass * Cp
+                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    base = ti.cast(gp - 0.5, ti.i32)
+                    fx = gp - ti.cast(base, ti.f32)
+                    w = weights(fx)
+                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    if ground:
+                        # Start the contact solve from the forces of the last substep.
+                        a = reaction[p]
+                        vp += dt_scatter * vec3(a[0], a[1], a[2])
+                    q = mass * vp - Q @ fx
+                    b4 = vec4(q[0], q[1], q[2], mass)
+                    c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
+                    c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
+                    c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
+                    for i in ti.static(range(3)):
+                        bi = b4 + float(i) * c0
+                        for j in ti.static(range(3)):
+                            wij = w[i][0] * w[j][1]
+                            bj = wij * (bi + float(j) * c1)
+                            cj = wij * c2
+                            for m in ti.static(range(3)):
+                                n = first + (i * 64 + j * 8 + m)
+                                scattered[n] = scattered[n] + w[m][2] * (bj + float(m) * cj)
+            margin = ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest)
+            r = k * SCALARS_PER_BLOCK
+            if gather == 1:
+                report[r] = speed2
+                report[r + 2] = ti.cast(margin, ti.f32) * (1.0 / FIXED_ONE)
+                report[r + 3] = clearance
+                report[r + 4] = sum2
+            if scatter == 1:
+                report[r + 1] = stiffness
+
+
+@ti.kernel
+def reduce_report(blocks: ti.i32, report: Scalars) -> ti.types.vector(5, ti.f32):
+    """The blocks' reports as one: max |v|^2, max c^2, min window margin, min ground distance, sum |v|^2."""
+    total = ti.Vector([0.0, 0.0, 1e9, 1e9, 0.0])
+    ti.loop_config(serialize=True)
+    for k in range(blocks):
+        r = k * SCALARS_PER_BLOCK
+        total[0] = ti.max(total[0], report[r])
+        total[1] = ti.max(total[1], report[r + 1])
+        total[2] = ti.min(total[2], report[r + 2])
+        total[3] = ti.min(total[3], report[r + 3])
+        total[4] += report[r + 4]
+    return total
