@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""What a caller asks of the reconstruction: the objects, and how to see the photo."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..errors import InputError
+from ..scene.model import Vector
+
+
+def _check(condition: bool, name: str, value: object, remedy: str) -> None:
+    if not condition:
+        raise InputError(f"{name} is {value!r}: {remedy}")
+
+
+def _inside(value: float | None, low: float, high: float) -> bool:
+    return value is None or (math.isfinite(value) and low <= value <= high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectRequest:
+    """One object of the photo.
+
+    box: x0, y0, x1, y1 in pixels of the upright photo (EXIF rotation applied), x1 and y1 exclusive; loose is fine.
+    name: names the object's files; None gives object_1, object_2, … by position.
+    size_m: largest extent in metres, 1e-4 to 1e3; the first one given sets the scale of the whole scene.
+    preset: material preset (presets/materials).
+    velocity: m/s; spin: rad/s; both at time 0.
+    thickness: depth over width of the body, 0.02 to 3; 1 makes a ball of a disc. None estimates it.
+    """
+
+    box: tuple[float, float, float, float]
+    name: str | None = None
+    size_m: float | None = None
+    preset: str = "medium"
+    velocity: Vector = (0.0, 0.0, 0.0)
+    spin: Vector = (0.0, 0.0, 0.0)
+    thickness: float | None = None
+
+    def __post_init__(self) -> None:
+        _check(
+            len(self.box) == 4 and all(math.isfinite(v) for v in self.box),
+            "box",
+            self.box,
+            "give x0,y0,x1,y1 as four finite numbers of pixels",
+        )
+        _check(_inside(self.size_m, 1e-4, 1e3), "size_m", self.size_m, "give metres from 0.0001 to 1000")
+        _check(_inside(self.thickness, 0.02, 3.0), "thickness", self.thickness, "give a ratio from 0.02 to 3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """How the photo is read. The defaults suit a phone's photo of things on a table or floor.
+
+    max_size: longest side of the working photo in pixels, 64 to 8192; larger photos are scaled down to it.
+    fov_deg: angle of view along the photo's longer side, 5 to 150 degrees; None takes EXIF, else 50.
+    horizon_y: height of the horizon as a fraction of the photo's height from the top, -10 to 0.95; may lie
+        outside the photo. None estimates it.
+    pitch_deg: angle of the optical axis below the horizontal, -20 to 85 degrees; an alternative to ``horizon_y``.
+    default_size_m: largest extent in metres of the first object when no object has a size, 1e-4 to 1e3.
+    grabcut_iterations: rounds of GrabCut, 1 to 20.
+    shadow_threshold: fixed grey value 0 to 255 below which ground is shadow (the paper takes 50); None compares
+        with the ground around the object.
+    hole_dilation: side in pixels of the dilation kernel for a photo of 1024 pixels, 0 to 300 (paper A.2: 50).
+    patch_radius: PatchMatch compares patches of (2 r + 1)² pixels, 1 to 10.
+    inpaint_pixels: photos with more pixels are inpainted at this number of pixels, 1e4 to 1e8.
+    seed: seed of PatchMatch; equal inputs give equal backgrounds.
+    mesh_vertices: aimed number of vertices of each object, 500 to 200000.
+    friction: Coulomb coefficient of the ground, 0 to 10.
+    """
+
+    max_size: int = 1920
+    fov_deg: float | None = None
+    horizon_y: float | None = None
+    pitch_deg: float | None = None
+    default_size_m: float = 0.15
+    grabcut_iterations: int = 6
+    shadow_threshold: float | None = None
+    hole_dilation: float = 50.0
+    patch_radius: int = 3
+    inpaint_pixels: int = 2_800_000
+    seed: int = 0
+    mesh_vertices: int = 12_000
+    friction: float = 0.4
+
+    def __post_init__(self) -> None:
+        limits: tuple[tuple[str, float | None, float, float, str], ...] = (
+            ("max_size", self.max_size, 64, 8192, "pixels"),
+            ("fov_deg", self.fov_deg, 5, 150, "degrees"),
+            ("horizon_y", self.horizon_y, -10, 0.95, "a fraction of the photo's height"),
+            ("pitch_deg", self.pitch_deg, -20, 85, "degrees"),
+            ("default_size_m", self.default_size_m, 1e-4, 1e3, "metres"),
+            ("grabcut_iterations", self.grabcut_iterations, 1, 20, "rounds"),
+            ("shadow_threshold", self.shadow_threshold, 0, 255, "a grey value"),
+            ("hole_dilation", self.hole_dilation, 0, 300, "pixels"),
+            ("patch_radius", self.patch_radius, 1, 10, "pixels"),
+            ("inpaint_pixels", self.inpaint_pixels, 1e4, 1e8, "pixels"),
+            ("seed", self.seed, 0, 2**32 - 1, "a whole number"),
+            ("mesh_vertices", self.mesh_vertices, 500, 200_000, "vertices"),
+            ("friction", self.friction, 0, 10, "a coefficient"),
+        )
+        for name, value, low, high, unit in limits:
+            _check(_inside(value, low, high), name, value, f"give {unit} from {low:g} to {high:g}")
+        if self.horizon_y is not None and self.pitch_deg is not None:
+            raise InputError(
+                f"horizon_y is {self.horizon_y!r} and pitch_deg is {self.pitch_deg!r}: give one of them, not both"
+            )

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: MIT
+"""A scene folder that appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import InputError
+from ..scene.folder import SCENE_FILE
+
+
+@contextmanager
+def replacing_folder(out: Path) -> Iterator[Path]:
+    """Yield a fresh temporary folder beside ``out``; on success it becomes ``out``, on failure it is removed.
+
+    An existing ``out`` is only replaced when it is empty or a scene folder, so that a mistyped path cannot cost
+    anyone their files. Raises InputError otherwise, or when the place cannot be written.
+    """
+    if out.is_dir():
+        if any(out.iterdir()) and not (out / SCENE_FILE).is_file():
+            raise InputError(f"{out}: holds files but is no scene folder; choose an empty or new folder")
+    elif out.exists() or out.is_symlink():
+        raise InputError(f"{out}: is a file; choose a folder")
+    tag = f"{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    partial, old = out.with_name(f".{out.name}.partial-{tag}"), out.with_name(f".{out.name}.old-{tag}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial.mkdir()
+        yield partial
+        if out.exists():
+            out.rename(old)
+        try:
+            partial.rename(out)
+        except OSError:
+            if old.exists():
+                old.rename(out)
+            raise
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
