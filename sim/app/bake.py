@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shutil
 import time
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,10 @@ __all__ = ["BakeOptions", "bake", "is_up_to_date"]
 CHECKPOINT_FILE = "checkpoints/state.npz"
 CHECKPOINT_SECONDS = 20.0
 """At most about this much computing is lost when a run is killed."""
+
+ADVANCE_PARTS = 4
+"""A frame of stiff matter can take many seconds; cancelling is looked for this many times in it. A fixed number, not
+a time, so that the same input gives the same bytes."""
 
 METRICS_FILE = "metrics.json"
 EVENTS_FILE = "events.jsonl"
@@ -91,7 +98,7 @@ def _bake_locked(
     folder: SceneFolder, out: Path, options: BakeOptions, progress: StageProgress, cancelled: IsCancelled
 ) -> BakeManifest:
     # Imported here, because opening Blender or rendering a frame must never pay for Taichi.
-    from .bodies import build_world
+    from .simulation import build_world
 
     meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
     _require_disk_space(out, meshes, options.frames)
@@ -138,24 +145,39 @@ class _Run:
     meshes: list[ObjectMesh]
     bindings: list[Binding | None]
     metrics: list[dict[str, Any]]
+    frame_started: float = 0.0
 
     def frames(self, first: int, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
-        writers = [
-            Pc2Writer(
-                self.out / item.file, vertex_count=item.vertices, start_frame=self.manifest.frame_start, keep=first
-            )
-            for item in self.manifest.objects
-        ]
+        """Bake from sample ``first`` to the end; the final manifest."""
+        try:
+            with contextlib.ExitStack() as stack:
+                writers = [stack.enter_context(self._writer(item, first)) for item in self.manifest.objects]
+                self._loop(first, writers, progress, cancelled)
+            write_json(self.out / METRICS_FILE, {"frames": self.metrics})
+            (self.out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(
+                f"{self.out}: cannot be written ({reason}); free space and run again to continue"
+            ) from error
+        if self.metrics and self.metrics[-1].get("at_walls"):
+            progress.notice("matter has reached the walls of the simulated box, which hold it there")
+        progress.report(self.manifest.frames)
+        return self._save("complete", self.manifest.frames)
+
+    def _writer(self, item: BakedObject, keep: int) -> Pc2Writer:
+        return Pc2Writer(
+            self.out / item.file, vertex_count=item.vertices, start_frame=self.manifest.frame_start, keep=keep
+        )
+
+    def _loop(self, first: int, writers: list[Pc2Writer], progress: StageProgress, cancelled: IsCancelled) -> None:
         last_checkpoint = time.monotonic()
         index = first
         try:
             for index in range(first, self.manifest.frames):
-                if cancelled():
-                    raise Cancelled(
-                        f"bake cancelled after frame {index} of {self.manifest.frames}; run it again to continue"
-                    )
-                progress.report(index, "compiling" if index == first else "")
-                self._sample(index, writers)
+                progress.report(index, "compiling" if index <= max(first, 1) else "")
+                self._advance_to(index, cancelled)
+                self._append_samples(index, writers)
                 if time.monotonic() - last_checkpoint > CHECKPOINT_SECONDS:
                     self._checkpoint(index + 1)
                     last_checkpoint = time.monotonic()
@@ -163,25 +185,23 @@ class _Run:
             self._checkpoint(index, keep_state=isinstance(error, Cancelled))
             self._save("cancelled", index)
             raise
-        except OSError as error:
-            raise InputError(
-                f"{self.out}: cannot be written ({error.strerror or error}); free space and run again to continue"
-            ) from error
-        finally:
-            for writer in writers:
-                writer.close()
-        write_json(self.out / METRICS_FILE, {"frames": self.metrics})
-        (self.out / CHECKPOINT_FILE).unlink(missing_ok=True)
-        progress.report(self.manifest.frames)
-        return self._save("complete", self.manifest.frames)
 
-    def _sample(self, index: int, writers: list[Pc2Writer]) -> None:
-        """Advance to frame ``index`` and append one sample to every cache."""
-        started = time.monotonic()
+    def _advance_to(self, index: int, cancelled: IsCancelled) -> None:
+        """Advance to the time of sample ``index`` in a fixed number of parts, between which cancelling is looked for."""
+        self.frame_started = time.monotonic()
         world = self.simulation.world
-        target = index / self.manifest.fps
-        if target > world.time:
-            world.advance(target - world.time)
+        for part in range(1, ADVANCE_PARTS + 1):
+            if cancelled():
+                raise Cancelled(
+                    f"bake cancelled at frame {index + 1} of {self.manifest.frames}; run it again to continue"
+                )
+            target = (index - 1 + part / ADVANCE_PARTS) / self.manifest.fps
+            if target > world.time:
+                world.advance(target - world.time)
+
+    def _append_samples(self, index: int, writers: list[Pc2Writer]) -> None:
+        """Append the present state to every cache as sample ``index``."""
+        world = self.simulation.world
         for slot, (mesh, binding, writer) in enumerate(zip(self.meshes, self.bindings, writers, strict=True)):
             body = self.simulation.body_of_object[slot]
             if binding is None or body is None or index == 0:
@@ -190,7 +210,11 @@ class _Run:
             else:
                 writer.append(deform(binding, world.positions(body), world.deformation_gradients(body)))
         self.metrics.append(
-            {**self.simulation.metrics(), "frame": index + 1, "seconds": round(time.monotonic() - started, 3)}
+            {
+                **self.simulation.metrics(),
+                "frame": index + 1,
+                "seconds": round(time.monotonic() - self.frame_started, 3),
+            }
         )
 
     def _checkpoint(self, frames_done: int, *, keep_state: bool = True) -> None:
@@ -232,7 +256,7 @@ def _resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[di
             if Pc2Reader(out / item.file).sample_count < frames_done:
                 return 0, []
         world.restore(state)
-    except (InputError, OSError, ValueError, KeyError, TypeError, EOFError):
+    except (InputError, OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         # A checkpoint that a crash left unreadable costs a fresh start, never the run.
         return 0, []
     return frames_done, metrics

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: MIT
+"""Baking real scenes with the real engine: what comes out, what is not done twice, what survives a crash."""
+
+import dataclasses
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from physgen.sim.app import bake as bake_module
+from physgen.sim.app import worker
+from physgen.sim.app.bake import bake
+from physgen.sim.app.bake_inputs import BakeOptions
+from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.errors import Cancelled, InputError, SimulationError
+from physgen.sim.scene.folder import save_scene
+from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.model import Effect, Light, Material
+
+QUICK = BakeOptions(frames=6, fps=24.0, quality="preview")
+
+
+def caches(out):
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*.pc2"))}
+
+
+def test_a_thrown_ball_flies_as_it_should(ball_scene, tmp_path):
+    folder = ball_scene(velocity=(0.3, 0.0, 1.0))
+    manifest = bake(folder.root, tmp_path / "bake", QUICK)
+    cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
+    mesh = load_object_mesh(folder, folder.scene.objects[0])
+    assert (manifest.state, manifest.frames_done, cache.sample_count) == ("complete", 6, 6)
+    assert np.array_equal(cache.sample(0), mesh.vertices.astype(np.float32)), "frame 1 is the scene at rest"
+    time = 5 / 24
+    travelled = cache.sample(5).mean(axis=0) - cache.sample(0).mean(axis=0)
+    expected = np.array([0.3 * time, 0.0, time - 0.5 * 9.81 * time**2])
+    # 0.5 % of ½gt² is the issue's tolerance for free fall.
+    assert np.abs(travelled - expected).max() < 0.005 * 0.5 * 9.81 * time**2
+    metrics = json.loads((tmp_path / "bake" / "metrics.json").read_text())["frames"]
+    assert [m["frame"] for m in metrics] == [1, 2, 3, 4, 5, 6]
+
+
+def test_nothing_changed_nothing_done(ball_scene, tmp_path):
+    folder = ball_scene()
+    out = tmp_path / "bake"
+    first = bake(folder.root, out, QUICK)
+    before = {p: p.stat().st_mtime_ns for p in out.iterdir()}
+    notices = []
+    bake(folder.root, out, QUICK, notices.append)
+    assert {p: p.stat().st_mtime_ns for p in out.iterdir()} == before
+    assert "up to date" in notices[-1]["message"]
+    # Light does not move anything, matter does.
+    save_scene(folder.root, dataclasses.replace(folder.scene, light=Light(sun_strength=3.0)))
+    assert bake_module.is_up_to_date(folder.root, out, QUICK)
+    stiffer = dataclasses.replace(folder.scene.objects[0], material=Material(youngs_modulus=1e5, density=200.0))
+    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(stiffer,)))
+    assert not bake_module.is_up_to_date(folder.root, out, QUICK)
+    assert bake(folder.root, out, QUICK).inputs_hash != first.inputs_hash
+
+
+def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
+    folder = ball_scene(velocity=(0.0, 0.0, -1.0))
+    bake(folder.root, tmp_path / "whole", QUICK)
+    asked = iter([False] * 14 + [True])
+    with pytest.raises(Cancelled, match="run it again"):
+        bake(folder.root, tmp_path / "parts", QUICK, cancelled=lambda: next(asked))
+    stopped = load_manifest(tmp_path / "parts")
+    assert stopped.state == "cancelled" and 0 < stopped.frames_done < 6
+    notices = []
+    bake(folder.root, tmp_path / "parts", QUICK, notices.append)
+    assert any("continuing" in n.get("message", "") for n in notices)
+    assert caches(tmp_path / "parts") == caches(tmp_path / "whole")
+
+
+def test_a_killed_worker_costs_a_rerun_and_nothing_else(ball_scene, tmp_path):
+    folder = ball_scene()
+    job = worker.BakeJob(
+        scene=str(folder.root), out=str(tmp_path / "bake"), options=dataclasses.replace(QUICK, frames=400)
+    )
+    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")], stdout=subprocess.PIPE
+    )
+    for line in process.stdout:
+        if json.loads(line).get("done", 0) >= 3:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert load_manifest(tmp_path / "bake").state == "running"
+    assert not bake_module.is_up_to_date(folder.root, tmp_path / "bake", job.options)
+    # Another length is another bake: the half-written one gives way.
+    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+    assert Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count == 6
+
+
+def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
+    folder = ball_scene()
+    job = worker.BakeJob(
+        scene=str(folder.root), out=str(tmp_path / "bake"), options=dataclasses.replace(QUICK, frames=400)
+    )
+    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")], stdout=subprocess.PIPE
+    )
+    events = []
+    for line in process.stdout:
+        events.append(json.loads(line))
+        if events[-1].get("done") == 3:
+            process.terminate()
+    assert process.wait() == 130
+    assert events[-1] == {"event": "error", "kind": "Cancelled", "message": events[-1]["message"]}
+    assert not (tmp_path / "bake" / ".lock").exists()
+
+
+def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
+    folder = ball_scene()
+    asked = iter([False] * 14 + [True])
+    with pytest.raises(Cancelled):
+        bake(folder.root, tmp_path / "bake", QUICK, cancelled=lambda: next(asked))
+    checkpoint = tmp_path / "bake" / bake_module.CHECKPOINT_FILE
+    for content in (b"", b"garbage", checkpoint.read_bytes()[: checkpoint.stat().st_size // 2]):
+        checkpoint.write_bytes(content)
+        save = load_manifest(tmp_path / "bake")
+        assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+        bake_module.save_manifest(tmp_path / "bake", save)
+
+
+def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):
+    folder = ball_scene()
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match="holds other files"):
+        bake(folder.root, tmp_path / "home", QUICK)
+    assert [p.name for p in (tmp_path / "home").iterdir()] == ["thesis.txt"]
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file"):
+        bake(folder.root, tmp_path / "file", QUICK)
+
+
+def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
+    folder = ball_scene()
+    job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
+    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    # A limit on file size fails writes as a full disk does, from the operating system.
+    limit = 3 * 642 * 12
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    environment = {**os.environ, "TI_OFFLINE_CACHE": "0"}
+    result = subprocess.run(
+        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")],
+        capture_output=True,
+        preexec_fn=small_files,
+        env=environment,
+        check=False,
+    )
+    assert result.returncode == 3, result.stderr[-2000:].decode()
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (result.returncode, last["kind"]) == (3, "InputError") and "free space" in last["message"], result.stderr[
+        -800:
+    ]
+    assert not bake_module.is_up_to_date(folder.root, tmp_path / "bake", QUICK)
+    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"effects": (Effect(name="wind"),)}, "wind"), ({"gravity": (0.0, 0.0, -9.81)}, None)],
+)
+def test_what_cannot_be_simulated_is_refused(ball_scene, tmp_path, changes, words):
+    folder = ball_scene(**changes)
+    if words is None:
+        assert bake(folder.root, tmp_path / "bake", dataclasses.replace(QUICK, frames=1)).frames_done == 1
+        return
+    with pytest.raises(InputError, match=words):
+        bake(folder.root, tmp_path / "bake", QUICK)
+
+
+def test_an_open_mesh_is_refused_by_its_objects_name(ball_scene, tmp_path):
+    import trimesh
+
+    folder = ball_scene()
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    mesh.update_faces(np.arange(len(mesh.faces)) > 10)
+    mesh.export(folder.root / "meshes" / "ball0.glb")
+    with pytest.raises(InputError, match="object ball0"):
+        bake(folder.root, tmp_path / "bake", QUICK)
+
+
+def test_two_bakes_into_one_folder_at_once(ball_scene, tmp_path):
+    folder = ball_scene()
+    with bake_module.folder_lock(tmp_path / "bake"):
+        code = f"""
+from pathlib import Path
+from physgen.sim.app.bake import bake
+from physgen.sim.errors import InputError
+try:
+    bake(Path({str(folder.root)!r}), Path({str(tmp_path / "bake")!r}))
+except InputError as error:
+    print(error)
+"""
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert f"in use by process {os.getpid()}" in result.stdout
+
+
+def test_a_run_that_diverges_names_the_body_and_keeps_the_good_frames(ball_scene, tmp_path):
+    folder = ball_scene(velocity=(0.0, 0.0, -1e6))
+    with pytest.raises(SimulationError, match="ball0"):
+        bake(folder.root, tmp_path / "bake", QUICK)
+    manifest = load_manifest(tmp_path / "bake")
+    assert manifest.state == "cancelled"
+    assert manifest.frames_done == Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count >= 1
