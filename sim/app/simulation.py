@@ -26,6 +26,9 @@ from .events import StageProgress
 from .quality import Quality, load_quality
 
 ENGINE_NAME = "mls-mpm"
+MAX_PARTICLE_STEPS = 2e12
+"""More is refused: at 10 million particle steps a second, which a laptop does, about two days."""
+
 GRIDS = (128, 256, 512, 1024)
 """Grid sizes tried, in this order, until the scene and its motion fit at the wanted cell size."""
 
@@ -93,6 +96,12 @@ def build_world(
     if world.arch != options.arch:
         progress.notice(f"{options.arch} is not available here; simulating on {world.arch}")
     count = sum(body.count for body in bodies)
+    steps = (options.frames - 1) / options.fps / world.stable_step
+    if steps * count > MAX_PARTICLE_STEPS:
+        raise InputError(
+            f"this would take about {steps:.2g} time steps of {count} particles, days of computing: lower the velocity or "
+            "Young's modulus, raise the density, bake fewer frames, or choose a coarser quality"
+        )
     cell_mm = solver.cell_size(similarity) * 1000
     progress.notice(f"{count} particles, cells of {cell_mm:.2g} mm, time steps of {world.stable_step * 1e6:.0f} µs")
     index = {scene_index: body_index for body_index, scene_index in enumerate(moving)}

@@ -212,9 +212,25 @@ except InputError as error:
 
 
 def test_a_run_that_diverges_names_the_body_and_keeps_the_good_frames(ball_scene, tmp_path):
-    folder = ball_scene(velocity=(0.0, 0.0, -1e6))
+    folder = ball_scene()
+    asked = iter([False] * 14 + [True])
+    with pytest.raises(Cancelled):
+        bake(folder.root, tmp_path / "bake", QUICK, cancelled=lambda: next(asked))
+    good = load_manifest(tmp_path / "bake").frames_done
+    # Fault injection: the engine goes on from a state in which a particle has lost its velocity.
+    checkpoint = tmp_path / "bake" / bake_module.CHECKPOINT_FILE
+    with np.load(checkpoint) as data:
+        state = {key: data[key].copy() for key in data.files}
+    state["state.v"][100] = np.nan
+    np.savez(checkpoint, **state)
     with pytest.raises(SimulationError, match="ball0"):
         bake(folder.root, tmp_path / "bake", QUICK)
     manifest = load_manifest(tmp_path / "bake")
-    assert manifest.state == "cancelled"
-    assert manifest.frames_done == Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count >= 1
+    assert manifest.state == "cancelled" and manifest.frames_done >= good > 0
+    assert Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count == manifest.frames_done
+
+
+def test_a_run_that_would_take_for_ever_is_refused_before_it_starts(ball_scene, tmp_path):
+    folder = ball_scene(velocity=(0.0, 0.0, 1e9))
+    with pytest.raises(InputError, match=r"time steps.*velocity"):
+        bake(folder.root, tmp_path / "bake", QUICK)

@@ -58,7 +58,6 @@ def test_rendering_and_opening_a_scene_never_pay_for_taichi():
     assert not {"taichi", "bpy"} & set(result.stdout.split())
 
 
-
 def test_the_package_list_is_the_tree():
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     found = {
