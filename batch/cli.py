@@ -60,6 +60,8 @@ def _add_photo(parser: argparse.ArgumentParser) -> None:
         "height of the horizon as a fraction of the photo's, 0 top, 1 bottom; may lie outside (default: estimated)"
     )
     parser.add_argument("--horizon", type=float, metavar="Y", help=horizon)
+    pitch = "angle of the view below the horizontal, instead of --horizon; about 50 for a look down at a table"
+    parser.add_argument("--pitch", type=float, metavar="DEGREES", help=pitch)
     parser.add_argument(
         "--fov", type=float, metavar="DEGREES", help="field of view of the longer side (default: EXIF, else 50)"
     )
@@ -160,7 +162,7 @@ def _object_requests(options: argparse.Namespace) -> tuple[ObjectRequest, ...]:
 
 
 def _reconstruct_options(options: argparse.Namespace) -> ReconstructOptions:
-    changes = {"horizon_y": options.horizon, "fov_deg": options.fov}
+    changes = {"horizon_y": options.horizon, "pitch_deg": options.pitch, "fov_deg": options.fov}
     return dataclasses.replace(ReconstructOptions(), **{k: v for k, v in changes.items() if v is not None})
 
 

@@ -34,7 +34,7 @@ class DemoConfig:
     sizes: tuple[float, ...]
     presets: tuple[str, ...]
     velocities: tuple[Vector, ...]
-    horizon: float | None = None
+    pitch: float | None = None
     frames: int
     fps: float
     samples: int
@@ -71,7 +71,7 @@ def request(config: DemoConfig, out: Path) -> pipeline.RunRequest:
         work=out,
         presets=config.presets,
         velocities=config.velocities,
-        reconstruct=ReconstructOptions(horizon_y=config.horizon),
+        reconstruct=ReconstructOptions(pitch_deg=config.pitch),
         bake=BakeOptions(frames=config.frames, fps=config.fps),
         render=pipeline.RenderRequest(samples=config.samples),
     )

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line as a user types it: arguments, exit codes, what is on the disk afterwards."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from physgen.batch.cli import build_parser, main
+from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.scene.folder import load_scene
+
+
+def physgen(*arguments):
+    """Run the command in a process of its own; exit code, events and standard error."""
+    command = [sys.executable, "-m", "physgen.batch.cli", *map(str, arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    events = [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
+    return result.returncode, events, result.stderr
+
+
+@pytest.fixture
+def photo(tmp_path):
+    """An orange disc with a shadow on a grey table."""
+    rng = np.random.default_rng(3)
+    image = np.clip(rng.normal(150, 6, (240, 320, 3)), 0, 255).astype(np.uint8)
+    cv2.ellipse(image, (185, 182), (52, 12), 0, 0, 360, (60, 60, 60), -1)
+    cv2.circle(image, (160, 140), 45, (20, 120, 230), -1)
+    path = tmp_path / "Foto mit Ümlaut.png"
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    return path
+
+
+def test_vectors_may_start_with_a_minus():
+    from physgen.batch.cli import _keep_negative_vectors
+
+    line = [
+        "run",
+        "p.jpg",
+        "--box",
+        "1,2,3,4",
+        "--box",
+        "5,6,7,8",
+        "--velocity",
+        "-1,0,.5",
+        "-.5,0,2",
+        "--preset",
+        "soft",
+        "hard",
+        "--out",
+        "v.mp4",
+    ]
+    options = build_parser().parse_args(_keep_negative_vectors(line))
+    assert options.velocity == [(-1.0, 0.0, 0.5), (-0.5, 0.0, 2.0)]
+    assert options.box == [(1, 2, 3, 4), (5, 6, 7, 8)] and options.preset == ["soft", "hard"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["run"], ["run", "p.jpg", "--out", "v.mp4"], ["run", "p.jpg", "--box", "1,2,3", "--out", "v.mp4"], ["dance"],
+     ["bake", "s", "--out", "b", "--preset", "unobtainium"], ["run", "p.jpg", "--box", "0,0,nan,4", "--out", "v.mp4"]],
+)  # fmt: skip
+def test_wrong_usage_is_exit_2(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_help_lists_every_stage(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert stopped.value.code == 0 and all(
+        stage in text for stage in ("run", "reconstruct", "bake", "render", "doctor")
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["reconstruct", "missing.jpg", "--box", "0,0,9,9", "--out", "{tmp}/s"], "missing.jpg"),
+        (["bake", "{tmp}", "--out", "{tmp}/b"], "scene.json"),
+        (["render", "{tmp}", "--bake", "{tmp}", "--out", "{tmp}/f"], "scene.json"),
+        (["reconstruct", "{photo}", "--box", "900,900,999,999", "--out", "{tmp}/s"], "box"),
+        (["reconstruct", "{photo}", "--box", "110,90,210,190", "--size", "1", "2", "--out", "{tmp}/s"], "--size"),
+    ],
+)
+def test_bad_input_is_exit_3_and_names_itself(arguments, words, tmp_path, photo):
+    code, _, errors = physgen(*(a.format(tmp=tmp_path, photo=photo) for a in arguments))
+    assert code == 3 and errors.startswith("error: ") and words in errors, errors
+    assert "Traceback" not in errors
+    assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith(".")) == [photo.name]
+
+
+def test_stages_one_by_one(tmp_path, photo):
+    scene, bake = tmp_path / "scene", tmp_path / "bake"
+    reconstruct = [
+        "reconstruct",
+        photo,
+        "--box",
+        "105,85,215,195",
+        "--name",
+        "ball",
+        "--size",
+        "0.08",
+        "--out",
+        scene,
+        "--json",
+    ]
+    code, events, errors = physgen(*reconstruct, "--preset", "soft", "--velocity", "0,0,0.8")
+    assert code == 0, errors
+    assert events[-1] == {"event": "done", "scene": str(scene)}
+    ball = load_scene(scene).scene.objects[0]
+    assert (ball.name, ball.material.preset, ball.velocity) == ("ball", "soft", (0.0, 0.0, 0.8))
+    assert ball.size_m == pytest.approx(0.08, rel=0.02)
+
+    code, events, errors = physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview", "--json")
+    assert code == 0, errors
+    assert [e["done"] for e in events if e["event"] == "progress"][-1] == 4
+    first = load_manifest(bake)
+    mesh_time = (scene / ball.mesh).stat().st_mtime_ns
+
+    # Another material: no reconstruction, another bake.
+    code, events, _ = physgen(*reconstruct, "--preset", "medium")
+    assert code == 0 and any("up to date" in e.get("message", "") for e in events)
+    assert (scene / ball.mesh).stat().st_mtime_ns == mesh_time
+    physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview")
+    assert load_manifest(bake).inputs_hash != first.inputs_hash
+
+    # The same again: nothing.
+    code, events, _ = physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview", "--json")
+    assert code == 0 and any("up to date" in e.get("message", "") for e in events)
+
+
+def test_doctor_finds_this_environment_fit():
+    code, events, errors = physgen("doctor", "--json")
+    report = {name: ok for name, ok, _ in events[-1]["report"]}
+    assert report["simulation"] and report["numpy"], errors
+    assert (code == 0) == all(report.values())
+
+
+def test_the_demo_names_a_photo_that_is_there():
+    from physgen.batch import demo
+
+    config = demo.load_config()
+    job = demo.request(config, Path("out"))
+    image = cv2.imread(str(job.photo))
+    assert image.shape == (400, 600, 3) and config.frames >= 48
+    assert all(0 <= b[0] < b[2] <= 600 and 0 <= b[1] < b[3] <= 400 for b in config.boxes)
