@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Stand the inflated silhouette on the ground, so that it stays there.
 
-Every pixel's ray holds matter from ``ref − h`` to ``ref + h``, cut where it enters the ground. The reference depth is
-that of a wall facing the camera, or of the ground in front of the wall, whichever is nearer: the silhouette is kept
+Every pixel's ray holds matter from ``ref − h`` to ``ref + b h``, cut where it enters the ground. The reference depth
+is that of a wall facing the camera, or of the ground in front of the wall, whichever is nearer: the silhouette is kept
 exactly, the base is flat, and the body reaches from the line where it visibly touches the ground to behind the wall.
-Moving the wall back enlarges the base, until the centre of mass lies well above it.
+The wall of a box is upright. That of a ball leans back until it is square to the view, or the ball would become an egg;
+other things lie between. What leans is filled behind (b > 1) so that it does not hang over. Moving the wall back
+enlarges the base, until the centre of mass lies well above it.
 """
 
 from __future__ import annotations
@@ -24,6 +26,10 @@ Points = NDArray[np.float64]
 STABLE_MARGIN = 0.25
 """Distance of the centre of mass from the edge of the base over the base's inscribed radius, as far as reachable."""
 MAX_YAW = np.radians(55.0)
+ROUND_YAW_SHARE = 0.4
+"""Things that are no boxes touch the ground in unseen places too: their visible contact tells less."""
+LEAN = 0.6
+"""Lean of the wall of things that are neither boxes nor balls, as a share of the angle of view below the horizontal."""
 FOLD = 0.35
 """Width of the fold between floor and wall over the half thickness."""
 
@@ -34,6 +40,7 @@ class Reference:
 
     camera: height 1 unit. origin: (3,) a point where the wall meets the ground; normal: (3,) unit, away from camera.
     unit_per_pixel: length of one pixel at the object. fold: units, softens the edge between ground and wall.
+    back: thickness behind the reference over that in front, 1 or more.
     """
 
     camera: Camera
@@ -41,6 +48,7 @@ class Reference:
     normal: NDArray[np.float64]
     unit_per_pixel: float
     fold: float
+    back: float = 1.0
 
     def depths(self, pixels: Points) -> tuple[Points, Points, Points]:
         """Reference depth (n), ground depth (n) and rays (n, 3) through ``pixels`` (n, 2), along the optical axis."""
@@ -104,7 +112,7 @@ def contact_yaw(camera: Camera, silhouette: Silhouette) -> float:
     if not np.isfinite(ends).all():
         return 0.0
     yaw = float(np.arctan2(ends[1, 1] - ends[0, 1], ends[1, 0] - ends[0, 0]))
-    weight = float(np.clip((share - 0.3) / 0.3, 0.0, 1.0))
+    weight = float(np.clip((share - 0.3) / 0.3, 0.0, 1.0)) * (1.0 if silhouette.slab else ROUND_YAW_SHARE)
     return float(np.clip(yaw * weight, -MAX_YAW, MAX_YAW))
 
 
@@ -133,19 +141,27 @@ def stand(camera: Camera, silhouette: Silhouette) -> tuple[Reference, Stance]:
     depth = float(ground_depth(camera, ray))
     unit = depth / camera.fx
     thick = silhouette.half_thickness * unit
-    yaw = contact_yaw(camera, silhouette)
-    normal = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     declination = float(np.arctan2(-ray[2], np.hypot(ray[0], ray[1])))
+    lean = 0.0 if silhouette.slab else declination * (LEAN + (1.0 - LEAN) * silhouette.roundness)
+    yaw = contact_yaw(camera, silhouette)
+    away = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    normal = np.cos(lean) * away - np.sin(lean) * np.array([0.0, 0.0, 1.0])
     outline = on_ground(camera, _lower_outline(silhouette))
     outline = outline[np.isfinite(outline).all(axis=1)]
-    front = float((outline @ normal).min()) if len(outline) else float(touch @ normal)
-    start = thick * np.tan(declination / 2.0)
+    front = float((outline @ away).min()) if len(outline) else float(touch @ away)
+    # The middle plane of a ball meets the ground before the line of sight that grazes it does.
+    start = thick * (np.tan(declination / 2.0) - silhouette.roundness * np.tan(lean))
+    back = 1.0 + 2.0 * np.sin(lean) * (1.0 - silhouette.roundness)
     pixels, heights = _samples(silhouette)
     best: tuple[Reference, Stance] | None = None
     for step in np.concatenate([[0.0], np.geomspace(0.08, 3.0, 16)]):
-        origin = normal * (front + start + step * thick)
         reference = Reference(
-            camera=camera, origin=origin, normal=normal, unit_per_pixel=unit, fold=FOLD * thick
+            camera=camera,
+            origin=away * (front + start + step * thick),
+            normal=normal,
+            unit_per_pixel=unit,
+            fold=FOLD * thick,
+            back=back,
         )
         stance = judge(reference, pixels, heights)
         if best is None or stance.margin > best[1].margin + 0.02:
@@ -173,12 +189,12 @@ def judge(reference: Reference, pixels: Points, heights: Points) -> Stance:
     """
     middle, ground, rays = reference.depths(pixels)
     half = heights * reference.unit_per_pixel / np.linalg.norm(rays, axis=1)
-    near, far = np.maximum(middle - half, 1e-6), np.minimum(middle + half, ground)
+    near, far = np.maximum(middle - half, 1e-6), np.minimum(middle + reference.back * half, ground)
     far = np.maximum(far, near)
     volume = (far**3 - near**3) / 3.0
     total = max(float(volume.sum()), 1e-300)
     centre = reference.camera.position + (rays * ((far**4 - near**4) / 4.0)[:, None]).sum(axis=0) / total
-    resting = (middle + half >= ground) & (half > 0)
+    resting = (middle + reference.back * half >= ground) & (half > 0)
     base = (reference.camera.position + ground[resting][:, None] * rays[resting])[:, :2]
     if len(base) < 3:
         return Stance(margin=-1.0, base=base, centre_of_mass=centre)

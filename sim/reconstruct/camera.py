@@ -8,7 +8,7 @@ horizontal, the horizon lies in the row  cy − fy tan p.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,14 +67,6 @@ def check_horizon(height: int, focal: float, pitch: float, lowest_contact: float
             f"{lowest_contact / height:.2f}: give a smaller horizon_y or a larger pitch_deg, "
             "the horizon lies above where things stand"
         )
-
-
-@dataclass(frozen=True)
-class GroundHit:
-    """Where rays meet the ground. points: (..., 3) world. depth: (...) along the optical axis, inf above the horizon."""
-
-    points: NDArray[np.float64]
-    depth: NDArray[np.float64]
 
 
 def ground_depth(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ class Silhouette:
     mask: (h, w); distance: (h, w) signed distance to the outline in pixels, positive inside, smooth to sub-pixels;
     square_height: (h, w) h² in pixels², negative outside with the slope it has inside.
     left, top: position of the crop's first pixel in the photo; its centre is at (left + 0.5, top + 0.5).
-    slab: whether the outline is a box'.
+    slab: whether the outline is a box'. roundness: 1 for an ellipse, 0 for anything far from one.
     """
 
     mask: Mask
@@ -44,6 +44,7 @@ class Silhouette:
     left: int
     top: int
     slab: bool
+    roundness: float
 
     @property
     def half_thickness(self) -> float:
@@ -73,6 +74,7 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
         left=int(columns[0]) - pad,
         top=int(rows[0]) - pad,
         slab=slab,
+        roundness=0.0 if slab else roundness(crop),
     )
 
 
@@ -93,6 +95,19 @@ def rectangularity(mask: Mask) -> float:
         return 0.0
     (_, size, _) = cv2.minAreaRect(points)
     return min(1.0, float(mask.sum()) / max(1.0, (size[0] + 1.0) * (size[1] + 1.0)))
+
+
+def roundness(mask: Mask) -> float:
+    """1 where ``mask`` is an ellipse (overlap of 0.96 with the ellipse of the same moments), falling to 0 at 0.9."""
+    rows, columns = np.nonzero(mask)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    centre = points.mean(axis=0)
+    covariance = np.cov(points.T) + 1e-6 * np.eye(2)
+    grid = np.stack(np.meshgrid(np.arange(mask.shape[1]), np.arange(mask.shape[0])), axis=-1) - centre
+    # A solid ellipse has variance (semi-axis)² / 4 along each axis.
+    ellipse = np.einsum("...i,ij,...j->...", grid, np.linalg.inv(4.0 * covariance), grid) <= 1.0
+    overlap = (ellipse & mask).sum() / max(1, int((ellipse | mask).sum()))
+    return float(np.clip((overlap - 0.9) / 0.06, 0.0, 1.0))
 
 
 def soap_film(mask: Mask) -> Field:

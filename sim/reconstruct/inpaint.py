@@ -6,28 +6,50 @@ pypatchmatch (MIT) ships a compiled library; with a fixed seed equal inputs give
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from ..errors import InputError
 
 Mask = NDArray[np.bool_]
 
+SOLVE_SIDE = 220.0
+"""Pixels; larger holes are filled at a scale that makes them this large. On more pixels PatchMatch's patches see too
+little of the structure around them, and it takes long."""
+GUIDE_SCALE, GUIDE_WEIGHT = 0.1, 0.015
+"""Cost of taking a patch from another height: found by eye; ten times as much repeats rows like wallpaper."""
 FEATHER = 4.0
 """Pixels at 1024 over which the filling fades into the photo, inside the hole only."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FillOptions:
+    """How holes are filled.
+
+    radius: patches span (2 radius + 1)² pixels, 1 to 10. limit: no fill searches more pixels, 1e4 to 1e8.
+    seed: 0 to 2³²−1. by_row: prefer sources at the same height of the photo, as where a wall meets a floor.
+    """
+
+    radius: int = 4
+    limit: int = 2_800_000
+    seed: int = 0
+    by_row: bool = False
+
+
 def inpaint(
-    pixels: NDArray[np.uint8], hole: Mask, objects: Mask, *, radius: int = 3, limit: int = 2_800_000, seed: int = 0
+    pixels: NDArray[np.uint8], hole: Mask, objects: Mask, options: FillOptions | None = None
 ) -> NDArray[np.uint8]:
     """``pixels`` (H, W, 3) with ``hole`` filled from elsewhere; outside the hole equal to the photo bit for bit.
 
     objects: what may be seen neither in the filling nor through the feather at its edge, inside ``hole``.
-    radius: patches span (2 radius + 1)² pixels. limit: more pixels than this are filled at lower resolution.
     Raises InputError when hardly any background is left to fill from, or the native library is missing.
     """
+    options = options or FillOptions()
     if not hole.any():
         return pixels.copy()
     if (~hole).mean() < 0.02:
@@ -35,55 +57,135 @@ def inpaint(
             f"objects and shadows cover {100 * hole.mean():.0f} % of the photo: no background is left to fill from; "
             "use a photo with more room around the objects, or a smaller hole_dilation"
         )
-    scale = min(1.0, float(np.sqrt(limit / hole.size)))
-    filling = _patch_match(pixels, hole, radius, seed) if scale == 1.0 else _at_scale(pixels, hole, scale, radius, seed)
+    filling = pixels.copy()
+    for part in _parts(hole):
+        _fill_part(filling, part, hole, options)
     alpha = _feather(hole, objects)[..., None]
     mixed = np.where(alpha >= 1.0, filling, pixels + alpha * (filling.astype(np.float32) - pixels))
     return np.where(hole[..., None], np.clip(mixed + 0.5, 0, 255).astype(np.uint8), pixels)
 
 
-def _patch_match(pixels: NDArray[np.uint8], hole: Mask, radius: int, seed: int) -> NDArray[np.uint8]:
+def _parts(hole: Mask) -> list[Mask]:
+    """The connected parts of ``hole``, smallest first: small ones are filled best and then serve as surroundings."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
+    order = np.argsort(stats[1:count, cv2.CC_STAT_AREA], kind="stable") + 1
+    return [np.asarray(labels == index) for index in order]
+
+
+def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillOptions) -> None:
+    """Fill the connected ``part`` of ``hole`` in ``pixels``, in place, from its surroundings outside of ``hole``."""
+    rows, columns = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
+    margin = max(48, round(0.7 * max(np.ptp(rows), np.ptp(columns))))
+    window = (
+        slice(max(0, rows[0] - margin), rows[-1] + 1 + margin),
+        slice(max(0, columns[0] - margin), columns[-1] + 1 + margin),
+    )
+    if (~hole[window]).mean() < 0.1:
+        window = (slice(None), slice(None))
+    crop, own, closed = pixels[window], part[window], hole[window]
+    side = float(np.sqrt(np.ptp(rows) * np.ptp(columns)))
+    scale = min(1.0, SOLVE_SIDE / max(side, 1.0), float(np.sqrt(options.limit / own.size)))
+    if scale > 0.8:
+        filled = _patch_match(crop, own, closed, options)
+    else:
+        filled = _at_scale(crop, own, closed, scale, options)
+    crop[own] = filled[own]
+
+
+def _patch_match(pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: FillOptions) -> NDArray[np.uint8]:
+    """``pixels`` with ``hole`` filled; ``closed`` pixels outside of it are no source."""
     # Imported late: loading a native library must not be the price of importing the package.
     from patchmatch import patch_match
 
     if not getattr(patch_match, "patchmatch_available", False):
         raise InputError("the inpainting library pypatchmatch cannot be loaded; install it again for this Python")
-    patch_match.set_random_seed(seed)
-    # Only the surroundings of the hole: far away patches cost time and seldom fit.
-    rows, columns = np.flatnonzero(hole.any(axis=1)), np.flatnonzero(hole.any(axis=0))
-    margin = max(64, round(0.6 * max(np.ptp(rows), np.ptp(columns))))
-    window = (
-        slice(max(0, rows[0] - margin), rows[-1] + 1 + margin),
-        slice(max(0, columns[0] - margin), columns[-1] + 1 + margin),
-    )
-    result = pixels.copy()
+    patch_match.set_random_seed(options.seed)
+    image, holes = np.ascontiguousarray(pixels), hole.astype(np.uint8)
+    barred = closed & ~hole
+    excluded = barred.astype(np.uint8) if barred.any() else None
     try:
-        result[window] = patch_match.inpaint(
-            np.ascontiguousarray(pixels[window]), hole[window].astype(np.uint8), patch_size=radius
-        )
+        if options.by_row:
+            guide = np.zeros(pixels.shape, dtype=np.float32)
+            guide[..., 0] = np.linspace(0.0, GUIDE_SCALE, len(guide), dtype=np.float32)[:, None]
+            return np.asarray(
+                patch_match.inpaint_regularity(
+                    image,
+                    holes,
+                    guide,
+                    global_mask=excluded,
+                    patch_size=options.radius,
+                    guide_weight=GUIDE_WEIGHT,
+                )
+            )
+        return np.asarray(patch_match.inpaint(image, holes, global_mask=excluded, patch_size=options.radius))
     except RuntimeError as error:
         raise InputError(f"inpainting failed ({error}); use a photo with more room around the objects") from error
-    return result
 
 
-def _at_scale(pixels: NDArray[np.uint8], hole: Mask, scale: float, radius: int, seed: int) -> NDArray[np.uint8]:
-    """Fill a smaller copy, enlarge the filling, and give it back the grain that the enlargement lacks."""
+def _at_scale(
+    pixels: NDArray[np.uint8], hole: Mask, closed: Mask, scale: float, options: FillOptions
+) -> NDArray[np.uint8]:
+    """Fill a smaller copy, where patches span whole structures, then give the enlargement its fine detail back.
+
+    The detail of each filled place comes from the place outside the hole whose coarse neighbourhood is most alike.
+    """
     height, width = hole.shape
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    small_hole = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-    filled = _patch_match(small, small_hole, radius, seed)
+    small_hole, small_closed = (
+        cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0 for mask in (hole, closed)
+    )
+    filled = _patch_match(small, small_hole, small_closed, options)
     enlarged = cv2.resize(filled, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
-    blurred = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
-    detail = pixels - blurred
-    # Detail of the photo left of the hole, mirrored into it column by column, is grain in the right place.
-    inside = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
+    source_rows, source_columns = _alike(filled, small_hole, small_closed)
     rows, columns = np.indices(hole.shape)
-    source_rows = np.clip(2 * inside[0] - rows, 0, height - 1)
-    source_columns = np.clip(2 * inside[1] - columns, 0, width - 1)
-    grain = np.clip(detail[source_rows, source_columns], -12, 12)
-    grain[hole[source_rows, source_columns]] = 0
-    return np.asarray(np.clip(enlarged + grain + 0.5, 0, 255), dtype=np.uint8)
+    near_rows = np.clip(np.round((rows + 0.5) * size[1] / height - 0.5).astype(int), 0, size[1] - 1)
+    near_columns = np.clip(np.round((columns + 0.5) * size[0] / width - 0.5).astype(int), 0, size[0] - 1)
+    down = source_rows[near_rows, near_columns] - near_rows
+    across = source_columns[near_rows, near_columns] - near_columns
+    from_rows = np.clip(rows + np.round(down * height / size[1]).astype(int), 0, height - 1)
+    from_columns = np.clip(columns + np.round(across * width / size[0]).astype(int), 0, width - 1)
+    known = np.where(closed[..., None], enlarged, pixels).astype(np.float32)
+    shrunk = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
+    coarse = cv2.resize(shrunk, (width, height), interpolation=cv2.INTER_CUBIC)
+    detail = known - coarse
+    return np.asarray(np.clip(enlarged + detail[from_rows, from_columns] + 0.5, 0, 255), dtype=np.uint8)
+
+
+def _alike(
+    filled: NDArray[np.uint8], hole: Mask, closed: Mask, block: int = 3, sources: int = 60_000
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each pixel (h, w) the row and column of the most similar one outside ``closed``; itself outside ``hole``.
+
+    Matched for one pixel of every ``block`` x ``block`` and carried to its neighbours, so that details stay together.
+    """
+    height, width = hole.shape
+    # Mean colours of a 3x3 neighbourhood of small squares describe a place well enough, in 27 numbers.
+    smooth = cv2.blur(filled, (2, 2)).astype(np.float32)
+    padded = np.pad(smooth, ((2, 2), (2, 2), (0, 0)), mode="reflect")
+    features = np.concatenate(
+        [padded[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width] for dy in (-2, 0, 2) for dx in (-2, 0, 2)], axis=-1
+    )
+    inner = np.zeros_like(hole)
+    inner[2 : height - 2, 2 : width - 2] = True
+    source = np.argwhere(inner & ~ndimage.binary_dilation(closed, iterations=3))
+    rows, columns = np.indices(hole.shape)
+    if len(source) == 0:
+        return rows, columns
+    source = source[:: max(1, len(source) // sources)]
+    anchors = np.argwhere(
+        ndimage.binary_dilation(hole, iterations=block) & (rows % block == 1) & (columns % block == 1)
+    )
+    if len(anchors) == 0:
+        return rows, columns
+    tree = cKDTree(features[source[:, 0], source[:, 1]])
+    match = source[tree.query(features[anchors[:, 0], anchors[:, 1]], eps=1.0)[1]]
+    offset = np.zeros((height, width, 2), dtype=np.int64)
+    offset[anchors[:, 0], anchors[:, 1]] = match - anchors
+    centre_rows = np.minimum(rows // block * block + 1, height - 1)
+    centre_columns = np.minimum(columns // block * block + 1, width - 1)
+    carried = np.where(hole[..., None], offset[centre_rows, centre_columns], 0)
+    return rows + carried[..., 0], columns + carried[..., 1]
 
 
 def _feather(hole: Mask, objects: Mask) -> NDArray[np.float32]:

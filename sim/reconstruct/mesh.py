@@ -37,7 +37,8 @@ class BodyMesh:
 class _DepthField:
     """φ(x, y, t) > 0 inside: x, y in crop pixels (centres at integers), t in pixels along the ray from the reference.
 
-    φ = min(h² − t², 2 h_max (t_ground − t)): the inflated silhouette, cut by the ground.
+    φ = min(h² − t², 2 h_max (t_ground − t)): the inflated silhouette, cut by the ground; t / b for t behind the
+    reference, where the body is b times as thick.
     """
 
     def __init__(self, silhouette: Silhouette, reference: Reference) -> None:
@@ -47,7 +48,8 @@ class _DepthField:
         pixels = np.stack([silhouette.left + columns + 0.5, silhouette.top + rows + 0.5], axis=-1).reshape(-1, 2)
         middle, ground, rays = reference.depths(pixels)
         self.half_thickness = silhouette.half_thickness
-        cap = 4.0 * self.half_thickness + 16.0
+        self._back = reference.back
+        cap = 4.0 * self._back * self.half_thickness + 16.0
         with np.errstate(invalid="ignore"):
             below = (ground - middle) * np.linalg.norm(rays, axis=1) / reference.unit_per_pixel
         self._ground = np.minimum(np.nan_to_num(below, nan=cap, posinf=cap), cap).reshape(height, width)
@@ -58,7 +60,10 @@ class _DepthField:
         square = ndimage.map_coordinates(self._square, at, order=1, mode="nearest")
         ground = ndimage.map_coordinates(self._ground, at, order=1, mode="nearest")
         t = points[:, 2]
-        return square - t**2, 2.0 * self.half_thickness * (ground - t)
+        return square - self._squared(t), 2.0 * self.half_thickness * (ground - t)
+
+    def _squared(self, t: Points) -> Points:
+        return np.asarray(np.where(t > 0, t / self._back, t) ** 2)
 
     def value(self, points: Points) -> Points:
         """φ (n) at ``points`` (n, 3)."""
@@ -68,13 +73,13 @@ class _DepthField:
     def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points]:
         """φ on a grid (x, y, t) of ``spacing`` pixels, and the grid's first corner (3,)."""
         height, width = self._square.shape
-        reach = self.half_thickness + 2.0 * spacing
+        front, behind = (int(np.ceil(factor * self.half_thickness / spacing)) + 2 for factor in (1.0, self._back))
         # Half a cell off t = 0, so that no grid node lies exactly on the surface along the outline.
-        first = np.array([0.25, 0.25, -(np.ceil(reach / spacing) + 0.5) * spacing])
+        first = np.array([0.25, 0.25, -(front + 0.5) * spacing])
         counts = (
             int((width - 1) // spacing) + 1,
             int((height - 1) // spacing) + 1,
-            2 * int(np.ceil(reach / spacing)) + 2,
+            front + behind + 2,
         )
         axes = [first[i] + spacing * np.arange(counts[i]) for i in range(3)]
         flat = np.stack(np.meshgrid(axes[0], axes[1], [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -82,7 +87,7 @@ class _DepthField:
         shape = (counts[0], counts[1], 1)
         t = axes[2][None, None, :]
         field = np.minimum(
-            film.reshape(shape) - t**2, ground.reshape(shape) - 2.0 * self.half_thickness * t
+            film.reshape(shape) - self._squared(t), ground.reshape(shape) - 2.0 * self.half_thickness * t
         )
         # A closed surface needs a border outside.
         for axis in range(3):
@@ -124,7 +129,8 @@ def _surface(field: _DepthField, spacing: float) -> tuple[Points, Faces]:
 def _largest_part(points: Points, faces: Faces) -> tuple[Points, Faces]:
     """The connected part with most faces, its vertices renumbered in order."""
     count = len(points)
-    links = sparse.coo_matrix((np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (count,) * 2)
+    ends = faces[:, [0, 1, 2, 1]].reshape(-1, 2)
+    links = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
     parts, labels = sparse.csgraph.connected_components(links, directed=False)
     if parts > 1:
         keep = np.argmax(np.bincount(labels[faces[:, 0]], minlength=parts))

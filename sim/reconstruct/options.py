@@ -65,7 +65,7 @@ class ReconstructOptions:
         with the ground around the object.
     hole_dilation: side in pixels of the dilation kernel for a photo of 1024 pixels, 0 to 300 (paper A.2: 50).
     patch_radius: PatchMatch compares patches of (2 r + 1)² pixels, 1 to 10.
-    inpaint_pixels: photos with more pixels are inpainted at this number of pixels, 1e4 to 1e8.
+    inpaint_pixels: at most this many pixels are searched for the filling of a hole, 1e4 to 1e8.
     seed: seed of PatchMatch; equal inputs give equal backgrounds.
     mesh_vertices: aimed number of vertices of each object, 500 to 200000.
     friction: Coulomb coefficient of the ground, 0 to 10.
@@ -79,7 +79,7 @@ class ReconstructOptions:
     grabcut_iterations: int = 6
     shadow_threshold: float | None = None
     hole_dilation: float = 50.0
-    patch_radius: int = 3
+    patch_radius: int = 4
     inpaint_pixels: int = 2_800_000
     seed: int = 0
     mesh_vertices: int = 12_000

@@ -21,7 +21,7 @@ from . import camera as cameras
 from .body import contact_pixel, stand
 from .horizon import estimate_pitch
 from .inflate import Silhouette, inflate
-from .inpaint import inpaint
+from .inpaint import FillOptions, inpaint
 from .light import environment_map, sun, write_environment
 from .mesh import BodyMesh, build_mesh
 from .options import ObjectRequest, ReconstructOptions
@@ -189,7 +189,12 @@ def _camera(
 
 
 def _take_apart(
-    picture: Photo, masks: Sequence[Mask], names: Sequence[str], view: Camera, options: ReconstructOptions, steps: _Steps
+    picture: Photo,
+    masks: Sequence[Mask],
+    names: Sequence[str],
+    view: Camera,
+    options: ReconstructOptions,
+    steps: _Steps,
 ) -> _Layers:
     pitch = math.asin(max(-1.0, min(1.0, -view.world_from_camera[2][2])))
     horizon = cameras.horizon_row(picture.height, view.fy, pitch)
@@ -199,9 +204,7 @@ def _take_apart(
     for name, mask in zip(names, masks, strict=True):
         steps.begin(f"shadow {name}")
         shadows.append(
-            find_shadow(
-                grey, mask, union & ~mask, horizon_row=horizon, fixed_threshold=options.shadow_threshold
-            )
+            find_shadow(grey, mask, union & ~mask, horizon_row=horizon, fixed_threshold=options.shadow_threshold)
         )
     dilation = options.hole_dilation * max(picture.width, picture.height) / 1024.0
     holes = object_holes(masks, shadows, dilation)
@@ -210,9 +213,13 @@ def _take_apart(
         picture.pixels,
         np.logical_or.reduce(holes),
         union,
-        radius=options.patch_radius,
-        limit=options.inpaint_pixels,
-        seed=options.seed,
+        FillOptions(
+            radius=options.patch_radius,
+            limit=options.inpaint_pixels,
+            seed=options.seed,
+            # Seen from high above, the ground is all there is, and looks the same at all heights.
+            by_row=horizon > -0.5 * picture.height,
+        ),
     )
     return _Layers(masks=tuple(masks), shadows=tuple(shadows), holes=tuple(holes), background=background)
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .mask_cleanup import surrounding_ring
+from .mask_cleanup import enclosed_holes, surrounding_ring
 
 Mask = NDArray[np.bool_]
 
@@ -47,7 +47,7 @@ def find_shadow(
     reach = round(0.7 * max(height, width))
     region = np.zeros_like(mask)
     # The lower part of the object and below: what is dark higher up stands behind it, a wall for instance.
-    top = max(round(rows[-1] - 0.4 * height - 0.1 * width), int(np.ceil(horizon_row)), 0)
+    top = max(round(rows[-1] - 0.22 * height - 0.05 * width), int(np.ceil(horizon_row)), 0)
     region[
         top : rows[-1] + reach // 2,
         max(0, columns[0] - reach) : columns[-1] + reach,
@@ -56,11 +56,8 @@ def find_shadow(
     ground = region & ~mask & ~others
     if not ground.any():
         return np.zeros_like(mask)
-    if fixed_threshold is None:
-        dark = grey < SHADOW_RATIO * _lit_ground(grey, ground)
-    else:
-        dark = grey < fixed_threshold
-    dark &= ground
+    threshold = SHADOW_RATIO * _lit_ground(grey, ground) if fixed_threshold is None else fixed_threshold
+    dark = (grey < threshold) & ground
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * near + 1, 2 * near + 1))
     grain = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (near // 3) + 1,) * 2)
     dark = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, grain) > 0
@@ -118,6 +115,8 @@ def object_holes(masks: Sequence[Mask], shadows: Sequence[Mask], dilation: float
     holes = []
     for index, (mask, shadow) in enumerate(zip(masks, shadows, strict=True)):
         hole = cv2.dilate((mask | shadow).astype(np.uint8), kernel) > 0
+        # What is left of the photo inside a strap would stand there as an island.
+        hole |= enclosed_holes(hole)
         for other, blocked in enumerate(masks):
             if other != index:
                 hole &= ~(blocked & ~mask)
