@@ -24,6 +24,10 @@ LOOK_EVERY = 4
 """Most substeps between two looks at the reports."""
 
 
+RECOVERY_HEIGHT = 0.02
+"""Cells that a particle which starts in the ground could fly up when it is pushed out."""
+
+
 class Diverged(Exception):
     """A velocity is not finite any more, or the stable substep has gone to zero."""
 
@@ -334,7 +338,7 @@ class Engine:
 
     def _contact_kernels(self, dt: float, reach: float) -> None:
         assert self.plane is not None
-        recovery = math.sqrt(0.2 * float(np.linalg.norm(self.gravity)))
+        recovery = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(self.gravity)))
         here = self._particles[0]
         for sweep in range(self.options.contact_sweeps):
             contact.solve_contact(

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
-import os
 import sys
 
 import taichi as ti
@@ -42,18 +43,24 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
         arguments["cpu_max_num_threads"] = wanted[1]
     if folder:
         arguments["offline_cache_file_path"] = folder
-    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     try:
-        ti.init(**arguments)
+        _start(arguments)
     except RuntimeError as error:
         if wanted[0] == "cpu":
             raise InputError(f"solver option cache_folder is {folder!r}: Taichi did not start ({error})") from error
         logger.warning("Taichi could not start on %s (%s); computing on the CPU", wanted[0], error)
-        ti.init(**{**arguments, "arch": ti.cpu})
+        _start({**arguments, "arch": ti.cpu})
         wanted = ("cpu", options.threads, folder)
     _ACTIVE = wanted
     _GENERATION += 1
     return wanted[0], _GENERATION
+
+
+def _start(arguments: dict[str, object]) -> None:
+    """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        ti.init(**arguments)
+    logger.debug("%s", said.getvalue().strip())
 
 
 def generation() -> int:

@@ -114,7 +114,8 @@ def sample_interior(
 def _too_few(count: int, spacing: float, extent: Array) -> InputError:
     return InputError(
         f"mesh of {extent[0]:g} x {extent[1]:g} x {extent[2]:g} gets {count} particles at a spacing of {spacing:g}, "
-        f"fewer than {MIN_PARTICLES}: use a finer grid (solver option grid), a larger similarity scale, or a larger mesh"
+        f"fewer than {MIN_PARTICLES}: use a finer grid (solver option grid), a larger similarity scale, or a "
+        "larger mesh"
     )
 
 

@@ -34,10 +34,7 @@ from .layout import (
 )
 
 SUNK_LIMIT = 0.05
-"""Depth in cells from which a particle is lifted out of the ground, should the contact solve not have held it."""
-
-LIFT = 0.01
-"""Cells that a sunk particle is lifted by at most in a substep."""
+"""Depth in cells below which no particle sinks, should the contact solve not have held it."""
 
 
 @ti.func
@@ -227,10 +224,12 @@ def advance_particles(
                     F[p] = Fp
                     step = vp * dt_gather
                     if ground:
-                        phi = level + normal.dot(gp + step) - fixed[3]
-                        if phi < -SUNK_LIMIT:
-                            step += ti.min(-SUNK_LIMIT - phi, LIFT) * normal
-                        clearance = ti.min(clearance, phi)
+                        phi = level + normal.dot(gp) - fixed[3]
+                        moved = phi + normal.dot(step)
+                        floor = ti.min(phi, -SUNK_LIMIT)
+                        if moved < floor:
+                            step += (floor - moved) * normal
+                        clearance = ti.min(clearance, moved)
                         old = reaction[p]
                         reaction[p] = vec4(old[0], old[1], old[2], A[3])
                     # Never outside the window, whatever the velocity: this is what keeps memory safe.

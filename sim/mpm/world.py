@@ -250,8 +250,9 @@ class World:
     def positions(self, index: int) -> Array:
         """Particle positions (N, 3) of body ``index``, world metres, in the order in which they were given."""
         body = self._body(index)
-        cells = self._gather("position", index, self._cells.points_to_engine(body.positions))
-        return self._cells.points_to_world(cells)
+        if not self._started[index]:
+            return body.positions.copy()
+        return self._cells.points_to_world(self._gather("position", index, np.zeros((body.count, 3))))
 
     def velocities(self, index: int) -> Array:
         """Particle velocities (N, 3) of body ``index``, m/s. Zero before the body starts."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from physgen.sim.mpm.options import Ground
 from physgen.sim.mpm.world import World
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from physgen.sim.mpm.options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
 from physgen.sim.scene.units import Similarity

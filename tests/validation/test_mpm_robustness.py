@@ -7,7 +7,6 @@ import io
 
 import numpy as np
 import pytest
-
 from physgen.sim.errors import InputError, SimulationError
 from physgen.sim.mpm.options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
