@@ -22,6 +22,8 @@ POISSON_UNKNOWNS = 40_000
 """Larger silhouettes are solved on a coarser grid; the outline stays at full resolution."""
 RECTANGULAR = 0.88
 """Area over that of the smallest rotated rectangle, above which an outline is a box; an ellipse has 0.785."""
+LONGEST_SLAB = 3.0
+"""Length over width of a box; longer ones are taken for bottles, pens and sticks, which are round."""
 SLAB_THICKNESS = 0.2
 """Default thickness over width of a box: between a book and a carton."""
 SLAB_BEVEL = 0.5
@@ -63,7 +65,7 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
     padded = np.pad(mask, pad)
     crop = padded[rows[0] : rows[-1] + 1 + 2 * pad, columns[0] : columns[-1] + 1 + 2 * pad]
     distance = signed_distance(crop)
-    slab = rectangularity(crop) > RECTANGULAR
+    slab = is_box(crop)
     if thickness is None:
         thickness = SLAB_THICKNESS if slab else 1.0
     square = _slab_profile(distance, thickness) if slab else _film_profile(crop, distance, thickness)
@@ -88,13 +90,14 @@ def signed_distance(mask: Mask) -> Field:
     return np.asarray(weight * exact + (1.0 - weight) * smooth)
 
 
-def rectangularity(mask: Mask) -> float:
-    """Area of ``mask`` over the area of the smallest rectangle, at any angle, that holds it; 0 to 1."""
+def is_box(mask: Mask) -> bool:
+    """Whether ``mask`` fills the smallest rectangle, at any angle, that holds it, and is not drawn out like a stick."""
     points = cv2.findNonZero(mask.astype(np.uint8))
     if points is None:
-        return 0.0
-    (_, size, _) = cv2.minAreaRect(points)
-    return min(1.0, float(mask.sum()) / max(1.0, (size[0] + 1.0) * (size[1] + 1.0)))
+        return False
+    _, size, _ = cv2.minAreaRect(points)
+    width, length = sorted((size[0] + 1.0, size[1] + 1.0))
+    return bool(mask.sum() > RECTANGULAR * width * length and length < LONGEST_SLAB * width)
 
 
 def roundness(mask: Mask) -> float:

@@ -85,10 +85,7 @@ def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillO
     crop, own, closed = pixels[window], part[window], hole[window]
     side = float(np.sqrt(np.ptp(rows) * np.ptp(columns)))
     scale = min(1.0, SOLVE_SIDE / max(side, 1.0), float(np.sqrt(options.limit / own.size)))
-    if scale > 0.8:
-        filled = _patch_match(crop, own, closed, options)
-    else:
-        filled = _at_scale(crop, own, closed, scale, options)
+    filled = _patch_match(crop, own, closed, options) if scale > 0.8 else _at_scale(crop, own, closed, scale, options)
     crop[own] = filled[own]
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Mask = NDArray[np.bool_]
 
@@ -43,45 +44,104 @@ def enclosed_holes(mask: Mask) -> Mask:
     return np.asarray((labels != labels[0, 0]) & (padded > 0))[1:-1, 1:-1]
 
 
-def fill_holes(pixels: NDArray[np.uint8], mask: Mask, *, small: float = 0.004, likeness: float = 14.0) -> Mask:
-    """``mask`` without pinholes; large holes stay open only where the background shows through them.
+def fill_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
+    """``mask`` without pinholes and prints; holes stay open only where the background shows through them.
 
-    pixels: (H, W, 3) sRGB. small: holes below this fraction of the mask's area are always filled, 0 to 1.
-    likeness: CIELAB distance (delta E) up to which a colour counts as the background's.
-    A hole is see-through when most of its pixels look like the ground next to the object at the same height, and it
-    is wider than a letter printed on a cover.
+    pixels: (H, W, 3) sRGB.
     """
     holes = enclosed_holes(mask)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
-    result = mask.copy()
-    if count <= 1:
-        return result
+    return mask | (holes & ~see_through(pixels, mask, holes))
+
+
+def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
+    """``mask`` without the regions inside it that look just like the background beside it: a handle, a strap.
+
+    GrabCut keeps them when the box holds so much background that it learns it as a colour of the object.
+    pixels: (H, W, 3) sRGB.
+    """
     area = int(mask.sum())
-    lab = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    lab = _lab(cv2.GaussianBlur(pixels, (0, 0), 1.0))
     ring = surrounding_ring(mask, max(4, round(0.12 * np.sqrt(area))))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    near, inside = lab[ring], lab[inner]
+    if len(near) < 50 or len(inside) < 50:
+        return mask.copy()
+    alike = np.zeros_like(mask)
+    alike[inner] = cKDTree(near[:: max(1, len(near) // 2000)]).query(inside, distance_upper_bound=6.0)[0] < 6.0
+    side = 2 * max(1, round(0.02 * np.sqrt(area))) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    alike = cv2.morphologyEx(alike, cv2.MORPH_OPEN, kernel)
+    candidates = (alike > 0) & mask
+    opened = see_through(pixels, mask, candidates, likeness=8.0, share=0.9)
+    # More than half of the object would not be holes any more, but an object of the ground's colour.
+    return mask & ~opened if opened.sum() < 0.5 * area else mask.copy()
+
+
+def see_through(
+    pixels: NDArray[np.uint8], mask: Mask, regions: Mask, *, likeness: float = 14.0, share: float = 0.85
+) -> Mask:
+    """Those connected parts of ``regions`` through which the background shows.
+
+    Most of their pixels (``share``, 0 to 1) look like the ground beside the object at about the same height, within
+    ``likeness`` (CIELAB delta E), they are as mottled as the ground, and wider than a letter printed on a cover.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(regions.astype(np.uint8), connectivity=4)
+    result = np.zeros_like(mask)
+    area = int(mask.sum())
+    lab = _lab(pixels)
+    ring = surrounding_ring(mask | regions, max(4, round(0.12 * np.sqrt(area))))
     for index in range(1, count):
-        hole = labels == index
-        size = int(stats[index, cv2.CC_STAT_AREA])
-        width = 2.0 * float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 3).max())
-        narrow = width < 0.05 * np.sqrt(area)
-        if size < small * area or narrow or not _shows_background(lab, hole, ring, stats[index], likeness):
-            result |= hole
+        region = labels == index
+        width = 2.0 * float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 3).max())
+        if stats[index, cv2.CC_STAT_AREA] < 0.004 * area or width < 0.05 * np.sqrt(area):
+            continue
+        top, height = int(stats[index, cv2.CC_STAT_TOP]), int(stats[index, cv2.CC_STAT_HEIGHT])
+        rows = slice(max(0, top - height), top + 2 * height)
+        near = lab[rows][ring[rows]]
+        if len(near) < 20:
+            continue
+        inside = lab[region]
+        # Some hundred colours of each tell as much as all of them.
+        near, inside = near[:: max(1, len(near) // 600)], inside[:: max(1, len(inside) // 600)]
+        distances = cKDTree(near).query(inside)[0]
+        apart = float(np.linalg.norm(np.median(near, axis=0) - np.median(inside, axis=0)))
+        if (distances < likeness).mean() > share and apart < 1.5 * likeness:
+            result |= region
     return result
 
 
-def _shows_background(
-    lab: NDArray[np.float32], hole: Mask, ring: Mask, stats: NDArray[np.int32], likeness: float
-) -> bool:
-    top, height = int(stats[cv2.CC_STAT_TOP]), int(stats[cv2.CC_STAT_HEIGHT])
-    rows = slice(max(0, top - height), top + 2 * height)
-    near = lab[rows][ring[rows]]
-    if len(near) < 20:
-        return False
-    inside = lab[hole]
-    # Up to 300 colours of each tell as much as all of them, in a small distance matrix.
-    near, inside = near[:: max(1, len(near) // 300)], inside[:: max(1, len(inside) // 300)]
-    nearest = np.linalg.norm(inside[:, None] - near[None], axis=2).min(axis=1)
-    return bool((nearest < likeness).mean() > 0.85)
+def _lab(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.asarray(cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB), dtype=np.float32)
+
+
+def settle_outline(pixels: NDArray[np.uint8], mask: Mask, *, band: int = 3, contrast: float = 25.0) -> Mask:
+    """``mask`` with its outline where object and background mix half and half.
+
+    GrabCut gives mixed pixels to the object, which then shows a rim of background wherever it moves. Within ``band``
+    pixels of the outline each pixel is compared with the mean colours of the object and of the background next to it;
+    where these differ by less than ``contrast`` (grey values), the outline stays.
+    """
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
+    binary = mask.astype(np.uint8)
+    core = cv2.erode(binary, kernel, borderValue=0) > 0
+    outside = cv2.dilate(binary, kernel) == 0
+    colours = pixels.astype(np.float32)
+    front, has_front = _local_mean(colours, core, 1.5 * band)
+    back, has_back = _local_mean(colours, outside, 1.5 * band)
+    difference = front - back
+    length = np.linalg.norm(difference, axis=2)
+    alpha = ((colours - back) * difference).sum(axis=2) / np.maximum(length**2, 1.0)
+    decided = ~core & ~outside & has_front & has_back & (length > contrast)
+    return np.asarray(np.where(decided, alpha > 0.5, mask))
+
+
+def _local_mean(colours: NDArray[np.float32], where: Mask, sigma: float) -> tuple[NDArray[np.float32], Mask]:
+    """Gaussian mean (H, W, 3) of ``colours`` in ``where``, and where there is anything to take it from."""
+    weight = where.astype(np.float32)
+    total = cv2.GaussianBlur(weight, (0, 0), sigma)
+    mean = cv2.GaussianBlur(colours * weight[..., None], (0, 0), sigma) / np.maximum(total, 1e-6)[..., None]
+    return np.asarray(mean, dtype=np.float32), np.asarray(total > 0.02)
 
 
 def drop_ground_shadow(pixels: NDArray[np.uint8], mask: Mask, *, most: float = 0.1) -> Mask:

@@ -70,18 +70,22 @@ class _DepthField:
         film, ground = self.sample(points)
         return np.minimum(film, ground)
 
-    def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points]:
-        """φ on a grid (x, y, t) of ``spacing`` pixels, and the grid's first corner (3,)."""
+    def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points, Points]:
+        """φ on a grid (x, y, t) of ``spacing`` pixels, the grid's first corner (3,) and its spacing along each axis.
+
+        Thin bodies get finer steps in depth, or they would slip between two layers of the grid.
+        """
+        steps = np.array([spacing, spacing, min(spacing, self.half_thickness / 3.0)])
         height, width = self._square.shape
-        front, behind = (int(np.ceil(factor * self.half_thickness / spacing)) + 2 for factor in (1.0, self._back))
+        front, behind = (int(np.ceil(factor * self.half_thickness / steps[2])) + 2 for factor in (1.0, self._back))
         # Half a cell off t = 0, so that no grid node lies exactly on the surface along the outline.
-        first = np.array([0.25, 0.25, -(front + 0.5) * spacing])
+        first = np.array([0.25, 0.25, -(front + 0.5) * steps[2]])
         counts = (
             int((width - 1) // spacing) + 1,
             int((height - 1) // spacing) + 1,
             front + behind + 2,
         )
-        axes = [first[i] + spacing * np.arange(counts[i]) for i in range(3)]
+        axes = [first[i] + steps[i] * np.arange(counts[i]) for i in range(3)]
         flat = np.stack(np.meshgrid(axes[0], axes[1], [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
         film, ground = self.sample(flat)
         shape = (counts[0], counts[1], 1)
@@ -96,7 +100,7 @@ class _DepthField:
                 edge[axis] = end  # type: ignore[call-overload]
                 field[tuple(edge)] = np.minimum(field[tuple(edge)], -1e-3)
         field[np.abs(field) < 1e-4] = -1e-4
-        return field.astype(np.float32), first
+        return field.astype(np.float32), first, steps
 
 
 def build_mesh(silhouette: Silhouette, reference: Reference, target: int = 12_000) -> BodyMesh:
@@ -118,11 +122,11 @@ def build_mesh(silhouette: Silhouette, reference: Reference, target: int = 12_00
 
 
 def _surface(field: _DepthField, spacing: float) -> tuple[Points, Faces]:
-    grid, first = field.grid(spacing)
+    grid, first, steps = field.grid(spacing)
     if not (grid > 0).any():
         raise InputError("the outline is too thin for a body; draw the box around a larger object")
     vertices, faces, _, _ = marching_cubes(grid, level=0.0, method="lewiner", allow_degenerate=True)
-    points = first + vertices.astype(np.float64) * spacing
+    points = first + vertices.astype(np.float64) * steps
     return _largest_part(points, faces.astype(np.int64))
 
 

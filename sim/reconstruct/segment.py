@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .mask_cleanup import drop_ground_shadow, fill_holes, largest_component, smooth_outline
+from .mask_cleanup import (
+    drop_ground_shadow,
+    fill_holes,
+    largest_component,
+    open_holes,
+    settle_outline,
+    smooth_outline,
+)
 
 Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
@@ -70,11 +77,12 @@ def segment(
     if found.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
         warn(f"{where}: colour does not tell the object from the background; an ellipse in the box is used instead")
         found = _ellipse(crop.shape[:2], inner)
-    elif crop.shape[0] * crop.shape[1] <= FINE_PIXELS:
-        found = _fine(crop, found)
-    found = largest_component(found)
-    found = drop_ground_shadow(crop, found)
-    found = fill_holes(crop, found)
+    else:
+        found = open_holes(crop, found)
+        if crop.shape[0] * crop.shape[1] <= FINE_PIXELS:
+            found = _fine(crop, found)
+        found = settle_outline(crop, drop_ground_shadow(crop, largest_component(found)))
+    found = fill_holes(crop, largest_component(found))
     found = largest_component(smooth_outline(found))
     found[:, : inner[0]] = found[: inner[1]] = False
     found[:, inner[2] :] = found[inner[3] :] = False
