@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201 (Taichi reads annotations; kernels and their functions cannot carry a return type of None or tuples)
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Fixed-corotated elasticity (Stomakhin et al. 2012, "Energetically consistent invertible elasticity").
 
     psi = mu * sum_i (s_i - 1)^2 + lambda / 2 * (J - 1)^2
@@ -21,7 +23,7 @@ NEWTON_STEPS = 4
 
 
 @ti.func
-def eigen_symmetric(a: mat3):  # type: ignore[no-untyped-def]
+def eigen_symmetric(a: mat3):
     """Eigenvalues and eigenvectors (columns) of a symmetric 3x3 matrix by cyclic Jacobi rotations."""
     d = a
     q = ti.Matrix.identity(ti.f32, 3)
@@ -47,7 +49,7 @@ def eigen_symmetric(a: mat3):  # type: ignore[no-untyped-def]
 
 
 @ti.func
-def fixed_corotated(F: mat3, two_mu: ti.f32, lam: ti.f32):  # type: ignore[no-untyped-def]
+def fixed_corotated(F: mat3, two_mu: ti.f32, lam: ti.f32):
     """Kirchhoff stress and the longitudinal stiffness rho0 c^2 that bounds the time step.
 
     A longitudinal wave along the principal direction i of the deformed body travels at

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201 (Taichi reads annotations; kernels and their functions cannot carry a return type of None or tuples)
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Coulomb contact with the ground plane, resolved at the particles.
 
 Zeroing the velocity of nodes below the plane stops a body up to a cell too early, because a particle feels nodes 1.5

@@ -145,9 +145,9 @@ class Engine:
         keys = (base[:, 0] * self.across + base[:, 1]) * self.across + base[:, 2]
         merged = {name: np.concatenate([state[name], new[name]]) for name in PARTICLE_ARRAYS}
         self._upload(merged, np.concatenate([state["keys"], keys.astype(np.int32)]))
-        self._speed = max(self._speed, float(np.sqrt((v**2).sum(axis=1).max())))
+        self._speed = max(self._speed, math.sqrt(float(np.max((v**2).sum(axis=1)))))
         stiffness = (constants[:, 1] + constants[:, 2]) / constants[:, 0]
-        self._wave_speed = max(self._wave_speed, math.sqrt(float(stiffness.max())))
+        self._wave_speed = max(self._wave_speed, math.sqrt(float(np.max(stiffness))))
 
     def _download(self) -> dict[str, NDArray[np.generic]]:
         """The active particles in engine order, with the block of each under "keys"."""

@@ -61,7 +61,7 @@ def fit_similarity(
     largest = max(lengths)
     if largest <= 0:
         raise InputError("bodies have no extent: give points that are not all in one place")
-    side = float((high - low).max()) + 2 * motion_margin
+    side = float(np.max(high - low)) + 2 * motion_margin
     usable = options.grid - 2 * PADDING_CELLS
     cells_per_metre = min(usable / side, cells_across / largest)
     smallest = min(lengths)

@@ -74,7 +74,7 @@ def sample_interior(
     low, high = points[triangles].min(axis=(0, 1)), points[triangles].max(axis=(0, 1))
     extent = high - low
     signed = _signed_volume(points, triangles)
-    if not extent.min() > 1e-12 * extent.max() or (oriented and abs(signed) <= 1e-9 * extent.prod()):
+    if not np.min(extent) > 1e-12 * np.max(extent) or (oriented and abs(signed) <= 1e-9 * extent.prod()):
         raise InputError(
             f"mesh has no volume (bounding box {extent[0]:g} x {extent[1]:g} x {extent[2]:g}, volume {abs(signed):g}): "
             "give it thickness"

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201 (Taichi reads annotations; kernels and their functions cannot carry a return type of None or tuples)
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Grouping the particles in blocks: which block each is in, the lists of blocks, their neighbours, the permutation.
 
 ``table_p`` and ``table_g`` map a block of the domain to its slot in the list of particle blocks and of grid blocks
@@ -29,7 +31,7 @@ def block_index(b: ivec3, across: ti.i32) -> ti.i32:
 
 
 @ti.func
-def neighbour_offset(d: ti.i32):  # type: ignore[no-untyped-def]
+def neighbour_offset(d: ti.i32):
     """Offset of neighbour ``d`` of 27, each component -1, 0 or 1."""
     return ivec3(d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1)
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201 (Taichi reads annotations; kernels and their functions cannot carry a return type of None or tuples)
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """The two kernels of every substep: nodes, then particles (MLS-MPM, Hu et al. 2018; APIC, Jiang et al. 2015).
 
 Quadratic B-splines; lengths in cells (see ``layout``), seconds, kilograms. A substep is
@@ -38,13 +40,13 @@ SUNK_LIMIT = 0.05
 
 
 @ti.func
-def weights(fx: vec3):  # type: ignore[no-untyped-def]
+def weights(fx: vec3):
     """Quadratic B-spline weights (list of three vectors) at distance ``fx`` from the lowest node, 0.5 <= fx < 1.5."""
     return [0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2]
 
 
 @ti.func
-def span(side: ti.i32):  # type: ignore[no-untyped-def]
+def span(side: ti.i32):
     """Window nodes [low, high) that fall in the block before (0), of (1) or after (2) the window's own block."""
     low = ti.select(side == 0, 0, ti.select(side == 1, 1, 5))
     high = ti.select(side == 0, 1, ti.select(side == 1, 5, 8))
@@ -52,7 +54,7 @@ def span(side: ti.i32):  # type: ignore[no-untyped-def]
 
 
 @ti.func
-def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):  # type: ignore[no-untyped-def]
+def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
     """Copy the nodes around particle block ``k`` into its private window."""
     for d in range(27):
         g = neighbours[k * 27 + d]
@@ -67,7 +69,7 @@ def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vector
 
 
 @ti.func
-def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):  # type: ignore[no-untyped-def]
+def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
     """Add the windows of the 27 particle blocks around grid block ``g`` to its nodes."""
     for d in range(27):
         k = neighbours[g * 27 + d]

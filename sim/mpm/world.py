@@ -83,7 +83,7 @@ class World:
     def _check_placement(self) -> None:
         for body in self.bodies:
             cells = self._cells.points_to_engine(body.positions)
-            low, high = float(cells.min()), float(cells.max())
+            low, high = float(np.min(cells)), float(np.max(cells))
             if low < PADDING_CELLS or high > self.options.grid - PADDING_CELLS:
                 raise InputError(
                     f"body {body.name!r}: positions span {low:.1f} to {high:.1f} of {self.options.grid} cells, the box "

@@ -69,12 +69,13 @@ def test_block_slides_down_a_slope(box, options, similarity, friction, degrees):
     ground = Ground(normal=tuple(rotation[:, 2]), friction=friction)
     world = World(bodies=[body], ground=ground, similarity=similarity, options=options)
     downhill = rotation[:, 0]
-    world.advance(0.05)
-    start = float(world.velocities(0).mean(axis=0) @ downhill)
-    world.advance(0.3)
-    end = float(world.velocities(0).mean(axis=0) @ downhill)
-    expected = G * (np.sin(angle) - friction * np.cos(angle))
-    assert (end - start) / 0.3 == pytest.approx(expected, rel=0.03)
+    track = []
+    for _ in range(14):
+        world.advance(0.025)
+        track.append((world.time, float(world.velocities(0).mean(axis=0) @ downhill)))
+    # The block starts without stress and bounces on itself: a line through the track evens that out.
+    slope = np.polyfit(*np.array(track).T, 1)[0]
+    assert slope == pytest.approx(G * (np.sin(angle) - friction * np.cos(angle)), rel=0.03)
 
 
 def test_block_sticks_below_the_friction_angle(box, options, similarity, cell):
