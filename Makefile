@@ -26,7 +26,7 @@ test-all: setup
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p physgen.sim -p physgen.batch
+	$(BIN)/mypy sim batch
 
 benchmark: setup
 	$(BIN)/python benchmarks/mpm.py
