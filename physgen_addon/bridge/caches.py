@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked point caches: checked against the scene, read, and attached as native Mesh Cache modifiers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from ...sim.cache.manifest import BakeManifest, load_manifest
+from ...sim.cache.pc2 import Pc2Reader
+from ...sim.errors import InputError
+from ...sim.scene.model import Scene
+
+MODIFIER = "PhysGen cache"
+
+
+@dataclass(frozen=True)
+class Bake:
+    """A bake that fits a scene: its caches in the order of the scene's objects."""
+
+    folder: Path
+    manifest: BakeManifest
+    caches: tuple[Pc2Reader, ...]
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the frame that shows sample 0, the scene at rest."""
+        return self.manifest.frame_start
+
+    @property
+    def last_frame(self) -> int:
+        """Number of the last frame that every cache holds."""
+        return self.manifest.frame_start + min(cache.sample_count for cache in self.caches) - 1
+
+
+def open_bake(folder: Path, scene: Scene) -> Bake:
+    """Open the bake in ``folder`` for ``scene``.
+
+    Raises InputError when there is none, an object of the scene has no cache in it, or a cache is damaged or empty.
+    """
+    manifest = load_manifest(folder)
+    files = {item.name: item for item in manifest.objects}
+    caches = []
+    for item in scene.objects:
+        if item.name not in files:
+            raise InputError(f"{folder}: holds no cache of object {item.name!r}; bake the scene again")
+        cache = Pc2Reader(folder / files[item.name].file)
+        if cache.sample_count < 1:
+            raise InputError(f"{cache.path}: holds no sample yet; let the bake run on")
+        caches.append(cache)
+    return Bake(folder=folder, manifest=manifest, caches=tuple(caches))
+
+
+def require_fit(cache: Pc2Reader, vertex_count: int, name: str) -> None:
+    """Raise InputError unless ``cache`` has the vertices of the mesh: Blender would only warn on the console."""
+    if cache.vertex_count != vertex_count:
+        raise InputError(
+            f"{cache.path}: has {cache.vertex_count} vertices, the mesh of {name!r} has {vertex_count}; bake again"
+        )
+
+
+def attach(item: bpy.types.Object, cache: Pc2Reader, first_frame: int) -> bpy.types.Modifier:
+    """Let ``item`` follow ``cache``, which must fit its mesh (``require_fit``); sample 0 shows at ``first_frame``.
+
+    The object's matrix must be the identity, because samples are in world metres. An earlier PhysGen cache is
+    replaced.
+    """
+    require_fit(cache, len(item.data.vertices), item.name)
+    modifier = item.modifiers.get(MODIFIER) or item.modifiers.new(MODIFIER, "MESH_CACHE")
+    modifier.cache_format = "PC2"
+    modifier.filepath = str(cache.path)
+    modifier.interpolation = "LINEAR"
+    modifier.frame_start = first_frame
+    return modifier

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every difference between the Blender lines that PhysGen runs on (4.5 and 5.2), and what a build has or lacks."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+
+import bpy
+
+from ...sim.errors import RenderError
+
+DENOISER = "OPENIMAGEDENOISE"
+
+
+def enable_cycles() -> None:
+    """Cycles is an add-on of Blender; as a Python module or in a factory start-up it may not be enabled.
+
+    Raises RenderError when this build has none.
+    """
+    if not hasattr(bpy.types.Scene, "cycles"):
+        import addon_utils
+
+        addon_utils.enable("cycles")
+    if not hasattr(bpy.types.Scene, "cycles"):
+        raise RenderError(f"Blender {bpy.app.version_string} was built without Cycles; use an official build")
+
+
+def denoiser_available() -> bool:
+    """Whether this build can denoise on the CPU."""
+    try:
+        import _cycles
+    except ImportError:
+        return False
+    return bool(getattr(_cycles, "with_openimagedenoise", False))
+
+
+def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
+    """The emptied node tree of a material or world."""
+    with warnings.catch_warnings():
+        # Always true from 5.0 on, where setting it warns; needed before.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        data.use_nodes = True
+    data.node_tree.nodes.clear()
+    return data.node_tree
+
+
+def set_exr(image: bpy.types.ImageFormatSettings) -> None:
+    """Full-float multilayer OpenEXR."""
+    if hasattr(image, "media_type"):
+        image.media_type = "MULTI_LAYER_IMAGE"
+    image.file_format = "OPEN_EXR_MULTILAYER"
+    image.color_depth = "32"
+    image.exr_codec = "NONE"
+
+
+def set_video(image: bpy.types.ImageFormatSettings) -> None:
+    """FFmpeg video output."""
+    if hasattr(image, "media_type"):
+        image.media_type = "VIDEO"
+    image.file_format = "FFMPEG"
+
+
+def strips(scene: bpy.types.Scene) -> bpy.types.bpy_prop_collection:
+    """The sequencer's strips, created when there are none (``sequences`` was their name before 4.4)."""
+    editor = scene.sequence_editor_create()
+    return editor.strips if hasattr(editor, "strips") else editor.sequences
+
+
+def layer_collection(layer: bpy.types.ViewLayer, name: str) -> bpy.types.LayerCollection:
+    """The layer collection ``name``; view layers of new scenes have none before their first update."""
+    layer.update()
+    return layer.layer_collection.children[name]
+
+
+@contextlib.contextmanager
+def active_scene(scene: bpy.types.Scene) -> Iterator[None]:
+    """Make ``scene`` the context's scene, for operators that look for it there."""
+    with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
+        yield

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The scene's light in Blender: the environment map and the sun."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Vector
+from numpy.typing import NDArray
+
+from ...sim.errors import InputError
+from ...sim.scene.folder import SceneFolder
+from . import compat
+from .exr import read_layers
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+MIN_SUN_COSINE = 0.05
+"""A sun lower than 3° over the ground would need an unbounded strength to light it as much as the scene says."""
+
+
+def environment_irradiance(radiance: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.float64]:
+    """RGB irradiance (3,) of an equirectangular map (H, W, 3) on open ground with unit ``normal``.
+
+    Blender's convention: the map's middle column looks along +X... see ``_directions``.
+    """
+    directions, solid_angle = _directions(*radiance.shape[:2])
+    cosine = np.clip(directions @ np.asarray(normal, dtype=float), 0.0, None)
+    return np.einsum("hwc,hw,hw->c", radiance[..., :3].astype(np.float64), cosine, solid_angle)
+
+
+def _directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World direction (H, W, 3) and solid angle (H, W) of each pixel of an equirectangular map, row 0 on top.
+
+    Blender: u = 1/2 - atan2(y, x) / 2π, v = 1/2 + latitude / π.
+    """
+    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * math.pi
+    edges = np.sin((0.5 - np.arange(height + 1) / height) * math.pi)
+    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
+    x = np.cos(latitude)[:, None] * np.cos(azimuth)
+    y = np.cos(latitude)[:, None] * np.sin(azimuth)
+    z = np.broadcast_to(np.sin(latitude)[:, None], x.shape)
+    solid = np.broadcast_to(((edges[:-1] - edges[1:]) * 2 * math.pi / width)[:, None], x.shape)
+    return np.stack([x, y, z], axis=-1), solid
+
+
+def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
+    """Give all ``scenes`` the light of ``folder``; the luminance of the irradiance on the open ground.
+
+    Raises InputError when the environment map is not readable or black.
+    """
+    light, ground = folder.scene.light, folder.scene.ground
+    normal = np.asarray(ground.normal, dtype=float)
+    world = bpy.data.worlds.new("environment")
+    tree = compat.node_tree(world)
+    shader = tree.nodes.new("ShaderNodeBackground")
+    output = tree.nodes.new("ShaderNodeOutputWorld")
+    tree.links.new(shader.outputs["Background"], output.inputs["Surface"])
+    if light.environment is None:
+        shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+        irradiance = math.pi
+    else:
+        path = folder.file(light.environment)
+        radiance = _read_environment(path)
+        irradiance = float(environment_irradiance(radiance, normal) @ LUMINANCE)
+        if not (math.isfinite(irradiance) and irradiance > 0):
+            raise InputError(f"{path}: lights the ground with {irradiance}; give an environment with finite light")
+        texture = tree.nodes.new("ShaderNodeTexEnvironment")
+        texture.image = bpy.data.images.load(str(path))
+        texture.image.colorspace_settings.name = "Linear Rec.709"
+        tree.links.new(texture.outputs["Color"], shader.inputs["Color"])
+        # Sampled at the map's own resolution; the automatic choice is larger and costs time in every frame.
+        world.cycles.sampling_method = "MANUAL"
+        world.cycles.sample_map_resolution = int(np.clip(radiance.shape[1], 4, 1024))
+    for scene in scenes:
+        scene.world = world
+    total = irradiance
+    if light.sun_direction is not None and light.sun_strength > 0:
+        total += light.sun_strength * irradiance
+        _add_sun(scenes, folder, light.sun_strength * irradiance)
+    return total
+
+
+def _add_sun(scenes: list[bpy.types.Scene], folder: SceneFolder, ground_irradiance: float) -> None:
+    light, normal = folder.scene.light, np.asarray(folder.scene.ground.normal)
+    direction = np.asarray(light.sun_direction)
+    data = bpy.data.lights.new("sun", "SUN")
+    # Blender's strength is the irradiance of a surface that faces the sun.
+    data.energy = ground_irradiance / max(float(direction @ normal), MIN_SUN_COSINE)
+    data.angle = light.sun_angle
+    item = bpy.data.objects.new("sun", data)
+    item.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
+    for scene in scenes:
+        scene.collection.objects.link(item)
+
+
+def _read_environment(path: Path) -> NDArray[np.float32]:
+    channels = read_layers(path)
+    try:
+        return np.stack([channels[name] for name in "RGB"], axis=-1)
+    except KeyError:
+        raise InputError(f"{path}: has channels {sorted(channels)}; an environment needs R, G and B") from None

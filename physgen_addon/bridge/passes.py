@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One still of one Blender scene as linear arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.errors import InputError, RenderError
+from . import compat
+from .exr import read_layers
+from .options import RenderOptions
+from .regions import Box
+
+Channels = dict[str, NDArray[np.float32]]
+
+
+def set_up(scene: bpy.types.Scene, options: RenderOptions, samples: int) -> None:
+    """Cycles for exact image formation: one pixel is the mean over its area, light is direct, nothing is clamped."""
+    render, cycles = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    cycles.device = "CPU"
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.seed, cycles.use_animated_seed = options.seed, False
+    # The ratio of light to rest light is only independent of albedo without bounces.
+    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = cycles.transmission_bounces = 0
+    cycles.transparent_max_bounces = 0
+    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
+    cycles.light_sampling_threshold = 0.0
+    cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
+    cycles.use_auto_tile = False
+    set_denoising(scene, options.denoise)
+    render.threads_mode = "FIXED" if options.threads else "AUTO"
+    if options.threads:
+        render.threads = options.threads
+    render.film_transparent = True
+    render.use_compositing = render.use_sequencer = render.use_motion_blur = False
+    # Keeps textures, lamps and the denoiser from one frame to the next.
+    render.use_persistent_data = True
+    render.use_border = render.use_crop_to_border = True
+    scene.view_settings.view_transform = "Standard"
+    compat.set_exr(render.image_settings)
+
+
+def set_denoising(scene: bpy.types.Scene, wanted: bool) -> None:
+    """Denoise with OpenImageDenoise if ``wanted`` and there."""
+    cycles = scene.cycles
+    cycles.use_denoising = wanted and compat.denoiser_available()
+    if cycles.use_denoising:
+        cycles.denoiser = compat.DENOISER
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_prefilter = "FAST"
+        cycles.denoising_quality = "BALANCED"
+
+
+def render(scene: bpy.types.Scene, frame: int, box: Box, folder: Path) -> Channels:
+    """Render ``box`` of ``scene`` at ``frame``; channels (h, w) of the box such as ``Combined.R``.
+
+    ``folder`` holds the temporary file. Raises RenderError when Blender fails.
+    """
+    settings = scene.render
+    width, height = settings.resolution_x, settings.resolution_y
+    # Blender cuts borders down to whole pixels; a quarter pixel keeps rounding on the right side.
+    settings.border_min_x, settings.border_max_x = (box.x0 + 0.25) / width, min((box.x1 + 0.25) / width, 1.0)
+    settings.border_min_y = (height - box.y1 + 0.25) / height
+    settings.border_max_y = min((height - box.y0 + 0.25) / height, 1.0)
+    path = folder / "layers.exr"
+    path.unlink(missing_ok=True)
+    settings.filepath = str(path)
+    scene.frame_set(frame)
+    try:
+        # The operator renders its scene at the frame of the context's scene.
+        with compat.active_scene(scene):
+            bpy.ops.render.render(write_still=True, scene=scene.name)
+    except RuntimeError as error:
+        raise RenderError(f"frame {frame}: Blender could not render it: {error}") from error
+    try:
+        channels = read_layers(path)
+    except InputError as error:
+        raise RenderError(f"frame {frame}: Blender wrote no usable image ({error})") from error
+    if next(iter(channels.values())).shape != (box.height, box.width):
+        found = next(iter(channels.values())).shape
+        raise RenderError(f"frame {frame}: Blender rendered {found} pixels instead of {(box.height, box.width)}")
+    return channels
+
+
+def stack(channels: Channels, name: str) -> NDArray[np.float32]:
+    """The pass ``name`` as (h, w, 3); RenderError when it is missing."""
+    try:
+        return np.stack([channels[f"{name}.{c}"] for c in "RGB"], axis=-1)
+    except KeyError:
+        raise RenderError(f"Blender wrote no pass {name!r}, only {sorted(channels)}") from None

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which part of the image objects and their shadows can touch, so that nothing else is rendered. Needs no bpy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.scene.model import Camera, Scene
+
+MARGIN_PX = 3
+SHADOW_REACH = 4.0
+"""How far around an object its contact shadow is rendered, over the height of its top above the ground. Beyond, it
+takes less than about 1/250 of the light of an even sky."""
+MIN_DEPTH_M = 1e-3
+
+
+class Box(NamedTuple):
+    """Pixels x0 ≤ x < x1, y0 ≤ y < y1, origin at the top left."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+    @property
+    def width(self) -> int:
+        """Pixels across."""
+        return self.x1 - self.x0
+
+    @property
+    def height(self) -> int:
+        """Pixels down."""
+        return self.y1 - self.y0
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns, to index an image."""
+        return slice(self.y0, self.y1), slice(self.x0, self.x1)
+
+
+def object_box(camera: Camera, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> Box | None:
+    """Pixels of an image of ``size`` (width, height) that objects with ``vertices`` (V, 3) cover; None out of view."""
+    return _bounds(camera, np.concatenate([np.asarray(v) for v in vertices]), size, MARGIN_PX)
+
+
+def shadow_box(scene: Scene, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> Box | None:
+    """Pixels whose ground the objects can darken: along the sun with its penumbra, and all around by the sky."""
+    boxes = [box for v in vertices if (box := _bounds(scene.camera, _footprint(scene, v), size, MARGIN_PX)) is not None]
+    if not boxes:
+        return None
+    return Box(min(b.x0 for b in boxes), min(b.y0 for b in boxes), max(b.x1 for b in boxes), max(b.y1 for b in boxes))
+
+
+def _footprint(scene: Scene, vertices: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Points (N, 3) on the ground that span where one object's shadow can fall."""
+    normal, origin = np.asarray(scene.ground.normal), np.asarray(scene.ground.point)
+    points = np.asarray(vertices, dtype=np.float64)
+    heights = np.clip((points - origin) @ normal, 0.0, None)
+    feet = points - ((points - origin) @ normal)[:, None] * normal
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    reach = SHADOW_REACH * max(float(heights.max()), 0.25 * size)
+    spans = [_grown(feet, normal, reach)]
+    sun = scene.light.sun_direction
+    if sun is not None and scene.light.sun_strength > 0:
+        direction = np.asarray(sun)
+        cosine = max(float(direction @ normal), 0.05)
+        # Half the sun's disc either way, stretched by its slant on the ground.
+        penumbra = float(heights.max()) * math.tan(min(scene.light.sun_angle, 2.5) / 2) / cosine**2
+        shadow = feet - heights[:, None] * (direction / cosine - normal)
+        spans.append(_grown(shadow, normal, penumbra + 0.05 * size))
+    return np.concatenate(spans)
+
+
+def _grown(points: NDArray[np.float64], normal: NDArray[np.floating], by: float) -> NDArray[np.float64]:
+    """A grid on the plane over the bounding box of ``points`` (N, 3) grown by ``by``.
+
+    A grid, because one of four corners may lie behind the camera.
+    """
+    axes = np.stack(plane_axes(normal))
+    flat = points @ axes.T
+    low, high = flat.min(axis=0) - by, flat.max(axis=0) + by
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, 17).T), axis=-1).reshape(-1, 2)
+    return np.asarray(grid @ axes + float(points.mean(axis=0) @ normal) * normal)
+
+
+def plane_axes(normal: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors that span the plane with ``normal``, right-handed with it."""
+    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def _bounds(camera: Camera, points: NDArray[np.floating], size: tuple[int, int], margin: int) -> Box | None:
+    width, height = size
+    projected = camera.project(points)
+    ahead = projected[:, 2] > MIN_DEPTH_M
+    if not ahead.any():
+        return None
+    if not ahead.all():
+        return Box(0, 0, width, height)
+    x = projected[:, 0] * (width / camera.width)
+    y = projected[:, 1] * (height / camera.height)
+    x0, x1 = math.floor(max(x.min(), -1e6)) - margin, math.ceil(min(x.max(), 1e6)) + margin
+    y0, y1 = math.floor(max(y.min(), -1e6)) - margin, math.ceil(min(y.max(), 1e6)) + margin
+    box = Box(max(x0, 0), max(y0, 0), min(x1, width), min(y1, height))
+    return box if box.width > 0 and box.height > 0 else None
+
+
+def feather(box: Box, size: tuple[int, int], share: float = 0.12) -> NDArray[np.float32]:
+    """Weights (H, W) of ``box`` that fall smoothly to 0 at its sides, except where these are the image's own."""
+
+    def ramp(count: int, at_start: bool, at_end: bool) -> NDArray[np.float32]:
+        width = max(1.0, share * count)
+        position = np.arange(count) + 0.5
+        weight = np.ones(count)
+        if not at_start:
+            weight = np.minimum(weight, position / width)
+        if not at_end:
+            weight = np.minimum(weight, (count - position) / width)
+        return (weight * weight * (3 - 2 * weight)).astype(np.float32)
+
+    width, height = size
+    rows = ramp(box.height, box.y0 == 0, box.y1 == height)
+    columns = ramp(box.width, box.x0 == 0, box.x1 == width)
+    return rows[:, None] * columns

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""Between stored pixels and light: the sRGB transfer function (IEC 61966-2-1), image files, resampling in light.
+
+Everything that mixes or scales pixels does so in linear light, because that is how lenses and shadows mix.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from ..atomic import replacing
+from ..errors import InputError
+
+Linear = NDArray[np.float32]
+"""(H, W, 3) linear light, Rec. 709 primaries, 1 is the white of an 8-bit image."""
+
+
+def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Linear light of sRGB values in 0…1, any shape."""
+    value = np.asarray(encoded, dtype=np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
+    """sRGB values of linear light, clipped to 0…1, any shape."""
+    value = np.clip(np.asarray(linear, dtype=np.float32), 0.0, 1.0)
+    curved = 1.055 * np.power(np.maximum(value, 0.0031308), 1 / 2.4) - 0.055
+    return np.where(value <= 0.0031308, value * 12.92, curved).astype(np.float32)
+
+
+_LINEAR_OF_BYTE = srgb_to_linear(np.arange(256) / 255.0)
+
+
+def bytes_to_linear(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Linear light of 8-bit sRGB, any shape."""
+    return _LINEAR_OF_BYTE[pixels]
+
+
+def linear_to_bytes(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """8-bit sRGB, rounded to the nearest; inverts ``bytes_to_linear`` exactly."""
+    return np.rint(linear_to_srgb(linear) * 255.0).astype(np.uint8)
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """An image file as (H, W, 3) 8-bit sRGB. Raises InputError when it is missing or not readable."""
+    return _read(path, "RGB")
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """A mask file as (H, W): True where it is brighter than half. Raises InputError as ``read_rgb`` does."""
+    return np.asarray(_read(path, "L") > 127)
+
+
+def _read(path: Path, mode: str) -> NDArray[np.uint8]:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert(mode))
+    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{path}: not a readable image ({error}); restore it or reconstruct the scene again"
+        ) from error
+
+
+def write_rgb(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write (H, W, 3) 8-bit sRGB as PNG, whole or not at all."""
+    with replacing(path) as partial:
+        Image.fromarray(pixels).save(partial, compress_level=3)
+
+
+def resized(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """``image`` (H, W, …) in linear light at another size: pixel areas are averaged down, interpolated up."""
+    if image.shape[:2] == (height, width):
+        return image
+    shrinking = width * height < image.shape[0] * image.shape[1]
+    method = cv2.INTER_AREA if shrinking else cv2.INTER_CUBIC
+    return np.maximum(cv2.resize(image, (width, height), interpolation=method), 0.0)
