@@ -38,10 +38,9 @@ RECOVERY = 0.2
 """Share of a particle's depth that one substep may take back."""
 
 
-@ti.kernel
+@ti.func
 def solve_contact(
     ground_blocks: ti.i32,
-    sweep: ti.i32,
     dt: ti.f32,
     reach: ti.f32,
     recovery_speed: ti.f32,
@@ -87,9 +86,7 @@ def solve_contact(
                     for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
                         u += (w[i][0] * w[j][1] * w[m][2]) * window[first + (i * 64 + j * 8 + m)]
                     share = 1.0
-                    if sweep > 0:
-                        share = ti.max(u[3], 0.02)
-                    elif old.norm_sqr() > 0.0 and past[3] > 0.0:
+                    if old.norm_sqr() > 0.0 and past[3] > 0.0:
                         share = ti.max(past[3], 0.02)
                     velocity = vec3(u[0], u[1], u[2])
                     v_n = velocity.dot(normal)
@@ -114,7 +111,7 @@ def solve_contact(
                             scattered[n] = scattered[n] + (w[i][0] * w[j][1] * w[m][2]) * q
 
 
-@ti.kernel
+@ti.func
 def apply_contact(
     ground_grid_blocks: ti.i32,
     ground_g: Integers,

@@ -10,18 +10,22 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from . import contact, sorting, transfer
+from . import sorting
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
+from .substep import substep
 
 Array = NDArray[np.float64]
 
 PARTICLE_ARRAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
 
 SAFETY = 1.5
-"""Factor by which the fastest particle may speed up between two looks at the reports."""
+"""Factor by which the fastest particle may speed up within a substep."""
 
-LOOK_EVERY = 4
-"""Most substeps between two looks at the reports."""
+LEAST_MARGIN = 0.1
+"""Cells kept free between the particles and the limits of their windows, for particles that start from rest."""
+
+LEAST_REACH = 0.02
+"""Cells from the ground within which a particle at rest takes part in the contact."""
 
 
 RECOVERY_HEIGHT = 0.02
@@ -49,7 +53,6 @@ class EngineOptions:
     cfl_elastic: float
     cfl_velocity: float
     max_step: float
-    contact_sweeps: int
 
 
 class Engine:
@@ -84,6 +87,12 @@ class Engine:
         self._clearance = 0.0
         self._normal = vec3(0.0, 0.0, 1.0) if plane is None else vec3(*plane.normal)
         self._offset = -1e9 if plane is None else plane.offset
+        recovery_speed = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(self.gravity)))
+        friction = 0.0 if plane is None else plane.friction
+        self._settings = ti.ndarray(ti.f32, 9)
+        self._settings.from_numpy(
+            np.array([*gravity, *self._normal, self._offset, friction, recovery_speed], dtype=np.float32)
+        )
 
     # ---- arrays -------------------------------------------------------------------------------------------------
 
@@ -276,119 +285,57 @@ class Engine:
         if self.count == 0:
             return
         done = 0.0
-        initial = self.stable_step()
+        shortest = 1e-3 * self.stable_step()
         self._sort()
         dt = self._even_step(duration)
-        self._particles_kernel(gather=False, scatter=True, store=False, dt_gather=0.0, dt_scatter=dt)
-        unseen = 0
+        self._substep(nodes=False, gather=False, scatter=True, dt=dt, dt_next=dt)
         while True:
-            self._nodes_kernel(dt)
-            if self.plane is not None and self._ground_p_count:
-                reach = SAFETY * self._speed * dt * (unseen + 1) + 0.02
-                if self._clearance < 2 * reach:
-                    self._contact_kernels(dt, reach)
             done += dt
-            self.substeps += 1
             remaining = duration - done
             last = remaining < 0.5 * dt
-            unseen += 1
-            travel = SAFETY * self._speed * dt
-            must_sort = not last and self._margin < travel * (unseen + 1) + 0.1
-            look = last or must_sort or unseen >= LOOK_EVERY or self._margin < travel * (unseen + 2) + 0.1
+            must_sort = not last and self._margin < 2.0 * SAFETY * self._speed * dt + LEAST_MARGIN
             next_dt = dt if last else self._even_step(remaining)
-            split = last or must_sort
-            self._particles_kernel(gather=True, scatter=not split, store=split, dt_gather=dt, dt_scatter=next_dt)
-            if look:
-                self._look(initial)
-                unseen = 0
+            self._substep(nodes=True, gather=True, scatter=not (last or must_sort), dt=dt, dt_next=next_dt)
+            self.substeps += 1
             if last:
                 return
+            if self.stable_step() < shortest:
+                raise Diverged
             if must_sort:
                 self._sort()
                 next_dt = self._even_step(remaining)
-                self._particles_kernel(gather=False, scatter=True, store=False, dt_gather=0.0, dt_scatter=next_dt)
+                self._substep(nodes=False, gather=False, scatter=True, dt=next_dt, dt_next=next_dt)
             dt = next_dt
 
     def _even_step(self, remaining: float) -> float:
         return remaining / max(1, math.ceil(remaining / self.stable_step() - 1e-6))
 
-    def _look(self, initial: float) -> None:
-        speed2, stiffness, margin, clearance, sum2 = (
-            float(value) for value in transfer.reduce_report(self._p_blocks, self._report)
-        )
-        if not (math.isfinite(sum2) and math.isfinite(stiffness)):
-            raise Diverged
-        self._speed = math.sqrt(speed2)
-        self._wave_speed = math.sqrt(stiffness)
-        self._margin, self._clearance = margin, clearance
-        if self.stable_step() < 1e-3 * initial:
-            raise Diverged
-
-    def _nodes_kernel(self, dt: float) -> None:
-        transfer.advance_nodes(
-            self._g_blocks,
-            self.options.grid,
-            vec3(*(self.gravity * dt)),
-            self._g_cells,
-            self._g_neighbours,
-            self._scattered,
-            self._nodes,
-            self._masses,
-        )
-
-    def _contact_kernels(self, dt: float, reach: float) -> None:
-        assert self.plane is not None
-        recovery = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(self.gravity)))
+    def _substep(self, *, nodes: bool, gather: bool, scatter: bool, dt: float, dt_next: float) -> None:
+        """Launch one substep or a part of one, and take note of what the particles report."""
         here = self._particles[0]
-        for sweep in range(self.options.contact_sweeps):
-            contact.solve_contact(
-                self._ground_p_count,
-                sweep,
-                dt,
-                reach,
-                recovery,
-                self.plane.friction,
-                self._normal,
-                self._offset,
-                self._ground_p,
-                self._p_cells,
-                self._starts,
-                self._p_neighbours,
-                here["x"],
-                here["constants"],
-                here["reaction"],
-                self._window,
-                self._nodes,
-                self._scattered,
-            )
-            contact.apply_contact(
-                self._ground_g_count,
-                self._ground_g,
-                self._g_neighbours,
-                self._near_ground,
-                self._scattered,
-                self._nodes,
-                self._masses,
-                self._sums,
-            )
-
-    def _particles_kernel(
-        self, *, gather: bool, scatter: bool, store: bool, dt_gather: float, dt_scatter: float
-    ) -> None:
-        here = self._particles[0]
-        transfer.advance_particles(
+        reach = SAFETY * self._speed * dt + LEAST_REACH
+        contact = nodes and self.plane is not None and self._clearance < 2.0 * reach
+        speed2, stiffness, margin, clearance, sum2 = substep(
             self._p_blocks,
+            self._g_blocks if nodes else 0,
+            self._ground_p_count if contact else 0,
+            self._ground_g_count if contact else 0,
+            self.options.grid,
             int(gather),
             int(scatter),
-            int(store),
-            dt_gather,
-            dt_scatter,
-            self._normal,
-            self._offset,
+            int(not scatter),
+            dt,
+            dt_next,
+            reach,
+            self._settings,
             self._p_cells,
+            self._g_cells,
             self._starts,
             self._p_neighbours,
+            self._g_neighbours,
             self._near_ground,
+            self._ground_p,
+            self._ground_g,
             here["x"],
             here["v"],
             here["C"],
@@ -396,7 +343,16 @@ class Engine:
             here["constants"],
             here["reaction"],
             self._window,
-            self._nodes,
             self._scattered,
+            self._nodes,
+            self._sums,
+            self._masses,
             self._report,
         )
+        if scatter:
+            self._wave_speed = math.sqrt(stiffness) if math.isfinite(stiffness) else math.inf
+        if gather:
+            if not (math.isfinite(sum2) and math.isfinite(self._wave_speed)):
+                raise Diverged
+            self._speed = math.sqrt(speed2)
+            self._margin, self._clearance = margin, clearance

@@ -39,9 +39,6 @@ class SolverOptions:
     """Longest substep in seconds, whatever the wave speed; above 0. After a fall of time t the position is wrong by
     max_step / t of the way."""
 
-    contact_sweeps: int = 1
-    """Jacobi sweeps of the ground contact in a substep; 1 to 20. One is enough, see docs/physics.md."""
-
     arch: str = "cpu"
     """Where to compute: "cpu", "cuda", "vulkan" or "metal"; falls back to "cpu" where that is not to be had."""
 
@@ -67,12 +64,6 @@ class SolverOptions:
         _require(0 < self.cfl_elastic <= 0.55, "cfl_elastic", self.cfl_elastic, "give a number above 0, up to 0.55")
         _require(0 < self.cfl_velocity <= 0.4, "cfl_velocity", self.cfl_velocity, "give a number above 0, up to 0.4")
         _require(math.isfinite(self.max_step) and self.max_step > 0, "max_step", self.max_step, "give seconds above 0")
-        _require(
-            isinstance(self.contact_sweeps, int) and 1 <= self.contact_sweeps <= 20,
-            "contact_sweeps",
-            self.contact_sweeps,
-            "give a whole number from 1 to 20",
-        )
         _require(self.arch in ARCHITECTURES, "arch", self.arch, f"choose one of {', '.join(ARCHITECTURES)}")
         _require(isinstance(self.threads, int) and self.threads >= 0, "threads", self.threads, "give 0 (all) or more")
 

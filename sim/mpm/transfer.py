@@ -2,12 +2,12 @@
 # ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
-"""The two kernels of every substep: nodes, then particles (MLS-MPM, Hu et al. 2018; APIC, Jiang et al. 2015).
+"""The two halves of every substep: nodes, then particles (MLS-MPM, Hu et al. 2018; APIC, Jiang et al. 2015).
 
 Quadratic B-splines; lengths in cells (see ``layout``), seconds, kilograms. A substep is
 
     advance_nodes      gather the windows, momentum -> velocity, gravity, walls
-    (contact kernels)  see ``contact``
+    (contact)          see ``contact``
     advance_particles  grid -> particles -> grid in one pass over the particles, without atomics
 """
 
@@ -86,7 +86,7 @@ def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vector
                         nodes[n] = nodes[n] + window[i * 64 + j * 8 + m + shift]
 
 
-@ti.kernel
+@ti.func
 def advance_nodes(
     blocks: ti.i32,
     grid: ti.i32,
@@ -99,7 +99,7 @@ def advance_nodes(
 ):
     """Nodes of all grid blocks: sum of the windows, velocity = momentum / mass, gravity, walls.
 
-    nodes: velocity in cells/s; the fourth number is left at 0 for the contact kernels, which find the mass in
+    nodes: velocity in cells/s; the fourth number is left at 0 for the contact, which finds the mass in
     ``masses`` (kg).
     """
     for gg in range(blocks * SPREAD):
@@ -126,7 +126,7 @@ def advance_nodes(
                     nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
 
 
-@ti.kernel
+@ti.func
 def advance_particles(
     blocks: ti.i32,
     gather: ti.i32,
@@ -285,18 +285,3 @@ def advance_particles(
                 report[r + 4] = sum2
             if scatter == 1:
                 report[r + 1] = stiffness
-
-
-@ti.kernel
-def reduce_report(blocks: ti.i32, report: Scalars) -> ti.types.vector(5, ti.f32):
-    """The blocks' reports as one: max |v|^2, max c^2, min window margin, min ground distance, sum |v|^2."""
-    total = ti.Vector([0.0, 0.0, 1e9, 1e9, 0.0])
-    ti.loop_config(serialize=True)
-    for k in range(blocks):
-        r = k * SCALARS_PER_BLOCK
-        total[0] = ti.max(total[0], report[r])
-        total[1] = ti.max(total[1], report[r + 1])
-        total[2] = ti.min(total[2], report[r + 2])
-        total[3] = ti.min(total[3], report[r + 3])
-        total[4] += report[r + 4]
-    return total

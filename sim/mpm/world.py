@@ -122,7 +122,6 @@ class World:
                 cfl_elastic=o.cfl_elastic,
                 cfl_velocity=o.cfl_velocity,
                 max_step=o.max_step,
-                contact_sweeps=o.contact_sweeps,
             ),
             plane=plane,
             gravity=(
