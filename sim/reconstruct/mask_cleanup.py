@@ -7,8 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from skimage.segmentation import watershed
 
 Mask = NDArray[np.bool_]
+
+SHADE = (0.28, 0.9)
+"""Brightness over that of the lit ground: darker is the crease itself or a black object, brighter the lit ground."""
 
 
 def largest_component(mask: Mask) -> Mask:
@@ -147,42 +151,44 @@ def _local_mean(colours: NDArray[np.float32], where: Mask, sigma: float) -> tupl
 def drop_ground_shadow(pixels: NDArray[np.uint8], mask: Mask, *, most: float = 0.1) -> Mask:
     """``mask`` without the contact shadow that GrabCut takes for a dark part of the object.
 
-    A shadow keeps the ground's chromaticity and only loses brightness. Only the lower part of the object, reached
-    from its outline, is looked at, and at most the fraction ``most`` of the mask is taken away.
+    Where an object meets the ground there is a dark crease. A watershed on darkness, from the object's inside and
+    from the ground, meets there: what the ground reaches is shadow if it is also coloured as shaded ground is (not
+    paler, of a similar hue). Only the lower part of the object near its outline is looked at, and when more than the
+    fraction ``most`` of the mask would go, it stays as it is.
     """
     rows = np.flatnonzero(mask.any(axis=1))
     if len(rows) == 0:
         return mask.copy()
-    top, bottom = int(rows[0]), int(rows[-1])
-    low = np.zeros_like(mask)
-    low[bottom - (bottom - top) // 3 :] = True
     area = int(mask.sum())
+    low = np.zeros_like(mask)
+    low[rows[-1] - np.ptp(rows) // 3 :] = True
     ground = surrounding_ring(mask, max(4, round(0.15 * np.sqrt(area)))) & low
-    if ground.sum() < 50:
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    band = mask & low & (depth < 0.12 * np.sqrt(area))
+    if ground.sum() < 50 or not band.any() or (band == mask).all():
         return mask.copy()
-    linear = (cv2.GaussianBlur(pixels, (0, 0), 1.2).astype(np.float32) / 255.0) ** 2.2 + 1e-4
-    brightness = linear.sum(axis=2)
-    chroma = linear / brightness[..., None]
-    reference = np.median(chroma[ground], axis=0)
-    spread = np.percentile(np.linalg.norm(chroma[ground] - reference, axis=1), 75)
-    like_ground = np.linalg.norm(chroma - reference, axis=2) < np.clip(2.5 * spread, 0.03, 0.09)
-    darker = brightness < 0.85 * np.median(brightness[ground])
-    suspect = mask & low & like_ground & darker
+    hue, saturation, value = cv2.split(cv2.cvtColor(cv2.GaussianBlur(pixels, (0, 0), 1.5), cv2.COLOR_RGB2HSV))
+    markers = np.where(mask & ~band, 1, np.where(mask, 0, 2))
+    reached = (watershed(255 - value, markers) == 2) & band
+    lit_hue, lit_saturation, lit = (float(np.median(channel[ground])) for channel in (hue, saturation, value))
+    apart = np.abs((hue.astype(np.float32) - lit_hue + 90.0) % 180.0 - 90.0)
+    brightness = value.astype(np.float32) / max(lit, 1.0)
+    # Light that reaches a shadow by way of the ground takes on its colour: darker is also redder on wood.
+    similar = (apart < 4.0 + 12.0 * (1.0 - brightness)) & (saturation > lit_saturation - 15)
+    # Under the object, the crease lies above its shadow in the photo.
+    height = max(3, round(0.12 * np.sqrt(area)))
+    above = cv2.erode(value, np.ones((height, 1), np.uint8), anchor=(0, height - 1))
+    shaded = similar & (brightness > SHADE[0]) & (brightness < SHADE[1]) & (above < 0.7 * value.astype(np.float32))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    suspect = cv2.morphologyEx(suspect.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
-    outside = ~mask & low
-    reached = largest_reaching(suspect, outside)
-    cleaned = cv2.morphologyEx((mask & ~reached).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
-    # Opening must not thin what was never suspected, a strap for instance.
-    cleaned |= mask & ~cv2.dilate(reached.astype(np.uint8), kernel, iterations=3).astype(bool)
-    cleaned = largest_component(cleaned)
+    shadow = cv2.morphologyEx((reached & shaded).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    shadow = touching(shadow, cv2.dilate((~mask).astype(np.uint8), kernel) > 0)
+    cleaned = largest_component(mask & ~shadow)
     removed = area - int(cleaned.sum())
     return cleaned if 0 < removed <= most * area else mask.copy()
 
 
-def largest_reaching(candidates: Mask, target: Mask) -> Mask:
-    """Those 8-connected parts of ``candidates`` that touch ``target``."""
-    _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=8)
-    touching = cv2.dilate(target.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    reached = np.unique(labels[touching & candidates])
+def touching(parts: Mask, target: Mask) -> Mask:
+    """Those 8-connected components of ``parts`` that overlap ``target``."""
+    _, labels = cv2.connectedComponents(parts.astype(np.uint8), connectivity=8)
+    reached = np.unique(labels[target & parts])
     return np.asarray(np.isin(labels, reached[reached > 0]))
