@@ -88,5 +88,5 @@ def scaled_to_metres(camera: Camera, origin: NDArray[np.floating], metres_per_un
     """``camera`` with the world's origin moved to ``origin`` (units) and lengths turned into metres."""
     pose = np.asarray(camera.world_from_camera, dtype=np.float64).copy()
     pose[:3, 3] = (pose[:3, 3] - origin) * metres_per_unit
-    matrix: Matrix4 = tuple(tuple(float(v) for v in row) for row in pose)  # type: ignore[assignment]
-    return replace(camera, world_from_camera=matrix)
+    rows = [(float(a), float(b), float(c), float(d)) for a, b, c, d in pose]
+    return replace(camera, world_from_camera=tuple(rows))

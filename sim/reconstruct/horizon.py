@@ -78,7 +78,7 @@ def _score(segments: NDArray[np.float64], width: int, height: int, focal: float,
     bins = 90
     position = (np.degrees(angle) % 90.0).astype(int) % bins
     histogram = np.bincount(position, weights=weight, minlength=bins)
-    smooth = sum(np.roll(histogram, shift) * share for shift, share in ((-1, 0.5), (0, 1.0), (1, 0.5)))
+    smooth = histogram + 0.5 * (np.roll(histogram, -1) + np.roll(histogram, 1))
     peak = int(np.argmax(smooth))
     off = np.abs((position - peak + 45) % 90 - 45)
     winners = off <= 2

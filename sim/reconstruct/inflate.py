@@ -145,7 +145,7 @@ def _film_profile(mask: Mask, distance: Field, thickness: float) -> Field:
         size = (max(4, round(width * scale)), max(4, round(height * scale)))
         near = cv2.resize(distance, size, interpolation=cv2.INTER_LINEAR)
         film = soap_film(near > 0) / scale**2
-        film = cv2.resize(film, (width, height), interpolation=cv2.INTER_LINEAR)
+        film = np.asarray(cv2.resize(film, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float64)
     else:
         film = soap_film(mask)
     # u over distance is smooth and positive up to the outline. Times the distance it vanishes exactly there, and

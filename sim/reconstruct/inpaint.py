@@ -128,7 +128,7 @@ def _at_scale(
     """
     height, width = hole.shape
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     small_hole, small_closed = (
         cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0 for mask in (hole, closed)
     )
@@ -151,7 +151,7 @@ def _at_scale(
 
 def _alike(
     filled: NDArray[np.uint8], hole: Mask, closed: Mask, block: int = 3, sources: int = 60_000
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
     """For each pixel (h, w) the row and column of the most similar one outside ``closed``; itself outside ``hole``.
 
     Matched for one pixel of every ``block`` x ``block`` and carried to its neighbours, so that details stay together.
@@ -166,7 +166,7 @@ def _alike(
     inner = np.zeros_like(hole)
     inner[2 : height - 2, 2 : width - 2] = True
     source = np.argwhere(inner & ~ndimage.binary_dilation(closed, iterations=3))
-    rows, columns = np.indices(hole.shape)
+    rows, columns = np.mgrid[:height, :width]
     if len(source) == 0:
         return rows, columns
     source = source[:: max(1, len(source) // sources)]

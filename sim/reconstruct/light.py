@@ -63,8 +63,12 @@ def write_environment(path: Path, environment: NDArray[np.float32]) -> None:
     spec = oiio.ImageSpec(width, height, channels, "float")
     spec.attribute("compression", "zip")
     output = oiio.ImageOutput.create(str(path))
-    written = bool(output) and output.open(str(path), spec)
-    written = written and output.write_image(np.ascontiguousarray(environment)) and output.close()
+    written = (
+        output is not None
+        and output.open(str(path), spec)
+        and output.write_image(np.ascontiguousarray(environment))
+        and output.close()
+    )
     if not written:
         raise InputError(f"{path}: cannot be written ({oiio.geterror() or 'no space?'}); choose another folder")
 

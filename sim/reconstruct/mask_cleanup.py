@@ -64,7 +64,7 @@ def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     pixels: (H, W, 3) sRGB.
     """
     area = int(mask.sum())
-    lab = _lab(cv2.GaussianBlur(pixels, (0, 0), 1.0))
+    lab = _lab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 1.0), dtype=np.uint8))
     ring = surrounding_ring(mask, max(4, round(0.12 * np.sqrt(area))))
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
     near, inside = lab[ring], lab[inner]
@@ -74,9 +74,8 @@ def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     alike[inner] = cKDTree(near[:: max(1, len(near) // 2000)]).query(inside, distance_upper_bound=6.0)[0] < 6.0
     side = 2 * max(1, round(0.02 * np.sqrt(area))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
-    alike = cv2.morphologyEx(alike, cv2.MORPH_OPEN, kernel)
-    candidates = (alike > 0) & mask
+    closed = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    candidates = (cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0) & mask
     opened = see_through(pixels, mask, candidates, likeness=8.0, share=0.9)
     # More than half of the object would not be holes any more, but an object of the ground's colour.
     return mask & ~opened if opened.sum() < 0.5 * area else mask.copy()
