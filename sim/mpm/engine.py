@@ -350,9 +350,11 @@ class Engine:
             self._report,
         )
         if scatter:
-            self._wave_speed = math.sqrt(stiffness) if math.isfinite(stiffness) else math.inf
+            if not math.isfinite(stiffness):
+                raise Diverged
+            self._wave_speed = math.sqrt(stiffness)
         if gather:
-            if not (math.isfinite(sum2) and math.isfinite(self._wave_speed)):
+            if not math.isfinite(sum2):
                 raise Diverged
             self._speed = math.sqrt(speed2)
             self._margin, self._clearance = margin, clearance

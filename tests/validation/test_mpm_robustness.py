@@ -145,3 +145,35 @@ def test_bad_input_is_an_input_error(box, options, similarity):
     with pytest.raises(InputError, match="another scene"):
         other = Similarity(scale=0.9, origin=(-1.0, -1.0, -1.0))
         World(bodies=[body], similarity=other, options=options).restore(world.checkpoint())
+
+
+def test_broken_deformation_is_a_simulation_error(box, options, similarity):
+    world = World(bodies=[box(bottom=(0.0, 0.0, 0.1), name="torn")], similarity=similarity, options=options)
+    broken = world.checkpoint()
+    broken["F"] = np.full_like(broken["F"], np.inf)
+    world.restore(broken)
+    with pytest.raises(SimulationError, match="torn"):
+        world.advance(0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("youngs_modulus", [1e4, 1e5, 1e6, 1e7, 1e8])
+@pytest.mark.parametrize("density", [20.0, 200.0, 1000.0, 8000.0])
+@pytest.mark.parametrize("poisson_ratio", [0.0, 0.3, 0.48])
+def test_no_material_blows_up_in_2000_substeps(box, options, similarity, cell, youngs_modulus, density, poisson_ratio):
+    """The fast test's grid, finer and longer: finite, and no faster than twice the impact."""
+    body = box(
+        cells=(3, 3, 3),
+        bottom=(0.003, 0.001, 0.05 * cell),
+        youngs_modulus=youngs_modulus,
+        density=density,
+        poisson_ratio=poisson_ratio,
+        velocity=(0.5, 0.0, -5.0),
+        spin=(3.0, 2.0, 1.0),
+    )
+    world = World(bodies=[body], ground=Ground(), similarity=similarity, options=options)
+    while world.substeps < 2000 and world.time < 0.3:
+        world.advance(min(200 * world.stable_step, 0.01))
+        assert np.isfinite(world.deformation_gradients(0)).all()
+        assert np.linalg.norm(world.velocities(0), axis=1).max() < 20.0
+        assert world.ground_gap(0) > -0.1 * cell
