@@ -26,6 +26,8 @@ LONGEST_SLAB = 3.0
 """Length over width of a box; longer ones are taken for bottles, pens and sticks, which are round."""
 SLAB_THICKNESS = 0.2
 """Default thickness over width of a box: between a book and a carton."""
+MIN_HALF_THICKNESS = 1.0
+"""Pixels; a thinner sheet has no inside that particles could be put into."""
 SLAB_BEVEL = 0.5
 """Rounding of a slab's edges over its half thickness."""
 
@@ -161,11 +163,12 @@ def _film_profile(mask: Mask, distance: Field, thickness: float) -> Field:
     square = ratio * distance
     # A long strip has u = W²/2 at its middle, a disc W²/4: measure both by their widest inscribed circle.
     widest = float(distance.max())
-    return np.asarray(square * (thickness * widest) ** 2 / max(float(square.max()), 1e-9))
+    half = max(MIN_HALF_THICKNESS, thickness * widest)
+    return np.asarray(square * half**2 / max(float(square.max()), 1e-9))
 
 
 def _slab_profile(distance: Field, thickness: float) -> Field:
-    half = thickness * float(distance.max())
+    half = max(MIN_HALF_THICKNESS, thickness * float(distance.max()))
     bevel = max(2.0, min(SLAB_BEVEL * half, 0.5 * float(distance.max())))
     rise = np.minimum(distance / bevel, 1.0)
     # A quarter circle from the outline up to the flat; outside it goes on with the slope at the outline.

@@ -23,6 +23,7 @@ from .horizon import estimate_pitch
 from .inflate import Silhouette, inflate
 from .inpaint import FillOptions, inpaint
 from .light import environment_map, sun, write_environment
+from .mask_cleanup import largest_component
 from .mesh import BodyMesh, build_mesh
 from .options import ObjectRequest, ReconstructOptions
 from .output import replacing_folder
@@ -152,7 +153,7 @@ def _segment_all(
     order = sorted(range(len(masks)), key=lambda i: -int(np.flatnonzero(masks[i].any(axis=1))[-1]))
     taken = np.zeros(masks[0].shape, dtype=bool)
     for index in order:
-        masks[index] = masks[index] & ~taken
+        masks[index] = largest_component(masks[index] & ~taken)
         taken |= masks[index]
     return masks
 
