@@ -2,6 +2,7 @@
 """From silhouettes to bodies that stand: inflation, camera, surface and texture."""
 
 import io
+import json
 import math
 
 import cv2
@@ -272,5 +273,13 @@ def test_glb_keeps_order_uv_and_pixels():
     assert np.abs(texture.photo_pixels(uv) - view().project(body.vertices)[:, :2]).max() < 0.05
     embedded = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB"))
     assert (embedded == texture.pixels).all()
-    # The file's own convention: +Y up, v downward from the top of the image.
+    # The file's own conventions, not trimesh's: v runs downward from the top of the image, and +Y is up.
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]]
+    start = 28 + length + document["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+    stored = np.frombuffer(data, np.float32, 2 * accessor["count"], start).reshape(-1, 2)
+    height, width = texture.pixels.shape[:2]
+    expected = (body.pixels - [texture.left, texture.top]) / [width, height]
+    assert stored == pytest.approx(expected, abs=1e-5)
     assert np.ptp(loaded.vertices[:, 1]) == pytest.approx(np.ptp(body.vertices[:, 2]) * 0.25, rel=1e-4)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.inpaint import FillOptions, inpaint
-from physgen.sim.reconstruct.mask_cleanup import fill_holes, largest_component
+from physgen.sim.reconstruct.mask_cleanup import drop_ground_shadow, fill_holes, largest_component, settle_outline
 from physgen.sim.reconstruct.segment import check_distinct, pixel_box, segment
 from physgen.sim.reconstruct.shadow import find_shadow, ground_brightness, object_holes
 from scipy import ndimage
@@ -67,6 +67,33 @@ def test_pinholes_are_filled_whatever_their_colour():
     mask = disc(150, 120, 60)
     pierced = mask & ~disc(140, 110, 2)
     assert (fill_holes(paint([]), pierced) == mask).all()
+
+
+def test_contact_shadow_is_not_part_of_the_object():
+    truth = disc(150, 100, 45)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    # Darkest where it meets the object, fading away from it, as under anything that stands on a floor.
+    away = ndimage.distance_transform_edt(~truth)
+    cast = (((columns - 155) / 48) ** 2 + ((rows - 138) / 16) ** 2 < 1) & ~truth & (rows > 118)
+    image = ground(2)
+    image[cast] *= np.clip(0.2 + away[cast] / 25.0, 0, 0.8)[:, None]
+    image[truth] = (60, 90, 200)
+    photo = np.clip(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    cleaned = drop_ground_shadow(photo, truth | cast, most=0.3)
+    assert cleaned[truth].mean() > 0.97
+    # The crease itself may stay with the object, the shadow beyond it may not.
+    beyond = cast & (away > 7) & (np.abs(columns - 150) < 35)
+    assert cleaned[beyond].mean() < 0.3
+    # Without a crease nothing is taken away.
+    assert (drop_ground_shadow(paint([(truth, (40, 80, 190))]), truth) == truth).all()
+
+
+def test_outline_settles_where_the_colours_mix_half_and_half():
+    truth = disc(150, 120, 45)
+    photo = paint([(truth, (40, 80, 190))])
+    wide = ndimage.binary_dilation(truth, iterations=2)
+    assert overlap(wide, truth) < 0.93
+    assert overlap(settle_outline(photo, wide), truth) > 0.98
 
 
 def test_largest_component_of_nothing_is_nothing():
