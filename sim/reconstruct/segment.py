@@ -90,7 +90,22 @@ def segment(
     mask[top:bottom, left:right] = found
     if mask.sum() < MIN_AREA:
         raise InputError(f"{where}: nothing was found in the box; draw it closer around the object")
+    for side in _cut_sides(mask, box):
+        warn(f"{where}: reaches the {side} edge of its box and may be cut there; draw the box larger")
     return mask
+
+
+def _cut_sides(mask: Mask, box: Box, share: float = 0.2) -> list[str]:
+    """Sides of ``box``, inside the photo, along which ``mask`` touches more than ``share`` of the side."""
+    height, width = mask.shape
+    x0, y0, x1, y1 = box
+    sides = (
+        ("left", x0 > 0, mask[y0:y1, x0]),
+        ("top", y0 > 0, mask[y0, x0:x1]),
+        ("right", x1 < width, mask[y0:y1, x1 - 1]),
+        ("bottom", y1 < height, mask[y1 - 1, x0:x1]),
+    )
+    return [name for name, inside, edge in sides if inside and edge.mean() > share]
 
 
 def check_distinct(masks: Sequence[Mask], names: Sequence[str]) -> None:

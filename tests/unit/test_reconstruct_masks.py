@@ -108,6 +108,17 @@ def test_what_colour_cannot_tell_falls_back_with_a_warning():
     assert 0.6 < mask.sum() / 1e4 < 0.9
 
 
+def test_a_box_that_cuts_the_object_is_told():
+    photo = paint([(disc(150, 120, 45), (40, 80, 190))])
+    told = []
+    segment(photo, (80, 100, 220, 200), "ball", warn=told.append)
+    assert len(told) == 1
+    assert "top" in told[0]
+    told.clear()
+    segment(photo, (80, 60, 220, 200), "ball", warn=told.append)
+    assert not told
+
+
 @pytest.mark.parametrize(
     ("box", "message"),
     [
