@@ -59,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all that are baked)")
     parser.add_argument("--engine", default="cycles", choices=["cycles"], help="render engine")
-    parser.add_argument("--samples", type=int, metavar="N", help="light samples a pixel")
+    parser.add_argument("--samples", type=int, metavar="N", help="rays and light samples a pixel")
     parser.add_argument("--scale", type=float, default=1.0, metavar="F", help="of the photo's resolution (default 1)")
     parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="CPU threads (default: all)")
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace, stream: TextIO, cancelled: threading.Event)
             ) from error
         frames, bridge = _load("physgen_addon.bridge.frames"), _load("physgen_addon.bridge.options")
         folder = _load("sim.scene.folder").load_scene(options.scene)
-        changes = {} if options.samples is None else {"samples": options.samples, "shadow_samples": options.samples}
+        changes = {} if options.samples is None else {"samples": options.samples}
         settings = bridge.RenderOptions(engine=options.engine, scale=options.scale, threads=options.threads, **changes)
         paths = frames.render_frames(
             folder, options.bake, options.out, settings, on_event, cancelled.is_set, frames=options.frames

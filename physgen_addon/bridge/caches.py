@@ -70,7 +70,7 @@ def attach(item: bpy.types.Object, cache: Pc2Reader, first_frame: int) -> bpy.ty
     require_fit(cache, len(item.data.vertices), item.name)
     modifier = item.modifiers.get(MODIFIER) or item.modifiers.new(MODIFIER, "MESH_CACHE")
     modifier.cache_format = "PC2"
-    modifier.filepath = str(cache.path)
+    modifier.filepath = str(cache.path.resolve())
     modifier.interpolation = "LINEAR"
     modifier.frame_start = first_frame
     return modifier

@@ -24,7 +24,7 @@ MIN_SUN_COSINE = 0.05
 def environment_irradiance(radiance: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.float64]:
     """RGB irradiance (3,) of an equirectangular map (H, W, 3) on open ground with unit ``normal``.
 
-    Blender's convention: the map's middle column looks along +X... see ``_directions``.
+    The map's middle column looks along +X, as Blender has it.
     """
     directions, solid_angle = _directions(*radiance.shape[:2])
     cosine = np.clip(directions @ np.asarray(normal, dtype=float), 0.0, None)
@@ -54,6 +54,7 @@ def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
     light, ground = folder.scene.light, folder.scene.ground
     normal = np.asarray(ground.normal, dtype=float)
     world = bpy.data.worlds.new("environment")
+    colour = np.ones(3)
     tree = compat.node_tree(world)
     shader = tree.nodes.new("ShaderNodeBackground")
     output = tree.nodes.new("ShaderNodeOutputWorld")
@@ -64,7 +65,8 @@ def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
     else:
         path = folder.file(light.environment)
         radiance = _read_environment(path)
-        irradiance = float(environment_irradiance(radiance, normal) @ LUMINANCE)
+        colour = environment_irradiance(radiance, normal)
+        irradiance = float(colour @ LUMINANCE)
         if not (math.isfinite(irradiance) and irradiance > 0):
             raise InputError(f"{path}: lights the ground with {irradiance}; give an environment with finite light")
         texture = tree.nodes.new("ShaderNodeTexEnvironment")
@@ -79,16 +81,21 @@ def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
     total = irradiance
     if light.sun_direction is not None and light.sun_strength > 0:
         total += light.sun_strength * irradiance
-        _add_sun(scenes, folder, light.sun_strength * irradiance)
+        _add_sun(scenes, folder, light.sun_strength * irradiance, colour / (colour @ LUMINANCE))
     return total
 
 
-def _add_sun(scenes: list[bpy.types.Scene], folder: SceneFolder, ground_irradiance: float) -> None:
+def _add_sun(
+    scenes: list[bpy.types.Scene], folder: SceneFolder, ground_irradiance: float, colour: NDArray[np.floating]
+) -> None:
     light, normal = folder.scene.light, np.asarray(folder.scene.ground.normal)
     direction = np.asarray(light.sun_direction)
     data = bpy.data.lights.new("sun", "SUN")
     # Blender's strength is the irradiance of a surface that faces the sun.
     data.energy = ground_irradiance / max(float(direction @ normal), MIN_SUN_COSINE)
+    # The photo's white balance has made the whole light white; a sun of another colour than the sky's light would
+    # tint the shadows.
+    data.color = colour.tolist()
     data.angle = light.sun_angle
     item = bpy.data.objects.new("sun", data)
     item.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()

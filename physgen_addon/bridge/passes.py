@@ -18,12 +18,12 @@ from .regions import Box
 Channels = dict[str, NDArray[np.float32]]
 
 
-def set_up(scene: bpy.types.Scene, options: RenderOptions, samples: int) -> None:
+def set_up(scene: bpy.types.Scene, options: RenderOptions, *, denoise: bool) -> None:
     """Cycles for exact image formation: one pixel is the mean over its area, light is direct, nothing is clamped."""
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
     cycles.device = "CPU"
-    cycles.samples = samples
+    cycles.samples = options.samples
     cycles.use_adaptive_sampling = False
     cycles.seed, cycles.use_animated_seed = options.seed, False
     # The ratio of light to rest light is only independent of albedo without bounces.
@@ -33,7 +33,7 @@ def set_up(scene: bpy.types.Scene, options: RenderOptions, samples: int) -> None
     cycles.light_sampling_threshold = 0.0
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
     cycles.use_auto_tile = False
-    set_denoising(scene, options.denoise)
+    set_denoising(scene, denoise and options.denoise)
     render.threads_mode = "FIXED" if options.threads else "AUTO"
     if options.threads:
         render.threads = options.threads

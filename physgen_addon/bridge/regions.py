@@ -48,12 +48,38 @@ def object_box(camera: Camera, vertices: Sequence[NDArray[np.floating]], size: t
     return _bounds(camera, np.concatenate([np.asarray(v) for v in vertices]), size, MARGIN_PX)
 
 
-def shadow_box(scene: Scene, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> Box | None:
+class ShadowRegion(NamedTuple):
+    """Where shadows can fall: pixels, and the depth in metres beyond which there is none."""
+
+    box: Box
+    far: float
+
+
+def shadow_region(scene: Scene, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> ShadowRegion | None:
     """Pixels whose ground the objects can darken: along the sun with its penumbra, and all around by the sky."""
-    boxes = [box for v in vertices if (box := _bounds(scene.camera, _footprint(scene, v), size, MARGIN_PX)) is not None]
-    if not boxes:
+    found = []
+    for points in (_footprint(scene, v) for v in vertices):
+        box = _bounds(scene.camera, points, size, MARGIN_PX)
+        if box is not None:
+            found.append((box, float(scene.camera.project(points)[:, 2].max())))
+    if not found:
         return None
-    return Box(min(b.x0 for b in boxes), min(b.y0 for b in boxes), max(b.x1 for b in boxes), max(b.y1 for b in boxes))
+    boxes = [box for box, _ in found]
+    box = Box(min(b.x0 for b in boxes), min(b.y0 for b in boxes), max(b.x1 for b in boxes), max(b.y1 for b in boxes))
+    return ShadowRegion(box, max(far for _, far in found))
+
+
+def ground_depth(scene: Scene, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Depth (H, W) in metres along the optical axis at which each pixel sees the ground; infinite where it does not."""
+    width, height = size
+    camera, normal = scene.camera, np.asarray(scene.ground.normal)
+    x = (np.arange(width) + 0.5) * camera.width / width
+    y = (np.arange(height) + 0.5) * camera.height / height
+    rays = camera.rays(np.stack(np.meshgrid(x, y), axis=-1))
+    drop = (np.asarray(scene.ground.point) - camera.position) @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = drop / (rays @ normal)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf).astype(np.float32)
 
 
 def _footprint(scene: Scene, vertices: NDArray[np.floating]) -> NDArray[np.float64]:

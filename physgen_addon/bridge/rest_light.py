@@ -42,7 +42,7 @@ def measure(built: BlenderScene, folder: Path) -> None:
     Raises RenderError when Blender fails.
     """
     ambient = AMBIENT * built.open_irradiance / math.pi
-    built.object_scene.frame_set(built.first_frame)
+    built.light_scene.frame_set(built.first_frame)
     for target in built.objects:
         set_rest_light(target, np.ones_like(target.mesh.vertices), 0.0)
     for target in built.objects:
@@ -55,7 +55,7 @@ def measure(built: BlenderScene, folder: Path) -> None:
 
 def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
     """Radiance (V, 3) of a white diffuse surface at the vertices."""
-    scene, item = built.object_scene, target.item
+    scene, item = built.light_scene, target.item
     layer = scene.view_layers[0]
     for other in built.objects:
         other.item.select_set(other is target, view_layer=layer)
@@ -111,12 +111,12 @@ def _visible(built: BlenderScene) -> list[NDArray[np.bool_]]:
 def _calibrate(built: BlenderScene, seen: list[NDArray[np.bool_]], ambient: float, folder: Path) -> None:
     """Multiply L₀ + k where the camera sees it by what the rest frame shows instead of 1."""
     camera = built.folder.scene.camera
-    box = object_box(camera, [target.mesh.vertices for target in built.objects], built.size)
+    box = object_box(camera, [target.mesh.vertices for target in built.objects], built.light_size)
     if box is None:
         return
-    channels = passes.render(built.object_scene, built.first_frame, box, folder)
+    channels = passes.render(built.light_scene, built.first_frame, box, folder)
     light, alpha = passes.stack(channels, "Combined"), channels["Combined.A"]
-    width, height = built.size
+    width, height = built.light_size
     for target, visible in zip(built.objects, seen, strict=True):
         pixels = camera.project(target.mesh.vertices[visible])
         x = (pixels[:, 0] * width / camera.width - 0.5 - box.x0).astype(np.float32)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A scene folder and its bake as Blender scenes: one shows the objects, one the light on the ground.
+"""A scene folder and its bake as three Blender scenes: the objects' colours, their light, the light on the ground.
 
-They share objects, lights and world. Rendered apart, the ground's light has no outlines in it, is known behind the
-objects too, and may be coarser than the picture.
+They share the objects, the latter two also lamps and world. Rendered apart, outlines and colours are as sharp as the
+photo and cost little, because no light is computed; light is smooth, denoised, and may be coarser than the picture;
+the ground's light has no outlines in it and is known behind the objects too.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class BlenderScene:
     folder: SceneFolder
     options: RenderOptions
     objects: list[RenderObject]
-    object_scene: bpy.types.Scene
+    colour_scene: bpy.types.Scene
+    light_scene: bpy.types.Scene
     shadow_scene: bpy.types.Scene
     open_irradiance: float
     first_frame: int
@@ -36,11 +38,11 @@ class BlenderScene:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the frames."""
-        return _size(self.object_scene)
+        return _size(self.colour_scene)
 
     @property
-    def shadow_size(self) -> tuple[int, int]:
-        """Width and height of the ground's light."""
+    def light_size(self) -> tuple[int, int]:
+        """Width and height in which light is computed."""
         return _size(self.shadow_scene)
 
 
@@ -72,19 +74,19 @@ def remove(built: BlenderScene) -> None:
 
 def _build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions) -> BlenderScene:
     scene = folder.scene
-    object_scene = bpy.data.scenes.new("PhysGen objects")
-    shadow_scene = bpy.data.scenes.new("PhysGen shadows")
-    scenes = [object_scene, shadow_scene]
+    colour_scene, light_scene, shadow_scene = scenes = [
+        bpy.data.scenes.new(f"PhysGen {name}") for name in ("colours", "light", "shadows")
+    ]
     collection = bpy.data.collections.new("PhysGen objects")
+    size = render_size(scene.camera, options.scale)
+    light_scale = options.scale * options.light_scale_for(max(size))
     for item in scenes:
         item.collection.children.link(collection)
-    passes.set_up(object_scene, options, options.samples)
-    passes.set_up(shadow_scene, options, options.shadow_samples)
-    object_scene.view_layers[0].aovs.add().name = COLOUR_LAYER
-    add_camera(object_scene, scene.camera, render_size(scene.camera, options.scale))
-    add_camera(shadow_scene, scene.camera, render_size(scene.camera, options.scale * options.shadow_scale))
+        passes.set_up(item, options, denoise=item is not colour_scene)
+        add_camera(item, scene.camera, size if item is colour_scene else render_size(scene.camera, light_scale))
+    colour_scene.view_layers[0].aovs.add().name = COLOUR_LAYER
     add_ground(shadow_scene, scene.ground, scene.camera)
-    open_irradiance = add_light(scenes, folder)
+    open_irradiance = add_light([light_scene, shadow_scene], folder)
     objects = [add_object(collection, folder, source) for source in scene.objects]
     # The ground's light is wanted without the objects in front of it, but with their shadows.
     compat.layer_collection(shadow_scene.view_layers[0], collection.name).indirect_only = True
@@ -95,7 +97,8 @@ def _build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions
         folder=folder,
         options=options,
         objects=objects,
-        object_scene=object_scene,
+        colour_scene=colour_scene,
+        light_scene=light_scene,
         shadow_scene=shadow_scene,
         open_irradiance=open_irradiance,
         first_frame=bake.first_frame if bake is not None else 1,

@@ -35,7 +35,7 @@ def encode(frames: Sequence[Path], video: Path, *, fps: float, on_event: OnEvent
     with tempfile.TemporaryDirectory(prefix="physgen-video-") as folder:
         staged = _staged(frames, Path(folder))
         with replacing(video) as partial:
-            _encode(staged, partial, fps)
+            _encode(staged, partial.resolve(), fps)
     on_event({"event": "progress", "stage": "encode", "done": total, "total": total, "eta_s": 0.0})
 
 

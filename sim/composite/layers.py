@@ -32,7 +32,7 @@ class ObjectLayer:
 
     texture: (H, W, 3) photo colours averaged over each pixel, premultiplied by ``alpha``.
     alpha: (H, W) coverage 0 to 1.
-    light: (H, W, 3) light over rest light, premultiplied by ``alpha``.
+    light: (H, W, 3) light over rest light, not premultiplied.
     """
 
     texture: Linear
@@ -45,22 +45,21 @@ def empty_layer(width: int, height: int) -> ObjectLayer:
     return ObjectLayer(
         texture=np.zeros((height, width, 3), np.float32),
         alpha=np.zeros((height, width), np.float32),
-        light=np.zeros((height, width, 3), np.float32),
+        light=np.ones((height, width, 3), np.float32),
     )
 
 
-def light_ratio(layer: ObjectLayer) -> Linear:
-    """Light over rest light (H, W, 3), no longer premultiplied; 1 where there is no object.
+def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:
+    """Light over rest light (H, W, 3) from the same times coverage, and the coverage (H, W); 1 far from objects.
 
-    Where an object covers less than a quarter of the pixel, the quotient of two small noisy numbers would sparkle
-    along the outline; there it comes from the neighbourhood.
+    Where an object covers little of a pixel, the quotient of two small noisy numbers would sparkle along the
+    outline; there, and for two pixels around, it comes from the neighbourhood.
     """
-    alpha = layer.alpha[..., None]
-    near_light = cv2.GaussianBlur(layer.light, (5, 5), 1.0)
-    near_alpha = cv2.GaussianBlur(layer.alpha, (5, 5), 1.0)[..., None]
+    near_light = cv2.GaussianBlur(premultiplied, (5, 5), 1.0)
+    near_alpha = cv2.GaussianBlur(alpha, (5, 5), 1.0)[..., None]
     near = np.where(near_alpha > 1e-3, near_light / np.maximum(near_alpha, 1e-3), 1.0)
-    own = np.where(alpha > 1e-3, layer.light / np.maximum(alpha, 1e-3), near)
-    weight = np.clip((alpha - 0.25) / 0.5, 0.0, 1.0)
+    own = np.where(alpha[..., None] > 1e-3, premultiplied / np.maximum(alpha[..., None], 1e-3), near)
+    weight = np.clip((alpha[..., None] - 0.25) / 0.5, 0.0, 1.0)
     return np.clip(near + (own - near) * weight, 0.0, MAX_RATIO).astype(np.float32)
 
 
@@ -80,14 +79,15 @@ def ground_layer(
     masks: (H, W) True where the photo shows an object; the photo is never used there.
     """
     weight = np.where(masks, 0.0, at_rest).astype(np.float32)[..., None]
-    # Written as P + (B·S − P)·… so that rest is the photo to the last bit: S / S₀ is exactly 1 there.
-    moved_shadow = photo * (shadow / np.maximum(rest_shadow, MIN_SHADOW))
-    same = np.maximum(rest_shadow, MIN_SHADOW) == np.maximum(shadow, MIN_SHADOW)
-    kept = np.where(same, photo, moved_shadow)
+    now, rest = np.maximum(shadow, MIN_SHADOW), np.maximum(rest_shadow, MIN_SHADOW)
     revealed = background * shadow
+    # Exactly the photo where the light is the same. Elsewhere P·S/S₀ overshoots when the rendered shadow is deeper
+    # than the photo's; what is under the shadow is neither brighter nor darker than both that are known.
+    kept = np.where(now == rest, photo, photo * (now / rest))
+    kept = np.clip(kept, np.minimum(photo, revealed), np.maximum(photo, revealed))
     return np.where(weight == 1.0, kept, revealed + (kept - revealed) * weight).astype(np.float32)
 
 
 def compose(layer: ObjectLayer, ground: Linear) -> Linear:
     """The frame (H, W, 3): objects over ground."""
-    return layer.texture * light_ratio(layer) + (1.0 - layer.alpha[..., None]) * ground
+    return layer.texture * layer.light + (1.0 - layer.alpha[..., None]) * ground

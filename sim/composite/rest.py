@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""How much of the photo's own shadow is still right: per object, fading as it leaves the place where it stood."""
+"""How much of the photo around an object is still right, fading as the object leaves the place where it stood.
+
+Two fades. The photo's own shadow goes when the object's contact has moved. The rim, a few pixels around the mask that
+still show some of the object itself, goes as soon as the outline there has moved by a pixel.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,18 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 FADE_START = 0.004
-FADE_END = 0.35
+FADE_END = 0.08
 """Displacement of the contact over the object's size between which the photo's shadow gives way to the rendered one.
 Below the first a body has merely settled; at the second its shadow has visibly left."""
+
+RIM_SHARE = 0.006
+"""Width of the rim over the longer side of the image; lenses and sharpening spread an outline about so far."""
+
+RIM_FADE_PX = (0.25, 1.5)
+"""Movement of the outline on the image, in pixels, between which the rim gives way."""
 
 CONTACT_HEIGHT = 0.15
 """Share of an object's height, from its lowest point, that counts as its contact."""
@@ -34,7 +45,12 @@ def contact_displacement(
 
 def rest_weight(displacement: float) -> float:
     """1 at rest, 0 when gone, smooth between (``displacement`` as ``contact_displacement`` gives it)."""
-    t = min(max((displacement - FADE_START) / (FADE_END - FADE_START), 0.0), 1.0)
+    return float(_fade(np.asarray(displacement), FADE_START, FADE_END))
+
+
+def _fade(value: NDArray[np.floating], start: float, end: float) -> NDArray[np.float64]:
+    """1 up to ``start``, 0 from ``end``, smooth between."""
+    t = np.clip((np.asarray(value, dtype=np.float64) - start) / (end - start), 0.0, 1.0)
     return 1.0 - t * t * (3.0 - 2.0 * t)
 
 
@@ -63,3 +79,29 @@ def rest_map(shares: NDArray[np.float32], weights: Sequence[float]) -> NDArray[n
     """
     moved = 1.0 - np.asarray(weights, dtype=np.float32)
     return np.clip(1.0 - np.tensordot(moved, shares, axes=1), 0.0, 1.0).astype(np.float32)
+
+
+class Rim:
+    """The pixels around one object's mask that still show some of it, and which of its vertices each belongs to."""
+
+    def __init__(self, mask: NDArray[np.bool_], others: NDArray[np.bool_], rest_px: NDArray[np.floating]) -> None:
+        """``mask``, and ``others`` that are never rim, are (H, W); ``rest_px`` (V, 2) are vertices in pixels."""
+        self._shape, self._rest_px = mask.shape, np.asarray(rest_px, dtype=np.float64)
+        width = max(2.0, RIM_SHARE * max(mask.shape))
+        distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+        self._pixels = np.nonzero((distance <= width) & ~mask & ~others) if mask.any() else (np.empty(0, int),) * 2
+        rows, columns = self._pixels
+        self._strength = _fade(distance[rows, columns], width / 2, width)
+        known = np.isfinite(self._rest_px).all(axis=1)
+        self._known = np.nonzero(known)[0]
+        if len(self._known):
+            _, nearest = KDTree(self._rest_px[known]).query(np.stack([columns + 0.5, rows + 0.5], axis=1))
+            self._vertex = self._known[nearest]
+
+    def apply(self, at_rest: NDArray[np.float32], now_px: NDArray[np.floating]) -> None:
+        """Lower ``at_rest`` (H, W) in place where the vertices, now at ``now_px`` (V, 2), have moved."""
+        if not len(self._known):
+            return
+        moved = np.linalg.norm(np.asarray(now_px) - self._rest_px, axis=1)[self._vertex]
+        weight = _fade(np.nan_to_num(moved, nan=np.inf, posinf=1e9), *RIM_FADE_PX)
+        at_rest[self._pixels] *= (1.0 - self._strength * (1.0 - weight)).astype(np.float32)
