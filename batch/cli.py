@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..sim.app.bake_inputs import BakeOptions
-from ..sim.app.events import IsCancelled
 from ..sim.app.reconstruct import reconstruct_scene, set_physics
 from ..sim.errors import Cancelled, InputError, PhysGenError
+from ..sim.events import IsCancelled
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from ..sim.app import worker
 from ..sim.app.bake_inputs import BakeOptions
-from ..sim.app.events import Event, IsCancelled, OnEvent
 from ..sim.app.process import run_stage
 from ..sim.app.reconstruct import reconstruct_scene, set_physics
 from ..sim.errors import RenderError, SimulationError
+from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.model import Vector
 

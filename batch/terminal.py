@@ -8,7 +8,7 @@ import sys
 import time
 from typing import TextIO
 
-from ..sim.app.events import Event
+from ..sim.events import Event
 
 STAGES = ("reconstruct", "bake", "render", "encode")
 

@@ -20,9 +20,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from physgen.batch import demo, pipeline
-from physgen.sim.app.events import ignore, never
 from physgen.sim.app.reconstruct import reconstruct_scene, set_physics
 from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.events import ignore, never
 
 
 def measure(stage: Callable[[], object]) -> dict[str, float]:
@@ -67,7 +67,8 @@ def main() -> int:
         print(json.dumps(result))
         return 0
     print(
-        f"coffee demo, {result['frames']} frames, {result['particles']} particles\n\n| stage | wall s | CPU s |\n| --- | --- | --- |"
+        f"coffee demo, {result['frames']} frames, {result['particles']} particles\n\n"
+        "| stage | wall s | CPU s |\n| --- | --- | --- |"
     )
     for name, times in [*result["stages"].items(), ("all", result["total"])]:  # type: ignore[attr-defined]
         print(f"| {name} | {times['wall_s']:.1f} | {times['cpu_s']:.1f} |")

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-
 from physgen.sim.scene.folder import SceneFolder, save_scene
 from physgen.sim.scene.materials import load_preset
 from physgen.sim.scene.model import Camera, Scene, SceneObject

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import bpy
 
-from ...sim.app.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...sim.atomic import replacing
 from ...sim.cache.lock import folder_lock
 from ...sim.composite import transfer
 from ...sim.errors import Cancelled
+from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.meshes import load_object_mesh
 from . import caches, compat

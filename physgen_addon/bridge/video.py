@@ -12,9 +12,9 @@ import bpy
 import numpy as np
 from PIL import Image
 
-from ...sim.app.events import OnEvent, ignore
 from ...sim.atomic import replacing
 from ...sim.errors import InputError, RenderError
+from ...sim.events import OnEvent, ignore
 from . import compat
 
 

@@ -20,12 +20,12 @@ from ..cache.lock import folder_lock
 from ..cache.manifest import MANIFEST_FILE, BakedObject, BakeManifest, load_manifest, save_manifest
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import Cancelled, InputError, SimulationError
+from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..scene.folder import SceneFolder, load_scene
 from ..scene.meshes import ObjectMesh, load_object_mesh
 from ..skinning.binding import Binding, bind, deform
 from ..version import VERSION
 from .bake_inputs import BakeOptions, inputs_hash
-from .events import IsCancelled, OnEvent, StageProgress, ignore, never
 
 __all__ = ["BakeOptions", "bake", "is_up_to_date"]
 
@@ -187,7 +187,7 @@ class _Run:
             raise
 
     def _advance_to(self, index: int, cancelled: IsCancelled) -> None:
-        """Advance to the time of sample ``index`` in a fixed number of parts, between which cancelling is looked for."""
+        """Advance to the time of sample ``index`` in a fixed number of parts; cancelling is looked for between them."""
         self.frame_started = time.monotonic()
         world = self.simulation.world
         for part in range(1, ADVANCE_PARTS + 1):

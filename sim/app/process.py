@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from queue import Empty, Queue
 
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
-from .events import Event, IsCancelled, OnEvent
+from ..events import Event, IsCancelled, OnEvent
 
 CANCEL_GRACE_S = 10.0
 """How long a stage may take to put things in order before it is killed."""

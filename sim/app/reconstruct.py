@@ -11,13 +11,13 @@ from pathlib import Path
 
 from ..atomic import write_json
 from ..errors import InputError
+from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct
 from ..scene.folder import SceneFolder, load_scene, save_scene
 from ..scene.json_fields import read_json, to_json
 from ..scene.materials import load_preset
 from ..scene.model import Vector
 from .bake_inputs import file_hash
-from .events import IsCancelled, OnEvent, ignore, never
 
 STAMP_FILE = "reconstruct.json"
 RECONSTRUCT_REVISION = 1

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..events import StageProgress
 from ..mpm.bodies import BodyParticles, ElasticMaterial
 from ..mpm.options import PADDING_CELLS, Ground, SolverOptions
 from ..mpm.placement import fit_similarity
@@ -22,7 +23,6 @@ from ..scene.meshes import ObjectMesh
 from ..scene.model import Scene, SceneObject
 from ..scene.units import Similarity
 from .bake_inputs import BakeOptions
-from .events import StageProgress
 from .quality import Quality, load_quality
 
 ENGINE_NAME = "mls-mpm"
@@ -99,8 +99,8 @@ def build_world(
     steps = (options.frames - 1) / options.fps / world.stable_step
     if steps * count > MAX_PARTICLE_STEPS:
         raise InputError(
-            f"this would take about {steps:.2g} time steps of {count} particles, days of computing: lower the velocity or "
-            "Young's modulus, raise the density, bake fewer frames, or choose a coarser quality"
+            f"this would take about {steps:.2g} time steps of {count} particles, days of computing: lower the velocity "
+            "or Young's modulus, raise the density, bake fewer frames, or choose a coarser quality"
         )
     cell_mm = solver.cell_size(similarity) * 1000
     progress.notice(f"{count} particles, cells of {cell_mm:.2g} mm, time steps of {world.stable_step * 1e6:.0f} µs")

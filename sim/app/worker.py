@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ..errors import InputError, PhysGenError
+from ..events import Event
 from ..scene.json_fields import parse, read_json, to_json
 from .bake import BakeOptions, bake
-from .events import Event
 
 JOB_FORMAT = "physgen-job/1"
 MODULE = __name__ if __name__ != "__main__" else f"{__package__}.worker"

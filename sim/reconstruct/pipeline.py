@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..errors import Cancelled, InputError
+from ..events import IsCancelled, OnEvent, ignore, never
 from ..scene.folder import SceneFolder, save_scene
 from ..scene.materials import load_preset
 from ..scene.model import Camera, Ground, Light, Scene, SceneObject
@@ -33,22 +34,12 @@ from .shadow import find_shadow, ground_brightness, object_holes
 from .texture import crop_texture, glb_bytes, world_from_gltf
 
 Mask = NDArray[np.bool_]
-Event = dict[str, Any]
-OnEvent = Callable[[Event], None]
-
-
-def _ignore(event: Event) -> None:
-    """Take no notice of ``event``."""
-
-
-def _never() -> bool:
-    return False
 
 
 class _Steps:
     """Reports progress, passes notices on, and stops between steps when asked to."""
 
-    def __init__(self, total: int, on_event: OnEvent, cancelled: Callable[[], bool]) -> None:
+    def __init__(self, total: int, on_event: OnEvent, cancelled: IsCancelled) -> None:
         self._total, self._done, self._on_event, self._cancelled = total, 0, on_event, cancelled
 
     def begin(self, name: str) -> None:
@@ -83,8 +74,8 @@ def reconstruct(
     objects: Sequence[ObjectRequest],
     out: Path,
     options: ReconstructOptions | None = None,
-    on_event: OnEvent = _ignore,
-    cancelled: Callable[[], bool] = _never,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
 ) -> SceneFolder:
     """Reconstruct the ``objects`` of ``photo`` into the scene folder ``out``, which is replaced when it is a scene.
 

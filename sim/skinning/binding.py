@@ -52,14 +52,14 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
     neighbours: how many particles carry a vertex, 4 to 64; more is smoother, fewer follows detail.
     Raises InputError when there are fewer particles than 4 or anything is not finite.
     """
-    vertices = np.asarray(vertices, dtype=np.float64)
+    rest: Array = np.array(vertices, dtype=np.float64)
     particles = np.asarray(particles, dtype=np.float64)
     if len(particles) < 4:
         raise InputError(f"skinning: {len(particles)} particles cannot carry a mesh; choose a finer quality")
-    if not (np.isfinite(vertices).all() and np.isfinite(particles).all()):
+    if not (np.isfinite(rest).all() and np.isfinite(particles).all()):
         raise InputError("skinning: vertices or particles are not finite")
     count = min(neighbours, len(particles) - 1)
-    distance, index = cKDTree(particles).query(vertices, k=count + 1)
+    distance, index = cKDTree(particles).query(rest, k=count + 1)
     # The first particle left out sets the support: weights vanish where the set of neighbours changes, which
     # keeps them continuous along the surface.
     support = np.maximum(distance[:, -1:], 1e-12)
@@ -71,9 +71,9 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
     return Binding(
         particles=index,
         weights=weights,
-        offsets=vertices[:, None, :] - particles[index],
+        offsets=rest[:, None, :] - particles[index],
         spacing=spacing,
-        rest=vertices.copy(),
+        rest=rest,
     )
 
 

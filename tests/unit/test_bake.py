@@ -11,7 +11,6 @@ import sys
 
 import numpy as np
 import pytest
-
 from physgen.sim.app import bake as bake_module
 from physgen.sim.app import worker
 from physgen.sim.app.bake import bake

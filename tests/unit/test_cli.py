@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
 from physgen.batch.cli import build_parser, main
 from physgen.sim.cache.manifest import load_manifest
 from physgen.sim.scene.folder import load_scene

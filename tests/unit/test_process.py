@@ -7,7 +7,6 @@ import textwrap
 import time
 
 import pytest
-
 from physgen.sim.app import process
 from physgen.sim.app.process import run_stage
 from physgen.sim.errors import Cancelled, InputError, RenderError
