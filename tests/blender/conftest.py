@@ -1,0 +1,192 @@
+"""A small world that Cycles renders twice: once as the truth, once from a "photo" of it through the render stage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+bpy = pytest.importorskip("bpy")
+
+from mathutils import Vector  # noqa: E402
+from physgen.physgen_addon.bridge import camera as bridge_camera  # noqa: E402
+from physgen.physgen_addon.bridge import compat, passes  # noqa: E402
+from physgen.physgen_addon.bridge.ground import add_ground  # noqa: E402
+from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.bridge.regions import Box  # noqa: E402
+from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest  # noqa: E402
+from physgen.sim.cache.pc2 import Pc2Writer  # noqa: E402
+from physgen.sim.composite.transfer import linear_to_bytes  # noqa: E402
+from physgen.sim.scene.folder import SceneFolder, save_scene  # noqa: E402
+from physgen.sim.scene.model import Camera, Ground, Light, Scene, SceneObject  # noqa: E402
+
+WIDTH, HEIGHT = 160, 120
+RADIUS = 0.05
+SUN = (0.48, 0.36, 0.8)
+SUN_STRENGTH = 1.5
+SUN_ANGLE = 0.2
+SHIFT = (-0.07, 0.03, 0.0)
+"""Where the moved ball is, from where it rests."""
+
+
+def look_down(*, pitch_deg: float = 35.0, height: float = 0.3, back: float = 0.4) -> tuple:
+    """Pose of a camera behind the origin that looks along +Y and down."""
+    s, c = math.sin(math.radians(pitch_deg)), math.cos(math.radians(pitch_deg))
+    return ((1.0, 0.0, 0.0, 0.0), (0.0, -s, c, -back), (0.0, -c, -s, height), (0.0, 0.0, 0.0, 1.0))
+
+
+def photo_camera() -> Camera:
+    """Unequal focal lengths and an off-centre principal point, so that every test covers them."""
+    return Camera(width=WIDTH, height=HEIGHT, fx=190.0, fy=200.0, cx=74.0, cy=63.5, world_from_camera=look_down())
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene folder with its photo, and the true pictures: photo, empty ground, ball moved by SHIFT."""
+
+    folder: SceneFolder
+    photo: np.ndarray
+    background: np.ndarray
+    moved: np.ndarray
+    moved_mask: np.ndarray
+
+
+@pytest.fixture(autouse=True)
+def fresh_blender():
+    """One bpy serves the whole session; each test begins with an empty file and must leave none of its data."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def floor_material() -> bpy.types.Material:
+    material = bpy.data.materials.new("floor")
+    tree = compat.node_tree(material)
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    noise.inputs["Scale"].default_value = 25.0
+    coordinates = tree.nodes.new("ShaderNodeNewGeometry")
+    tree.links.new(coordinates.outputs["Position"], noise.inputs["Vector"])
+    ramp = tree.nodes.new("ShaderNodeValToRGB")
+    ramp.color_ramp.elements[0].color = (0.25, 0.15, 0.08, 1)
+    ramp.color_ramp.elements[1].color = (0.7, 0.6, 0.45, 1)
+    tree.links.new(noise.outputs[0], ramp.inputs[0])
+    return _diffuse(material, tree, ramp.outputs[0])
+
+
+def _diffuse(material, tree, colour) -> bpy.types.Material:
+    shader = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    if isinstance(colour, tuple):
+        shader.inputs["Color"].default_value = colour
+    else:
+        tree.links.new(colour, shader.inputs["Color"])
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(shader.outputs[0], output.inputs[0])
+    return material
+
+
+def render_truth(shift: tuple[float, float, float] | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The picture (H, W, 3) in 8-bit sRGB and the ball's mask (H, W), by Cycles alone; None leaves the ball out."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    compat.enable_cycles()
+    scene = bpy.data.scenes.new("truth")
+    passes.set_up(scene, RenderOptions(samples=256, seed=7), denoise=False)
+    scene.render.use_persistent_data = False
+    bridge_camera.add_camera(scene, photo_camera(), (WIDTH, HEIGHT))
+    scene.world = bpy.data.worlds.new("sky")
+    tree = compat.node_tree(scene.world)
+    sky, output = tree.nodes.new("ShaderNodeBackground"), tree.nodes.new("ShaderNodeOutputWorld")
+    sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (1, 1, 1, 1), 0.3
+    tree.links.new(sky.outputs[0], output.inputs[0])
+    sun = bpy.data.lights.new("sun", "SUN")
+    sun.energy, sun.angle = 0.3 * SUN_STRENGTH * math.pi / SUN[2], SUN_ANGLE
+    lamp = bpy.data.objects.new("sun", sun)
+    lamp.rotation_euler = Vector(SUN).to_track_quat("Z", "Y").to_euler()
+    scene.collection.objects.link(lamp)
+    floor = add_ground(scene, Ground(), photo_camera())
+    floor.data.materials[0] = floor_material()
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    box = Box(0, 0, WIDTH, HEIGHT)
+    if shift is not None:
+        ball = ball_mesh()
+        data = bpy.data.meshes.new("ball")
+        data.from_pydata((ball.vertices + np.asarray(shift)).tolist(), [], ball.faces.tolist())
+        data.shade_smooth()
+        material = bpy.data.materials.new("ball")
+        data.materials.append(_diffuse(material, compat.node_tree(material), (0.55, 0.25, 0.08, 1)))
+        scene.collection.objects.link(bpy.data.objects.new("ball", data))
+        floor.hide_render = True
+        mask = passes.render(scene, 1, box, folder)["Combined.A"] > 0.5
+        floor.hide_render = False
+    scene.render.film_transparent = False
+    picture = passes.stack(passes.render(scene, 1, box, folder), "Combined")
+    return linear_to_bytes(picture), mask
+
+
+def ball_mesh() -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    ball.vertices += [0.02, 0.0, RADIUS]
+    return ball
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory) -> World:
+    """The world, reconstructed perfectly."""
+    root = tmp_path_factory.mktemp("scene")
+    for name in ("meshes", "masks", "shadows"):
+        (root / name).mkdir()
+    photo, mask = render_truth((0.0, 0.0, 0.0), root)
+    background, _ = render_truth(None, root)
+    moved, moved_mask = render_truth(SHIFT, root)
+    camera, ball = photo_camera(), ball_mesh()
+    pixels = camera.project(ball.vertices)
+    uv = np.stack([pixels[:, 0] / WIDTH, 1 - pixels[:, 1] / HEIGHT], axis=1)
+    # What a reconstruction does: colours beyond the outline continue those inside.
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(_extended(photo, mask)))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    trimesh.Trimesh(ball.vertices, ball.faces, visual=visual, process=False).export(root / "meshes" / "ball.glb")
+    Image.fromarray(photo).save(root / "photo.png")
+    Image.fromarray(background).save(root / "background.png")
+    Image.fromarray(mask.astype(np.uint8) * 255).save(root / "masks" / "ball.png")
+    item = SceneObject(name="ball", mesh="meshes/ball.glb", size_m=2 * RADIUS, mask="masks/ball.png")
+    light = Light(sun_direction=SUN, sun_strength=SUN_STRENGTH, sun_angle=SUN_ANGLE)
+    folder = save_scene(root, Scene(camera=camera, objects=(item,), light=light))
+    return World(folder=folder, photo=photo, background=background, moved=moved, moved_mask=moved_mask)
+
+
+def _extended(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    from scipy import ndimage
+
+    rows, columns = ndimage.distance_transform_edt(~mask, return_indices=True)[1]
+    return photo[rows, columns]
+
+
+@pytest.fixture
+def bake(world, tmp_path):
+    """A function that writes a bake of the ball's shifts, one (3,) a frame; its folder."""
+
+    def write(shifts, name: str = "bake", vertices: np.ndarray | None = None) -> Path:
+        folder = tmp_path / name
+        folder.mkdir()
+        rest = ball_mesh().vertices if vertices is None else vertices
+        with Pc2Writer(folder / "ball.pc2", vertex_count=len(rest)) as writer:
+            for shift in shifts:
+                writer.append(rest + np.asarray(shift))
+        manifest = BakeManifest(
+            inputs_hash="0",
+            fps=24.0,
+            frame_start=1,
+            frames=len(shifts),
+            frames_done=len(shifts),
+            state="complete",
+            engine="test",
+            version="0",
+            particles=1,
+            objects=(BakedObject(name="ball", file="ball.pc2", vertices=len(rest)),),
+        )
+        save_manifest(folder, manifest)
+        return folder
+
+    return write

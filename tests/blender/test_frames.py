@@ -1,0 +1,142 @@
+"""The loop over frames: what is skipped, what is resumed, what is refused; the script; the video."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from physgen.sim.composite.transfer import read_rgb, write_rgb
+from physgen.sim.errors import Cancelled, InputError
+
+bpy = pytest.importorskip("bpy")
+import cv2  # noqa: E402
+from physgen.physgen_addon.bridge import frames as frames_module  # noqa: E402
+from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
+from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.bridge.plan import parse_range  # noqa: E402
+from physgen.physgen_addon.bridge.video import encode  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = RenderOptions(samples=1, scale=0.5)
+SHIFTS = [(0, 0, 0), (0.02, 0, 0), (0.02, 0, 0), (0.04, 0, 0)]
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """Samples that were really rendered."""
+    calls = []
+    original = frames_module.Renderer.frame
+
+    def count(self, sample):
+        calls.append(sample)
+        return original(self, sample)
+
+    monkeypatch.setattr(frames_module.Renderer, "frame", count)
+    return calls
+
+
+def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered):
+    folder, out = bake(SHIFTS), tmp_path / "out"
+    paths = render_frames(world.folder, folder, out, QUICK)
+    assert [p.name for p in paths] == ["0001.png", "0002.png", "0003.png", "0004.png"]
+    assert rendered == [0, 1, 3]
+    assert paths[1].read_bytes() == paths[2].read_bytes()
+
+    rendered.clear()
+    render_frames(world.folder, folder, out, QUICK)
+    assert rendered == []
+
+    paths[3].unlink()
+    render_frames(world.folder, folder, out, QUICK)
+    assert rendered == [3]
+
+    paths[0].write_bytes(paths[0].read_bytes()[:200])
+    rendered.clear()
+    render_frames(world.folder, folder, out, QUICK)
+    assert rendered == [0]
+    assert read_rgb(paths[0]).shape == (60, 80, 3)
+
+
+def test_cancelling_keeps_complete_frames(world, bake, tmp_path, rendered):
+    folder, out = bake(SHIFTS), tmp_path / "out"
+    with pytest.raises(Cancelled, match="1 of 4"):
+        render_frames(world.folder, folder, out, QUICK, cancelled=lambda: len(rendered) >= 1)
+    assert sorted(p.name for p in out.iterdir()) == ["0001.png", "frames.json"]
+    assert read_rgb(out / "0001.png").shape == (60, 80, 3)
+
+
+def test_unusable_input_is_named(world, bake, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="no bake there"):
+        render_frames(world.folder, tmp_path / "none", out, QUICK)
+    with pytest.raises(InputError, match="has 7 vertices, the mesh of 'ball' has"):
+        render_frames(world.folder, bake(SHIFTS, "other", np.zeros((7, 3))), out, QUICK)
+    folder = bake(SHIFTS)
+    with pytest.raises(InputError, match="frames 1 to 4 are baked"):
+        render_frames(world.folder, folder, out, QUICK, frames="1-9")
+    cache = folder / "ball.pc2"
+    cache.write_bytes(cache.read_bytes()[:-5])
+    with pytest.raises(InputError, match="cut off"):
+        render_frames(world.folder, folder, out, QUICK)
+    assert not out.exists()
+    foreign = tmp_path / "holiday"
+    write_rgb(foreign / "0001.png", np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match="choose an empty or new folder"):
+        render_frames(world.folder, bake(SHIFTS, "again"), foreign, QUICK)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"), [(None, [1, 2, 3, 4, 5]), ("2-4", [2, 3, 4]), ("5,1", [1, 5]), ("1-5x2", [1, 3, 5])]
+)
+def test_ranges(text, numbers):
+    assert parse_range(text, 1, 5) == numbers
+
+
+@pytest.mark.parametrize("text", ["", "x", "3-1", "1-5x0", "0", "6", "-1", "1-"])
+def test_ranges_that_are_none(text):
+    with pytest.raises(InputError, match="frames"):
+        parse_range(text, 1, 5)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (65, 47)])
+def test_video_keeps_number_size_and_colours(tmp_path, size):
+    width, height = size
+    colours = [(200, 60, 40), (40, 160, 90), (30, 60, 190), (128, 128, 128), (250, 245, 240)]
+    paths = []
+    for index, colour in enumerate(colours):
+        paths.append(tmp_path / f"{index + 3:04d}.png")
+        write_rgb(paths[-1], np.full((height, width, 3), colour, np.uint8))
+    encode(paths, tmp_path / "clip.mp4", fps=23.976)
+    video = cv2.VideoCapture(str(tmp_path / "clip.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(23.976, abs=0.01)
+    for colour in colours:
+        there, frame = video.read()
+        assert there
+        assert frame.shape[:2] == (height + height % 2, width + width % 2)
+        assert np.abs(frame[..., ::-1].mean((0, 1)) - colour).max() < 6
+    assert not video.read()[0]
+    video.release()
+    assert sorted(p.name for p in tmp_path.glob("*.mp4")) == ["clip.mp4"]
+
+
+def run_script(*arguments):
+    command = [sys.executable, str(ROOT / "batch" / "render.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+def test_script_speaks_json_and_exit_codes(world, bake, tmp_path):
+    folder = bake(SHIFTS)
+    common = [world.folder.root, "--bake", folder, "--out", tmp_path / "out", "--json"]
+    result = run_script(*common, "--frames", "1,4", "--samples", 1, "--scale", 0.5, "--video", tmp_path / "v.mp4")
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert result.returncode == 0, result.stderr
+    assert events[0]["event"] == "progress"
+    assert events[-1]["event"] == "done"
+    assert events[-1]["frames"] == 2
+    assert (tmp_path / "v.mp4").stat().st_size > 0
+    refused = run_script(*common, "--frames", "99")
+    assert refused.returncode == 3
+    assert json.loads(refused.stdout.splitlines()[-1])["kind"] == "InputError"
+    assert run_script("--nonsense").returncode == 2

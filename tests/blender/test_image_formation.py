@@ -1,0 +1,78 @@
+"""Rendered frames against the photo and against what Cycles renders of the true world."""
+
+import numpy as np
+import pytest
+from physgen.sim.composite.metrics import psnr
+from physgen.sim.composite.transfer import bytes_to_linear, read_mask, read_rgb
+
+bpy = pytest.importorskip("bpy")
+from physgen.physgen_addon.bridge import renderer as renderer_module  # noqa: E402
+from physgen.physgen_addon.bridge.caches import open_bake  # noqa: E402
+from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
+from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.bridge.regions import Box, ShadowRegion  # noqa: E402
+from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
+from scipy import ndimage  # noqa: E402
+
+SHIFT = (-0.07, 0.03, 0.0)
+LIFTED = (0.0, 0.0, 0.004)
+
+
+@pytest.fixture
+def frames(world, bake, tmp_path):
+    shifts = [(0, 0, 0), (1e-4, 0, 0), SHIFT]
+    paths = render_frames(world.folder, bake(shifts), tmp_path / "out", RenderOptions(samples=32))
+    return [read_rgb(path) for path in paths]
+
+
+def test_rest_is_the_photo_and_motion_is_the_truth(world, frames):
+    mask = read_mask(world.folder.file("masks/ball.png"))
+    first, second, moved = frames
+    assert psnr(first, world.photo, mask) > 35
+    assert psnr(first, world.photo) > 38
+    # Nothing pops when the ball has moved by a tenth of a pixel.
+    outside = ~ndimage.binary_dilation(mask, iterations=2)
+    assert np.abs(second.astype(float) - first)[outside].mean() < 0.2
+
+    assert psnr(moved, world.moved) > 30
+    # Where the ball stood there is the background again; some of it lies in the new shadow's faint outskirts.
+    gone = ndimage.binary_erosion(mask & ~world.moved_mask, iterations=3)
+    assert np.abs(moved.astype(float) - world.moved)[gone].mean() < 4
+    # The shadow is a ratio of light: compare it with the truth's.
+    ground = ~ndimage.binary_dilation(world.moved_mask | mask, iterations=3)
+    empty = np.maximum(bytes_to_linear(world.background), 1e-3)
+    ratio, truth = (bytes_to_linear(image).mean(-1) / empty.mean(-1) for image in (moved, world.moved))
+    shadow = ground & (truth < 0.75)
+    assert shadow.sum() > 50
+    assert abs(np.median(ratio[shadow] - truth[shadow])) < 0.03
+    # The ball turns no brighter or darker than it would in truth.
+    inside = ndimage.binary_erosion(world.moved_mask, iterations=3)
+    assert abs(float((moved.astype(float) - world.moved)[inside].mean())) < 6
+
+
+def test_only_rendering_what_can_be_seen_changes_nothing(world, bake, monkeypatch):
+    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.scene)
+    options = RenderOptions(samples=64)
+    pictures = []
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(renderer_module, "object_box", lambda _camera, _vertices, size: Box(0, 0, *size))
+            monkeypatch.setattr(
+                renderer_module, "shadow_region", lambda _scene, _vertices, size: ShadowRegion(Box(0, 0, *size), 1e3)
+            )
+        renderer = Renderer(world.folder, opened, options)
+        pictures.append(renderer.frame(1).astype(int))
+        renderer.close()
+    difference = np.abs(pictures[0] - pictures[1])
+    assert difference.mean() < 0.3
+    assert np.percentile(difference, 99) <= 2
+
+
+def test_out_of_view_is_the_background_alone(world, bake):
+    opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.scene)
+    renderer = Renderer(world.folder, opened, RenderOptions(samples=4))
+    gone = renderer.frame(1)
+    renderer.close()
+    mask = read_mask(world.folder.file("masks/ball.png"))
+    assert np.array_equal(gone[mask], world.background[mask])
+    assert not [scene for scene in bpy.data.scenes if scene.name.startswith("PhysGen")]

@@ -1,0 +1,136 @@
+"""Image formation on small arrays."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from physgen.sim.composite import layers, rest, transfer
+from physgen.sim.composite.metrics import psnr
+from physgen.sim.errors import InputError
+
+
+def test_every_byte_survives_linear_light():
+    values = np.arange(256, dtype=np.uint8)
+    assert np.array_equal(transfer.linear_to_bytes(transfer.bytes_to_linear(values)), values)
+    assert transfer.srgb_to_linear(np.array(0.5)) == pytest.approx(0.21404, abs=1e-5)
+
+
+def test_psnr():
+    black, grey = np.zeros((4, 4, 3), np.uint8), np.full((4, 4, 3), 51, np.uint8)
+    assert psnr(black, black) == math.inf
+    assert psnr(black, grey) == pytest.approx(20 * math.log10(5))
+    mask = np.zeros((4, 4), bool)
+    assert psnr(black, grey, mask) == math.inf
+
+
+def test_shrinking_averages_light():
+    image = np.zeros((2, 2, 3), np.float32)
+    image[0, 0] = 1.0
+    assert transfer.resized(image, 1, 1)[0, 0, 0] == pytest.approx(0.25)
+
+
+def test_unreadable_images_are_named(tmp_path):
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG nothing")
+    for name in ("bad.png", "missing.png"):
+        with pytest.raises(InputError, match=name):
+            transfer.read_rgb(tmp_path / name)
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(1)
+    photo, background = rng.random((2, 6, 8, 3)).astype(np.float32)
+    mask = np.zeros((6, 8), bool)
+    mask[2:4, 3:5] = True
+    shadow = rng.uniform(0.2, 1, (6, 8, 3)).astype(np.float32)
+    return photo, background, mask, shadow
+
+
+def ground(scene, shadow, at_rest):
+    photo, background, mask, rest_shadow = scene
+    return layers.ground_layer(
+        photo=photo,
+        background=background,
+        shadow=shadow,
+        rest_shadow=rest_shadow,
+        at_rest=np.full((6, 8), at_rest, np.float32),
+        masks=mask,
+    )
+
+
+def test_rest_is_the_photo_to_the_bit_but_never_inside_masks(scene):
+    photo, background, mask, shadow = scene
+    result = ground(scene, shadow, 1.0)
+    assert np.array_equal(result[~mask], photo[~mask])
+    assert np.allclose(result[mask], (background * shadow)[mask])
+
+
+def test_gone_is_the_background_in_the_new_light(scene):
+    _, background, _, shadow = scene
+    assert np.allclose(ground(scene, shadow, 0.0), background * shadow)
+    assert np.allclose(ground(scene, np.ones_like(shadow), 0.0), background)
+
+
+def test_lifting_a_shadow_never_overshoots(scene):
+    photo, background, mask, shadow = scene
+    result = ground(scene, np.ones_like(shadow), 1.0)
+    assert (result <= np.maximum(photo, background) + 1e-6)[~mask].all()
+
+
+def test_light_ratio_is_one_at_rest_and_continues_beyond_the_outline():
+    alpha = np.zeros((20, 20), np.float32)
+    alpha[5:15, 5:15] = 1.0
+    alpha[5, 5:15] = 0.1
+    ratio = layers.light_ratio(alpha[..., None] * np.float32(0.5) * np.ones(3, np.float32), alpha)
+    assert np.allclose(ratio[4:16, 4:16], 0.5, atol=1e-3)
+    assert np.allclose(ratio[0, 0], 1.0)
+
+
+def test_compose_mixes_by_coverage():
+    layer = layers.empty_layer(2, 1)
+    layer.alpha[0, 0] = 0.25
+    layer.texture[0, 0] = 0.25
+    result = layers.compose(layer, np.full((1, 2, 3), 0.4, np.float32))
+    assert result[0, 0, 0] == pytest.approx(0.25 + 0.75 * 0.4)
+    assert result[0, 1, 0] == pytest.approx(0.4)
+
+
+def test_rest_weight_fades_smoothly_from_one_to_zero():
+    weights = [rest.rest_weight(d) for d in np.linspace(0, 0.2, 100)]
+    assert weights[0] == 1.0
+    assert weights[-1] == 0.0
+    assert all(a >= b for a, b in itertools.pairwise(weights))
+    assert max(abs(a - b) for a, b in itertools.pairwise(weights)) < 0.06
+
+
+def test_shares_sum_to_one_and_rest_is_exactly_one():
+    places = np.zeros((3, 10, 12), bool)
+    places[0, 2, 2] = places[1, 8, 9] = True
+    shares = rest.influence(list(places))
+    assert np.allclose(shares.sum(0), 1)
+    assert (rest.rest_map(shares, [1.0, 1.0, 1.0]) == 1.0).all()
+    moved = rest.rest_map(shares, [0.0, 1.0, 1.0])
+    assert moved[2, 2] < 0.1 < 0.9 < moved[8, 9]
+
+
+def test_the_rim_gives_way_where_its_outline_moves():
+    mask = np.zeros((30, 40), bool)
+    mask[10:20, 10:30] = True
+    corners = np.array([[10.0, 15.0], [30.0, 15.0]])
+    rim = rest.Rim(mask, mask, corners)
+    weights = np.ones(mask.shape, np.float32)
+    rim.apply(weights, corners)
+    assert (weights == 1).all()
+    rim.apply(weights, corners + np.array([[5.0, 0.0], [0.0, 0.0]]))
+    assert weights[15, 9] == pytest.approx(0, abs=0.01)
+    assert weights[15, 30] == 1
+    assert weights[0, 0] == 1
+
+
+def test_contact_is_the_foot():
+    vertices = np.array([[0, 0, z] for z in np.linspace(0, 1, 11)])
+    contact = rest.contact_vertices(vertices, np.array([0, 0, 1.0]))
+    assert contact.sum() == 2
+    moved = vertices + np.array([0.3, 0.0, 0.0])
+    assert rest.contact_displacement(vertices, moved, contact, 1.0) == pytest.approx(0.3)
