@@ -60,7 +60,7 @@ def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:
     near = np.where(near_alpha > 1e-3, near_light / np.maximum(near_alpha, 1e-3), 1.0)
     own = np.where(alpha[..., None] > 1e-3, premultiplied / np.maximum(alpha[..., None], 1e-3), near)
     weight = np.clip((alpha[..., None] - 0.25) / 0.5, 0.0, 1.0)
-    return np.clip(near + (own - near) * weight, 0.0, MAX_RATIO).astype(np.float32)
+    return np.asarray(np.clip(near + (own - near) * weight, 0.0, MAX_RATIO), dtype=np.float32)
 
 
 def ground_layer(

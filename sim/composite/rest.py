@@ -91,7 +91,7 @@ class Rim:
         distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
         self._pixels = np.nonzero((distance <= width) & ~mask & ~others) if mask.any() else (np.empty(0, int),) * 2
         rows, columns = self._pixels
-        self._strength = _fade(distance[rows, columns], width / 2, width)
+        self._strength = _fade(np.asarray(distance[rows, columns], dtype=np.float64), width / 2, width)
         known = np.isfinite(self._rest_px).all(axis=1)
         self._known = np.nonzero(known)[0]
         if len(self._known):
