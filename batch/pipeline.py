@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -67,7 +68,7 @@ def render_stage(
         "--out",
         str(out.resolve()),
     ]
-    command += ["--engine", request.engine, "--scale", repr(request.scale), "--json"]
+    command += ["--engine", request.engine, "--scale", repr(request.scale), "--json", "--parent", str(os.getpid())]
     if request.samples is not None:
         command += ["--samples", str(request.samples)]
     if request.frames is not None:

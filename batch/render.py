@@ -62,6 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--samples", type=int, metavar="N", help="rays and light samples a pixel")
     parser.add_argument("--scale", type=float, default=1.0, metavar="F", help="of the photo's resolution (default 1)")
     parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     return parser
@@ -94,9 +95,12 @@ def _show(event: dict[str, Any], stream: TextIO, as_json: bool) -> None:
     stream.flush()
 
 
-def run(options: argparse.Namespace, stream: TextIO, cancelled: threading.Event) -> int:
+def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> int:
     """Render as ``options`` ask; the exit code."""
     errors = _load("sim.errors")
+
+    def cancelled() -> bool:
+        return stop.is_set() or (options.parent is not None and os.getppid() != options.parent)
 
     def on_event(event: dict[str, Any]) -> None:
         _show(event, stream, options.json)
@@ -114,12 +118,17 @@ def run(options: argparse.Namespace, stream: TextIO, cancelled: threading.Event)
         changes = {} if options.samples is None else {"samples": options.samples}
         settings = bridge.RenderOptions(engine=options.engine, scale=options.scale, threads=options.threads, **changes)
         paths = frames.render_frames(
-            folder, options.bake, options.out, settings, on_event, cancelled.is_set, frames=options.frames
+            folder, options.bake, options.out, settings, on_event, cancelled, frames=options.frames
         )
         done = {"event": "done", "frames": len(paths), "out": str(options.out)}
         if options.video is not None:
             manifest = _load("sim.cache.manifest").load_manifest(options.bake)
-            _load("physgen_addon.bridge.video").encode(paths, options.video, fps=manifest.fps, on_event=on_event)
+            ledger = _load("physgen_addon.bridge.ledger").Ledger(options.out)
+            if ledger.has_video(options.video, paths, manifest.fps):
+                on_event({"event": "notice", "stage": "encode", "message": f"up to date: {options.video}"})
+            else:
+                _load("physgen_addon.bridge.video").encode(paths, options.video, fps=manifest.fps, on_event=on_event)
+                ledger.record_video(options.video, paths, manifest.fps)
             done["video"] = str(options.video)
     except errors.PhysGenError as error:
         if options.json:
