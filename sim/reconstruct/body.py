@@ -11,6 +11,7 @@ enlarges the base, until the centre of mass lies well above it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,8 @@ from .inflate import Silhouette
 
 Points = NDArray[np.float64]
 
-STABLE_MARGIN = 0.25
-"""Distance of the centre of mass from the edge of the base over the base's inscribed radius, as far as reachable."""
+STABLE = 0.25
+"""``stability`` that a body gets, as far as it is reachable."""
 MAX_YAW = np.radians(55.0)
 ROUND_YAW_SHARE = 0.4
 """Things that are no boxes touch the ground in unseen places too: their visible contact tells less."""
@@ -59,15 +60,6 @@ class Reference:
             facing > 0.05, ((self.origin - self.camera.position) @ self.normal) / np.maximum(facing, 0.05), np.inf
         )
         return _soft_min(wall, ground, self.fold), ground, rays
-
-
-@dataclass(frozen=True)
-class Stance:
-    """How well a body stands. margin: see STABLE_MARGIN, negative when it topples; base: (k, 2) hull on the ground."""
-
-    margin: float
-    base: Points
-    centre_of_mass: NDArray[np.float64]
 
 
 def _soft_min(first: Points, second: Points, width: float) -> Points:
@@ -129,11 +121,11 @@ def _lower_hull(points: Points) -> Points:
     return np.array(chain)
 
 
-def stand(camera: Camera, silhouette: Silhouette) -> tuple[Reference, Stance]:
-    """The reference surface on which the body stands best, and how it stands.
+def references(camera: Camera, silhouette: Silhouette) -> Iterator[Reference]:
+    """Reference surfaces to try, the most natural one first.
 
     The wall starts where a ball of this thickness would touch the ground, R tan(a/2) behind the lowest visible point
-    for a view a below the horizontal, and moves back in steps until the body stands with STABLE_MARGIN.
+    for a view a below the horizontal, and moves back in steps, which enlarges the base.
     """
     contact = contact_pixel(silhouette)
     ray = camera.rays(contact)
@@ -145,64 +137,41 @@ def stand(camera: Camera, silhouette: Silhouette) -> tuple[Reference, Stance]:
     lean = 0.0 if silhouette.slab else declination * (LEAN + (1.0 - LEAN) * silhouette.roundness)
     yaw = contact_yaw(camera, silhouette)
     away = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    normal = np.cos(lean) * away - np.sin(lean) * np.array([0.0, 0.0, 1.0])
     outline = on_ground(camera, _lower_outline(silhouette))
     outline = outline[np.isfinite(outline).all(axis=1)]
     front = float((outline @ away).min()) if len(outline) else float(touch @ away)
     # The middle plane of a ball meets the ground before the line of sight that grazes it does.
     start = thick * (np.tan(declination / 2.0) - silhouette.roundness * np.tan(lean))
-    back = 1.0 + 2.0 * np.sin(lean) * (1.0 - silhouette.roundness)
-    pixels, heights = _samples(silhouette)
-    best: tuple[Reference, Stance] | None = None
-    for step in np.concatenate([[0.0], np.geomspace(0.08, 3.0, 16)]):
-        reference = Reference(
+    for step in np.concatenate([[0.0], np.geomspace(0.08, 3.0, 12)]):
+        yield Reference(
             camera=camera,
             origin=away * (front + start + step * thick),
-            normal=normal,
+            normal=np.cos(lean) * away - np.sin(lean) * np.array([0.0, 0.0, 1.0]),
             unit_per_pixel=unit,
             fold=FOLD * thick,
-            back=back,
+            back=1.0 + 2.0 * np.sin(lean) * (1.0 - silhouette.roundness),
         )
-        stance = judge(reference, pixels, heights)
-        if best is None or stance.margin > best[1].margin + 0.02:
-            best = (reference, stance)
-        if stance.margin >= STABLE_MARGIN:
-            return reference, stance
-    assert best is not None
-    return best
 
 
-def _samples(silhouette: Silhouette, count: int = 6000) -> tuple[Points, Points]:
-    """Pixels (n, 2) spread evenly over the silhouette and h (n) there, in pixels."""
-    step = max(1, int(np.sqrt(silhouette.mask.sum() / count)))
-    rows, columns = np.nonzero(silhouette.mask[::step, ::step])
-    rows, columns = rows * step, columns * step
-    pixels = np.column_stack([silhouette.left + columns + 0.5, silhouette.top + rows + 0.5])
-    return pixels, np.sqrt(np.maximum(silhouette.square_height[rows, columns], 0.0))
+def stability(vertices: Points, faces: NDArray[np.int64]) -> float:
+    """How safely a closed body of uniform density stands on z = 0; negative when it topples.
 
-
-def judge(reference: Reference, pixels: Points, heights: Points) -> Stance:
-    """Centre of mass at uniform density and base of the body, from the matter that each pixel's ray holds.
-
-    pixels (n, 2) must sample the silhouette evenly; heights (n) in pixels. A ray of unit depth r between depths
-    a and b holds the volume ∝ (b³ − a³)/3 with first moment r (b⁴ − a⁴)/4.
+    The distance of its centre of mass from the edge of the convex hull of what touches the ground, over the distance
+    of the hull's middle from that edge; -1 when fewer than three points touch it.
     """
-    middle, ground, rays = reference.depths(pixels)
-    half = heights * reference.unit_per_pixel / np.linalg.norm(rays, axis=1)
-    near, far = np.maximum(middle - half, 1e-6), np.minimum(middle + reference.back * half, ground)
-    far = np.maximum(far, near)
-    volume = (far**3 - near**3) / 3.0
-    total = max(float(volume.sum()), 1e-300)
-    centre = reference.camera.position + (rays * ((far**4 - near**4) / 4.0)[:, None]).sum(axis=0) / total
-    resting = (middle + reference.back * half >= ground) & (half > 0)
-    base = (reference.camera.position + ground[resting][:, None] * rays[resting])[:, :2]
+    size = float(np.ptp(vertices, axis=0).max())
+    base = vertices[vertices[:, 2] < 1e-6 * size][:, :2]
     if len(base) < 3:
-        return Stance(margin=-1.0, base=base, centre_of_mass=centre)
+        return -1.0
     try:
         hull = ConvexHull(base)
     except QhullError:
-        return Stance(margin=-1.0, base=base, centre_of_mass=centre)
-    corners = base[hull.vertices]
-    inner = -(hull.equations[:, :2] @ corners.mean(axis=0) + hull.equations[:, 2]).max()
-    distance = -(hull.equations[:, :2] @ centre[:2] + hull.equations[:, 2]).max()
-    return Stance(margin=float(distance / max(inner, 1e-12)), base=corners, centre_of_mass=centre)
+        return -1.0
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    volumes = np.einsum("ti,ti->t", a, np.cross(b, c))
+    centre = ((a + b + c) * volumes[:, None]).sum(axis=0) / (4.0 * volumes.sum())
+
+    def inside(point: NDArray[np.float64]) -> float:
+        return -float((hull.equations[:, :2] @ point + hull.equations[:, 2]).max())
+
+    return inside(centre[:2]) / max(inside(base[hull.vertices].mean(axis=0)), 1e-12)

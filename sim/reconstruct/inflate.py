@@ -26,6 +26,9 @@ LONGEST_SLAB = 3.0
 """Length over width of a box; longer ones are taken for bottles, pens and sticks, which are round."""
 SLAB_THICKNESS = 0.2
 """Default thickness over width of a box: between a book and a carton."""
+OUTSET = 2e-4
+"""How far bodies reach beyond their mask, over the photo's longer side (0.4 pixels at 1920). Triangles cut the corners
+of an outline, and there the background would show inside the mask: as bright specks around a dark thing."""
 MIN_HALF_THICKNESS = 1.0
 """Pixels; a thinner sheet has no inside that particles could be put into."""
 SLAB_BEVEL = 0.5
@@ -66,7 +69,7 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
     # Beyond the photo's border the object ends, as far as anyone can see: pad with background.
     padded = np.pad(mask, pad)
     crop = padded[rows[0] : rows[-1] + 1 + 2 * pad, columns[0] : columns[-1] + 1 + 2 * pad]
-    distance = signed_distance(crop)
+    distance = signed_distance(crop) + OUTSET * max(mask.shape)
     slab = is_box(crop)
     if thickness is None:
         thickness = SLAB_THICKNESS if slab else 1.0

@@ -11,7 +11,8 @@ from scipy import ndimage, sparse
 from skimage.measure import marching_cubes
 
 from ..errors import InputError
-from .body import Reference
+from ..scene.model import Camera
+from .body import STABLE, Reference, references, stability
 from .inflate import Silhouette
 
 Points = NDArray[np.float64]
@@ -103,12 +104,31 @@ class _DepthField:
         return field.astype(np.float32), first, steps
 
 
-def build_mesh(silhouette: Silhouette, reference: Reference, target: int = 12_000) -> BodyMesh:
-    """The closed surface of the body with about ``target`` vertices, standing on the ground.
+def build_mesh(camera: Camera, silhouette: Silhouette, target: int = 12_000) -> tuple[BodyMesh, float]:
+    """The closed surface of the body with about ``target`` vertices, standing on the ground, and its stability.
+
+    Of the body's references it takes the first that makes it stand safely, or the best. That is judged on the surface
+    itself: what touches the ground is often a narrow strip, which anything coarser would miss.
 
     Raises InputError when the silhouette is too thin for any closed surface.
     """
-    field = _DepthField(silhouette, reference)
+    best: tuple[BodyMesh, float] | None = None
+    for reference in references(camera, silhouette):
+        field = _DepthField(silhouette, reference)
+        points, faces = _surface_of_size(field, silhouette, target)
+        body = _to_world(silhouette, reference, _relax(field, points, faces), faces)
+        margin = stability(body.vertices, body.faces)
+        if best is None or margin > best[1]:
+            best = (body, margin)
+        if margin >= STABLE:
+            break
+    assert best is not None
+    return best
+
+
+def _surface_of_size(field: _DepthField, silhouette: Silhouette, target: int) -> tuple[Points, Faces]:
+    """The surface on a grid that gives about ``target`` vertices."""
+    # A round body has 2.6 vertices a cell, front and back.
     spacing = max(0.5, float(np.sqrt(2.6 * silhouette.mask.sum() / target)))
     for _ in range(3):
         points, faces = _surface(field, spacing)
@@ -117,8 +137,7 @@ def build_mesh(silhouette: Silhouette, reference: Reference, target: int = 12_00
         if 0.8 < ratio < 1.25 or abs(finer / spacing - 1.0) < 0.05:
             break
         spacing = finer
-    points = _relax(field, points, faces)
-    return _to_world(silhouette, reference, points, faces)
+    return points, faces
 
 
 def _surface(field: _DepthField, spacing: float) -> tuple[Points, Faces]:

@@ -19,7 +19,7 @@ from ..scene.folder import SceneFolder, save_scene
 from ..scene.materials import load_preset
 from ..scene.model import Camera, Ground, Light, Scene, SceneObject
 from . import camera as cameras
-from .body import contact_pixel, stand
+from .body import contact_pixel
 from .horizon import estimate_pitch
 from .inflate import Silhouette, inflate
 from .inpaint import FillOptions, inpaint
@@ -217,10 +217,10 @@ def _take_apart(
 
 
 def _body(name: str, view: Camera, silhouette: Silhouette, options: ReconstructOptions, steps: _Steps) -> BodyMesh:
-    reference, stance = stand(view, silhouette)
-    if stance.margin < 0.05:
+    body, margin = build_mesh(view, silhouette, options.mesh_vertices)
+    if margin < 0.05:
         steps.notice(f"{name}: may topple, its base does not carry its centre of mass; a larger thickness helps")
-    return build_mesh(silhouette, reference, options.mesh_vertices)
+    return body
 
 
 def _metres_per_unit(

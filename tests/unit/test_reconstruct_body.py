@@ -13,7 +13,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import camera as cameras
-from physgen.sim.reconstruct.body import stand
 from physgen.sim.reconstruct.horizon import estimate_pitch
 from physgen.sim.reconstruct.inflate import inflate, signed_distance, soap_film
 from physgen.sim.reconstruct.mask_cleanup import largest_component
@@ -53,8 +52,7 @@ def blob(seed, detail=14.0):
 
 def body_of(mask, pitch_deg=25.0, thickness=None, vertices=4000):
     silhouette = inflate(mask, thickness)
-    reference, stance = stand(view(pitch_deg), silhouette)
-    return build_mesh(silhouette, reference, vertices), stance
+    return build_mesh(view(pitch_deg), silhouette, vertices)
 
 
 def seen(body, camera):
