@@ -20,7 +20,7 @@ from ..scene.model import Vector
 from .bake_inputs import file_hash
 
 STAMP_FILE = "reconstruct.json"
-RECONSTRUCT_REVISION = 1
+RECONSTRUCT_REVISION = 2
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 
