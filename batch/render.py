@@ -17,6 +17,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -95,6 +96,15 @@ def _show(event: dict[str, Any], stream: TextIO, as_json: bool) -> None:
     stream.flush()
 
 
+def _report(error: Any, as_json: bool, stream: TextIO) -> int:
+    """Say what the PhysGenError ``error`` says; the exit code it stands for."""
+    if as_json:
+        _show({"event": "error", "kind": type(error).__name__, "message": str(error)}, stream, True)
+    else:
+        sys.stderr.write(f"error: {error}\n")
+    return int(error.exit_code)
+
+
 def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> int:
     """Render as ``options`` ask; the exit code."""
     errors = _load("sim.errors")
@@ -131,11 +141,11 @@ def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> i
                 ledger.record_video(options.video, paths, manifest.fps)
             done["video"] = str(options.video)
     except errors.PhysGenError as error:
-        if options.json:
-            _show({"event": "error", "kind": type(error).__name__, "message": str(error)}, stream, True)
-        else:
-            sys.stderr.write(f"error: {error}\n")
-        return int(error.exit_code)
+        return _report(error, options.json, stream)
+    except OSError as error:
+        # Of the temporary folder, most likely: layers and textures pass through it.
+        message = f"{error.filename or tempfile.gettempdir()}: {error.strerror or error}; free space, then run again"
+        return _report(errors.RenderError(message), options.json, stream)
     done["seconds"] = round(time.monotonic() - started, 1)
     _show(done, stream, options.json)
     if not options.json:

@@ -81,7 +81,10 @@ def render(scene: bpy.types.Scene, frame: int, box: Box, folder: Path) -> Channe
     try:
         channels = read_layers(path)
     except InputError as error:
-        raise RenderError(f"frame {frame}: Blender wrote no usable image ({error})") from error
+        # Blender says nothing when a write fails, and a full disk is the usual reason.
+        raise RenderError(
+            f"frame {frame}: Blender wrote no usable image; free space in the temporary folder, then run again ({error})"
+        ) from error
     if next(iter(channels.values())).shape != (box.height, box.width):
         found = next(iter(channels.values())).shape
         raise RenderError(f"frame {frame}: Blender rendered {found} pixels instead of {(box.height, box.width)}")

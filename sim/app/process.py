@@ -69,7 +69,7 @@ def run_stage(
         raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
     if process.returncode != 0 or final is None:
         words = "\n".join(tail).strip() or "it said nothing"
-        raise failure(f"the {failure.__name__} stage ended with code {process.returncode}: {words}")
+        raise failure(f"the process ended with code {process.returncode}: {words}")
     return final
 
 

@@ -131,3 +131,14 @@ def test_a_stopped_run_goes_on(job, photo, tmp_path, how):
     assert sorted(p.name for p in (work / "frames").glob("*.png")) == [f"{i:04d}.png" for i in range(1, FRAMES + 1)]
     assert (work / "ball.mp4").is_file()
     assert not [p for p in work.rglob(".*") if "partial" in p.name]
+
+
+def test_a_full_disk_is_named(job, tmp_path):
+    work, _ = job
+    # A limit on file size fails writes as a full disk does, from the operating system.
+    script = 'ulimit -f 20; exec "$@"'
+    render = ["render", work / "scene", "--bake", work / "bake", "--out", tmp_path / "frames", "--samples", "4"]
+    line = ["bash", "-c", script, "bash", sys.executable, "-m", "physgen.batch.cli", *map(str, render)]
+    result = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert result.returncode in (3, 5) and "free space" in result.stderr and "Traceback" not in result.stderr
+    assert not list((tmp_path / "frames").glob("*.png"))
