@@ -83,7 +83,7 @@ def render(scene: bpy.types.Scene, frame: int, box: Box, folder: Path) -> Channe
     except InputError as error:
         # Blender says nothing when a write fails, and a full disk is the usual reason.
         raise RenderError(
-            f"frame {frame}: Blender wrote no usable image; free space in the temporary folder, then run again ({error})"
+            f"frame {frame}: Blender wrote no usable image; free space for temporary files, then run again ({error})"
         ) from error
     if next(iter(channels.values())).shape != (box.height, box.width):
         found = next(iter(channels.values())).shape
