@@ -39,7 +39,8 @@ def cubes(count: int, seed: int = 0) -> list[np.ndarray]:
 
 def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, object]:
     """One measurement in this process."""
-    from physgen.sim.mpm.bodies import BodyParticles, ElasticMaterial
+    from physgen.sim.mpm.bodies import BodyParticles
+    from physgen.sim.mpm.materials import ElasticMaterial
     from physgen.sim.mpm.options import Ground, SolverOptions
     from physgen.sim.mpm.world import World
     from physgen.sim.scene.units import Similarity

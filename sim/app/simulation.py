@@ -13,14 +13,22 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..events import StageProgress
-from ..mpm.bodies import BodyParticles, ElasticMaterial
+from ..mpm.bodies import BodyParticles
+from ..mpm.materials import (
+    ElasticMaterial,
+    FluidMaterial,
+    NeoHookeanMaterial,
+    SandMaterial,
+    SnowMaterial,
+    VonMisesMaterial,
+)
 from ..mpm.options import PADDING_CELLS, Ground, SolverOptions
 from ..mpm.placement import fit_similarity
 from ..mpm.sampling import sample_interior
 from ..mpm.world import World
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
-from ..scene.model import Scene, SceneObject
+from ..scene.model import Material, Scene, SceneObject
 from ..scene.units import Similarity
 from .bake_inputs import BakeOptions
 from .quality import Quality, load_quality
@@ -132,18 +140,42 @@ def _body(
         sample = sample_interior(mesh.vertices, mesh.faces, solver.particle_spacing(similarity), seed=seed)
     except InputError as error:
         raise InputError(f"object {item.name}: {error}") from None
-    material = item.material
     return BodyParticles(
         name=item.name,
         positions=sample.positions,
         volumes=sample.volumes,
         contact_radii=sample.contact_radii,
-        material=ElasticMaterial(
-            density=material.density, youngs_modulus=material.youngs_modulus, poisson_ratio=material.poisson_ratio
-        ),
+        material=engine_material(item.material),
         velocity=item.velocity,
         spin=item.spin,
     )
+
+
+def engine_material(material: Material) -> ElasticMaterial:
+    """The engine's class for the material's law, with the numbers that count under it."""
+    m = material
+    if m.law == "fluid":
+        return FluidMaterial(density=m.density, bulk_modulus=m.bulk_modulus, viscosity=m.viscosity)
+    solid = {
+        "density": m.density,
+        "youngs_modulus": m.youngs_modulus,
+        "poisson_ratio": m.poisson_ratio,
+        "damping_time": m.damping_time,
+    }
+    if m.law == "neo_hookean":
+        return NeoHookeanMaterial(**solid)
+    if m.law == "von_mises":
+        return VonMisesMaterial(**solid, yield_stress=m.yield_stress)
+    if m.law == "snow":
+        return SnowMaterial(
+            **solid,
+            critical_compression=m.critical_compression,
+            critical_stretch=m.critical_stretch,
+            hardening=m.hardening,
+        )
+    if m.law == "sand":
+        return SandMaterial(**solid, friction_angle=m.friction_angle)
+    return ElasticMaterial(**solid)
 
 
 def _resolution(

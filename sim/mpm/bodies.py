@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is simulated: elastic bodies made of particles. World metres, kilograms, seconds."""
+"""What is simulated: bodies made of particles. World metres, kilograms, seconds."""
 
 from __future__ import annotations
 
@@ -10,46 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .materials import ElasticMaterial
 
 Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ElasticMaterial:
-    """Isotropic fixed-corotated elastic solid. Raises InputError on a value out of range."""
-
-    density: float
-    """Mass density in kg/m³; above 0."""
-
-    youngs_modulus: float
-    """Young's modulus E in Pa; above 0."""
-
-    poisson_ratio: float
-    """Poisson's ratio; 0 up to, but not, 0.5. The substep goes to zero as it nears 0.5."""
-
-    def __post_init__(self) -> None:
-        for field in ("density", "youngs_modulus"):
-            value = getattr(self, field)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"material {field} is {value!r}: give a finite number above 0")
-        if not (0 <= self.poisson_ratio < 0.5):
-            raise InputError(f"material poisson_ratio is {self.poisson_ratio!r}: give 0 or more and less than 0.5")
-
-    @property
-    def shear_modulus(self) -> float:
-        """First half of the Lamé parameters, mu in Pa."""
-        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
-
-    @property
-    def lame_lambda(self) -> float:
-        """Second half of the Lamé parameters, lambda in Pa."""
-        nu = self.poisson_ratio
-        return self.youngs_modulus * nu / ((1 + nu) * (1 - 2 * nu))
-
-    @property
-    def wave_speed(self) -> float:
-        """Speed in m/s of longitudinal waves in the undeformed solid, sqrt((lambda + 2 mu) / rho)."""
-        return math.sqrt((self.lame_lambda + 2 * self.shear_modulus) / self.density)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,7 +29,7 @@ class BodyParticles:
     """Volume of each particle (N,), m³, above 0."""
 
     material: ElasticMaterial
-    """The whole body's material."""
+    """The whole body's material: any of ``materials``."""
 
     contact_radii: NDArray[np.float64] | None = None
     """Distance (N,) in metres at which a particle touches the ground: its distance to the body's surface, at most half

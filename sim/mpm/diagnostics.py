@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .materials import FIXED_COROTATED, FLUID, NEO_HOOKEAN, SNOW, ElasticMaterial, SnowMaterial
+
 Array = NDArray[np.float64]
 
 
@@ -62,10 +64,25 @@ def kinetic_energy(masses: Array, velocities: Array, affine: Array, cell_size: f
     return float(0.5 * masses @ squares)
 
 
-def elastic_energy(volumes: Array, shear_modulus: Array, lame_lambda: Array, deformation: Array) -> float:
-    """Sum of V0 (mu sum (s_i - 1)² + lambda/2 (J - 1)²), s_i signed where a particle is inverted."""
+def elastic_energy(material: ElasticMaterial, volumes: Array, deformation: Array, memories: Array) -> float:
+    """Sum of V0 psi over particles with elastic ``deformation`` (N, 3, 3), in J; the laws are in ``laws``."""
+    mu, lam = material.shear_modulus, material.lame_lambda
+    if material.law == FLUID:
+        # psi = integral of p dJ from J to 1 with p = K/7 (J^-7 - 1); none in tension.
+        ratio = np.exp(np.minimum(memories, 0.0))
+        return float(volumes @ (material.bulk_number / 7 * ((ratio**-6 - 1) / 6 + ratio - 1)))
     stretches = np.linalg.svd(deformation, compute_uv=False)
     volume_ratio = np.linalg.det(deformation)
-    stretches[:, 2] = np.copysign(stretches[:, 2], volume_ratio)
-    density = shear_modulus * ((stretches - 1) ** 2).sum(axis=1) + 0.5 * lame_lambda * (volume_ratio - 1) ** 2
-    return float(volumes @ density)
+    if material.law in (FIXED_COROTATED, SNOW):
+        stretches[:, 2] = np.copysign(stretches[:, 2], volume_ratio)
+        density = mu * ((stretches - 1) ** 2).sum(axis=1) + 0.5 * lam * (volume_ratio - 1) ** 2
+        if isinstance(material, SnowMaterial):
+            density = density * np.exp(material.hardening * (1 - np.exp(memories)))
+        return float(volumes @ density)
+    strains = np.log(np.maximum(stretches, 1e-3))
+    total = strains.sum(axis=1)
+    if material.law == NEO_HOOKEAN:
+        shear = 0.5 * mu * ((stretches**2).sum(axis=1) - 3) - mu * total
+    else:
+        shear = mu * (strains**2).sum(axis=1)
+    return float(volumes @ (shear + 0.5 * lam * total**2))

@@ -10,13 +10,19 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from . import sorting
+from . import laws, sorting
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .substep import substep
+from .materials import FIXED_COROTATED, ROW
+from .substep import substep, substep_of_laws
 
 Array = NDArray[np.float64]
 
 PARTICLE_ARRAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
+
+MATTER_ARRAYS = ("memory", "material")
+"""Arrays that only laws other than fixed-corotated elasticity need."""
+
+ONLY_ELASTIC = 1 << FIXED_COROTATED
 
 SAFETY = 1.5
 """Factor by which the fastest particle may speed up within a substep."""
@@ -46,6 +52,14 @@ class Plane:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Matter:
+    """All materials of a world as the kernels see them: the set of their laws and a row of numbers for each."""
+
+    laws: int = ONLY_ELASTIC
+    table: tuple[tuple[float, ...], ...] = ((0.0,) * ROW,)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """What the loop needs of ``SolverOptions``; see there for units and ranges."""
 
@@ -62,10 +76,21 @@ class Engine:
     """
 
     def __init__(
-        self, *, capacity: int, options: EngineOptions, plane: Plane | None, gravity: tuple[float, float, float]
+        self,
+        *,
+        capacity: int,
+        options: EngineOptions,
+        plane: Plane | None,
+        gravity: tuple[float, float, float],
+        matter: Matter | None = None,
     ) -> None:
         self.options = options
         self.plane = plane
+        self.laws = ONLY_ELASTIC if matter is None else matter.laws
+        self._names = PARTICLE_ARRAYS + (() if self.laws == ONLY_ELASTIC else MATTER_ARRAYS)
+        self._table = ti.ndarray(ti.f32, ROW if matter is None else len(matter.table) * ROW)
+        if matter is not None:
+            self._table.from_numpy(np.asarray(matter.table, dtype=np.float32).ravel())
         self.gravity = np.asarray(gravity, dtype=np.float64)
         self.across = options.grid // 4
         self.count = 0
@@ -98,15 +123,18 @@ class Engine:
 
     def _particle_arrays(self) -> dict[str, ti.Ndarray]:
         n = self._capacity
-        return {
-            "x": ti.ndarray(ivec3, n),
-            "v": ti.ndarray(vec3, n),
-            "C": ti.ndarray(mat3, n),
-            "F": ti.ndarray(mat3, n),
-            "constants": ti.ndarray(vec4, n),
-            "reaction": ti.ndarray(vec4, n),
-            "ids": ti.ndarray(ti.i32, n),
+        kinds = {
+            "x": ivec3,
+            "v": vec3,
+            "C": mat3,
+            "F": mat3,
+            "constants": vec4,
+            "reaction": vec4,
+            "ids": ti.i32,
+            "memory": ti.f32,
+            "material": ti.i32,
         }
+        return {name: ti.ndarray(kinds[name], n) for name in self._names}
 
     def _allocate_blocks(self, p_capacity: int, g_capacity: int) -> None:
         p, g = min(p_capacity, self.across**3), min(g_capacity, self.across**3)
@@ -130,15 +158,30 @@ class Engine:
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
-        per_particle = 2 * 4 * (3 + 3 + 9 + 9 + 4 + 4 + 1) + 8
+        per_particle = 2 * 4 * (3 + 3 + 9 + 9 + 4 + 4 + 1 + len(self._names) - len(PARTICLE_ARRAYS)) + 8
         per_p = 4 * (3 + 1 + 1 + 27 + 2 + SCALARS_PER_BLOCK) + 2 * 16 * WINDOW_NODES
         per_g = 4 * (3 + 27 + 1) + 36 * BLOCK_NODES
         return self._capacity * per_particle + self._p_capacity * per_p + self._g_capacity * per_g + 8 * self.across**3
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
-    def add(self, *, x: Array, v: Array, C: Array, F: Array, constants: Array, ids: NDArray[np.int32]) -> None:
-        """Append particles: positions (N, 3) in cells, the rest as ``transfer.advance_particles`` describes it."""
+    def add(
+        self,
+        *,
+        x: Array,
+        v: Array,
+        C: Array,
+        F: Array,
+        constants: Array,
+        ids: NDArray[np.int32],
+        wave_speed: float,
+        material: int = 0,
+    ) -> None:
+        """Append particles: positions (N, 3) in cells, the rest as ``transfer.advance_particles`` describes it.
+
+        wave_speed: of the fastest wave in them, cells/s, as ``materials.bounding_speed`` gives it; material: their
+        row in the table.
+        """
         state = self._download()
         base = np.clip(np.floor(x - 0.5).astype(np.int64) >> 2, 1, self.across - 2)
         local = np.rint((x - (4 * base - 1)) * FIXED_ONE)
@@ -150,18 +193,19 @@ class Engine:
             "constants": constants.astype(np.float32),
             "reaction": np.zeros((len(x), 4), dtype=np.float32),
             "ids": ids.astype(np.int32),
+            "memory": np.zeros(len(x), dtype=np.float32),
+            "material": np.full(len(x), material, dtype=np.int32),
         }
         keys = (base[:, 0] * self.across + base[:, 1]) * self.across + base[:, 2]
-        merged = {name: np.concatenate([state[name], new[name]]) for name in PARTICLE_ARRAYS}
+        merged = {name: np.concatenate([state[name], new[name]]) for name in self._names}
         self._upload(merged, np.concatenate([state["keys"], keys.astype(np.int32)]))
         self._speed = max(self._speed, math.sqrt(float(np.max((v**2).sum(axis=1)))))
-        stiffness = (constants[:, 1] + constants[:, 2]) / constants[:, 0]
-        self._wave_speed = max(self._wave_speed, math.sqrt(float(np.max(stiffness))))
+        self._wave_speed = max(self._wave_speed, wave_speed)
 
     def _download(self) -> dict[str, NDArray[np.generic]]:
         """The active particles in engine order, with the block of each under "keys"."""
         n = self.count
-        state = {name: self._particles[0][name].to_numpy()[:n] for name in PARTICLE_ARRAYS}
+        state = {name: self._particles[0][name].to_numpy()[:n] for name in self._names}
         cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64)
         starts = self._starts.to_numpy()[: self._p_blocks + 1]
         keys = (cells[:, 0] * self.across + cells[:, 1]) * self.across + cells[:, 2]
@@ -170,7 +214,7 @@ class Engine:
 
     def _upload(self, state: dict[str, NDArray[np.generic]], keys: NDArray[np.int32]) -> None:
         n = len(keys)
-        for name in PARTICLE_ARRAYS:
+        for name in self._names:
             array = self._particles[0][name]
             host = array.to_numpy()
             host[:n] = state[name]
@@ -262,6 +306,13 @@ class Engine:
             *(old[name] for name in PARTICLE_ARRAYS),
             *(new[name] for name in PARTICLE_ARRAYS),
         )
+        if self.laws != ONLY_ELASTIC:
+            laws.permute_matter(
+                self.count,
+                self._targets,
+                *(old[name] for name in MATTER_ARRAYS),
+                *(new[name] for name in MATTER_ARRAYS),
+            )
         self._particles.reverse()
         self._margin = 1.0
         self._clearance = 0.0
@@ -315,7 +366,7 @@ class Engine:
         here = self._particles[0]
         reach = SAFETY * self._speed * dt + LEAST_REACH
         contact = nodes and self.plane is not None and self._clearance < 2.0 * reach
-        speed2, stiffness, margin, clearance, sum2 = substep(
+        first = (
             self._p_blocks,
             self._g_blocks if nodes else 0,
             self._ground_p_count if contact else 0,
@@ -341,6 +392,8 @@ class Engine:
             here["C"],
             here["F"],
             here["constants"],
+        )
+        last = (
             here["reaction"],
             self._window,
             self._scattered,
@@ -349,6 +402,11 @@ class Engine:
             self._masses,
             self._report,
         )
+        if self.laws == ONLY_ELASTIC:
+            found = substep(*first, *last)
+        else:
+            found = substep_of_laws(self.laws, *first, here["material"], self._table, here["memory"], *last)
+        speed2, stiffness, margin, clearance, sum2 = found
         if scatter:
             if not math.isfinite(stiffness):
                 raise Diverged

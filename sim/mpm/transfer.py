@@ -14,6 +14,7 @@ Quadratic B-splines; lengths in cells (see ``layout``), seconds, kilograms. A su
 import taichi as ti
 
 from .constitutive import fixed_corotated
+from .laws import deform, respond
 from .layout import (
     BLOCK_NODES,
     FIXED_HIGH,
@@ -128,6 +129,7 @@ def advance_nodes(
 
 @ti.func
 def advance_particles(
+    laws: ti.template(),
     blocks: ti.i32,
     gather: ti.i32,
     scatter: ti.i32,
@@ -145,6 +147,9 @@ def advance_particles(
     C: Matrices,
     F: Matrices,
     constants: Vectors4,
+    material: Integers,
+    table: Scalars,
+    memory: Scalars,
     reaction: Vectors4,
     window: Vectors4,
     nodes: Vectors4,
@@ -153,10 +158,12 @@ def advance_particles(
 ):
     """Grid to particles over ``dt_gather``, then particles to grid with the stress impulse of ``dt_scatter``.
 
+    laws: the set of constitutive laws that occur, see ``materials``; 1, only fixed-corotated solids, touches neither
+    ``material`` (the particle's row in ``table``) nor ``memory``.
     gather, scatter: 0 leaves that half out (before and after a sort); store: 1 writes ``v`` and ``C``, which are
     otherwise recomputed before anyone reads them.
     x: window coordinates, fixed point; v: cells/s; C: 1/s; F: 1.
-    constants: mass kg, 2 mu V0, lambda V0 (kg cells^2/s^2), contact radius in cells.
+    constants: mass kg, 2 mu V0, lambda V0 (kg cells^2/s^2; of fluids 2 eta V0 and K V0), contact radius in cells.
     reaction: contact acceleration of the last substep (cells/s^2) and the share of contacting mass at the particle.
     report, 8 numbers a block: largest |v|^2, largest c^2, least distance to the window's limits in cells, least
     distance to the ground, sum of |v|^2 (not finite when the simulation is lost), 3 spare.
@@ -222,7 +229,10 @@ def advance_particles(
                         Cp[r, 0] = 4.0 * B0[r]
                         Cp[r, 1] = 4.0 * B1[r]
                         Cp[r, 2] = 4.0 * B2[r]
-                    Fp += dt_gather * Cp @ Fp
+                    if ti.static(laws == 1):
+                        Fp += dt_gather * Cp @ Fp
+                    else:
+                        Fp = deform(laws, p, dt_gather, Cp, F, material, table, memory)
                     F[p] = Fp
                     step = vp * dt_gather
                     if ground:
@@ -250,7 +260,12 @@ def advance_particles(
                     Cp = C[p]
                 if scatter == 1:
                     mass = fixed[0]
-                    tau, modulus = fixed_corotated(Fp, fixed[1], fixed[2])
+                    tau = mat3(0.0)
+                    modulus = 0.0
+                    if ti.static(laws == 1):
+                        tau, modulus = fixed_corotated(Fp, fixed[1], fixed[2])
+                    else:
+                        tau, modulus = respond(laws, p, Fp, Cp, fixed, F, material, table, memory)
                     stiffness = ti.max(stiffness, modulus / mass)
                     Q = (-4.0 * dt_scatter) * tau + mass * Cp
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The engine's facade: a world of elastic bodies above a ground, in metres, kilograms and seconds.
+"""The engine's facade: a world of bodies above a ground, in metres, kilograms and seconds.
 
 similarity = fit_similarity([vertices], ground, options=options)
 sample = sample_interior(vertices, faces, options.particle_spacing(similarity))
@@ -10,7 +10,9 @@ world.positions(0)
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -20,7 +22,9 @@ from ..errors import InputError, SimulationError
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import diagnostics, runtime
 from .bodies import BodyParticles, Vector
-from .engine import Diverged, Engine, EngineOptions, Plane
+from .engine import Diverged, Engine, EngineOptions, Matter, Plane
+from .fitting import FittedGradients
+from .materials import bounding_speed
 from .options import PADDING_CELLS, Ground, SolverOptions
 from .placement import fit_similarity
 
@@ -35,7 +39,7 @@ STANDARD_GRAVITY: Vector = (0.0, 0.0, -9.81)
 
 
 class World:
-    """Elastic bodies above a ground plane, advanced in time.
+    """Bodies above a ground plane, advanced in time.
 
     bodies: in the order in which ``positions(i)`` and the rest count them.
     ground: the plane that carries them, or None for free flight.
@@ -76,6 +80,7 @@ class World:
         self._started = [False] * len(bodies)
         self._engine = self._new_engine()
         self._host: dict[str, NDArray[np.generic]] | None = None
+        self._fits: dict[int, FittedGradients] = {}
         self._start_bodies()
 
     # ---- setup --------------------------------------------------------------------------------------------------
@@ -129,6 +134,10 @@ class World:
                 self._cells.length(self.gravity[1]),
                 self._cells.length(self.gravity[2]),
             ),
+            matter=Matter(
+                laws=functools.reduce(operator.or_, (body.material.laws for body in self.bodies)),
+                table=tuple(body.material.row for body in self.bodies),
+            ),
         )
 
     def _start_bodies(self) -> None:
@@ -143,8 +152,8 @@ class World:
             constants = np.stack(
                 [
                     body.masses,
-                    2 * self._cells.modulus(body.material.shear_modulus) * volumes,
-                    self._cells.modulus(body.material.lame_lambda) * volumes,
+                    self._cells.modulus(body.material.shear_number) * volumes,
+                    self._cells.modulus(body.material.bulk_number) * volumes,
                     body.contact_radii * scale,
                 ],
                 axis=1,
@@ -156,6 +165,10 @@ class World:
                 F=np.broadcast_to(np.eye(3), (body.count, 3, 3)),
                 constants=constants,
                 ids=np.arange(self._offsets[i], self._offsets[i + 1], dtype=np.int32),
+                wave_speed=bounding_speed(
+                    self._cells.length(body.material.wave_speed), scale**2 * body.material.diffusivity
+                ),
+                material=i,
             )
             self._host = None
 
@@ -262,8 +275,28 @@ class World:
         return self._gather("C", index, np.zeros((self._body(index).count, 3, 3)))
 
     def deformation_gradients(self, index: int) -> Array:
-        """Deformation gradients (N, 3, 3) of body ``index``: current from undeformed shape."""
+        """Deformation gradients (N, 3, 3) of body ``index``: current from undeformed shape.
+
+        Of matter that flows they are fitted to the particles' positions, because its own deformation gradient knows
+        the elastic part only; see ``fitting``.
+        """
+        body = self._body(index)
+        if not body.material.flows:
+            return self.elastic_gradients(index)
+        if index not in self._fits:
+            self._fits[index] = FittedGradients(body.positions)
+        return self._fits[index].gradients(self.positions(index))
+
+    def elastic_gradients(self, index: int) -> Array:
+        """Elastic parts (N, 3, 3) of the deformation gradients of body ``index``, which carry its stress."""
         return self._gather("F", index, np.broadcast_to(np.eye(3), (self._body(index).count, 3, 3)).copy())
+
+    def memories(self, index: int) -> Array:
+        """What the law remembers of each particle (N,): ln J_P of snow, ln of lost contact in sand, ln J of fluids."""
+        body = self._body(index)
+        if not body.material.flows:
+            return np.zeros(body.count)
+        return self._gather("memory", index, np.zeros(body.count))
 
     def _body(self, index: int) -> BodyParticles:
         if not 0 <= index < len(self.bodies):
@@ -305,10 +338,7 @@ class World:
                 masses, self.velocities(i), self.velocity_gradients(i), 1.0 / self._cells.scale
             )
             elastic += diagnostics.elastic_energy(
-                body.volumes,
-                np.full(body.count, body.material.shear_modulus),
-                np.full(body.count, body.material.lame_lambda),
-                self.deformation_gradients(i),
+                body.material, body.volumes, self.elastic_gradients(i), self.memories(i)
             )
             potential -= float(masses @ (self.positions(i) @ np.asarray(self.gravity)))
         return diagnostics.Energy(kinetic=kinetic, elastic=elastic, potential=potential)

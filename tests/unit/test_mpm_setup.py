@@ -9,7 +9,8 @@ import sys
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError
-from physgen.sim.mpm.bodies import BodyParticles, ElasticMaterial
+from physgen.sim.mpm.bodies import BodyParticles
+from physgen.sim.mpm.materials import ElasticMaterial
 from physgen.sim.mpm.options import PADDING_CELLS, Ground, SolverOptions
 from physgen.sim.mpm.placement import fit_similarity
 

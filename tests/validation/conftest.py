@@ -10,7 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.bodies import BodyParticles, ElasticMaterial
+from physgen.sim.mpm.bodies import BodyParticles
+from physgen.sim.mpm.materials import ElasticMaterial
 from physgen.sim.mpm.options import SolverOptions
 from physgen.sim.scene.units import Similarity
 
