@@ -162,7 +162,8 @@ class SandMaterial(ElasticMaterial):
     """Dry granular matter that holds no tension and flows where shear exceeds friction."""
 
     friction_angle: float
-    """Angle of internal friction in radians; above 0, below 1.4."""
+    """Steepest slope that stands, in radians; above 0, up to 1.4. The Drucker–Prager cone is fitted to plane shear, in
+    which a slope fails; a cone fitted to triaxial compression (Klár et al. 2016) would stand some 5 degrees steeper."""
 
     law: ClassVar[int] = SAND
 
@@ -171,9 +172,9 @@ class SandMaterial(ElasticMaterial):
         _in_range(self, "friction_angle", 1e-3, 1.4, "give radians above 0 and up to 1.4")
 
     def _own(self) -> tuple[float, ...]:
-        sine = math.sin(self.friction_angle)
+        # |dev tau| <= -alpha tr tau is shear <= tan(angle) pressure in plane shear with alpha = sqrt(2)/3 tan(angle).
         stiff = (3 * self.lame_lambda + 2 * self.shear_modulus) / (2 * self.shear_modulus)
-        return (math.sqrt(2 / 3) * 2 * sine / (3 - sine) * stiff,)
+        return (math.sqrt(2) / 3 * math.tan(self.friction_angle) * stiff,)
 
 
 @dataclass(frozen=True, kw_only=True)
