@@ -45,6 +45,19 @@ def test_a_thrown_ball_flies_as_it_should(ball_scene, tmp_path):
     assert [m["frame"] for m in metrics] == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_ball_of_clay_is_dented_and_its_skin_follows(ball_scene, tmp_path):
+    """Thrown down at 5 m/s it stays flat at the foot: lower than 95 % of itself, wider than before, whole and above the
+    ground; and it is still as flat a tenth of a second later (1 % of the diameter)."""
+    folder = ball_scene(preset="clay", velocity=(0.0, 0.0, -5.0))
+    bake(folder.root, tmp_path / "bake", QUICK)
+    cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
+    rest, middle, last = (np.ptp(cache.sample(i), axis=0) for i in (0, 3, 5))
+    assert last[2] < 0.95 * rest[2] and last[0] > rest[0]
+    assert np.abs(last - middle).max() < 0.01 * rest[2]
+    assert np.isfinite(cache.sample(5)).all() and cache.sample(5)[:, 2].min() > -0.002
+    assert np.ptp(cache.sample(5), axis=0).max() < 2 * rest.max()
+
+
 def test_nothing_changed_nothing_done(ball_scene, tmp_path):
     folder = ball_scene()
     out = tmp_path / "bake"
