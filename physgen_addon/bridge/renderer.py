@@ -92,6 +92,12 @@ class Renderer:
         if name is None:
             return np.zeros(self._size[::-1], dtype=bool)
         mask = transfer.read_mask(self._folder.file(name))
+        camera = self._scene.camera
+        if mask.shape != (camera.height, camera.width):
+            raise InputError(
+                f"{self._folder.file(name)}: is {mask.shape[1]}×{mask.shape[0]}, the camera's image is "
+                f"{camera.width}×{camera.height}; reconstruct the scene again"
+            )
         return np.asarray(transfer.resized(mask.astype(np.float32), *self._size) > 0.5)
 
     def _samples(self, sample: int) -> Samples:

@@ -95,6 +95,8 @@ def _relay(
             continue
         if line is None:
             process.wait()
+            if final is None and asked_at is not None:
+                raise Cancelled("cancelled while starting; run it again to continue")
             return final
         event = _parse_event(line)
         if event is None:

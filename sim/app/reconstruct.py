@@ -38,6 +38,8 @@ def reconstruct_scene(
     Raises what ``sim.reconstruct.reconstruct`` raises.
     """
     options = options or ReconstructOptions()
+    if not photo.is_file():
+        raise InputError(f"{photo}: there is no such photo; check its name")
     stamp = {"inputs_hash": _inputs_hash(photo, objects, options)}
     if _stamp(out) == stamp:
         try:
@@ -47,8 +49,6 @@ def reconstruct_scene(
         else:
             on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
             return folder
-    if not photo.is_file():
-        raise InputError(f"{photo}: there is no such photo")
     folder = reconstruct(photo, objects, out, options, on_event, cancelled)
     write_json(out / STAMP_FILE, stamp)
     return folder

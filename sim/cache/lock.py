@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,34 +36,47 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 def _acquire(path: Path) -> None:
-    owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode()
-    for _ in range(3):
-        try:
-            descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-        except FileExistsError:
-            _drop_if_dead(path)
-            continue
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(owner)
-        return
+    """Put a whole lock at ``path``: written beside it and linked, so that no one ever reads half of it."""
+    mine = path.with_name(f"{LOCK_FILE}-{os.getpid()}-{uuid.uuid4().hex[:8]}")
+    mine.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
+    try:
+        for _ in range(3):
+            try:
+                os.link(mine, path)
+            except FileExistsError:
+                _drop_if_dead(path)
+                continue
+            return
+    finally:
+        mine.unlink(missing_ok=True)
     raise InputError(f"{path.parent}: another run took this folder just now; wait for it or choose another folder")
 
 
 def _drop_if_dead(path: Path) -> None:
     """Remove the lock of a dead process; InputError for one that lives or cannot be asked."""
+    content = b""
     try:
-        owner = json.loads(path.read_text())
+        content = path.read_bytes()
+        owner = json.loads(content)
         pid, host = int(owner["pid"]), str(owner["host"])
     except FileNotFoundError:
         return
     except (ValueError, KeyError, TypeError):
-        path.unlink(missing_ok=True)
-        return
+        pid, host = 0, socket.gethostname()
     if host != socket.gethostname():
         raise InputError(f"{path.parent}: in use by process {pid} on {host}; if that run is gone, delete {path}")
     if pid != os.getpid() and process_alive(pid):
         raise InputError(f"{path.parent}: in use by process {pid}; wait for it, stop it, or choose another folder")
-    path.unlink(missing_ok=True)
+    # Taken away under a name of its own: of two that find it dead, one gets it, and sees that it is still the same.
+    taken = path.with_name(f"{LOCK_FILE}-dead-{os.getpid()}-{uuid.uuid4().hex[:8]}")
+    try:
+        path.rename(taken)
+        if taken.read_bytes() != content:
+            os.link(taken, path)
+    except (FileNotFoundError, FileExistsError):
+        return
+    finally:
+        taken.unlink(missing_ok=True)
 
 
 def process_alive(pid: int) -> bool:

@@ -67,7 +67,10 @@ class Pc2Reader:
             raise InputError(
                 f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames"
             )
-        return np.array(self._data[index])
+        sample = np.array(self._data[index])
+        if not np.isfinite(sample).all():
+            raise InputError(f"{self.path}: sample {index} has positions that are not finite; bake again")
+        return sample
 
 
 class Pc2Writer:

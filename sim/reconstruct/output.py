@@ -12,6 +12,26 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..scene.folder import SCENE_FILE
+from ..scene.json_fields import read_json
+
+OWN_ENTRIES = frozenset(
+    (SCENE_FILE, "reconstruct.json", "photo.png", "background.png", "masks", "shadows", "holes", "meshes", "light")
+)
+"""What a scene folder of ours holds; anything else in it belongs to somebody."""
+
+
+def _require_own(out: Path) -> None:
+    names = {path.name for path in out.iterdir()}
+    foreign = sorted(names - OWN_ENTRIES)
+    if foreign:
+        raise InputError(f"{out}: holds files that are no scene folder's ({foreign[0]}); choose an empty or new folder")
+    if names:
+        try:
+            data = read_json(out / SCENE_FILE)
+        except InputError:
+            data = None
+        if not isinstance(data, dict) or not str(data.get("format", "")).startswith("physgen-scene/"):
+            raise InputError(f"{out}: holds files that are no scene folder's ({SCENE_FILE}); choose an empty or new folder")
 
 
 @contextmanager
@@ -21,9 +41,9 @@ def replacing_folder(out: Path) -> Iterator[Path]:
     An existing ``out`` is only replaced when it is empty or a scene folder, so that a mistyped path cannot cost
     anyone their files. Raises InputError otherwise, or when the place cannot be written.
     """
+    out = out.resolve()
     if out.is_dir():
-        if any(out.iterdir()) and not (out / SCENE_FILE).is_file():
-            raise InputError(f"{out}: holds files but is no scene folder; choose an empty or new folder")
+        _require_own(out)
     elif out.exists() or out.is_symlink():
         raise InputError(f"{out}: is a file; choose a folder")
     tag = f"{os.getpid()}-{uuid.uuid4().hex[:8]}"

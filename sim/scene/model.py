@@ -307,7 +307,12 @@ class Scene:
 
     def __post_init__(self) -> None:
         _require(len(self.objects) > 0, "objects", (), "a scene needs at least one object")
-        _require(_finite(*self.gravity), "gravity", self.gravity, "give three finite numbers in m/s²")
+        _require(
+            _finite(*self.gravity) and math.hypot(*self.gravity) <= 1e4,
+            "gravity",
+            self.gravity,
+            "give three numbers in m/s², together up to 10000",
+        )
         names = [o.name.casefold() for o in self.objects]
         _require(
             len(set(names)) == len(names),

@@ -141,3 +141,37 @@ def test_a_broken_lock_is_taken_over(tmp_path, content):
     (tmp_path / LOCK_FILE).write_text(content)
     with folder_lock(tmp_path):
         pass
+
+
+def test_a_cache_with_nan_is_refused_where_it_is_read(tmp_path):
+    path = tmp_path / "a.pc2"
+    with Pc2Writer(path, vertex_count=1) as writer:
+        writer.append(np.zeros((1, 3)))
+    content = bytearray(path.read_bytes())
+    content[32:36] = np.float32(np.nan).tobytes()
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="sample 0"):
+        Pc2Reader(path).sample(0)
+
+
+def test_of_many_that_find_a_dead_lock_one_holds_the_folder_at_a_time(tmp_path):
+    code = """
+import sys, time
+from pathlib import Path
+from physgen.sim.cache.lock import folder_lock
+from physgen.sim.errors import InputError
+folder = Path(sys.argv[1])
+for _ in range(40):
+    try:
+        with folder_lock(folder):
+            (folder / "inside").touch(exist_ok=False)
+            time.sleep(0.001)
+            (folder / "inside").unlink()
+    except InputError:
+        pass
+"""
+    (tmp_path / LOCK_FILE).write_text(json.dumps({"pid": 2**22 + 1, "host": socket.gethostname()}))
+    runs = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stderr=subprocess.PIPE) for _ in range(4)]
+    assert [(run.wait(), run.stderr.read()) for run in runs] == [(0, b"")] * 4
+    for run in runs:
+        run.stderr.close()

@@ -270,3 +270,19 @@ def test_options_are_checked(fields):
 def test_requests_are_checked(fields):
     with pytest.raises(InputError):
         ObjectRequest(**{"box": BALL, **fields})
+
+
+def test_a_scene_folder_with_something_of_the_users_in_it_is_not_replaced(photo, tmp_path):
+    out = tmp_path / "scene"
+    reconstruct(photo, [ObjectRequest(box=BALL)], out, QUICK)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        reconstruct(photo, [ObjectRequest(box=CRATE)], out, QUICK)
+    assert (out / "notes.txt").read_text() == "mine" and load_scene(out)
+    stranger = tmp_path / "stranger"
+    stranger.mkdir()
+    for name in ("scene.json", "photo.png"):
+        (stranger / name).write_text("mine")
+    with pytest.raises(InputError, match="no scene folder"):
+        reconstruct(photo, [ObjectRequest(box=BALL)], stranger, QUICK)
+    assert (stranger / "photo.png").read_text() == "mine"

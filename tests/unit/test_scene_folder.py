@@ -51,7 +51,7 @@ def scenes(draw):
         objects=objects,
         effects=effects,
         ground=Ground(friction=draw(st.floats(0, 2, allow_subnormal=False))),
-        gravity=draw(vector),
+        gravity=tuple(g / 1e3 for g in draw(vector)),
         light=Light(),
     )
 
