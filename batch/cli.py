@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import os
 import re
 import signal
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..sim.app.bake_inputs import BakeOptions
-from ..sim.app.reconstruct import reconstruct_scene, set_physics
+from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics
 from ..sim.errors import Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -175,11 +176,12 @@ def _render_request(options: argparse.Namespace, frames: str | None = None) -> p
 
 
 def _run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    pipeline.check_render(_render_request(options), options.out)
     request = pipeline.RunRequest(
         photo=options.photo,
         objects=_object_requests(options),
         video=options.out,
-        work=options.work or options.out.with_name(options.out.stem + "_work"),
+        work=options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work"),
         presets=tuple(options.preset),
         velocities=tuple(options.velocity),
         spins=tuple(options.spin),
@@ -197,16 +199,17 @@ def _run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled
 
 def _reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     requests, settings = _object_requests(options), _reconstruct_options(options)
+    require_physics(len(requests), options.preset, options.velocity, options.spin)
     reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
-    set_physics(options.out, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    set_all_physics(options.out, presets=options.preset, velocities=options.velocity, spins=options.spin)
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0
 
 
 def _bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
-    set_physics(options.scene, presets=options.preset, velocities=options.velocity, spins=options.spin)
-    done = pipeline.bake_stage(options.scene, options.out, _bake_options(options), terminal, cancelled)
+    folder = set_physics(options.scene, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    done = pipeline.bake_stage(folder, options.out, _bake_options(options), terminal, cancelled)
     terminal(done)
     terminal.line(f"bake: {options.out}")
     return 0
@@ -246,12 +249,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run: Command = options.run
         return run(options, terminal, stop.is_set)
-    except Cancelled as error:
-        terminal.error("Cancelled", str(error))
-        return error.exit_code
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code
+    except BrokenPipeError:
+        # Whoever read the output has gone; the stages were stopped on the way here.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return Cancelled.exit_code
 
 
 if __name__ == "__main__":

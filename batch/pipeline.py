@@ -12,13 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..physgen_addon.bridge.options import RenderOptions
 from ..sim.app import worker
-from ..sim.app.bake_inputs import BakeOptions
+from ..sim.app.bake_inputs import BakeOptions, inputs_hash
 from ..sim.app.process import run_stage
-from ..sim.app.reconstruct import reconstruct_scene, set_physics
-from ..sim.errors import RenderError, SimulationError
+from ..sim.app.quality import load_quality
+from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
+from ..sim.errors import InputError, RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.scene.folder import SceneFolder
 from ..sim.scene.model import Vector
 
 RENDER_SCRIPT = Path(__file__).with_name("render.py")
@@ -29,7 +32,7 @@ class RenderRequest:
     """How frames are rendered.
 
     samples: Cycles samples a pixel, None for the default.
-    scale: of the photo's resolution, above 0 to 1.
+    scale: of the photo's resolution, above 0 to 4.
     frames: range such as ``1-48``, ``1,5,9`` or ``1-48x2``; None for all that are baked.
     """
 
@@ -39,13 +42,32 @@ class RenderRequest:
     frames: str | None = None
 
 
-def bake_stage(scene: Path, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled) -> Event:
-    """Bake in the worker process. Raises what ``sim.app.bake.bake`` raises."""
-    job = worker.BakeJob(scene=str(scene.resolve()), out=str(out.resolve()), options=options)
-    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
-        path = Path(folder) / "job.json"
+def bake_stage(
+    folder: SceneFolder, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled
+) -> Event:
+    """Bake the scene that ``folder`` was when it was loaded, in the worker process.
+
+    Raises what ``sim.app.bake.bake`` raises, and InputError when the scene was changed meanwhile.
+    """
+    load_quality(options.quality)
+    job = worker.BakeJob(
+        scene=str(folder.root.resolve()),
+        out=str(out.resolve()),
+        options=options,
+        expected_inputs=inputs_hash(folder, options),
+    )
+    with tempfile.TemporaryDirectory(prefix="physgen-") as temporary:
+        path = Path(temporary) / "job.json"
         path.write_text(json.dumps(worker.job_to_json(job)), encoding="utf-8")
         return run_stage([sys.executable, "-m", worker.MODULE, str(path)], on_event, cancelled, failure=SimulationError)
+
+
+def check_render(request: RenderRequest, video: Path | None) -> None:
+    """Raise InputError for render options or a video name that cannot be used."""
+    samples = RenderOptions().samples if request.samples is None else request.samples
+    RenderOptions(engine=request.engine, scale=request.scale, samples=samples)
+    if video is not None and (video.suffix.lower() != ".mp4" or video.is_dir()):
+        raise InputError(f"video {video}: give a file name that ends in .mp4")
 
 
 def render_stage(
@@ -59,6 +81,7 @@ def render_stage(
     video: Path | None = None,
 ) -> Event:
     """Render frames, and ``video`` from them, in a process that holds bpy."""
+    check_render(request, video)
     command = [
         sys.executable,
         str(RENDER_SCRIPT),
@@ -82,7 +105,8 @@ def render_stage(
 class RunRequest:
     """A whole job. ``work`` keeps ``scene``, ``bake`` and ``frames``; ``video`` is the result.
 
-    presets, velocities, spins: by object, in the order of ``objects``; empty keeps the scene's own.
+    presets, velocities, spins: by object, in the order of ``objects``; what is not given is ``medium`` and at rest, so
+    that the same request always gives the same video. A single preset goes to all objects.
     """
 
     photo: Path
@@ -104,10 +128,16 @@ def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "ba
 
 
 def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
-    """Photo → video. Each stage does nothing when its inputs have not changed."""
+    """Photo → video. Each stage does nothing when its inputs have not changed.
+
+    Everything that can be checked before the first stage is: nobody should wait for a message about the last one.
+    """
+    require_physics(len(request.objects), request.presets, request.velocities, request.spins)
+    load_quality(request.bake.quality)
+    check_render(request.render, request.video)
     scene, bake = request.work / "scene", request.work / "bake"
     reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
-    set_physics(scene, presets=request.presets, velocities=request.velocities, spins=request.spins)
-    bake_stage(scene, bake, request.bake, on_event, cancelled)
+    folder = set_all_physics(scene, presets=request.presets, velocities=request.velocities, spins=request.spins)
+    bake_stage(folder, bake, request.bake, on_event, cancelled)
     render_stage(scene, bake, request.work / "frames", request.render, on_event, cancelled, video=request.video)
     return request.video

@@ -23,6 +23,7 @@ from physgen.batch import demo, pipeline
 from physgen.sim.app.reconstruct import reconstruct_scene, set_physics
 from physgen.sim.cache.manifest import load_manifest
 from physgen.sim.events import ignore, never
+from physgen.sim.scene.folder import load_scene
 
 
 def measure(stage: Callable[[], object]) -> dict[str, float]:
@@ -43,7 +44,7 @@ def run(frames: int | None, out: Path) -> dict[str, object]:
     scene, bake, images = out / "scene", out / "bake", out / "frames"
     stages: dict[str, Callable[[], object]] = {
         "reconstruct": lambda: reconstruct_scene(job.photo, job.objects, scene, job.reconstruct),
-        "bake": lambda: pipeline.bake_stage(scene, bake, job.bake, ignore, never),
+        "bake": lambda: pipeline.bake_stage(load_scene(scene), bake, job.bake, ignore, never),
         "render": lambda: pipeline.render_stage(scene, bake, images, job.render, ignore, never, video=job.video),
     }
     times: dict[str, dict[str, float]] = {}

@@ -77,6 +77,33 @@ def _inputs_hash(photo: Path, objects: Sequence[ObjectRequest], options: Reconst
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def require_physics(
+    objects: int, presets: Sequence[str], velocities: Sequence[Vector], spins: Sequence[Vector]
+) -> None:
+    """Raise InputError when there are more entries than ``objects``, or an unknown preset."""
+    for name, values in (("preset", presets), ("velocity", velocities), ("spin", spins)):
+        if len(values) > objects:
+            raise InputError(f"{name}: {len(values)} given for {objects} objects; give at most one an object")
+    for preset in presets:
+        load_preset(preset)
+
+
+def set_all_physics(
+    root: Path, *, presets: Sequence[str] = (), velocities: Sequence[Vector] = (), spins: Sequence[Vector] = ()
+) -> SceneFolder:
+    """Like ``set_physics``, but objects beyond a list become ``medium`` and are at rest, whatever they were before."""
+    count = len(load_scene(root).scene.objects)
+    if len(presets) != 1:
+        presets = [*presets, *["medium"] * (count - len(presets))]
+    still: Vector = (0.0, 0.0, 0.0)
+    return set_physics(
+        root,
+        presets=presets,
+        velocities=[*velocities, *[still] * (count - len(velocities))],
+        spins=[*spins, *[still] * (count - len(spins))],
+    )
+
+
 def set_physics(
     root: Path, *, presets: Sequence[str] = (), velocities: Sequence[Vector] = (), spins: Sequence[Vector] = ()
 ) -> SceneFolder:
@@ -87,11 +114,7 @@ def set_physics(
     """
     folder = load_scene(root)
     scene = folder.scene
-    for name, values in (("preset", presets), ("velocity", velocities), ("spin", spins)):
-        if len(values) > len(scene.objects):
-            raise InputError(
-                f"{name}: {len(values)} given for {len(scene.objects)} objects; give at most one an object"
-            )
+    require_physics(len(scene.objects), presets, velocities, spins)
     if len(presets) == 1:
         presets = [presets[0]] * len(scene.objects)
     changed = list(scene.objects)

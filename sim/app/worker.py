@@ -12,26 +12,37 @@ import os
 import signal
 import sys
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..errors import InputError, PhysGenError
-from ..events import Event
+from ..errors import Cancelled, InputError, PhysGenError
+from ..events import Event, IsCancelled, OnEvent
+from ..scene.folder import load_scene
 from ..scene.json_fields import parse, read_json, to_json
 from .bake import BakeOptions, bake
+from .bake_inputs import inputs_hash
 
 JOB_FORMAT = "physgen-job/1"
+LAST_GRACE_S = 15.0
+"""Longer than the asker waits before it kills (process.py), for when there is no asker any more."""
 MODULE = __name__ if __name__ != "__main__" else f"{__package__}.worker"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeJob:
-    """One bake. scene, out: absolute folders."""
+    """One bake.
+
+    scene, out: absolute folders.
+    expected_inputs: the ``inputs_hash`` that the asker saw, so that a scene that somebody changes meanwhile is never
+    baked under the wrong name; None takes the scene as it is.
+    """
 
     scene: str
     out: str
     options: BakeOptions = field(default_factory=BakeOptions)
+    expected_inputs: str | None = None
 
 
 def job_to_json(job: BakeJob) -> dict[str, Any]:
@@ -39,7 +50,7 @@ def job_to_json(job: BakeJob) -> dict[str, Any]:
     return {"format": JOB_FORMAT, "use_case": "bake", **to_json(job)}
 
 
-def run_job(path: Path, emit: Any, cancelled: Any) -> Event:
+def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
     """Carry out the job file at ``path``; the event to end with."""
     data = read_json(path)
     if not isinstance(data, dict) or data.pop("format", None) != JOB_FORMAT:
@@ -48,8 +59,18 @@ def run_job(path: Path, emit: Any, cancelled: Any) -> Event:
     if use_case != "bake":
         raise InputError(f"{path}: use_case is {use_case!r}: this version knows 'bake'")
     job = parse(BakeJob, data, str(path))
+    if job.expected_inputs not in (None, inputs_hash(load_scene(Path(job.scene)), job.options)):
+        raise InputError(f"{job.scene}: was changed by another run since this one began; run it again")
     manifest = bake(Path(job.scene), Path(job.out), job.options, emit, cancelled)
     return {"event": "done", "stage": "bake", "out": job.out, "frames": manifest.frames_done}
+
+
+def _end_at_last(cancelled: IsCancelled) -> None:
+    """End the process when it was asked to stop and has not: a single time step can take longer than anyone waits."""
+    while not cancelled():
+        time.sleep(0.5)
+    time.sleep(LAST_GRACE_S)
+    os._exit(Cancelled.exit_code)
 
 
 def main(arguments: list[str]) -> int:
@@ -68,6 +89,7 @@ def main(arguments: list[str]) -> int:
     def cancelled() -> bool:
         return stop.is_set() or os.getppid() != parent
 
+    threading.Thread(target=_end_at_last, args=(cancelled,), daemon=True).start()
     try:
         if len(arguments) != 1:
             raise InputError(f"worker: expected one job file, found {len(arguments)} arguments")

@@ -42,7 +42,7 @@ def _acquire(path: Path) -> None:
     try:
         for _ in range(3):
             try:
-                os.link(mine, path)
+                _publish(mine, path)
             except FileExistsError:
                 _drop_if_dead(path)
                 continue
@@ -50,6 +50,18 @@ def _acquire(path: Path) -> None:
     finally:
         mine.unlink(missing_ok=True)
     raise InputError(f"{path.parent}: another run took this folder just now; wait for it or choose another folder")
+
+
+def _publish(mine: Path, path: Path) -> None:
+    """Make ``path`` a lock with the content of ``mine``; FileExistsError when there is one."""
+    try:
+        os.link(mine, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # exFAT and some network folders know no links.
+        with path.open("xb") as file:
+            file.write(mine.read_bytes())
 
 
 def _drop_if_dead(path: Path) -> None:
@@ -72,7 +84,7 @@ def _drop_if_dead(path: Path) -> None:
     try:
         path.rename(taken)
         if taken.read_bytes() != content:
-            os.link(taken, path)
+            _publish(taken, path)
     except (FileNotFoundError, FileExistsError):
         return
     finally:

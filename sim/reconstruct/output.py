@@ -31,7 +31,7 @@ def _require_own(out: Path) -> None:
         except InputError:
             data = None
         if not isinstance(data, dict) or not str(data.get("format", "")).startswith("physgen-scene/"):
-            raise InputError(f"{out}: holds files that are no scene folder's ({SCENE_FILE}); choose an empty or new folder")
+            raise InputError(f"{out}: holds files that are no scene folder's ({SCENE_FILE}); choose an empty one")
 
 
 @contextmanager

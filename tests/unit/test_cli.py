@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from physgen.batch.cli import build_parser, main
+from physgen.sim.app.bake_inputs import BakeOptions
+from physgen.sim.app.worker import MODULE, BakeJob, job_to_json
 from physgen.sim.cache.manifest import load_manifest
 from physgen.sim.scene.folder import load_scene
 
@@ -86,6 +88,12 @@ def test_help_lists_every_stage(capsys):
         (["bake", "{tmp}", "--out", "{tmp}/b"], "scene.json"),
         (["render", "{tmp}", "--bake", "{tmp}", "--out", "{tmp}/f"], "scene.json"),
         (["reconstruct", "{photo}", "--box", "900,900,999,999", "--out", "{tmp}/s"], "box"),
+        (["run", "{photo}", "--box", "110,90,210,190", "--out", "{tmp}/v.avi"], ".mp4"),
+        (["run", "{photo}", "--box", "110,90,210,190", "--out", "."], ".mp4"),
+        (["run", "{photo}", "--box", "110,90,210,190", "--out", "{tmp}/v.mp4", "--scale", "nan"], "scale"),
+        (["run", "{photo}", "--box", "110,90,210,190", "--out", "{tmp}/v.mp4", "--quality", "best"], "quality"),
+        (["run", "{photo}", "--box", "1,1,9,9", "--out", "{tmp}/v.mp4", "--velocity", "0,0,1", "0,0,2"], "velocity"),
+        (["reconstruct", "{photo}", "--box", "110,90,210,190", "--out", "."], "."),
         (["reconstruct", "{photo}", "--box", "110,90,210,190", "--size", "1", "2", "--out", "{tmp}/s"], "--size"),
     ],
 )
@@ -128,8 +136,13 @@ def test_stages_one_by_one(tmp_path, photo):
     code, events, _ = physgen(*reconstruct, "--preset", "medium")
     assert code == 0 and any("up to date" in e.get("message", "") for e in events)
     assert (scene / ball.mesh).stat().st_mtime_ns == mesh_time
-    physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview")
-    assert load_manifest(bake).inputs_hash != first.inputs_hash
+    again = physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview")
+    assert again[0] == 0 and load_manifest(bake).inputs_hash != first.inputs_hash
+
+    # What is not said is not remembered: the same command gives the same scene, whatever ran before.
+    physgen(*reconstruct)
+    ball = load_scene(scene).scene.objects[0]
+    assert (ball.material.preset, ball.velocity) == ("medium", (0.0, 0.0, 0.0))
 
     # The same again: nothing.
     code, events, _ = physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview", "--json")
@@ -151,3 +164,22 @@ def test_the_demo_names_a_photo_that_is_there():
     image = cv2.imread(str(job.photo))
     assert image.shape == (400, 600, 3) and config.frames >= 48
     assert all(0 <= b[0] < b[2] <= 600 and 0 <= b[1] < b[3] <= 400 for b in config.boxes)
+
+
+def test_a_reader_that_leaves_is_no_crash(photo, tmp_path):
+    line = [sys.executable, "-m", "physgen.batch.cli", "reconstruct", str(photo), "--box", "105,85,215,195", "--json"]
+    process = subprocess.Popen([*line, "--out", str(tmp_path / "s")], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    errors = process.stderr.read()
+    process.stderr.close()
+    assert process.wait() == 130 and b"Traceback" not in errors, errors
+
+
+def test_a_bake_is_of_the_scene_that_was_asked_for(photo, tmp_path):
+    scene = tmp_path / "scene"
+    physgen("reconstruct", photo, "--box", "105,85,215,195", "--out", scene)
+    job = BakeJob(scene=str(scene), out=str(tmp_path / "b"), options=BakeOptions(frames=2), expected_inputs="0" * 64)
+    (tmp_path / "job.json").write_text(json.dumps(job_to_json(job)))
+    command = [sys.executable, "-m", MODULE, str(tmp_path / "job.json")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 3 and "changed by another run" in json.loads(result.stdout.splitlines()[-1])["message"]
