@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 import re
 import signal
 import sys
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics
-from ..sim.errors import Cancelled, InputError, PhysGenError
+from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.materials import preset_names
@@ -248,14 +247,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     terminal = Terminal(as_json=options.json, expected_s=expected)
     try:
         run: Command = options.run
-        return run(options, terminal, stop.is_set)
+        return run(options, terminal, lambda: stop.is_set() or terminal.reader_gone)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code
-    except BrokenPipeError:
-        # Whoever read the output has gone; the stages were stopped on the way here.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return Cancelled.exit_code
 
 
 if __name__ == "__main__":

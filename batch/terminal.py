@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from typing import TextIO
@@ -24,6 +25,7 @@ class Terminal:
         # Stages that have not begun yet count with a first guess, so that the time left is of the whole job.
         self._left = dict(expected_s or {})
         self._last_line = 0.0
+        self.reader_gone = False
         self._open_line = False
 
     def __call__(self, event: Event) -> None:
@@ -37,12 +39,20 @@ class Terminal:
                 self._left[stage] = 0.0
             event = {**event, "job_eta_s": round(sum(self._left.values()), 1)}
         if self._json:
-            self._out.write(json.dumps(event, ensure_ascii=False) + "\n")
-            self._out.flush()
+            self._write(json.dumps(event, ensure_ascii=False) + "\n")
         elif kind == "progress":
             self._progress(event, stage)
         elif "message" in event:
             self.line(f"{stage + ': ' if stage else ''}{event['message']}")
+
+    def _write(self, text: str) -> None:
+        try:
+            self._out.write(text)
+            self._out.flush()
+        except BrokenPipeError:
+            # As after ``physgen … | head -1``: nobody listens any more, which is a wish to stop and no crash.
+            self.reader_gone = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._out.fileno())
 
     def _progress(self, event: Event, stage: str) -> None:
         done, total = int(event["done"]), int(event["total"])
@@ -55,25 +65,22 @@ class Terminal:
         left = _clock(float(event["job_eta_s"]))
         text = f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} gone, about {left} left"
         if self._live:
-            self._out.write("\r\x1b[K" + text + ("\n" if finished else ""))
+            self._write("\r\x1b[K" + text + ("\n" if finished else ""))
             self._open_line = not finished
         else:
-            self._out.write(text + "\n")
-        self._out.flush()
+            self._write(text + "\n")
 
     def line(self, text: str) -> None:
         """Print one line of text, below a progress line that is being renewed."""
         if self._json:
             return
-        self._out.write(("\n" if self._open_line else "") + text + "\n")
+        self._write(("\n" if self._open_line else "") + text + "\n")
         self._open_line = False
-        self._out.flush()
 
     def error(self, kind: str, message: str) -> None:
         """Report the error that ends the run."""
         if self._json:
-            self._out.write(json.dumps({"event": "error", "kind": kind, "message": message}, ensure_ascii=False) + "\n")
-            self._out.flush()
+            self._write(json.dumps({"event": "error", "kind": kind, "message": message}, ensure_ascii=False) + "\n")
         else:
             sys.stderr.write(("\n" if self._open_line else "") + f"error: {message}\n")
 
