@@ -8,9 +8,11 @@ from pathlib import Path
 
 import bpy
 
+from ...sim.app.bake_inputs import geometry_hash
 from ...sim.cache.manifest import BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
+from ...sim.scene.folder import SceneFolder
 from ...sim.scene.model import Scene
 
 MODIFIER = "PhysGen cache"
@@ -51,6 +53,15 @@ def open_bake(folder: Path, scene: Scene) -> Bake:
             raise InputError(f"{cache.path}: holds no sample yet; let the bake run on")
         caches.append(cache)
     return Bake(folder=folder, manifest=manifest, caches=tuple(caches))
+
+
+def require_scene(bake: Bake, folder: SceneFolder) -> None:
+    """Raise InputError when ``bake`` was made from other meshes, or from the same in another place."""
+    known = bake.manifest.geometry_hash
+    if known and known != geometry_hash(folder):
+        raise InputError(
+            f"{bake.folder}: was baked from other meshes or poses than {folder.root} has now; bake the scene again"
+        )
 
 
 def require_fit(cache: Pc2Reader, vertex_count: int, name: str) -> None:

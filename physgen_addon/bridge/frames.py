@@ -41,6 +41,7 @@ def render_frames(
     """
     options = options or RenderOptions()
     opened = caches.open_bake(bake, scene.scene)
+    caches.require_scene(opened, scene)
     for source, cache in zip(scene.scene.objects, opened.caches, strict=True):
         caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
     numbers = parse_range(frames, opened.first_frame, opened.last_frame)

@@ -25,7 +25,7 @@ from ..scene.folder import SceneFolder, load_scene
 from ..scene.meshes import ObjectMesh, load_object_mesh
 from ..skinning.binding import Binding, bind, deform
 from ..version import VERSION
-from .bake_inputs import BakeOptions, inputs_hash
+from .bake_inputs import BakeOptions, geometry_hash, inputs_hash
 
 __all__ = ["BakeOptions", "bake", "is_up_to_date"]
 
@@ -114,6 +114,7 @@ def _bake_locked(
         engine=simulation.engine_name,
         version=VERSION,
         particles=simulation.particle_count,
+        geometry_hash=geometry_hash(folder),
         objects=tuple(
             BakedObject(name=item.name, file=f"{item.name}.pc2", vertices=len(mesh.vertices))
             for item, mesh in zip(folder.scene.objects, meshes, strict=True)

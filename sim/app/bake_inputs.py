@@ -63,6 +63,12 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def geometry_hash(folder: SceneFolder) -> str:
+    """SHA-256 over the objects' names, meshes and rest poses: what a bake must share with the scene it is shown in."""
+    content = [[o.name, file_hash(folder.file(o.mesh)), o.world_from_mesh] for o in folder.scene.objects]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
 def file_hash(path: Path) -> str:
     """SHA-256 of a file's bytes; InputError when it cannot be read."""
     try:

@@ -33,6 +33,8 @@ class BakeManifest:
     fps, frame_start, frames: frame ``frame_start + i`` is sample ``i`` at ``i / fps`` seconds.
     frames_done: samples that every cache holds.
     particles: simulated particles of all objects together.
+    geometry_hash: SHA-256 over the objects' meshes and where they stand (sim/app/bake_inputs.py: geometry_hash), by
+        which a bake of another scene is told; empty when not known.
     """
 
     inputs_hash: str
@@ -45,6 +47,7 @@ class BakeManifest:
     version: str
     particles: int
     objects: tuple[BakedObject, ...]
+    geometry_hash: str = ""
 
     def __post_init__(self) -> None:
         if self.state not in STATES:

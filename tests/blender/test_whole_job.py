@@ -2,6 +2,7 @@
 """``physgen run`` as a user has it: photo → video in real processes, again, changed, stopped and killed."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -131,6 +132,19 @@ def test_a_stopped_run_goes_on(job, photo, tmp_path, how):
     assert sorted(p.name for p in (work / "frames").glob("*.png")) == [f"{i:04d}.png" for i in range(1, FRAMES + 1)]
     assert (work / "ball.mp4").is_file()
     assert not [p for p in work.rglob(".*") if "partial" in p.name]
+
+
+def test_a_bake_of_another_scene_is_refused(job, tmp_path):
+    work, _ = job
+    shutil.copytree(work / "scene", tmp_path / "scene")
+    path = tmp_path / "scene" / "scene.json"
+    data = json.loads(path.read_text())
+    data["objects"][0]["world_from_mesh"][0][3] += 0.2
+    path.write_text(json.dumps(data))
+    render = ["render", tmp_path / "scene", "--bake", work / "bake", "--out", tmp_path / "frames", "--samples", "4"]
+    line = [sys.executable, "-m", "physgen.batch.cli", *map(str, render)]
+    result = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert result.returncode == 3 and "bake the scene again" in result.stderr
 
 
 def test_a_full_disk_is_named(job, tmp_path):
