@@ -38,7 +38,6 @@ ADVANCE_PARTS = 4
 a time, so that the same input gives the same bytes."""
 
 METRICS_FILE = "metrics.json"
-EVENTS_FILE = "events.jsonl"
 
 
 def is_up_to_date(scene_root: Path, out: Path, options: BakeOptions) -> bool:
@@ -271,7 +270,7 @@ def _remove_previous(out: Path) -> None:
         return
     for item in previous.objects:
         (out / item.file).unlink(missing_ok=True)
-    for name in (CHECKPOINT_FILE, METRICS_FILE, EVENTS_FILE):
+    for name in (CHECKPOINT_FILE, METRICS_FILE):
         (out / name).unlink(missing_ok=True)
 
 

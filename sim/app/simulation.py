@@ -22,7 +22,7 @@ from ..mpm.materials import (
     SnowMaterial,
     VonMisesMaterial,
 )
-from ..mpm.options import PADDING_CELLS, Ground, SolverOptions
+from ..mpm.options import PADDING_CELLS, SolverOptions
 from ..mpm.placement import fit_similarity
 from ..mpm.sampling import sample_interior
 from ..mpm.world import World
@@ -99,8 +99,7 @@ def build_world(
         scene, [meshes[i] for i in moving], [scene.objects[i] for i in moving], quality, options
     )
     bodies = [_body(scene.objects[i], meshes[i], solver, similarity, options.seed) for i in moving]
-    ground = Ground(point=scene.ground.point, normal=scene.ground.normal, friction=scene.ground.friction)
-    world = World(bodies=bodies, ground=ground, gravity=scene.gravity, similarity=similarity, options=solver)
+    world = World(bodies=bodies, ground=scene.ground, gravity=scene.gravity, similarity=similarity, options=solver)
     if world.arch != options.arch:
         progress.notice(f"{options.arch} is not available here; simulating on {world.arch}")
     count = sum(body.count for body in bodies)
@@ -190,7 +189,6 @@ def _resolution(
     largest = 0.4 * (GRIDS[-1] - 2 * PADDING_CELLS) * cell
     margin = min(largest, max([*lengths, *(_reach(scene, item, options) for item in items)]))
     points = [mesh.vertices for mesh in meshes]
-    ground = Ground(point=scene.ground.point, normal=scene.ground.normal, friction=scene.ground.friction)
     low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
     room = float((high - low).max()) + 2 * margin
     for grid in [quality.grid] if quality.grid else GRIDS:
@@ -198,7 +196,9 @@ def _resolution(
         if (grid - 2 * PADDING_CELLS) * cell >= room or grid == (quality.grid or GRIDS[-1]):
             break
     # ``fit_similarity`` makes cells coarser where even the largest grid has no room at the wanted size.
-    fitted = fit_similarity(points, ground, motion_margin=margin, cells_across=max(lengths) / cell, options=solver)
+    fitted = fit_similarity(
+        points, scene.ground, motion_margin=margin, cells_across=max(lengths) / cell, options=solver
+    )
     return solver, fitted
 
 
