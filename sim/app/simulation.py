@@ -155,7 +155,7 @@ def engine_material(material: Material) -> ElasticMaterial:
     m = material
     if m.law == "fluid":
         return FluidMaterial(density=m.density, bulk_modulus=m.bulk_modulus, viscosity=m.viscosity)
-    solid = {
+    solid: dict[str, Any] = {
         "density": m.density,
         "youngs_modulus": m.youngs_modulus,
         "poisson_ratio": m.poisson_ratio,

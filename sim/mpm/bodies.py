@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .materials import ElasticMaterial
+from .colliders import Surface
+from .contacts import GROUND_NAME
+from .forces import NO_FORCES, BodyForces
+from .materials import ElasticMaterial, RigidMaterial
+from .tracks import Track
 
 Vector = tuple[float, float, float]
 
@@ -28,8 +32,46 @@ class BodyParticles:
     volumes: NDArray[np.float64]
     """Volume of each particle (N,), m³, above 0."""
 
-    material: ElasticMaterial
-    """The whole body's material: any of ``materials``."""
+    material: ElasticMaterial | RigidMaterial
+    """What the body is made of: any of ``materials``."""
+
+    materials: tuple[ElasticMaterial, ...] = ()
+    """More materials in the same body, for the particles that ``material_index`` sends there; none may be rigid."""
+
+    material_index: NDArray[np.int32] | None = None
+    """Material of each particle (N,): 0 is ``material``, i is ``materials[i - 1]``. None: all of ``material``."""
+
+    density_scale: NDArray[np.float64] | None = None
+    """Factor (N,) on the density of each particle, above 0; None: 1."""
+
+    stiffness_scale: NDArray[np.float64] | None = None
+    """Factor (N,) on the moduli of each particle, above 0; None: 1."""
+
+    surface: Surface | None = None
+    """The body's skin at rest, world metres; a rigid body needs it."""
+
+    forces: BodyForces = NO_FORCES
+    """What acts on the body besides gravity and contact."""
+
+    acceleration: Track | None = None
+    """Force over mass of the whole body over time, (K, 3) m/s²."""
+
+    velocity_keys: Track | None = None
+    """At each of its times the body as a whole is given the velocity (3,) in m/s: what it has is changed by the same
+    amount everywhere. Between the times it moves freely."""
+
+    pins: NDArray[np.bool_] | None = None
+    """Particles (N,) held in place, or where ``pin_motion`` takes them. Not of rigid bodies."""
+
+    pin_motion: Track | None = None
+    """Way (K, 3) in metres of all pinned particles from their places at rest, over time; None holds them there."""
+
+    goal_stiffness: float = 0.0
+    """Pull of every particle to its place at rest (moved with ``pin_motion``), force over mass and distance in 1/s²,
+    0 (none) to 1e6."""
+
+    goal_damping: float = 0.0
+    """Share of critical damping of the pull to the goal, 0 to 1."""
 
     contact_radii: NDArray[np.float64] | None = None
     """Distance (N,) in metres at which a particle touches the ground: its distance to the body's surface, at most half
@@ -74,6 +116,7 @@ class BodyParticles:
             f"give {len(positions)} finite metres, none below 0",
         )
         object.__setattr__(self, "contact_radii", radii)
+        self._check_fields(len(positions))
         for field in ("velocity", "spin"):
             vector = getattr(self, field)
             self._require(
@@ -85,6 +128,42 @@ class BodyParticles:
             self.start_time,
             "give seconds, 0 or more",
         )
+
+    def _check_fields(self, count: int) -> None:
+        """The fields that a particle or a time has values of its own for."""
+        for field in ("density_scale", "stiffness_scale"):
+            scale = getattr(self, field)
+            if scale is not None:
+                scale = np.ascontiguousarray(scale, dtype=np.float64)
+                good = scale.shape == (count,) and bool(np.isfinite(scale).all() and (scale > 0).all())
+                self._require(good, field, scale.shape, f"give {count} finite numbers above 0")
+                object.__setattr__(self, field, scale)
+        if self.material_index is not None:
+            index = np.ascontiguousarray(self.material_index, dtype=np.int32)
+            good = index.shape == (count,) and bool((index >= 0).all() and (index <= len(self.materials)).all())
+            self._require(good, "material_index", index.shape, f"give {count} numbers from 0 to {len(self.materials)}")
+            object.__setattr__(self, "material_index", index)
+        if self.pins is not None:
+            pins = np.ascontiguousarray(self.pins, dtype=np.bool_)
+            self._require(pins.shape == (count,), "pins", pins.shape, f"give {count}, one a particle")
+            object.__setattr__(self, "pins", pins)
+        for field in ("acceleration", "velocity_keys", "pin_motion"):
+            track = getattr(self, field)
+            if track is not None:
+                self._require(track.values.shape[1:] == (3,), field, track.values.shape, "give values (K, 3)")
+        for field, high in (("goal_stiffness", 1e6), ("goal_damping", 1.0)):
+            value = getattr(self, field)
+            self._require(math.isfinite(value) and 0 <= value <= high, field, value, f"give 0 to {high:g}")
+        self._require(self.name != GROUND_NAME, "name", self.name, "choose another, this one is the ground's")
+        if self.rigid:
+            self._require(self.surface is not None, "surface", None, "give the mesh of a rigid body")
+            held = self.pins is not None or self.goal_stiffness > 0 or bool(self.materials)
+            self._require(not held, "pins, goals and materials", "given", "leave them out of a rigid body")
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the body moves as one."""
+        return isinstance(self.material, RigidMaterial)
 
     def _require(self, condition: bool, field: str, value: object, remedy: str) -> None:
         if not condition:
@@ -98,12 +177,15 @@ class BodyParticles:
     @property
     def masses(self) -> NDArray[np.float64]:
         """Mass of each particle (N,), kg."""
-        return self.volumes * self.material.density
+        density = np.full(self.count, self.material.density)
+        if self.material_index is not None:
+            density = np.array([self.material.density, *(m.density for m in self.materials)])[self.material_index]
+        return self.volumes * density if self.density_scale is None else self.volumes * density * self.density_scale
 
     @property
     def center_of_mass(self) -> NDArray[np.float64]:
         """Centre of mass (3,), world metres."""
-        return np.average(self.positions, axis=0, weights=self.volumes)
+        return np.average(self.positions, axis=0, weights=self.masses)
 
     @property
     def initial_velocities(self) -> NDArray[np.float64]:

@@ -44,12 +44,23 @@ class ElasticMaterial:
     """Kelvin–Voigt retardation time viscosity / modulus in s; 0 (none) or more. A vibration of angular frequency w
     decays at the rate damping_time w² / 2; long times cost substeps."""
 
+    fibre_modulus: float = 0.0
+    """Extra Young's modulus in Pa along ``fibre_axis``, 0 (none) to 1e12: fibres that pull and push, psi = k/2 (s-1)²
+    with their stretch s."""
+
+    fibre_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector of the fibres in the undeformed body, world axes."""
+
     law: ClassVar[int] = FIXED_COROTATED
 
     def __post_init__(self) -> None:
         self._above_zero("density", "youngs_modulus")
         _in_range(self, "poisson_ratio", 0.0, math.nextafter(0.5, 0.0), "give 0 or more and less than 0.5")
         _in_range(self, "damping_time", 0.0, 1e3, "give seconds from 0 to 1000")
+        _in_range(self, "fibre_modulus", 0.0, 1e12, "give pascals from 0 to 1e12")
+        axis = self.fibre_axis
+        if len(axis) != 3 or not abs(math.hypot(*axis) - 1.0) < 1e-3:
+            raise InputError(f"material fibre_axis is {axis!r}: give a unit vector")
 
     def _above_zero(self, *fields: str) -> None:
         for field in fields:
@@ -216,6 +227,18 @@ class FluidMaterial(ElasticMaterial):
     def bulk_number(self) -> float:
         """The bulk modulus in Pa."""
         return self.bulk_modulus
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidMaterial:
+    """A body that does not deform. Raises InputError on a value out of range."""
+
+    density: float
+    """Mass density in kg/m³; above 0."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.density) and self.density > 0):
+            raise InputError(f"material density is {self.density!r}: give a finite number above 0")
 
 
 def bounding_speed(wave_speed: float, diffusivity: float) -> float:

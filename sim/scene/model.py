@@ -102,12 +102,16 @@ class Camera:
 class Ground:
     """The supporting plane. ``normal`` is a unit vector that points to the side on which objects stand.
 
-    friction: Coulomb coefficient, 0 (ice) and up; 0.4 is wood on wood.
+    friction: Coulomb's kinetic coefficient, 0 (ice) and up; 0.4 is wood on wood.
+    static_friction: Coulomb's static coefficient, not below ``friction``; None takes ``friction``.
+    restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1.
     """
 
     point: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
     friction: float = 0.4
+    static_friction: float | None = None
+    restitution: float = 0.0
 
     def __post_init__(self) -> None:
         _require(_finite(*self.point), "ground.point", self.point, "give three finite numbers in metres")
@@ -117,7 +121,20 @@ class Ground:
             self.normal,
             "give a unit vector",
         )
-        _require(_finite(self.friction) and self.friction >= 0, "ground.friction", self.friction, "give 0 or more")
+        _require(_finite(self.friction) and 0 <= self.friction <= 10, "ground.friction", self.friction, "give 0 to 10")
+        static = self.static_friction
+        _require(
+            static is None or (_finite(static) and self.friction <= static <= 10),
+            "ground.static_friction",
+            static,
+            "give friction or more, up to 10, or null",
+        )
+        _require(
+            _finite(self.restitution) and 0 <= self.restitution <= 1,
+            "ground.restitution",
+            self.restitution,
+            "give 0 to 1",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

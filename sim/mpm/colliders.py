@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""Surfaces that bodies hit and that no body moves: static, moving, deforming. No Taichi."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .contacts import GROUND_NAME
+from .tracks import Track
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """A closed triangle mesh: vertices (V, 3) in metres, faces (T, 3). Raises InputError on bad shapes or numbers.
+
+    Whether it is closed is checked where it matters, by ``distance.signed_distance``.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.asarray(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) == 0 or not np.isfinite(vertices).all():
+            raise InputError(f"surface vertices have shape {vertices.shape}: give finite (V, 3), V above 0")
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
+            raise InputError(f"surface faces have shape {faces.shape}: give whole numbers (T, 3), T above 0")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"surface faces name vertex {int(faces.max())}: there are {len(vertices)}, counted from 0")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Collider:
+    """A surface that bodies hit.
+
+    name: what messages and the table of contacts call it.
+    surface: at rest, world metres.
+    translations: Track of (3,) metres added to the surface, or None.
+    rotations: Track of rotation vectors (3,) in radians (axis times angle) about ``pivot``, or None. Between keyframes
+        the turn is steady about the axis that leads from one to the next.
+    pivot: world point about which it turns; None takes the middle of the surface's bounding box.
+    vertices: Track of (V, 3) world metres for a surface that deforms, in place of translations and rotations.
+    """
+
+    name: str
+    surface: Surface
+    translations: Track | None = None
+    rotations: Track | None = None
+    pivot: tuple[float, float, float] | None = None
+    vertices: Track | None = None
+
+    def __post_init__(self) -> None:
+        if self.name == GROUND_NAME:
+            raise InputError(f"collider name is {GROUND_NAME!r}: choose another, this one is the ground's")
+        for field in ("translations", "rotations"):
+            track = getattr(self, field)
+            if track is not None and track.values.shape[1:] != (3,):
+                raise InputError(f"collider {self.name!r}: {field} has values {track.values.shape}: give (K, 3)")
+        if self.vertices is not None:
+            if self.translations is not None or self.rotations is not None:
+                raise InputError(f"collider {self.name!r}: give vertices or translations and rotations, not both")
+            if self.vertices.values.shape[1:] != self.surface.vertices.shape:
+                raise InputError(
+                    f"collider {self.name!r}: vertices has values {self.vertices.values.shape}: give (K, V, 3) with "
+                    f"V = {len(self.surface.vertices)}, the surface's"
+                )
+        if self.pivot is not None and not all(math.isfinite(c) for c in self.pivot):
+            raise InputError(f"collider {self.name!r}: pivot is {self.pivot!r}: give three finite numbers")
+
+    @property
+    def middle(self) -> Array:
+        """The world point (3,) about which it turns."""
+        if self.pivot is not None:
+            return np.asarray(self.pivot, dtype=np.float64)
+        return np.asarray(0.5 * (self.surface.vertices.min(axis=0) + self.surface.vertices.max(axis=0)))
