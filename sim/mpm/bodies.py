@@ -41,6 +41,10 @@ class BodyParticles:
     material_index: NDArray[np.int32] | None = None
     """Material of each particle (N,): 0 is ``material``, i is ``materials[i - 1]``. None: all of ``material``."""
 
+    material_track: tuple[tuple[float, int], ...] = ()
+    """(time s, index), in rising order: from that time on all particles are of that material, counted as in
+    ``material_index``."""
+
     density_scale: NDArray[np.float64] | None = None
     """Factor (N,) on the density of each particle, above 0; None: 1."""
 
@@ -143,6 +147,11 @@ class BodyParticles:
             good = index.shape == (count,) and bool((index >= 0).all() and (index <= len(self.materials)).all())
             self._require(good, "material_index", index.shape, f"give {count} numbers from 0 to {len(self.materials)}")
             object.__setattr__(self, "material_index", index)
+        for time, index in self.material_track:
+            good = math.isfinite(time) and 0 <= index <= len(self.materials)
+            self._require(good, "material_track", (time, index), f"give seconds and 0 to {len(self.materials)}")
+        times = [time for time, _ in self.material_track]
+        self._require(times == sorted(times), "material_track", times, "give the times in rising order")
         if self.pins is not None:
             pins = np.ascontiguousarray(self.pins, dtype=np.bool_)
             self._require(pins.shape == (count,), "pins", pins.shape, f"give {count}, one a particle")

@@ -2,16 +2,22 @@
 # ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
-"""Coulomb contact with the ground plane, resolved at the particles.
+"""Coulomb contact with the ground plane and with solids, and pins, resolved at the particles.
 
-Zeroing the velocity of nodes below the plane stops a body up to a cell too early, because a particle feels nodes 1.5
-cells away. Here the unknowns are one contact impulse m_p a_p per particle near the plane, spread to the nodes with the
-particle's own weights (so momentum is exact), and the conditions hold at the particles, whose distance to the plane is
-known far below a cell:
+Zeroing the velocity of nodes below a surface stops a body up to a cell too early, because a particle feels nodes 1.5
+cells away. Here the unknowns are one contact impulse m_p a_p per particle near a surface, spread to the nodes with the
+particle's own weights (so momentum is exact), and the conditions hold at the particles, whose distance to the surface
+is known far below a cell:
 
-    phi_p = n . (x_p - x_0) - r_p            r_p: contact radius, the particle's distance to its body's surface
+    phi_p = distance(x_p) - r_p              r_p: contact radius, the particle's distance to its body's surface
     a_n >= 0,   v_n + phi_p / dt >= 0,   one of the two an equality         (no attraction, no penetration)
-    |a_t| <= mu a_n,   v_t = 0 inside the cone                              (Coulomb)
+    |a_t| <= mu_s a_n,   v_t = 0 inside the cone, mu_k a_n beyond it        (Coulomb; v against the surface's velocity)
+
+Where the pair's restitution e is above 0, the share e of a_n comes from a spring on the depth instead, which gives back
+the energy of the layer that the inelastic condition stops.
+
+Of the surfaces around a particle the nearest is treated so; the next one only pushes. A pin is a surface that holds
+the particle from all sides.
 
 One projected Jacobi sweep a substep, started from the impulses of the last substep, which the particles have already
 added to the grid. The sweep divides by the row sums of the contact matrix W M^-1 W^T (the share of contacting mass at
@@ -22,132 +28,229 @@ import taichi as ti
 
 from .layout import (
     BLOCK_NODES,
+    CONTROL_ROW,
+    ELAPSED,
+    FIELD_INTEGERS,
+    FIRST_TOUCH,
     FIXED_ONE,
+    FULL,
+    HAS_ANCHORS,
+    HAS_PLANE,
+    MODE,
+    PHASE,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
+    RECOVERY_SPEED,
+    RESTITUTION,
+    SEPARATE,
+    SLIDING,
+    SLIP,
+    SPEED,
     SPREAD,
+    STEP,
+    STICKING,
+    TOUCH_ROW,
     WINDOW_NODES,
+    WORLD,
+    WORLD_ROW,
     Cells,
+    Doubles,
     Integers,
     Scalars,
     Vectors4,
     vec3,
     vec4,
 )
-from .transfer import load_window, weights
+from .transfer import PIN, add_windows_where, anchor_place, load_window, weights
 
 RECOVERY = 0.2
 """Share of a particle's depth that one substep may take back."""
 
+LEAST_REACH = 0.02
+"""Cells from a surface within which a particle at rest takes part in the contact."""
+
+SPRING = 0.15
+"""Share of a particle's depth, in velocity times substep, that an elastic contact gives back each substep: the spring
+of a layer one cell thick where waves travel 0.39 cells a substep, hence as stable as the body itself."""
+
+REACH_FACTOR = 1.5
+"""Steps of the fastest particle within which a particle takes part in the contact."""
+
+HOLD = 0.1
+"""Cells within which surfaces that must not part count as touching."""
+
+
+@ti.func
+def coulomb(wanted: vec3, normal_size: ti.f32, sticking: ti.f32, sliding: ti.f32):
+    """The tangential impulse ``wanted`` to hold the surfaces together, as far as friction on ``normal_size`` allows."""
+    size = wanted.norm()
+    result = wanted
+    if size > sticking * normal_size:
+        result = wanted * (sliding * normal_size / size)
+    return result
+
+
+@ti.func
+def press(
+    old: vec3,
+    velocity: vec3,
+    phi: ti.f32,
+    normal: vec3,
+    share: ti.f32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    touch: ti.i32,
+    touches: Scalars,
+):
+    """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away."""
+    v_n = velocity.dot(normal)
+    wanted = -phi / dt
+    if phi < 0.0:
+        wanted = ti.min(RECOVERY * wanted, recovery)
+    old_n = old.dot(normal)
+    elastic = touches[touch + RESTITUTION]
+    new_n = (1.0 - elastic) * (old_n + (wanted - v_n) / share) + elastic * (SPRING * ti.max(0.0, -phi) / (dt * share))
+    new_t = old - old_n * normal - (velocity - v_n * normal) / share
+    mode = ti.cast(touches[touch + MODE], ti.i32)
+    if mode == SEPARATE or phi > HOLD:
+        new_n = ti.max(0.0, new_n)
+        new_t = coulomb(new_t, new_n, touches[touch + STICKING], touches[touch + SLIDING])
+    elif mode == SLIP:
+        new_t *= 0.0
+    return new_n * normal + new_t
+
 
 @ti.func
 def solve_contact(
-    ground_blocks: ti.i32,
-    dt: ti.f32,
-    reach: ti.f32,
-    recovery_speed: ti.f32,
-    friction: ti.f32,
-    normal: vec3,
-    offset: ti.f32,
-    ground_p: Integers,
-    block_cells: Cells,
+    near_blocks: ti.i32,
+    near_p: Integers,
+    p_cells: Cells,
+    p_field: Integers,
     starts: Integers,
     neighbours: Integers,
+    field_integers: Integers,
+    fields: Scalars,
+    world_integers: Integers,
+    worlds: Scalars,
+    touches: Scalars,
+    control: Doubles,
     x: Cells,
     constants: Vectors4,
+    anchors: Vectors4,
     reaction: Vectors4,
     window: Vectors4,
     nodes: Vectors4,
     scattered: Vectors4,
+    touched: Integers,
 ):
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
 
-    reach: particles farther than this many cells from the plane cannot touch it in this substep.
-    recovery_speed: fastest speed (cells/s) at which a sunk particle may be pushed out, so that nothing is launched.
+    touched: per particle block 1 where something was scattered.
     """
-    for ss in range(ground_blocks * SPREAD):
+    for ss in range(near_blocks * SPREAD):
         if ss % SPREAD == 0:
-            s = ss // SPREAD
-            k = ground_p[s]
-            load_window(k, neighbours, window, nodes)
-            for i in range(WINDOW_NODES):
-                scattered[k * WINDOW_NODES + i] = vec4(0.0)
-            level = normal.dot(ti.cast(block_cells[k] * 4 - 1, ti.f32)) - offset
-            for p in range(starts[k], starts[k + 1]):
-                gp = ti.cast(x[p], ti.f32) * (1.0 / FIXED_ONE)
-                fixed = constants[p]
-                phi = level + normal.dot(gp) - fixed[3]
-                past = reaction[p]
-                old = dt * vec3(past[0], past[1], past[2])
-                if phi < reach or old.norm_sqr() > 0.0:
-                    base = ti.cast(gp - 0.5, ti.i32)
-                    fx = gp - ti.cast(base, ti.f32)
-                    w = weights(fx)
-                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
-                    u = vec4(0.0)
-                    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                        u += (w[i][0] * w[j][1] * w[m][2]) * window[first + (i * 64 + j * 8 + m)]
-                    share = 1.0
-                    if old.norm_sqr() > 0.0 and past[3] > 0.0:
-                        share = ti.max(past[3], 0.02)
-                    velocity = vec3(u[0], u[1], u[2])
-                    v_n = velocity.dot(normal)
-                    v_t = velocity - v_n * normal
-                    wanted = -phi / dt
-                    if phi < 0.0:
-                        wanted = ti.min(RECOVERY * wanted, recovery_speed)
-                    old_n = old.dot(normal)
-                    new_n = ti.max(0.0, old_n + (wanted - v_n) / share)
-                    new_t = old - old_n * normal - v_t / share
-                    length = new_t.norm()
-                    if length > friction * new_n:
-                        new_t *= friction * new_n / length
-                    new = new_n * normal + new_t
-                    reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
-                    if new_n > 0.0 or old_n > 0.0:
-                        change = fixed[0] * (new - old)
-                        mass = ti.select(new_n > 0.0, fixed[0], 0.0)
-                        q = vec4(change[0], change[1], change[2], mass)
+            k = near_p[ss // SPREAD]
+            f = p_field[k]
+            w = field_integers[f * FIELD_INTEGERS + WORLD]
+            c = w * CONTROL_ROW
+            touched[k] = 0
+            if control[c + PHASE] == FULL:
+                dt = ti.cast(control[c + STEP], ti.f32)
+                # Particles farther away cannot touch in this substep.
+                reach = REACH_FACTOR * ti.cast(control[c + SPEED], ti.f32) * dt + LEAST_REACH
+                recovery = worlds[w * WORLD_ROW + RECOVERY_SPEED]
+                has_plane = worlds[w * WORLD_ROW + HAS_PLANE] > 0.5
+                plane = vec3(
+                    worlds[w * WORLD_ROW + PLANE_NORMAL],
+                    worlds[w * WORLD_ROW + PLANE_NORMAL + 1],
+                    worlds[w * WORLD_ROW + PLANE_NORMAL + 2],
+                )
+                offset = worlds[w * WORLD_ROW + PLANE_OFFSET]
+                first_touch = field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
+                has_anchors = field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
+                first_node = ti.cast(p_cells[k] * 4 - 1, ti.f32)
+                level = plane.dot(first_node) - offset
+                time = ti.cast(control[c + ELAPSED], ti.f32) + dt
+                for p in range(starts[k], starts[k + 1]):
+                    gp = ti.cast(x[p], ti.f32) * (1.0 / FIXED_ONE)
+                    fixed = constants[p]
+                    past = reaction[p]
+                    old = dt * vec3(past[0], past[1], past[2])
+                    phi = 1e9
+                    normal = plane
+                    surface_velocity = vec3(0.0)
+                    touch = first_touch * TOUCH_ROW
+                    if has_plane:
+                        phi = level + plane.dot(gp) - fixed[3]
+                    pinned = False
+                    if has_anchors:
+                        pinned = anchors[p][3] == PIN
+                    if phi < reach or old.norm_sqr() > 0.0 or pinned:
+                        if touched[k] == 0:
+                            touched[k] = 1
+                            load_window(k, neighbours, window, nodes)
+                            for i in range(WINDOW_NODES):
+                                scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                        base = ti.cast(gp - 0.5, ti.i32)
+                        fx = gp - ti.cast(base, ti.f32)
+                        w3 = weights(fx)
+                        first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                        u = vec4(0.0)
                         for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                            n = first + (i * 64 + j * 8 + m)
-                            scattered[n] = scattered[n] + (w[i][0] * w[j][1] * w[m][2]) * q
+                            u += (w3[i][0] * w3[j][1] * w3[m][2]) * window[first + (i * 64 + j * 8 + m)]
+                        share = 1.0
+                        if old.norm_sqr() > 0.0 and past[3] > 0.0:
+                            share = ti.max(past[3], 0.02)
+                        velocity = vec3(u[0], u[1], u[2])
+                        new = vec3(0.0)
+                        if pinned:
+                            place, rate = anchor_place(f, time, anchors[p], fields)
+                            back = RECOVERY * (place - rate * dt - first_node - gp) / dt
+                            size = back.norm()
+                            if size > recovery:
+                                back *= recovery / size
+                            new = old + (rate + back - velocity) / share
+                        else:
+                            new = press(
+                                old, velocity - surface_velocity, phi, normal, share, dt, recovery, touch, touches
+                            )
+                        reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
+                        if new.norm_sqr() > 0.0 or old.norm_sqr() > 0.0:
+                            change = fixed[0] * (new - old)
+                            mass = ti.select(new.norm_sqr() > 0.0, fixed[0], 0.0)
+                            q = vec4(change[0], change[1], change[2], mass)
+                            for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+                                n = first + (i * 64 + j * 8 + m)
+                                scattered[n] = scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
 
 
 @ti.func
 def apply_contact(
-    ground_grid_blocks: ti.i32,
-    ground_g: Integers,
+    near_grid_blocks: ti.i32,
+    near_g: Integers,
+    g_field: Integers,
     neighbours: Integers,
-    near_ground: Integers,
+    field_integers: Integers,
+    control: Doubles,
+    touched: Integers,
     scattered: Vectors4,
     nodes: Vectors4,
     masses: Scalars,
     sums: Vectors4,
 ):
     """Add the change of impulse to the nodes' velocity; leave the share of contacting mass in their fourth number."""
-    for ss in range(ground_grid_blocks * SPREAD):
+    for ss in range(near_grid_blocks * SPREAD):
         if ss % SPREAD == 0:
             s = ss // SPREAD
-            g = ground_g[s]
-            for i in range(BLOCK_NODES):
-                sums[s * BLOCK_NODES + i] = vec4(0.0)
-            for d in range(27):
-                k = neighbours[g * 27 + d]
-                near = False
-                if k >= 0:
-                    near = near_ground[k] >= 0
-                if near:
-                    di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
-                    il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
-                    jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
-                    ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
-                    shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
-                    for i in range(il, ih):
-                        for j in range(jl, jh):
-                            for m in range(ml, mh):
-                                n = s * BLOCK_NODES + i * 16 + j * 4 + m
-                                sums[n] = sums[n] + scattered[i * 64 + j * 8 + m + shift]
-            for i in range(BLOCK_NODES):
-                n = g * BLOCK_NODES + i
-                if masses[n] > 0.0:
-                    q = sums[s * BLOCK_NODES + i] / masses[n]
-                    u = nodes[n]
-                    nodes[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+            g = near_g[s]
+            w = field_integers[g_field[g] * FIELD_INTEGERS + WORLD]
+            if control[w * CONTROL_ROW + PHASE] == FULL:
+                for i in range(BLOCK_NODES):
+                    sums[s * BLOCK_NODES + i] = vec4(0.0)
+                add_windows_where(g, s, neighbours, touched, 1, scattered, sums)
+                for i in range(BLOCK_NODES):
+                    n = g * BLOCK_NODES + i
+                    if masses[n] > 0.0:
+                        q = sums[s * BLOCK_NODES + i] / masses[n]
+                        u = nodes[n]
+                        nodes[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])

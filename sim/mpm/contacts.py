@@ -29,7 +29,8 @@ class SurfaceContact:
 
     restitution: float = 0.0
     """Newton's coefficient for rigid bodies: speed of leaving over speed of approach, 0 to 1. Matter that deforms
-    bounces by its own elasticity and does not heed it (docs/physics.md)."""
+    bounces by its own elasticity; there it is the share of its outermost layer's energy that comes back, which matters
+    the less the finer the cells are (docs/physics.md)."""
 
     mode: str = "separate"
     """"separate": Coulomb friction, free to leave. "slip": neither leaves nor rubs. "sticky": neither leaves nor

@@ -1,128 +1,137 @@
 # SPDX-License-Identifier: MIT
-"""The substep loop and the arrays on the device. Lengths in cells; ``world`` converts from and to SI units."""
+"""The substep loop and the arrays on the device. Lengths in cells; ``worlds`` converts from and to SI units."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from . import laws, sorting
+from . import layout, meeting, sorting
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .materials import FIXED_COROTATED, ROW
-from .substep import substep, substep_of_laws
+from .materials import FIXED_COROTATED
+from .nodes import SUMS
+from .stepping import prime_worlds
+from .substep import substep
 
 Array = NDArray[np.float64]
+State = dict[str, NDArray[np.generic]]
 
-PARTICLE_ARRAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
+ALWAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
+"""Arrays that every particle needs."""
 
-MATTER_ARRAYS = ("memory", "material")
+MATTER = ("memory", "material")
 """Arrays that only laws other than fixed-corotated elasticity need."""
 
 ONLY_ELASTIC = 1 << FIXED_COROTATED
 
-SAFETY = 1.5
-"""Factor by which the fastest particle may speed up within a substep."""
+MOST_RETRIES = 6
+"""Times that a stretch of substeps is tried again with half the step, before the run is given up."""
 
-LEAST_MARGIN = 0.1
-"""Cells kept free between the particles and the limits of their windows, for particles that start from rest."""
+RECOVER = 1.25
+"""Factor by which a step that had to be shortened grows again after each stretch that went well."""
 
-LEAST_REACH = 0.02
-"""Cells from the ground within which a particle at rest takes part in the contact."""
+LEAST_STEP = 1e-10
+"""Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a lost run."""
 
-
-RECOVERY_HEIGHT = 0.02
-"""Cells that a particle which starts in the ground could fly up when it is pushed out."""
+LEAST_BLOCKS = 64
+GROWTH = 1.3
+"""Room for more blocks than there are, so that the arrays are not made anew at every sort."""
 
 
 class Diverged(Exception):
-    """A velocity is not finite any more, or the stable substep has gone to zero."""
+    """World ``world`` went wrong in field ``field`` and shorter steps did not help."""
+
+    def __init__(self, world: int, field: int) -> None:
+        super().__init__(f"world {world}, field {field}")
+        self.world = world
+        self.field = field
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plane:
-    """Ground in cells: points with normal . x = offset; friction is Coulomb's coefficient."""
+class Numbers:
+    """What the kernels know of the worlds and their fields, packed as ``layout`` says; see ``packing``."""
 
-    normal: tuple[float, float, float]
-    offset: float
-    friction: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Matter:
-    """All materials of a world as the kernels see them: the set of their laws and a row of numbers for each."""
-
-    laws: int = ONLY_ELASTIC
-    table: tuple[tuple[float, ...], ...] = ((0.0,) * ROW,)
+    laws: int
+    table: NDArray[np.float32]
+    world_integers: NDArray[np.int32]
+    worlds: NDArray[np.float32]
+    field_integers: NDArray[np.int32]
+    fields: NDArray[np.float32]
+    touches: NDArray[np.float32]
+    pairs: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class EngineOptions:
-    """What the loop needs of ``SolverOptions``; see there for units and ranges."""
+class Added:
+    """Particles to add to field ``field``, N of them, as ``transfer.advance_particles`` describes them."""
 
-    grid: int
-    cfl_elastic: float
-    cfl_velocity: float
-    max_step: float
+    field: int
+    x: Array
+    v: Array
+    C: Array
+    F: Array
+    constants: Array
+    ids: NDArray[np.int32]
+    material: NDArray[np.int32]
+    volumes: Array
+    anchors: Array
 
 
 class Engine:
-    """State of one simulation on the device.
+    """State of all worlds on the device.
 
-    Particles are added once (``add``) and numbered in that order; ``ids`` maps the engine's order back to it.
+    Particles are numbered by the caller (``ids``); the engine keeps them sorted by field and block.
     """
 
-    def __init__(
-        self,
-        *,
-        capacity: int,
-        options: EngineOptions,
-        plane: Plane | None,
-        gravity: tuple[float, float, float],
-        matter: Matter | None = None,
-    ) -> None:
-        self.options = options
-        self.plane = plane
-        self.laws = ONLY_ELASTIC if matter is None else matter.laws
-        self._names = PARTICLE_ARRAYS + (() if self.laws == ONLY_ELASTIC else MATTER_ARRAYS)
-        self._table = ti.ndarray(ti.f32, ROW if matter is None else len(matter.table) * ROW)
-        if matter is not None:
-            self._table.from_numpy(np.asarray(matter.table, dtype=np.float32).ravel())
-        self.gravity = np.asarray(gravity, dtype=np.float64)
-        self.across = options.grid // 4
+    def __init__(self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: Numbers) -> None:
+        self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
+        self.laws = numbers.laws
+        self.world_count = len(numbers.worlds)
+        self.field_count = len(numbers.fields)
+        self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
+        several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
+        anchored = bool(numbers.field_integers[:, layout.HAS_ANCHORS].any())
+        self._names = ALWAYS + (() if self.laws == ONLY_ELASTIC else MATTER)
+        self._names += ("volumes",) if several else ()
+        self._names += ("anchors",) if anchored else ()
+        self._several = several
         self.count = 0
-        self.substeps = 0
         self.sorts = 0
-        self._capacity = capacity
+        self.retries = 0
+        self._table = _upload_new(numbers.table)
+        self._world_integers = _upload_new(numbers.world_integers)
+        self._worlds = _upload_new(numbers.worlds)
+        self._field_integers = _upload_new(numbers.field_integers)
+        self._field_world = numbers.field_integers[:, layout.WORLD].copy()
+        self._fields = _upload_new(numbers.fields)
+        self._touches = _upload_new(numbers.touches)
+        self._pairs = _upload_new(numbers.pairs)
+        self._means = ti.ndarray(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
+        self._control = ti.ndarray(ti.f64, self.world_count * layout.CONTROL_ROW)
+        control = np.zeros((self.world_count, layout.CONTROL_ROW))
+        control[:, layout.CFL_SCALE] = 1.0
+        control[:, layout.STATUS] = layout.DONE
+        control[:, layout.LONGEST_STEP] = math.inf
+        self._put_control(control)
+        self._capacity = max(1, capacity)
         self._particles = [self._particle_arrays() for _ in range(2)]
-        self._keys = ti.ndarray(ti.i32, capacity)
-        self._targets = ti.ndarray(ti.i32, capacity)
-        self._table_p = ti.ndarray(ti.i32, self.across**3)
-        self._table_g = ti.ndarray(ti.i32, self.across**3)
+        self._keys = ti.ndarray(ti.i64, self._capacity)
+        self._targets = ti.ndarray(ti.i32, self._capacity)
+        self._g_starts = ti.ndarray(ti.i32, self.field_count + 1)
         self._p_blocks = self._g_blocks = 0
-        self._ground_p_count = self._ground_g_count = 0
-        self._allocate_blocks(max(64, capacity // 64), 512)
-        self._forget_all()
-        self._speed = 0.0
-        self._wave_speed = 0.0
-        self._margin = 0.0
-        self._clearance = 0.0
-        self._normal = vec3(0.0, 0.0, 1.0) if plane is None else vec3(*plane.normal)
-        self._offset = -1e9 if plane is None else plane.offset
-        recovery_speed = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(self.gravity)))
-        friction = 0.0 if plane is None else plane.friction
-        self._settings = ti.ndarray(ti.f32, 9)
-        self._settings.from_numpy(
-            np.array([*gravity, *self._normal, self._offset, friction, recovery_speed], dtype=np.float32)
-        )
+        self._near = self._meeting = (0, 0)
+        self._meet_p_count = 0
+        self._p_capacity = self._g_capacity = 0
+        self._allocate_blocks(LEAST_BLOCKS, 4 * LEAST_BLOCKS)
 
     # ---- arrays -------------------------------------------------------------------------------------------------
 
     def _particle_arrays(self) -> dict[str, ti.Ndarray]:
-        n = self._capacity
         kinds = {
             "x": ivec3,
             "v": vec3,
@@ -133,86 +142,117 @@ class Engine:
             "ids": ti.i32,
             "memory": ti.f32,
             "material": ti.i32,
+            "volumes": ti.f32,
+            "anchors": vec4,
         }
-        return {name: ti.ndarray(kinds[name], n) for name in self._names}
+        return {name: ti.ndarray(kinds[name], self._capacity) for name in self._names}
 
-    def _allocate_blocks(self, p_capacity: int, g_capacity: int) -> None:
-        p, g = min(p_capacity, self.across**3), min(g_capacity, self.across**3)
-        self._p_capacity, self._g_capacity = p, g
-        self._p_cells, self._g_cells = ti.ndarray(ivec3, p), ti.ndarray(ivec3, g)
-        self._starts = ti.ndarray(ti.i32, p + 1)
-        self._cursors = ti.ndarray(ti.i32, p)
-        self._p_neighbours, self._g_neighbours = ti.ndarray(ti.i32, p * 27), ti.ndarray(ti.i32, g * 27)
-        self._near_ground, self._ground_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-        self._ground_g = ti.ndarray(ti.i32, g)
-        self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
-        self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
-        self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
-        self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
-
-    def _forget_all(self) -> None:
-        self._table_p.fill(-1)
-        self._table_g.fill(-1)
-        self._p_blocks = self._g_blocks = 0
+    def _allocate_blocks(self, p: int, g: int) -> None:
+        if p > self._p_capacity:
+            self._p_capacity = p
+            self._p_cells, self._p_field = ti.ndarray(ivec3, p), ti.ndarray(ti.i32, p)
+            self._starts, self._cursors = ti.ndarray(ti.i32, p + 1), ti.ndarray(ti.i32, p)
+            self._p_neighbours = ti.ndarray(ti.i32, p * 27)
+            self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
+            self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
+            self._touched = ti.ndarray(ti.i32, p)
+            self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
+            self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
+            self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
+            self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
+        if g > self._g_capacity:
+            self._g_capacity = g
+            self._g_cells, self._g_field = ti.ndarray(ivec3, g), ti.ndarray(ti.i32, g)
+            self._g_neighbours = ti.ndarray(ti.i32, g * 27)
+            self._near_g, self._mate, self._meet = (ti.ndarray(ti.i32, g) for _ in range(3))
+            self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
+            self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
+            self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
+            self._block_sums = ti.ndarray(ti.f32, g * SUMS)
+            self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
+            self._g_keys, self._g_slots = ti.ndarray(ti.i64, self._g_mask + 1), ti.ndarray(ti.i32, self._g_mask + 1)
 
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
-        per_particle = 2 * 4 * (3 + 3 + 9 + 9 + 4 + 4 + 1 + len(self._names) - len(PARTICLE_ARRAYS)) + 8
-        per_p = 4 * (3 + 1 + 1 + 27 + 2 + SCALARS_PER_BLOCK) + 2 * 16 * WINDOW_NODES
-        per_g = 4 * (3 + 27 + 1) + 36 * BLOCK_NODES
-        return self._capacity * per_particle + self._p_capacity * per_p + self._g_capacity * per_g + 8 * self.across**3
+        arrays = [a for group in self._particles for a in group.values()]
+        arrays += [a for a in vars(self).values() if isinstance(a, ti.Ndarray)]
+        return sum(_bytes(a) for a in arrays)
+
+    def control(self) -> Array:
+        """Progress of the worlds (W, CONTROL_ROW), as ``layout`` names its columns."""
+        return np.asarray(self._control.to_numpy().reshape(self.world_count, layout.CONTROL_ROW))
+
+    def _put_control(self, control: Array) -> None:
+        self._control.from_numpy(np.ascontiguousarray(control).ravel())
+
+    def set_rows(self, *, worlds: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
+        """Take the numbers of worlds and fields for the next segment of time."""
+        self._worlds.from_numpy(np.ascontiguousarray(worlds, dtype=np.float32).ravel())
+        if self.field_count:
+            self._fields.from_numpy(np.ascontiguousarray(fields, dtype=np.float32).ravel())
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
-    def add(
-        self,
-        *,
-        x: Array,
-        v: Array,
-        C: Array,
-        F: Array,
-        constants: Array,
-        ids: NDArray[np.int32],
-        wave_speed: float,
-        material: int = 0,
-    ) -> None:
-        """Append particles: positions (N, 3) in cells, the rest as ``transfer.advance_particles`` describes it.
-
-        wave_speed: of the fastest wave in them, cells/s, as ``materials.bounding_speed`` gives it; material: their
-        row in the table.
-        """
+    def add(self, added: Added, *, wave_speed: float) -> None:
+        """Take in particles; ``wave_speed`` is that of the fastest wave in them, cells/s (``bounding_speed``)."""
         state = self._download()
-        base = np.clip(np.floor(x - 0.5).astype(np.int64) >> 2, 1, self.across - 2)
-        local = np.rint((x - (4 * base - 1)) * FIXED_ONE)
+        base = np.clip(np.floor(added.x - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
+        n = len(added.x)
         new = {
-            "x": local.astype(np.int32),
-            "v": v.astype(np.float32),
-            "C": C.astype(np.float32),
-            "F": F.astype(np.float32),
-            "constants": constants.astype(np.float32),
-            "reaction": np.zeros((len(x), 4), dtype=np.float32),
-            "ids": ids.astype(np.int32),
-            "memory": np.zeros(len(x), dtype=np.float32),
-            "material": np.full(len(x), material, dtype=np.int32),
+            "x": np.rint((added.x - (4 * base - 1)) * FIXED_ONE).astype(np.int32),
+            "v": added.v.astype(np.float32),
+            "C": added.C.astype(np.float32),
+            "F": added.F.astype(np.float32),
+            "constants": added.constants.astype(np.float32),
+            "reaction": np.zeros((n, 4), dtype=np.float32),
+            "ids": added.ids.astype(np.int32),
+            "memory": np.zeros(n, dtype=np.float32),
+            "material": added.material.astype(np.int32),
+            "volumes": added.volumes.astype(np.float32),
+            "anchors": added.anchors.astype(np.float32),
         }
-        keys = (base[:, 0] * self.across + base[:, 1]) * self.across + base[:, 2]
+        biased = base + sorting.BIAS
+        keys = ((np.int64(added.field) << 16 | biased[:, 0]) << 16 | biased[:, 1]) << 16 | biased[:, 2]
         merged = {name: np.concatenate([state[name], new[name]]) for name in self._names}
-        self._upload(merged, np.concatenate([state["keys"], keys.astype(np.int32)]))
-        self._speed = max(self._speed, math.sqrt(float(np.max((v**2).sum(axis=1)))))
-        self._wave_speed = max(self._wave_speed, wave_speed)
+        all_keys = np.concatenate([state["keys"], keys])
+        order = np.argsort(all_keys >> 48, kind="stable")
+        control = self.control()
+        world = self._field_world[added.field]
+        fastest = math.sqrt(float(np.max((added.v**2).sum(axis=1))))
+        control[world, layout.SPEED] = max(control[world, layout.SPEED], fastest)
+        control[world, layout.WAVE_SPEED] = max(control[world, layout.WAVE_SPEED], wave_speed)
+        self._put_control(control)
+        means = self._means.to_numpy()
+        first = added.field * layout.MEAN_ROW + layout.MEAN_PLACE
+        means[first : first + 3] = np.average(added.x, axis=0, weights=added.constants[:, 0])
+        self._means.from_numpy(means)
+        self._upload({name: values[order] for name, values in merged.items()}, all_keys[order])
 
-    def _download(self) -> dict[str, NDArray[np.generic]]:
-        """The active particles in engine order, with the block of each under "keys"."""
+    def raise_speed(self, world: int, speed: float) -> None:
+        """Let the next substep of ``world`` be stable for particles of this speed, cells/s."""
+        control = self.control()
+        control[world, layout.SPEED] = max(control[world, layout.SPEED], speed)
+        self._put_control(control)
+
+    def raise_wave_speed(self, world: int, wave_speed: float) -> None:
+        """Let the next substep of ``world`` be stable for waves of this speed, cells/s."""
+        control = self.control()
+        control[world, layout.WAVE_SPEED] = max(control[world, layout.WAVE_SPEED], wave_speed)
+        self._put_control(control)
+
+    def _download(self) -> State:
+        """The particles in engine order, with the block key of each under "keys"."""
         n = self.count
-        state = {name: self._particles[0][name].to_numpy()[:n] for name in self._names}
-        cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64)
+        state: State = {name: self._particles[0][name].to_numpy()[:n] for name in self._names}
+        cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64) + sorting.BIAS
+        fields = self._p_field.to_numpy()[: self._p_blocks].astype(np.int64)
         starts = self._starts.to_numpy()[: self._p_blocks + 1]
-        keys = (cells[:, 0] * self.across + cells[:, 1]) * self.across + cells[:, 2]
-        state["keys"] = np.repeat(keys, np.diff(starts)).astype(np.int32) if n else np.zeros(0, dtype=np.int32)
+        keys = ((fields << 16 | cells[:, 0]) << 16 | cells[:, 1]) << 16 | cells[:, 2]
+        state["keys"] = np.repeat(keys, np.diff(starts)) if n else np.zeros(0, dtype=np.int64)
         return state
 
-    def _upload(self, state: dict[str, NDArray[np.generic]], keys: NDArray[np.int32]) -> None:
+    def _upload(self, state: Mapping[str, NDArray[np.generic]], keys: NDArray[np.int64]) -> None:
         n = len(keys)
         for name in self._names:
             array = self._particles[0][name]
@@ -225,194 +265,289 @@ class Engine:
         self.count = n
         self._group()
 
-    def state(self) -> dict[str, NDArray[np.generic]]:
-        """Active particles in engine order: everything that ``restore`` needs, and "position" (n, 3) in cells."""
+    def state(self) -> State:
+        """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells, "field" (n,)."""
         state = self._download()
         keys = state["keys"].astype(np.int64)
-        cells = np.stack([keys // self.across**2, keys // self.across % self.across, keys % self.across], axis=1)
+        cells = np.stack([(keys >> shift & 0xFFFF) - sorting.BIAS for shift in (32, 16, 0)], axis=1)
         state["position"] = 4 * cells - 1 + state["x"].astype(np.float64) / FIXED_ONE
-        state["step_bounds"] = np.array([self._speed, self._wave_speed])
+        state["field"] = keys >> 48
+        state["control"] = self.control()
+        state["means"] = self._means.to_numpy()
         return state
 
-    def restore(self, state: dict[str, NDArray[np.generic]]) -> None:
-        """Take up a state that ``state`` returned, on an engine of the same capacity and options."""
-        self._upload(state, np.asarray(state["keys"], dtype=np.int32))
-        self._speed, self._wave_speed = (float(value) for value in state["step_bounds"])
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Take up a state that ``state`` returned, on an engine of the same capacity and worlds."""
+        self._upload(state, np.asarray(state["keys"], dtype=np.int64))
+        self._put_control(np.asarray(state["control"], dtype=np.float64))
+        self._means.from_numpy(np.asarray(state["means"], dtype=np.float32))
+
+    def replace(self, state: State) -> None:
+        """Take particles that the caller has changed, as ``state`` returned them, in the same order."""
+        self._upload(state, np.asarray(state["keys"], dtype=np.int64))
 
     # ---- grouping -----------------------------------------------------------------------------------------------
 
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
-        here = self._particles[0]
-        sorting.rebase(self._p_blocks, self.across, self._p_cells, self._starts, here["x"], self._keys)
+        sorting.rebase(
+            self._p_blocks,
+            self._p_cells,
+            self._p_field,
+            self._starts,
+            self._field_integers,
+            self._control,
+            self._particles[0]["x"],
+            self._keys,
+        )
         self._group()
         self.sorts += 1
 
     def _group(self) -> None:
         """Lists, neighbours and permutation for the blocks named in ``_keys``."""
-        sorting.forget_blocks(
-            self._p_blocks, self._g_blocks, self.across, self._p_cells, self._g_cells, self._table_p, self._table_g
-        )
         while True:
+            self._p_keys.fill(-1)
             p = sorting.list_particle_blocks(
-                self.count, self.across, self._p_capacity, self._keys, self._table_p, self._p_cells, self._starts
+                self.count,
+                self._p_capacity,
+                self._p_mask,
+                self._keys,
+                self._p_keys,
+                self._p_slots,
+                self._p_cells,
+                self._p_field,
+                self._starts,
             )
-            g = 0
             if p <= self._p_capacity:
-                g = sorting.list_grid_blocks(
-                    p,
-                    self.across,
-                    self._g_capacity,
-                    self._p_cells,
-                    self._table_g,
-                    self._g_cells,
-                    self._starts,
-                    self._cursors,
-                )
-            if p <= self._p_capacity and g <= self._g_capacity:
                 break
-            self._allocate_blocks(max(self._p_capacity, p * 3 // 2), max(self._g_capacity, g * 3 // 2))
-            self._forget_all()
+            self._allocate_blocks(int(GROWTH * p) + LEAST_BLOCKS, 0)
+        # The grid's list turns the counts of particles into offsets, once: its room must do the first time.
+        counts = None
+        while True:
+            self._g_keys.fill(-1)
+            if counts is None:
+                counts = self._starts.to_numpy()
+            else:
+                self._starts.from_numpy(counts)
+            g = sorting.list_grid_blocks(
+                p,
+                self.field_count,
+                self._g_capacity,
+                self._g_mask,
+                self._p_cells,
+                self._p_field,
+                self._g_keys,
+                self._g_slots,
+                self._g_cells,
+                self._g_field,
+                self._g_starts,
+                self._starts,
+                self._cursors,
+            )
+            if g <= self._g_capacity:
+                break
+            self._allocate_blocks(0, int(GROWTH * g) + LEAST_BLOCKS)
         self._p_blocks, self._g_blocks = p, g
         sorting.link_blocks(
             p,
             g,
-            self.across,
+            self._p_mask,
+            self._g_mask,
             self._p_cells,
+            self._p_field,
             self._g_cells,
-            self._table_p,
-            self._table_g,
+            self._g_field,
+            self._p_keys,
+            self._p_slots,
+            self._g_keys,
+            self._g_slots,
             self._p_neighbours,
             self._g_neighbours,
         )
-        found = sorting.list_ground_blocks(
-            p,
-            g,
-            self._normal,
-            self._offset,
-            1.0,
-            self._p_cells,
-            self._g_neighbours,
-            self._near_ground,
-            self._ground_p,
-            self._ground_g,
-        )
-        self._ground_p_count, self._ground_g_count = int(found[0]), int(found[1])
-        sorting.place(self.count, self._keys, self._table_p, self._cursors, self._targets)
+        sorting.place(self.count, self._p_mask, self._keys, self._p_keys, self._p_slots, self._cursors, self._targets)
         old, new = self._particles
-        sorting.permute(
-            self.count,
-            self._targets,
-            *(old[name] for name in PARTICLE_ARRAYS),
-            *(new[name] for name in PARTICLE_ARRAYS),
-        )
-        if self.laws != ONLY_ELASTIC:
-            laws.permute_matter(
-                self.count,
-                self._targets,
-                *(old[name] for name in MATTER_ARRAYS),
-                *(new[name] for name in MATTER_ARRAYS),
-            )
+        sorting.permute(self.count, self._targets, *(old[name] for name in ALWAYS), *(new[name] for name in ALWAYS))
+        movers = {
+            "memory": sorting.permute_numbers,
+            "material": sorting.permute_integers,
+            "volumes": sorting.permute_numbers,
+            "anchors": sorting.permute_vectors,
+        }
+        for name in self._names:
+            if name in movers:
+                movers[name](self.count, self._targets, old[name], new[name])
         self._particles.reverse()
-        self._margin = 1.0
-        self._clearance = 0.0
+        self._list_contacts()
+
+    def _list_contacts(self) -> None:
+        found = meeting.list_near_blocks(
+            self._p_blocks,
+            self._g_blocks,
+            self._p_cells,
+            self._p_field,
+            self._g_neighbours,
+            self._field_integers,
+            self._worlds,
+            self._near_of_p,
+            self._near_p,
+            self._near_g,
+        )
+        self._touched.fill(0)
+        self._near = (int(found[0]), int(found[1]))
+        if self._several:
+            found = meeting.list_meeting_blocks(
+                self._p_blocks,
+                self._g_blocks,
+                self._g_mask,
+                self._g_cells,
+                self._g_field,
+                self._g_keys,
+                self._g_slots,
+                self._p_neighbours,
+                self._field_integers,
+                self._world_integers,
+                self._mate,
+                self._meet,
+                self._meet_g,
+                self._leads,
+                self._meet_p,
+                self._meets_p,
+            )
+            self._meeting, self._meet_p_count = (int(found[0]), int(found[1])), int(found[2])
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
-    def stable_step(self) -> float:
-        """Longest stable substep in seconds for the state as last reported."""
-        fastest = self._speed + float(np.linalg.norm(self.gravity)) * self.options.max_step
-        return min(
-            self.options.max_step,
-            self.options.cfl_elastic / max(self._wave_speed, 1e-30),
-            self.options.cfl_velocity / max(fastest, 1e-30),
+    def stable_step(self, world: int) -> float:
+        """Longest stable substep in seconds of ``world`` for its state as last reported."""
+        row = self.control()[world]
+        scale, fastest = row[layout.CFL_SCALE], max(row[layout.SPEED], row[layout.SOLID_SPEED])
+        return float(
+            min(
+                row[layout.LONGEST_STEP],
+                scale * self.cfl_elastic / max(row[layout.WAVE_SPEED], 1e-30),
+                scale * self.cfl_velocity / max(fastest, 1e-30),
+            )
         )
 
-    def advance(self, duration: float) -> None:
-        """Advance by exactly ``duration`` seconds in substeps no longer than ``stable_step``.
+    def advance(self, durations: Array, *, longest_step: Array) -> None:
+        """Advance every world by its duration (W,) in s, 0 to let it be, in substeps of at most ``longest_step`` (W,).
 
-        Raises Diverged when the state is not finite.
+        Raises Diverged when a world goes wrong and shorter steps do not help; the others may then be anywhere.
         """
-        if self.count == 0:
-            return
-        done = 0.0
-        shortest = 1e-3 * self.stable_step()
-        self._sort()
-        dt = self._even_step(duration)
-        self._substep(nodes=False, gather=False, scatter=True, dt=dt, dt_next=dt)
-        while True:
-            done += dt
-            remaining = duration - done
-            last = remaining < 0.5 * dt
-            must_sort = not last and self._margin < 2.0 * SAFETY * self._speed * dt + LEAST_MARGIN
-            next_dt = dt if last else self._even_step(remaining)
-            self._substep(nodes=True, gather=True, scatter=not (last or must_sort), dt=dt, dt_next=next_dt)
-            self.substeps += 1
-            if last:
-                return
-            if self.stable_step() < shortest:
-                raise Diverged
-            if must_sort:
-                self._sort()
-                next_dt = self._even_step(remaining)
-                self._substep(nodes=False, gather=False, scatter=True, dt=next_dt, dt_next=next_dt)
-            dt = next_dt
+        control = self.control()
+        control[:, layout.LONGEST_STEP] = longest_step
+        control[:, layout.REMAINING] = durations
+        control[:, layout.ELAPSED] = 0.0
+        control[:, layout.PHASE] = layout.IDLE
+        control[:, layout.LOST_FIELD] = -1.0
+        control[:, layout.STATUS] = np.where(durations > 0, layout.WANTS_SORT, layout.DONE)
+        self._put_control(control)
+        for world in range(self.world_count):
+            control[world, layout.SHORTEST_STEP] = max(LEAST_STEP, 1e-3 * self.stable_step(world))
+        attempts = np.zeros(self.world_count, dtype=np.int64)
+        while (control[:, layout.STATUS] == layout.WANTS_SORT).any():
+            self._put_control(control)
+            self._sort()
+            while True:
+                prime_worlds(self.world_count, self.cfl_elastic, self.cfl_velocity, self._control)
+                while self._substep() > 0:
+                    pass
+                after = self.control()
+                lost = after[:, layout.STATUS] == layout.DIVERGED
+                if not lost.any():
+                    break
+                attempts[lost] += 1
+                if attempts.max() > MOST_RETRIES:
+                    world = int(np.argmax(attempts))
+                    raise Diverged(world, int(after[world, layout.LOST_FIELD]))
+                self.retries += 1
+                # The other half of the particle arrays still holds the state from before the sort.
+                self._particles.reverse()
+                self._group()
+                control[lost, layout.CFL_SCALE] *= 0.5
+                self._put_control(control)
+            sorted_now = control[:, layout.STATUS] == layout.WANTS_SORT
+            attempts[sorted_now] = 0
+            control = after
+            recovered = np.minimum(1.0, RECOVER * control[:, layout.CFL_SCALE])
+            control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
+        self._put_control(control)
 
-    def _even_step(self, remaining: float) -> float:
-        return remaining / max(1, math.ceil(remaining / self.stable_step() - 1e-6))
-
-    def _substep(self, *, nodes: bool, gather: bool, scatter: bool, dt: float, dt_next: float) -> None:
-        """Launch one substep or a part of one, and take note of what the particles report."""
+    def _substep(self) -> int:
+        """Launch one substep of all worlds; returns how many want another one."""
         here = self._particles[0]
-        reach = SAFETY * self._speed * dt + LEAST_REACH
-        contact = nodes and self.plane is not None and self._clearance < 2.0 * reach
-        first = (
-            self._p_blocks,
-            self._g_blocks if nodes else 0,
-            self._ground_p_count if contact else 0,
-            self._ground_g_count if contact else 0,
-            self.options.grid,
-            int(gather),
-            int(scatter),
-            int(not scatter),
-            dt,
-            dt_next,
-            reach,
-            self._settings,
-            self._p_cells,
-            self._g_cells,
-            self._starts,
-            self._p_neighbours,
-            self._g_neighbours,
-            self._near_ground,
-            self._ground_p,
-            self._ground_g,
-            here["x"],
-            here["v"],
-            here["C"],
-            here["F"],
-            here["constants"],
+        return int(
+            substep(
+                self.laws,
+                self.world_count,
+                self._mean_fields,
+                self._p_blocks,
+                self._g_blocks,
+                self._near[0],
+                self._near[1],
+                self._meeting[0],
+                self._meeting[1],
+                self._meet_p_count,
+                self.cfl_elastic,
+                self.cfl_velocity,
+                self._p_cells,
+                self._p_field,
+                self._starts,
+                self._p_neighbours,
+                self._near_of_p,
+                self._near_p,
+                self._meets_p,
+                self._meet_p,
+                self._touched,
+                self._g_cells,
+                self._g_field,
+                self._g_starts,
+                self._g_neighbours,
+                self._near_g,
+                self._mate,
+                self._meet,
+                self._meet_g,
+                self._leads,
+                self._world_integers,
+                self._worlds,
+                self._field_integers,
+                self._fields,
+                self._means,
+                self._touches,
+                self._pairs,
+                self._control,
+                here["x"],
+                here["v"],
+                here["C"],
+                here["F"],
+                here["constants"],
+                here["reaction"],
+                here.get("material", self._starts),
+                self._table,
+                here.get("memory", self._masses),
+                here.get("volumes", self._masses),
+                here.get("anchors", self._nodes),
+                self._window,
+                self._scattered,
+                self._nodes,
+                self._sums,
+                self._masses,
+                self._block_sums,
+                self._report,
+            )
         )
-        last = (
-            here["reaction"],
-            self._window,
-            self._scattered,
-            self._nodes,
-            self._sums,
-            self._masses,
-            self._report,
-        )
-        if self.laws == ONLY_ELASTIC:
-            found = substep(*first, *last)
-        else:
-            found = substep_of_laws(self.laws, *first, here["material"], self._table, here["memory"], *last)
-        speed2, stiffness, margin, clearance, sum2 = found
-        if scatter:
-            if not math.isfinite(stiffness):
-                raise Diverged
-            self._wave_speed = math.sqrt(stiffness)
-        if gather:
-            if not math.isfinite(sum2):
-                raise Diverged
-            self._speed = math.sqrt(speed2)
-            self._margin, self._clearance = margin, clearance
+
+
+def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
+    """A new array on the device with the numbers of ``values``, flat; at least one long."""
+    kind = {np.dtype(np.float32): ti.f32, np.dtype(np.int32): ti.i32}[values.dtype]
+    array = ti.ndarray(kind, max(1, values.size))
+    if values.size:
+        array.from_numpy(np.ascontiguousarray(values).ravel())
+    return array
+
+
+def _bytes(array: ti.Ndarray) -> int:
+    """Bytes of ``array`` on the device."""
+    elements = int(np.prod(array.shape)) * int(np.prod(array.element_shape))
+    return elements * (8 if array.dtype in (ti.i64, ti.f64) else 4)

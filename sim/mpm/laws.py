@@ -222,19 +222,3 @@ def respond(
             speed = half + ti.sqrt(half * half + stiffness / fixed[0])
             stiffness = fixed[0] * speed * speed
     return tau, stiffness
-
-
-@ti.kernel
-def permute_matter(
-    count: ti.i32,
-    targets: Integers,
-    memory: Scalars,
-    material: Integers,
-    memory_new: Scalars,
-    material_new: Integers,
-):
-    """Move the laws' own data of every particle to its new index, as ``sorting.permute`` does with the rest."""
-    for p in range(count):
-        t = targets[p]
-        memory_new[t] = memory[p]
-        material_new[t] = material[p]

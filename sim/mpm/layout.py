@@ -6,6 +6,9 @@ nodes that they touch on each axis; a block owns a private window of 8x8x8 nodes
 A particle's position is kept relative to the window's first node, as a 32-bit integer in units of 2**-28 cells. That
 resolves 4e-9 cells everywhere, where a float32 coordinate in a box of 256 cells would resolve 1.5e-5 and lose the
 motion of stiff bodies whose substeps are a microsecond long.
+
+A *field* is one deformable body in one world. Blocks belong to a field, so bodies never share nodes; what one body
+does to another is a matter of contact. Several worlds lie side by side in the same arrays and never meet.
 """
 
 import taichi as ti
@@ -27,14 +30,55 @@ FIXED_LOW = FIXED_ONE // 2
 FIXED_HIGH = 13 * (FIXED_ONE // 2) - 1
 """Window coordinates 0.5 up to 6.5 cells: where all three nodes of a particle lie in the window."""
 
-WALL_NODES = 6
-"""Nodes 0..6 and grid-7..grid-1 never move outward, which keeps particles out of the outermost blocks."""
-
 SPREAD = 128
 """Loop iterations spent on one block: Taichi's CPU backend gives a thread at least 512 iterations at a time."""
 
 SCALARS_PER_BLOCK = 8
 """Numbers that a block reports each substep, see ``transfer.advance_particles``."""
+
+FARTHEST_BLOCK = 32_000
+"""Blocks count from -FARTHEST_BLOCK to FARTHEST_BLOCK on each axis; particles that fly farther stay in the last."""
+
+# Numbers of a world, constant over a segment of time. Lengths in cells.
+GRAVITY, GRAVITY_RATE, PLANE_NORMAL, PLANE_OFFSET, RECOVERY_SPEED, HAS_PLANE = 0, 3, 6, 9, 10, 11
+WORLD_ROW = 12
+
+# Whole numbers of a world.
+FIRST_SOLID, SOLIDS, FIRST_FIELD, FIELDS, FIRST_PAIR = range(5)
+WORLD_INTEGERS = 8
+
+# Numbers of a field, constant over a segment of time; see ``forces.BodyForces``.
+GRAVITY_FACTOR, DRAG, WIND, LIFT = 0, 1, 2, 5
+TETHER_STIFFNESS, TETHER_LENGTH, TETHER_ANCHOR, TETHER_STRING = 6, 7, 8, 11
+ACCELERATION, ACCELERATION_RATE, GOAL_STIFFNESS, GOAL_DAMPING, MOTION, MOTION_RATE = 12, 15, 18, 19, 20, 23
+FIELD_ROW = 26
+
+# Whole numbers of a field. WANTS_MEANS: whether the body's means (below) are kept; HAS_ANCHORS: pins or goals.
+WORLD, FIRST_TOUCH, WANTS_MEANS, HAS_ANCHORS = range(4)
+FIELD_INTEGERS = 4
+
+# Means of a field: mass (kg), centre of mass (cells), velocity (cells/s), angular velocity (1/s), acceleration by
+# contact (cells/s²), its mass in contact (kg).
+MEAN_MASS, MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN, MEAN_REACTION, MEAN_TOUCHING = 0, 1, 4, 7, 10, 13
+MEAN_ROW = 16
+
+# How a field meets an obstacle (its world's plane is obstacle 0, solid i is obstacle i + 1), or another field.
+STICKING, SLIDING, MODE, ADHESION, REACH, RESTITUTION = range(6)
+TOUCH_ROW = 6
+SEPARATE, SLIP, STICKY = range(3)
+"""Numbers of ``contacts.MODES``."""
+
+# Progress of a world through a segment of time, float64. Seconds, cells, cells/s.
+REMAINING, ELAPSED, STEP, NEXT_STEP, PHASE, SCATTER, STORE, SPEED, WAVE_SPEED, MARGIN = range(10)
+CFL_SCALE, SUBSTEPS, STATUS = range(10, 13)
+SOLID_SPEED, SOLID_DRIFT, LOST_FIELD, FASTEST_FIELD, LONGEST_STEP, SHORTEST_STEP = range(13, 19)
+CONTROL_ROW = 19
+
+IDLE, PRIME, FULL = range(3)
+"""Phases: nothing; particles to grid only (after a sort); a whole substep."""
+
+RUNNING, WANTS_SORT, DONE, DIVERGED = range(4)
+"""Statuses."""
 
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
@@ -42,6 +86,8 @@ ivec3 = ti.types.vector(3, ti.i32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Doubles = ti.types.ndarray(dtype=ti.f64, ndim=1)
+Keys = ti.types.ndarray(dtype=ti.i64, ndim=1)
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Vectors3 = ti.types.ndarray(dtype=vec3, ndim=1)
 Vectors4 = ti.types.ndarray(dtype=vec4, ndim=1)

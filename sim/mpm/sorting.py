@@ -4,30 +4,82 @@
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Grouping the particles in blocks: which block each is in, the lists of blocks, their neighbours, the permutation.
 
-``table_p`` and ``table_g`` map a block of the domain to its slot in the list of particle blocks and of grid blocks
-(blocks that particles can reach), -1 for none. They are the only arrays of the domain's size: one integer for 64 cells.
+A block's key packs its field and its three coordinates in 64 bits. Two hash tables map keys to slots in the list of
+particle blocks and of grid blocks (blocks that particles can reach), so time and memory follow the occupied blocks and
+a body may go anywhere. Everything that decides an order is serial, hence the same on every run.
 """
 
 import taichi as ti
 
 from .layout import (
+    CONTROL_ROW,
+    FARTHEST_BLOCK,
+    FIELD_INTEGERS,
     FIXED_BITS,
     FIXED_LOW,
     FIXED_ONE,
+    STATUS,
+    WANTS_SORT,
+    WORLD,
     Cells,
+    Doubles,
     Integers,
+    Keys,
     Matrices,
+    Scalars,
     Vectors3,
     Vectors4,
     ivec3,
-    vec3,
 )
+
+BIAS = 1 << 15
+"""Added to block coordinates to make them positive in a key."""
 
 
 @ti.func
-def block_index(b: ivec3, across: ti.i32) -> ti.i32:
-    """Index of block ``b`` in the tables of a domain of ``across`` blocks a side."""
-    return (b[0] * across + b[1]) * across + b[2]
+def block_key(field: ti.i32, b: ivec3):
+    """Key of block ``b`` of ``field``."""
+    key = ti.cast(field, ti.i64)
+    for n in ti.static(range(3)):
+        key = (key << 16) | ti.cast(b[n] + BIAS, ti.i64)
+    return key
+
+
+@ti.func
+def key_field(key: ti.i64):
+    """Field of a key."""
+    return ti.cast(key >> 48, ti.i32)
+
+
+@ti.func
+def key_block(key: ti.i64):
+    """Block coordinates of a key."""
+    return ivec3(
+        ti.cast((key >> 32) & 0xFFFF, ti.i32) - BIAS,
+        ti.cast((key >> 16) & 0xFFFF, ti.i32) - BIAS,
+        ti.cast(key & 0xFFFF, ti.i32) - BIAS,
+    )
+
+
+@ti.func
+def place_in_table(key: ti.i64, mask: ti.i32, table_keys: Keys):
+    """Where ``key`` stands in the table, or the empty place where it would go (linear probing)."""
+    b = key_block(key)
+    h = (b[0] * 73856093) ^ (b[1] * 19349663) ^ (b[2] * 83492791) ^ (key_field(key) * 25165843)
+    h = (h ^ (h >> 15)) & mask
+    while table_keys[h] != key and table_keys[h] != -1:
+        h = (h + 1) & mask
+    return h
+
+
+@ti.func
+def slot_of(key: ti.i64, mask: ti.i32, table_keys: Keys, table_slots: Integers):
+    """Slot of the block ``key``, -1 where there is none."""
+    h = place_in_table(key, mask, table_keys)
+    slot = -1
+    if table_keys[h] == key:
+        slot = table_slots[h]
+    return slot
 
 
 @ti.func
@@ -37,57 +89,70 @@ def neighbour_offset(d: ti.i32):
 
 
 @ti.kernel
-def rebase(blocks: ti.i32, across: ti.i32, block_cells: Cells, starts: Integers, x: Cells, keys: Integers):
-    """Find each particle's new block and express its position in that block's window. Exact: integers are shifted."""
-    for k in range(blocks):
-        old = block_cells[k]
-        for p in range(starts[k], starts[k + 1]):
-            xi = x[p]
-            new = ivec3(0)
-            for c in ti.static(range(3)):
-                base = old[c] * 4 - 1 + ((xi[c] - FIXED_LOW) >> FIXED_BITS)
-                new[c] = ti.min(ti.max(base >> 2, 1), across - 2)
-            x[p] = xi + (old - new) * (4 * FIXED_ONE)
-            keys[p] = block_index(new, across)
-
-
-@ti.kernel
-def forget_blocks(
-    p_blocks: ti.i32,
-    g_blocks: ti.i32,
-    across: ti.i32,
+def rebase(
+    blocks: ti.i32,
     p_cells: Cells,
-    g_cells: Cells,
-    table_p: Integers,
-    table_g: Integers,
+    p_field: Integers,
+    starts: Integers,
+    field_integers: Integers,
+    control: Doubles,
+    x: Cells,
+    keys: Keys,
 ):
-    """Empty the tables where the old lists had filled them."""
-    for k in range(p_blocks):
-        table_p[block_index(p_cells[k], across)] = -1
-    for k in range(g_blocks):
-        table_g[block_index(g_cells[k], across)] = -1
+    """Find each particle's new block and express its position in that block's window. Exact: integers are shifted.
+
+    Only in worlds that want a sort: in the others it would change the order of sums.
+    """
+    for k in range(blocks):
+        f = p_field[k]
+        if control[field_integers[f * FIELD_INTEGERS + WORLD] * CONTROL_ROW + STATUS] == WANTS_SORT:
+            old = p_cells[k]
+            for p in range(starts[k], starts[k + 1]):
+                xi = x[p]
+                new = ivec3(0)
+                for c in ti.static(range(3)):
+                    base = old[c] * 4 - 1 + ((xi[c] - FIXED_LOW) >> FIXED_BITS)
+                    new[c] = ti.min(ti.max(base >> 2, -FARTHEST_BLOCK), FARTHEST_BLOCK)
+                x[p] = xi + (old - new) * (4 * FIXED_ONE)
+                keys[p] = block_key(f, new)
 
 
 @ti.kernel
 def list_particle_blocks(
-    count: ti.i32, across: ti.i32, capacity: ti.i32, keys: Integers, table_p: Integers, p_cells: Cells, starts: Integers
+    count: ti.i32,
+    capacity: ti.i32,
+    mask: ti.i32,
+    keys: Keys,
+    table_keys: Keys,
+    table_slots: Integers,
+    p_cells: Cells,
+    p_field: Integers,
+    starts: Integers,
 ) -> ti.i32:
     """List the occupied blocks in the order of the particles and count their particles into ``starts[k + 1]``.
 
-    Returns the number of blocks; lists none past ``capacity``. Serial, hence the same on every run.
+    Returns the number of blocks; past ``capacity`` only that it is larger. The table must be empty.
     """
     found = 0
+    past = ti.cast(-1, ti.i64)
+    slot = -1
     ti.loop_config(serialize=True)
     for p in range(count):
         key = keys[p]
-        slot = table_p[key]
-        if slot < 0:
-            slot = found
-            found += 1
-            table_p[key] = slot
-            if slot < capacity:
-                p_cells[slot] = ivec3(key // (across * across), key // across % across, key % across)
-                starts[slot + 1] = 0
+        if key != past and found <= capacity:
+            past = key
+            h = place_in_table(key, mask, table_keys)
+            if table_keys[h] == key:
+                slot = table_slots[h]
+            else:
+                slot = found
+                found += 1
+                if slot < capacity:
+                    table_keys[h] = key
+                    table_slots[h] = slot
+                    p_cells[slot] = key_block(key)
+                    p_field[slot] = key_field(key)
+                    starts[slot + 1] = 0
         if slot < capacity:
             starts[slot + 1] += 1
     return found
@@ -96,29 +161,49 @@ def list_particle_blocks(
 @ti.kernel
 def list_grid_blocks(
     p_blocks: ti.i32,
-    across: ti.i32,
+    field_count: ti.i32,
     capacity: ti.i32,
+    mask: ti.i32,
     p_cells: Cells,
-    table_g: Integers,
+    p_field: Integers,
+    table_keys: Keys,
+    table_slots: Integers,
     g_cells: Cells,
+    g_field: Integers,
+    g_starts: Integers,
     starts: Integers,
     cursors: Integers,
 ) -> ti.i32:
-    """List the blocks around the particle blocks; turn the counts in ``starts`` into offsets. Returns their number."""
+    """List the blocks around the particle blocks, those of a field one after the other from ``g_starts`` on.
+
+    Also turns the counts in ``starts`` into offsets. Returns the number of blocks; past ``capacity`` only that it is
+    larger. The table must be empty.
+    """
     found = 0
     starts[0] = 0
+    ti.loop_config(serialize=True)
+    for f in range(field_count + 1):
+        g_starts[f] = 0
     ti.loop_config(serialize=True)
     for k in range(p_blocks):
         cursors[k] = starts[k]
         starts[k + 1] += starts[k]
         for d in range(27):
             b = p_cells[k] + neighbour_offset(d)
-            key = block_index(b, across)
-            if table_g[key] < 0:
-                if found < capacity:
-                    table_g[key] = found
-                    g_cells[found] = b
-                found += 1
+            key = block_key(p_field[k], b)
+            if found <= capacity:
+                h = place_in_table(key, mask, table_keys)
+                if table_keys[h] != key:
+                    if found < capacity:
+                        table_keys[h] = key
+                        table_slots[h] = found
+                        g_cells[found] = b
+                        g_field[found] = p_field[k]
+                        g_starts[p_field[k] + 1] += 1
+                    found += 1
+    ti.loop_config(serialize=True)
+    for f in range(field_count):
+        g_starts[f + 1] += g_starts[f]
     return found
 
 
@@ -126,74 +211,42 @@ def list_grid_blocks(
 def link_blocks(
     p_blocks: ti.i32,
     g_blocks: ti.i32,
-    across: ti.i32,
+    p_mask: ti.i32,
+    g_mask: ti.i32,
     p_cells: Cells,
+    p_field: Integers,
     g_cells: Cells,
-    table_p: Integers,
-    table_g: Integers,
+    g_field: Integers,
+    p_keys: Keys,
+    p_slots: Integers,
+    g_keys: Keys,
+    g_slots: Integers,
     p_neighbours: Integers,
     g_neighbours: Integers,
 ):
     """Neighbour lists: 27 grid blocks around each particle block, 27 particle blocks around each grid block."""
     for k in range(p_blocks):
         for d in range(27):
-            p_neighbours[k * 27 + d] = table_g[block_index(p_cells[k] + neighbour_offset(d), across)]
+            key = block_key(p_field[k], p_cells[k] + neighbour_offset(d))
+            p_neighbours[k * 27 + d] = slot_of(key, g_mask, g_keys, g_slots)
     for g in range(g_blocks):
         for d in range(27):
-            b = g_cells[g] + neighbour_offset(d)
-            slot = -1
-            if b.min() >= 0 and b.max() < across:
-                slot = table_p[block_index(b, across)]
-            g_neighbours[g * 27 + d] = slot
+            key = block_key(g_field[g], g_cells[g] + neighbour_offset(d))
+            g_neighbours[g * 27 + d] = slot_of(key, p_mask, p_keys, p_slots)
 
 
 @ti.kernel
-def list_ground_blocks(
-    p_blocks: ti.i32,
-    g_blocks: ti.i32,
-    normal: vec3,
-    offset: ti.f32,
-    reach: ti.f32,
-    p_cells: Cells,
-    g_neighbours: Integers,
-    near_ground: Integers,
-    ground_p: Integers,
-    ground_g: Integers,
-) -> ti.types.vector(2, ti.i32):
-    """List the blocks whose particles can come within ``reach`` cells of the plane before the next sort.
-
-    near_ground: per particle block its slot in ``ground_p`` or -1; ground_g: the grid blocks around these.
-    Returns the number of either.
-    """
-    found = ti.Vector([0, 0])
-    ti.loop_config(serialize=True)
-    for k in range(p_blocks):
-        centre = ti.cast(p_cells[k] * 4, ti.f32) + 2.5
-        half = 3.0 * (ti.abs(normal[0]) + ti.abs(normal[1]) + ti.abs(normal[2]))
-        near_ground[k] = -1
-        if normal.dot(centre) - offset - half < reach:
-            near_ground[k] = found[0]
-            ground_p[found[0]] = k
-            found[0] += 1
-    ti.loop_config(serialize=True)
-    for g in range(g_blocks):
-        near = 0
-        for d in range(27):
-            k = g_neighbours[g * 27 + d]
-            if k >= 0 and near_ground[ti.max(k, 0)] >= 0:
-                near = 1
-        if near == 1:
-            ground_g[found[1]] = g
-            found[1] += 1
-    return found
-
-
-@ti.kernel
-def place(count: ti.i32, keys: Integers, table_p: Integers, cursors: Integers, targets: Integers):
-    """New index of every particle; particles of a block keep their order. Serial, hence the same on every run."""
+def place(
+    count: ti.i32, mask: ti.i32, keys: Keys, p_keys: Keys, p_slots: Integers, cursors: Integers, targets: Integers
+):
+    """New index of every particle; particles of a block keep their order."""
+    past = ti.cast(-1, ti.i64)
+    slot = 0
     ti.loop_config(serialize=True)
     for p in range(count):
-        slot = table_p[keys[p]]
+        if keys[p] != past:
+            past = keys[p]
+            slot = slot_of(past, mask, p_keys, p_slots)
         targets[p] = cursors[slot]
         cursors[slot] += 1
 
@@ -227,3 +280,24 @@ def permute(
         constants_new[t] = constants[p]
         reaction_new[t] = reaction[p]
         ids_new[t] = ids[p]
+
+
+@ti.kernel
+def permute_numbers(count: ti.i32, targets: Integers, old: Scalars, new: Scalars):
+    """Move one number a particle to its new index."""
+    for p in range(count):
+        new[targets[p]] = old[p]
+
+
+@ti.kernel
+def permute_integers(count: ti.i32, targets: Integers, old: Integers, new: Integers):
+    """Move one whole number a particle to its new index."""
+    for p in range(count):
+        new[targets[p]] = old[p]
+
+
+@ti.kernel
+def permute_vectors(count: ti.i32, targets: Integers, old: Vectors4, new: Vectors4):
+    """Move one vector a particle to its new index."""
+    for p in range(count):
+        new[targets[p]] = old[p]

@@ -2,12 +2,13 @@
 # ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
-"""The two halves of every substep: nodes, then particles (MLS-MPM, Hu et al. 2018; APIC, Jiang et al. 2015).
+"""The particles' half of a substep, and the windows between particles and nodes.
 
-Quadratic B-splines; lengths in cells (see ``layout``), seconds, kilograms. A substep is
+MLS-MPM (Hu et al. 2018), APIC (Jiang et al. 2015), quadratic B-splines; lengths in cells (see ``layout``), seconds,
+kilograms. A substep is
 
-    advance_nodes      gather the windows, momentum -> velocity, gravity, walls
-    (contact)          see ``contact``
+    advance_nodes      gather the windows, momentum -> velocity, forces: ``nodes``
+    contact            between fields: ``separation``; with planes and solids: ``contact``
     advance_particles  grid -> particles -> grid in one pass over the particles, without atomics
 """
 
@@ -17,14 +18,35 @@ from .constitutive import fixed_corotated
 from .laws import deform, respond
 from .layout import (
     BLOCK_NODES,
+    CONTROL_ROW,
+    ELAPSED,
+    FIELD_INTEGERS,
+    FIELD_ROW,
     FIXED_HIGH,
     FIXED_LOW,
     FIXED_ONE,
+    FULL,
+    GOAL_DAMPING,
+    GOAL_STIFFNESS,
+    HAS_ANCHORS,
+    HAS_PLANE,
+    IDLE,
+    MOTION,
+    MOTION_RATE,
+    NEXT_STEP,
+    PHASE,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
     SCALARS_PER_BLOCK,
+    SCATTER,
     SPREAD,
-    WALL_NODES,
+    STEP,
+    STORE,
     WINDOW_NODES,
+    WORLD,
+    WORLD_ROW,
     Cells,
+    Doubles,
     Integers,
     Matrices,
     Scalars,
@@ -35,6 +57,9 @@ from .layout import (
     vec3,
     vec4,
 )
+
+PIN, GOAL = 1.0, 2.0
+"""Kinds of anchors."""
 
 SUNK_LIMIT = 0.05
 """Depth in cells below which no particle sinks, should the contact solve not have held it."""
@@ -88,60 +113,78 @@ def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vector
 
 
 @ti.func
-def advance_nodes(
-    blocks: ti.i32,
-    grid: ti.i32,
-    gravity_step: vec3,
-    block_cells: Cells,
-    neighbours: Integers,
-    scatter: Vectors4,
-    nodes: Vectors4,
-    masses: Scalars,
+def add_windows_where(
+    g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, least: ti.i32, window: Vectors4, sums: Vectors4
 ):
-    """Nodes of all grid blocks: sum of the windows, velocity = momentum / mass, gravity, walls.
+    """``add_windows`` for the particle blocks whose number in ``chosen`` is ``least`` or more, into slot ``s``."""
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        wanted = False
+        if k >= 0:
+            wanted = chosen[k] >= least
+        if wanted:
+            di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
+            il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
+            jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
+            ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
+            shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
+            for i in range(il, ih):
+                for j in range(jl, jh):
+                    for m in range(ml, mh):
+                        n = s * BLOCK_NODES + i * 16 + j * 4 + m
+                        sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
 
-    nodes: velocity in cells/s; the fourth number is left at 0 for the contact, which finds the mass in
-    ``masses`` (kg).
-    """
-    for gg in range(blocks * SPREAD):
-        if gg % SPREAD == 0:
-            g = gg // SPREAD
-            for i in range(BLOCK_NODES):
-                nodes[g * BLOCK_NODES + i] = vec4(0.0)
-            add_windows(g, neighbours, scatter, nodes)
-            first = block_cells[g] * 4
-            wall = (first < WALL_NODES + 1).any() or (first + 4 > grid - WALL_NODES - 1).any()
-            for i in range(BLOCK_NODES):
-                q = nodes[g * BLOCK_NODES + i]
-                masses[g * BLOCK_NODES + i] = q[3]
-                if q[3] > 0.0:
-                    inverse = 1.0 / q[3]
-                    u = vec3(q[0], q[1], q[2]) * inverse + gravity_step
-                    if wall:
-                        cell = first + ivec3(i // 16, i // 4 % 4, i % 4)
-                        for c in ti.static(range(3)):
-                            if cell[c] <= WALL_NODES and u[c] < 0.0:
-                                u[c] = 0.0
-                            if cell[c] >= grid - WALL_NODES - 1 and u[c] > 0.0:
-                                u[c] = 0.0
-                    nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
+
+@ti.func
+def anchor_place(f: ti.i32, time: ti.f32, place: vec4, fields: Scalars):
+    """Where the anchor at rest at ``place`` is ``time`` s into the segment (cells), and its velocity."""
+    row = f * FIELD_ROW
+    motion, rate = vec3(0.0), vec3(0.0)
+    for n in ti.static(range(3)):
+        rate[n] = fields[row + MOTION_RATE + n]
+        motion[n] = fields[row + MOTION + n] + time * rate[n]
+    return vec3(place[0], place[1], place[2]) + motion, rate
+
+
+@ti.func
+def goal_step(
+    f: ti.i32,
+    c: ti.i32,
+    p: ti.i32,
+    dt: ti.f32,
+    first_node: vec3,
+    xi: ivec3,
+    v: vec3,
+    stiffness: ti.f32,
+    fields: Scalars,
+    control: Doubles,
+    anchors: Vectors4,
+):
+    """Change of velocity over ``dt`` by the spring and damper between particle ``p`` and its goal."""
+    change = vec3(0.0)
+    if anchors[p][3] == GOAL:
+        time = ti.cast(control[c + ELAPSED], ti.f32)
+        if control[c + PHASE] == FULL:
+            time += ti.cast(control[c + STEP], ti.f32)
+        target, velocity = anchor_place(f, time, anchors[p], fields)
+        here = first_node + ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+        change = dt * (stiffness * (target - here) + fields[f * FIELD_ROW + GOAL_DAMPING] * (velocity - v))
+    return change
 
 
 @ti.func
 def advance_particles(
     laws: ti.template(),
     blocks: ti.i32,
-    gather: ti.i32,
-    scatter: ti.i32,
-    store: ti.i32,
-    dt_gather: ti.f32,
-    dt_scatter: ti.f32,
-    normal: vec3,
-    offset: ti.f32,
-    block_cells: Cells,
+    p_cells: Cells,
+    p_field: Integers,
     starts: Integers,
     neighbours: Integers,
-    near_ground: Integers,
+    near: Integers,
+    field_integers: Integers,
+    fields: Scalars,
+    worlds: Scalars,
+    control: Doubles,
     x: Cells,
     v: Vectors3,
     C: Matrices,
@@ -150,47 +193,70 @@ def advance_particles(
     material: Integers,
     table: Scalars,
     memory: Scalars,
+    anchors: Vectors4,
     reaction: Vectors4,
     window: Vectors4,
     nodes: Vectors4,
     scattered: Vectors4,
     report: Scalars,
 ):
-    """Grid to particles over ``dt_gather``, then particles to grid with the stress impulse of ``dt_scatter``.
+    """Grid to particles over ``STEP``, then particles to grid with the stress impulse of ``NEXT_STEP``.
 
     laws: the set of constitutive laws that occur, see ``materials``; 1, only fixed-corotated solids, touches neither
     ``material`` (the particle's row in ``table``) nor ``memory``.
-    gather, scatter: 0 leaves that half out (before and after a sort); store: 1 writes ``v`` and ``C``, which are
-    otherwise recomputed before anyone reads them.
+    The world's phase leaves the first half out (after a sort), its SCATTER the second (before one); STORE writes ``v``
+    and ``C``, which are otherwise recomputed before anyone reads them.
     x: window coordinates, fixed point; v: cells/s; C: 1/s; F: 1.
     constants: mass kg, 2 mu V0, lambda V0 (kg cells^2/s^2; of fluids 2 eta V0 and K V0), contact radius in cells.
+    anchors: place in cells that a pin or goal holds the particle at, and 1 (pin), 2 (goal) or 0.
     reaction: contact acceleration of the last substep (cells/s^2) and the share of contacting mass at the particle.
-    report, 8 numbers a block: largest |v|^2, largest c^2, least distance to the window's limits in cells, least
-    distance to the ground, sum of |v|^2 (not finite when the simulation is lost), 3 spare.
+    report, 8 numbers a block: largest |v|^2, largest c^2, least distance to the window's limits in cells, 1 spare,
+    sum of |v|^2 (not finite when the simulation is lost), 3 spare.
     """
     for kk in range(blocks * SPREAD):
         if kk % SPREAD == 0:
             k = kk // SPREAD
-            if gather == 1:
+            f = p_field[k]
+            world = field_integers[f * FIELD_INTEGERS + WORLD]
+            c = world * CONTROL_ROW
+            phase = control[c + PHASE]
+            gather = phase == FULL
+            scatter = phase != IDLE and control[c + SCATTER] == 1.0
+            store = control[c + STORE] == 1.0
+            dt_gather = ti.cast(control[c + STEP], ti.f32)
+            dt_scatter = ti.cast(control[c + NEXT_STEP], ti.f32)
+            if gather:
                 load_window(k, neighbours, window, nodes)
-            if scatter == 1:
+            if scatter:
                 for i in range(WINDOW_NODES):
                     scattered[k * WINDOW_NODES + i] = vec4(0.0)
-            ground = near_ground[k] >= 0
-            level = normal.dot(ti.cast(block_cells[k] * 4 - 1, ti.f32)) - offset
+            touching = near[k] >= 0
+            on_plane = touching and worlds[world * WORLD_ROW + HAS_PLANE] > 0.5
+            normal = vec3(
+                worlds[world * WORLD_ROW + PLANE_NORMAL],
+                worlds[world * WORLD_ROW + PLANE_NORMAL + 1],
+                worlds[world * WORLD_ROW + PLANE_NORMAL + 2],
+            )
+            first_node = ti.cast(p_cells[k] * 4 - 1, ti.f32)
+            level = normal.dot(first_node) - worlds[world * WORLD_ROW + PLANE_OFFSET]
+            goal = 0.0
+            if field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1:
+                goal = fields[f * FIELD_ROW + GOAL_STIFFNESS]
             speed2 = 0.0
             stiffness = 0.0
             sum2 = 0.0
             lowest = FIXED_HIGH
             highest = FIXED_LOW
-            clearance = 1e9
-            for p in range(starts[k], starts[k + 1]):
+            first_p, last_p = starts[k], starts[k + 1]
+            if phase == IDLE:
+                last_p = first_p
+            for p in range(first_p, last_p):
                 xi = x[p]
                 fixed = constants[p]
                 vp = vec3(0.0)
                 Cp = mat3(0.0)
                 Fp = F[p]
-                if gather == 1:
+                if gather:
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
@@ -235,13 +301,13 @@ def advance_particles(
                         Fp = deform(laws, p, dt_gather, Cp, F, material, table, memory)
                     F[p] = Fp
                     step = vp * dt_gather
-                    if ground:
-                        phi = level + normal.dot(gp) - fixed[3]
-                        moved = phi + normal.dot(step)
-                        floor = ti.min(phi, -SUNK_LIMIT)
-                        if moved < floor:
-                            step += (floor - moved) * normal
-                        clearance = ti.min(clearance, moved)
+                    if touching:
+                        if on_plane:
+                            phi = level + normal.dot(gp) - fixed[3]
+                            floor = ti.min(phi, -SUNK_LIMIT)
+                            moved = phi + normal.dot(step)
+                            if moved < floor:
+                                step += (floor - moved) * normal
                         old = reaction[p]
                         reaction[p] = vec4(old[0], old[1], old[2], A[3])
                     # Never outside the window, whatever the velocity: this is what keeps memory safe.
@@ -252,13 +318,15 @@ def advance_particles(
                     here2 = vp.dot(vp)
                     sum2 += here2
                     speed2 = ti.max(speed2, here2)
-                    if store == 1:
+                    if store:
                         v[p] = vp
                         C[p] = Cp
                 else:
                     vp = v[p]
                     Cp = C[p]
-                if scatter == 1:
+                if scatter:
+                    if goal > 0.0:
+                        vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, fields, control, anchors)
                     mass = fixed[0]
                     tau = mat3(0.0)
                     modulus = 0.0
@@ -273,7 +341,7 @@ def advance_particles(
                     fx = gp - ti.cast(base, ti.f32)
                     w = weights(fx)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
-                    if ground:
+                    if touching:
                         # Start the contact solve from the forces of the last substep.
                         a = reaction[p]
                         vp += dt_scatter * vec3(a[0], a[1], a[2])
@@ -293,10 +361,9 @@ def advance_particles(
                                 scattered[n] = scattered[n] + w[m][2] * (bj + float(m) * cj)
             margin = ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest)
             r = k * SCALARS_PER_BLOCK
-            if gather == 1:
+            if gather:
                 report[r] = speed2
                 report[r + 2] = ti.cast(margin, ti.f32) * (1.0 / FIXED_ONE)
-                report[r + 3] = clearance
                 report[r + 4] = sum2
-            if scatter == 1:
+            if scatter:
                 report[r + 1] = stiffness

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""The nodes' half of a substep: gather the windows, momentum to velocity, gravity and the forces of ``forces``.
+
+Fields are single bodies, so a force on a body is a force on its nodes; it costs nothing a particle.
+"""
+
+import taichi as ti
+
+from .layout import (
+    ACCELERATION,
+    ACCELERATION_RATE,
+    BLOCK_NODES,
+    CONTROL_ROW,
+    DRAG,
+    ELAPSED,
+    FIELD_INTEGERS,
+    FIELD_ROW,
+    FULL,
+    GRAVITY,
+    GRAVITY_FACTOR,
+    GRAVITY_RATE,
+    LIFT,
+    MEAN_MASS,
+    MEAN_PLACE,
+    MEAN_ROW,
+    MEAN_SPIN,
+    MEAN_VELOCITY,
+    PHASE,
+    SPREAD,
+    STEP,
+    TETHER_ANCHOR,
+    TETHER_LENGTH,
+    TETHER_STIFFNESS,
+    TETHER_STRING,
+    WANTS_MEANS,
+    WIND,
+    WORLD,
+    WORLD_ROW,
+    Cells,
+    Doubles,
+    Integers,
+    Scalars,
+    Vectors4,
+    ivec3,
+    vec3,
+    vec4,
+)
+from .transfer import add_windows
+
+SUMS = 16
+"""Numbers that a grid block adds to its field's means: mass, mass x place (3), momentum (3), angular momentum (3) and
+the six second moments xx, yy, zz, xy, yz, zx, places counted from the field's last centre of mass."""
+
+
+@ti.func
+def triple(numbers: Scalars, first: ti.i32):
+    """The three numbers from ``first`` on."""
+    return vec3(numbers[first], numbers[first + 1], numbers[first + 2])
+
+
+@ti.func
+def steady_acceleration(f: ti.i32, w: ti.i32, time: ti.f32, worlds: Scalars, fields: Scalars, means: Scalars):
+    """Acceleration (cells/s²) of field ``f`` whatever its local velocity, ``time`` s into the segment."""
+    row, world, mean = f * FIELD_ROW, w * WORLD_ROW, f * MEAN_ROW
+    gravity = triple(worlds, world + GRAVITY) + time * triple(worlds, world + GRAVITY_RATE)
+    a = fields[row + GRAVITY_FACTOR] * gravity
+    a += triple(fields, row + ACCELERATION) + time * triple(fields, row + ACCELERATION_RATE)
+    if fields[row + TETHER_STIFFNESS] > 0.0:
+        arm = triple(fields, row + TETHER_ANCHOR) - triple(means, mean + MEAN_PLACE)
+        distance = arm.norm() + 1e-12
+        stretch = distance - fields[row + TETHER_LENGTH]
+        if fields[row + TETHER_STRING] > 0.5:
+            stretch = ti.max(stretch, 0.0)
+        a += (fields[row + TETHER_STIFFNESS] * stretch / distance) * arm
+    return a
+
+
+@ti.func
+def advance_nodes(
+    blocks: ti.i32,
+    g_cells: Cells,
+    g_field: Integers,
+    neighbours: Integers,
+    field_integers: Integers,
+    fields: Scalars,
+    worlds: Scalars,
+    means: Scalars,
+    control: Doubles,
+    scattered: Vectors4,
+    nodes: Vectors4,
+    masses: Scalars,
+    block_sums: Scalars,
+):
+    """Nodes of all grid blocks: sum of the windows, velocity = momentum / mass, forces.
+
+    nodes: velocity in cells/s; the fourth number is left at 0 for the contact, which finds the mass in
+    ``masses`` (kg). block_sums: see ``SUMS``, of fields whose means are wanted.
+    """
+    for gg in range(blocks * SPREAD):
+        if gg % SPREAD == 0:
+            g = gg // SPREAD
+            f = g_field[g]
+            w = field_integers[f * FIELD_INTEGERS + WORLD]
+            c = w * CONTROL_ROW
+            if control[c + PHASE] == FULL:
+                dt = ti.cast(control[c + STEP], ti.f32)
+                time = ti.cast(control[c + ELAPSED], ti.f32) + 0.5 * dt
+                push = dt * steady_acceleration(f, w, time, worlds, fields, means)
+                wants_means = field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1
+                drag, lift = fields[f * FIELD_ROW + DRAG], fields[f * FIELD_ROW + LIFT]
+                wind = triple(fields, f * FIELD_ROW + WIND)
+                turn = (dt * lift) * triple(means, f * MEAN_ROW + MEAN_SPIN)
+                for i in range(BLOCK_NODES):
+                    nodes[g * BLOCK_NODES + i] = vec4(0.0)
+                add_windows(g, neighbours, scattered, nodes)
+                for i in range(BLOCK_NODES):
+                    q = nodes[g * BLOCK_NODES + i]
+                    masses[g * BLOCK_NODES + i] = q[3]
+                    if q[3] > 0.0:
+                        inverse = 1.0 / q[3]
+                        u = vec3(q[0], q[1], q[2]) * inverse + push
+                        if drag > 0.0 or lift != 0.0:
+                            through = u - wind
+                            # Implicit in the speed, so that no drag can turn a body back.
+                            u += turn.cross(through) - through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
+                        nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
+                if wants_means:
+                    add_sums(g, g_cells, triple(means, f * MEAN_ROW + MEAN_PLACE), nodes, masses, block_sums)
+
+
+@ti.func
+def add_sums(g: ti.i32, g_cells: Cells, centre: vec3, nodes: Vectors4, masses: Scalars, block_sums: Scalars):
+    """What grid block ``g`` adds to the means of its field; the grid holds the particles' moments exactly (APIC)."""
+    for n in range(SUMS):
+        block_sums[g * SUMS + n] = 0.0
+    first = g_cells[g] * 4
+    for i in range(BLOCK_NODES):
+        m = masses[g * BLOCK_NODES + i]
+        if m > 0.0:
+            u = nodes[g * BLOCK_NODES + i]
+            r = ti.cast(first + ivec3(i // 16, i // 4 % 4, i % 4), ti.f32) - centre
+            velocity = vec3(u[0], u[1], u[2])
+            spin = r.cross(velocity)
+            block_sums[g * SUMS] += m
+            for n in ti.static(range(3)):
+                block_sums[g * SUMS + 1 + n] += m * r[n]
+                block_sums[g * SUMS + 4 + n] += m * velocity[n]
+                block_sums[g * SUMS + 7 + n] += m * spin[n]
+                block_sums[g * SUMS + 10 + n] += m * r[n] * r[n]
+                block_sums[g * SUMS + 13 + n] += m * r[n] * r[(n + 1) % 3]
+
+
+@ti.func
+def gather_means(
+    field_count: ti.i32,
+    g_starts: Integers,
+    field_integers: Integers,
+    control: Doubles,
+    block_sums: Scalars,
+    means: Scalars,
+):
+    """Means of the fields that want them, from their grid blocks ``g_starts[f]`` up to ``g_starts[f + 1]``."""
+    ti.loop_config(serialize=True)
+    for f in range(field_count):
+        w = field_integers[f * FIELD_INTEGERS + WORLD]
+        if field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1 and control[w * CONTROL_ROW + PHASE] == FULL:
+            total = ti.Vector([0.0 for _ in range(SUMS)], ti.f64)
+            for g in range(g_starts[f], g_starts[f + 1]):
+                for n in ti.static(range(SUMS)):
+                    total[n] += block_sums[g * SUMS + n]
+            mass = total[0]
+            if mass > 0.0:
+                mean = f * MEAN_ROW
+                shift = ti.Vector([total[1], total[2], total[3]]) / mass
+                velocity = ti.Vector([total[4], total[5], total[6]]) / mass
+                spin = ti.Vector([total[7], total[8], total[9]]) - mass * shift.cross(velocity)
+                xx = total[10] - mass * shift[0] * shift[0]
+                yy = total[11] - mass * shift[1] * shift[1]
+                zz = total[12] - mass * shift[2] * shift[2]
+                xy = total[13] - mass * shift[0] * shift[1]
+                yz = total[14] - mass * shift[1] * shift[2]
+                zx = total[15] - mass * shift[2] * shift[0]
+                inertia = ti.Matrix([[yy + zz, -xy, -zx], [-xy, zz + xx, -yz], [-zx, -yz, xx + yy]])
+                omega = inertia.inverse() @ spin
+                means[mean + MEAN_MASS] = ti.cast(mass, ti.f32)
+                for n in ti.static(range(3)):
+                    means[mean + MEAN_PLACE + n] += ti.cast(shift[n], ti.f32)
+                    means[mean + MEAN_VELOCITY + n] = ti.cast(velocity[n], ti.f32)
+                    means[mean + MEAN_SPIN + n] = ti.cast(omega[n], ti.f32)

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""From setups in SI units to the rows of numbers that the kernels read (``layout`` names the columns)."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.units import Similarity
+from . import layout
+from .bodies import BodyParticles
+from .contacts import GROUND_NAME, MODES, SurfaceContact
+from .engine import ONLY_ELASTIC, Added, Numbers
+from .materials import ROW, ElasticMaterial, RigidMaterial, bounding_speed
+from .setup import WorldSetup
+from .transfer import GOAL, PIN
+
+Array = NDArray[np.float64]
+
+RECOVERY_HEIGHT = 0.02
+"""Cells that a particle which starts in the ground could fly up when it is pushed out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """World ``world`` and how its metres become cells."""
+
+    world: int
+    setup: WorldSetup
+    cells: Similarity
+    first_field: int
+    first_material: int
+
+    @property
+    def soft(self) -> tuple[int, ...]:
+        """Indices of the setup's bodies that are fields: those that deform."""
+        return tuple(i for i, body in enumerate(self.setup.bodies) if not body.rigid)
+
+    def field(self, body: int) -> int:
+        """The field of the setup's body ``body``, which must not be rigid."""
+        return self.first_field + self.soft.index(body)
+
+
+def places(setups: Sequence[WorldSetup], cells: Sequence[Similarity]) -> tuple[Place, ...]:
+    """Where each world's fields and materials stand in the common arrays."""
+    result: list[Place] = []
+    field = material = 0
+    for world, (setup, similarity) in enumerate(zip(setups, cells, strict=True)):
+        result.append(Place(world=world, setup=setup, cells=similarity, first_field=field, first_material=material))
+        field += len(result[-1].soft)
+        material += sum(1 + len(setup.bodies[i].materials) for i in result[-1].soft)
+    return tuple(result)
+
+
+def materials_of(body: BodyParticles) -> tuple[ElasticMaterial, ...]:
+    """All materials of a body that deforms, in the order of ``material_index``."""
+    assert not isinstance(body.material, RigidMaterial)
+    return (body.material, *body.materials)
+
+
+def first_material(place: Place, body: int) -> int:
+    """Row of the body's first material in the table."""
+    before = place.soft[: place.soft.index(body)]
+    return place.first_material + sum(1 + len(place.setup.bodies[i].materials) for i in before)
+
+
+def pack(all_places: Sequence[Place]) -> Numbers:
+    """All that stays the same for the whole run; rows of worlds and fields are those at time 0."""
+    bodies = [place.setup.bodies[i] for place in all_places for i in place.soft]
+    laws = functools.reduce(operator.or_, (m.laws for body in bodies for m in materials_of(body)), 0) or ONLY_ELASTIC
+    table = [m.row for body in bodies for m in materials_of(body)] or [(0.0,) * ROW]
+    touches: list[tuple[float, ...]] = []
+    pairs: list[tuple[float, ...]] = []
+    world_integers = np.zeros((len(all_places), layout.WORLD_INTEGERS), dtype=np.int32)
+    field_integers = np.zeros((len(bodies), layout.FIELD_INTEGERS), dtype=np.int32)
+    first_solid = 0
+    for place in all_places:
+        setup, soft = place.setup, place.soft
+        obstacles = obstacle_names(setup)
+        row = world_integers[place.world]
+        row[layout.FIRST_SOLID], row[layout.SOLIDS] = first_solid, len(obstacles)
+        row[layout.FIRST_FIELD], row[layout.FIELDS] = place.first_field, len(soft)
+        row[layout.FIRST_PAIR] = len(pairs)
+        first_solid += len(obstacles)
+        for i in soft:
+            body = setup.bodies[i]
+            integers = field_integers[place.field(i)]
+            integers[layout.WORLD] = place.world
+            integers[layout.FIRST_TOUCH] = len(touches)
+            integers[layout.WANTS_MEANS] = int(body.forces.lift != 0 or body.forces.tether_stiffness > 0)
+            integers[layout.HAS_ANCHORS] = int(body.pins is not None or body.goal_stiffness > 0)
+            for name in (GROUND_NAME, *obstacles):
+                touches.append(touch_row(setup.contact(body.name, name), place.cells))
+            for j in soft:
+                pairs.append(touch_row(setup.contact(body.name, setup.bodies[j].name), place.cells))
+    return Numbers(
+        laws=laws,
+        table=np.asarray(table, dtype=np.float32),
+        world_integers=world_integers,
+        worlds=np.stack([world_row(place, 0.0, 0.0) for place in all_places]),
+        field_integers=field_integers,
+        fields=field_rows(all_places, [0.0] * len(all_places), [0.0] * len(all_places)),
+        touches=np.asarray(touches, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
+        pairs=np.asarray(pairs, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
+    )
+
+
+def obstacle_names(setup: WorldSetup) -> tuple[str, ...]:
+    """Names of a world's solids in the order in which the kernels count them: rigid bodies, then colliders."""
+    return (*(body.name for body in setup.bodies if body.rigid), *(collider.name for collider in setup.colliders))
+
+
+def touch_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]:
+    """One row of the tables ``touches`` and ``pairs``."""
+    return (
+        contact.sticking,
+        contact.friction,
+        float(MODES.index(contact.mode)),
+        cells.length(contact.adhesion),
+        cells.length(contact.adhesion_reach),
+        contact.restitution,
+    )
+
+
+def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
+    """Numbers of a world for the segment of time from ``start`` to ``end`` in s."""
+    row = np.zeros(layout.WORLD_ROW)
+    scale = place.cells.scale
+    gravity = np.asarray(place.setup.gravity_at(start)) * scale
+    row[layout.GRAVITY : layout.GRAVITY + 3] = gravity
+    if end > start:
+        later = np.asarray(place.setup.gravity_at(end)) * scale
+        row[layout.GRAVITY_RATE : layout.GRAVITY_RATE + 3] = (later - gravity) / (end - start)
+    ground = place.setup.ground
+    row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = (0.0, 0.0, 1.0)
+    if ground is not None:
+        normal = np.asarray(ground.normal, dtype=np.float64)
+        normal = normal / np.linalg.norm(normal)
+        row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = normal
+        row[layout.PLANE_OFFSET] = normal @ place.cells.points_to_engine(np.asarray(ground.point))
+        row[layout.HAS_PLANE] = 1.0
+    row[layout.RECOVERY_SPEED] = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
+    return row.astype(np.float32)
+
+
+def field_rows(all_places: Sequence[Place], starts: Sequence[float], ends: Sequence[float]) -> NDArray[np.float32]:
+    """Numbers of all fields, each for its world's segment of time."""
+    rows = [field_row(place, i, starts[place.world], ends[place.world]) for place in all_places for i in place.soft]
+    return np.stack(rows) if rows else np.zeros((0, layout.FIELD_ROW), dtype=np.float32)
+
+
+def field_row(place: Place, body_index: int, start: float, end: float) -> NDArray[np.float32]:
+    """Numbers of one field for the segment of time from ``start`` to ``end`` in s."""
+    body, scale = place.setup.bodies[body_index], place.cells.scale
+    forces = body.forces
+    row = np.zeros(layout.FIELD_ROW)
+    row[layout.GRAVITY_FACTOR] = forces.gravity_factor
+    row[layout.DRAG] = forces.drag / scale
+    row[layout.WIND : layout.WIND + 3] = np.asarray(forces.wind) * scale
+    row[layout.LIFT] = forces.lift
+    row[layout.TETHER_STIFFNESS] = forces.tether_stiffness
+    row[layout.TETHER_LENGTH] = forces.tether_length * scale
+    row[layout.TETHER_ANCHOR : layout.TETHER_ANCHOR + 3] = place.cells.points_to_engine(
+        np.asarray(forces.tether_anchor, dtype=np.float64)
+    )
+    row[layout.TETHER_STRING] = float(forces.tether_string)
+    for track, column, rate in (
+        (body.acceleration, layout.ACCELERATION, layout.ACCELERATION_RATE),
+        (body.pin_motion, layout.MOTION, layout.MOTION_RATE),
+    ):
+        if track is not None:
+            now, later = track.at(start) * scale, track.at(end) * scale
+            row[column : column + 3] = now
+            if end > start:
+                row[rate : rate + 3] = (later - now) / (end - start)
+    row[layout.GOAL_STIFFNESS] = body.goal_stiffness
+    row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
+    return row.astype(np.float32)
+
+
+def particles(place: Place, body_index: int, first_id: int, choice: NDArray[np.int32]) -> tuple[Added, float]:
+    """The particles of a body as the engine takes them, and the speed in cells/s of the fastest wave in them.
+
+    choice: material of each particle (N,), as in ``BodyParticles.material_index``.
+    """
+    body, cells = place.setup.bodies[body_index], place.cells
+    scale = cells.scale
+    volumes = body.volumes * scale**3
+    assert body.contact_radii is not None
+    anchors = np.zeros((body.count, 4))
+    anchors[:, :3] = cells.points_to_engine(body.positions)
+    if body.goal_stiffness > 0:
+        anchors[:, 3] = GOAL
+    if body.pins is not None:
+        anchors[body.pins, 3] = PIN
+    constants, wave_speed = stiffness(body, choice, cells)
+    added = Added(
+        field=place.field(body_index),
+        x=cells.points_to_engine(body.positions),
+        v=body.initial_velocities * scale,
+        C=np.broadcast_to(body.initial_velocity_gradient, (body.count, 3, 3)),
+        F=np.broadcast_to(np.eye(3), (body.count, 3, 3)),
+        constants=np.column_stack([body.masses, constants, body.contact_radii * scale]),
+        ids=np.arange(first_id, first_id + body.count, dtype=np.int32),
+        material=first_material(place, body_index) + choice,
+        volumes=volumes,
+        anchors=anchors,
+    )
+    return added, wave_speed
+
+
+def stiffness(body: BodyParticles, choice: NDArray[np.int32], cells: Similarity) -> tuple[Array, float]:
+    """2 mu V0 and lambda V0 (N, 2) of particles of the materials ``choice``; their fastest wave's speed in cells/s."""
+    every = materials_of(body)
+    scale = cells.scale
+    factor = np.ones(body.count) if body.stiffness_scale is None else body.stiffness_scale
+    shear = np.array([m.shear_number for m in every])[choice] * factor
+    bulk = np.array([m.bulk_number for m in every])[choice] * factor
+    volumes = body.volumes * scale**3
+    constants = np.column_stack([cells.modulus(1.0) * shear * volumes, cells.modulus(1.0) * bulk * volumes])
+    lighter = 1.0 if body.density_scale is None else float(body.density_scale.min())
+    fastest = max(
+        bounding_speed(
+            cells.length(every[i].wave_speed) * math.sqrt(float(factor.max()) / lighter),
+            scale**2 * every[i].diffusivity * float(factor.max()) / lighter,
+        )
+        for i in np.unique(choice)
+    )
+    return constants, fastest

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""What can be seen of one world among ``Worlds``: places, velocities, deformation, energies. World SI units."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import diagnostics, layout
+from .bodies import BodyParticles, Vector
+from .packing import materials_of
+from .setup import WorldSetup
+
+if TYPE_CHECKING:
+    from .worlds import Worlds
+
+Array = NDArray[np.float64]
+
+
+class WorldView:
+    """World ``index`` of ``worlds``, to look at."""
+
+    def __init__(self, worlds: Worlds, index: int) -> None:
+        self._worlds = worlds
+        self._index = index
+
+    @property
+    def setup(self) -> WorldSetup:
+        """What the world holds."""
+        return self._worlds.setups[self._index]
+
+    @property
+    def bodies(self) -> tuple[BodyParticles, ...]:
+        """The world's bodies, in the order in which methods count them."""
+        return self.setup.bodies
+
+    @property
+    def time(self) -> float:
+        """Simulated time in s."""
+        return self._worlds.time(self._index)
+
+    @property
+    def substeps(self) -> int:
+        """Substeps taken since the world was made."""
+        return int(self._worlds.control(self._index)[layout.SUBSTEPS])
+
+    @property
+    def stable_step(self) -> float:
+        """Longest substep in s that the present state allows."""
+        return self._worlds.stable_step(self._index)
+
+    # ---- state --------------------------------------------------------------------------------------------------
+
+    def _number(self, index: int) -> int:
+        return self._worlds.body_number(self._index, index)
+
+    def _gather(self, name: str, index: int, resting: Array) -> Array:
+        return self._worlds.gather(name, self._number(index), resting)
+
+    def _scale(self) -> float:
+        return self._worlds.cells.scale
+
+    def positions(self, index: int) -> Array:
+        """Particle positions (N, 3) of body ``index``, world metres, in the order in which they were given."""
+        number, body = self._number(index), self.bodies[index]
+        if not self._worlds.started(number):
+            return body.positions.copy()
+        return self._worlds.cells.points_to_world(self._gather("position", index, np.zeros((body.count, 3))))
+
+    def velocities(self, index: int) -> Array:
+        """Particle velocities (N, 3) of body ``index``, m/s. Zero before the body starts."""
+        number = self._number(index)
+        return self._worlds.gather("v", number, np.zeros((self.bodies[index].count, 3))) / self._scale()
+
+    def velocity_gradients(self, index: int) -> Array:
+        """APIC velocity gradients (N, 3, 3) of body ``index``, 1/s."""
+        number = self._number(index)
+        return self._worlds.gather("C", number, np.zeros((self.bodies[index].count, 3, 3)))
+
+    def deformation_gradients(self, index: int) -> Array:
+        """Deformation gradients (N, 3, 3) of body ``index``: current from undeformed shape.
+
+        Of matter that flows they are fitted to the particles' positions, because its own deformation gradient knows
+        the elastic part only; see ``fitting``.
+        """
+        number, body = self._number(index), self.bodies[index]
+        if not any(material.flows for material in materials_of(body)):
+            return self.elastic_gradients(index)
+        return self._worlds.fitted(number, body.positions).gradients(self.positions(index))
+
+    def elastic_gradients(self, index: int) -> Array:
+        """Elastic parts (N, 3, 3) of the deformation gradients of body ``index``, which carry its stress."""
+        number = self._number(index)
+        return self._worlds.gather("F", number, np.broadcast_to(np.eye(3), (self.bodies[index].count, 3, 3)).copy())
+
+    def memories(self, index: int) -> Array:
+        """What the law remembers of each particle (N,): ln J_P of snow, ln of lost contact in sand, ln J of fluids."""
+        number, body = self._number(index), self.bodies[index]
+        if not any(material.flows for material in materials_of(body)):
+            return np.zeros(body.count)
+        return self._worlds.gather("memory", number, np.zeros(body.count))
+
+    # ---- diagnostics --------------------------------------------------------------------------------------------
+
+    def _moving(self) -> list[int]:
+        return [i for i in range(len(self.bodies)) if self._worlds.started(self._number(i))]
+
+    def linear_momentum(self) -> Array:
+        """Momentum (3,) of all bodies, kg m/s."""
+        terms = [diagnostics.linear_momentum(self.bodies[i].masses, self.velocities(i)) for i in self._moving()]
+        return np.asarray(np.sum(terms, axis=0)) if terms else np.zeros(3)
+
+    def angular_momentum(self, about: Vector = (0.0, 0.0, 0.0)) -> Array:
+        """Angular momentum (3,) of all bodies about a world point, kg m²/s, with the affine velocities' part."""
+        terms = [
+            diagnostics.angular_momentum(
+                self.bodies[i].masses,
+                self.positions(i),
+                self.velocities(i),
+                self.velocity_gradients(i),
+                1.0 / self._scale(),
+                np.asarray(about, dtype=np.float64),
+            )
+            for i in self._moving()
+        ]
+        return np.asarray(np.sum(terms, axis=0)) if terms else np.zeros(3)
+
+    def energy(self) -> diagnostics.Energy:
+        """Energies of all bodies that have started, J."""
+        kinetic = elastic = potential = 0.0
+        gravity = np.asarray(self.setup.gravity_at(self.time))
+        for i in self._moving():
+            body = self.bodies[i]
+            masses = body.masses
+            kinetic += diagnostics.kinetic_energy(
+                masses, self.velocities(i), self.velocity_gradients(i), 1.0 / self._scale()
+            )
+            elastic += self._elastic_energy(i)
+            potential -= float(masses @ (self.positions(i) @ gravity))
+        return diagnostics.Energy(kinetic=kinetic, elastic=elastic, potential=potential)
+
+    def _elastic_energy(self, index: int) -> float:
+        body = self.bodies[index]
+        choice = self._worlds.material_choice(self._index, index)
+        volumes = body.volumes if body.stiffness_scale is None else body.volumes * body.stiffness_scale
+        gradients, memories = self.elastic_gradients(index), self.memories(index)
+        return sum(
+            diagnostics.elastic_energy(material, volumes[mine], gradients[mine], memories[mine])
+            for material, mine in ((m, choice == i) for i, m in enumerate(materials_of(body)))
+            if mine.any()
+        )
+
+    def ground_gap(self, index: int) -> float:
+        """Least distance in metres of body ``index``'s surface to the ground; below 0 under it, inf without ground."""
+        ground = self.setup.ground
+        if ground is None:
+            return math.inf
+        radii = self.bodies[index].contact_radii
+        assert radii is not None
+        normal = np.asarray(ground.normal, dtype=np.float64)
+        heights = (self.positions(index) - np.asarray(ground.point)) @ (normal / np.linalg.norm(normal))
+        return float((heights - radii).min())
+
+    def particles_outside(self, index: int) -> int:
+        """Particles of body ``index`` that have left the box of the profile; they fly on, outside as inside."""
+        cells = self._worlds.cells.points_to_engine(self.positions(index))
+        outside = (cells < 0.0) | (cells > self._worlds.options.grid)
+        return int(outside.any(axis=1).sum())

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: MIT
+"""Many worlds that advance together, each as if it were alone.
+
+worlds = Worlds([setup, dataclasses.replace(setup, gravity=(0, 0, -1.62))], similarity=similarity, options=options)
+worlds.advance(1 / 24)
+worlds[1].positions(0)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, SimulationError
+from ..scene.units import ENGINE_BOX_SIZE, Similarity
+from . import packing, runtime
+from .checks import check_start
+from .engine import Diverged, Engine
+from .fitting import FittedGradients
+from .options import SolverOptions
+from .placement import fit_similarity
+from .setup import WorldSetup
+from .view import WorldView
+
+Array = NDArray[np.float64]
+State = dict[str, NDArray[np.generic]]
+
+CHECKPOINT_FORMAT = 2
+
+INSTANT = 1e-12
+"""Times closer than this in s are the same."""
+
+
+class Worlds:
+    """Copies of a scene, or different scenes, that advance in the same launches.
+
+    setups: what each world holds.
+    similarity: where the worlds stand in the engine's box; None fits it to the bodies of the first.
+    options: of the solver, for all of them.
+
+    Every world takes its own substeps and gives the same bytes as it would alone. Deterministic on the CPU. Raises
+    InputError when a body is smaller than the cells, or starts too deep in the ground.
+    """
+
+    def __init__(
+        self,
+        setups: Sequence[WorldSetup],
+        *,
+        similarity: Similarity | None = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        if not setups:
+            raise InputError("setups is empty: give at least one world")
+        self.setups = tuple(setups)
+        self.options = options or SolverOptions()
+        first = self.setups[0]
+        self.similarity = similarity or fit_similarity(
+            [body.positions for body in first.bodies], first.ground, options=self.options
+        )
+        self.cells = Similarity(
+            scale=self.similarity.scale * self.options.grid / ENGINE_BOX_SIZE, origin=self.similarity.origin
+        )
+        for setup in self.setups:
+            check_start(setup, self.cells)
+        self.arch, self._generation = runtime.ensure_started(self.options)
+        self._places = packing.places(self.setups, [self.cells] * len(self.setups))
+        counts = [body.count for setup in self.setups for body in setup.bodies]
+        self._first_body = np.concatenate([[0], np.cumsum([len(setup.bodies) for setup in self.setups])])
+        self._offsets = np.concatenate([[0], np.cumsum(counts)])
+        self._started = np.zeros(len(counts), dtype=bool)
+        self._times = np.zeros(len(self.setups))
+        self._engine = self._new_engine()
+        self._host: State | None = None
+        self._fits: dict[int, FittedGradients] = {}
+        for place in self._places:
+            self._reach_time(place, -math.inf)
+
+    def _new_engine(self) -> Engine:
+        soft = [not body.rigid for setup in self.setups for body in setup.bodies]
+        return Engine(
+            capacity=int(np.diff(self._offsets)[soft].sum()),
+            cfl_elastic=self.options.cfl_elastic,
+            cfl_velocity=self.options.cfl_velocity,
+            numbers=packing.pack(self._places),
+        )
+
+    def __len__(self) -> int:
+        return len(self.setups)
+
+    def __getitem__(self, index: int) -> WorldView:
+        """World ``index``, to look at."""
+        return WorldView(self, range(len(self))[index])
+
+    # ---- time ---------------------------------------------------------------------------------------------------
+
+    def time(self, world: int = 0) -> float:
+        """Simulated time in s of world ``world``."""
+        return float(self._times[world])
+
+    def control(self, world: int) -> Array:
+        """Progress of world ``world`` as the engine keeps it, see ``layout``."""
+        return self._engine.control()[world]
+
+    def stable_step(self, world: int) -> float:
+        """Longest substep in s that the present state of world ``world`` allows."""
+        return min(self._engine.stable_step(world), self._longest_step(self._places[world]))
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes that the engine's arrays take on the device."""
+        return self._engine.device_bytes
+
+    @property
+    def retries(self) -> int:
+        """Stretches of substeps that were taken again with shorter steps because they had gone wrong."""
+        return self._engine.retries
+
+    def advance(self, duration: float) -> None:
+        """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
+
+        Raises SimulationError that names the body when a world goes wrong and shorter substeps do not help.
+        """
+        if not (math.isfinite(duration) and duration >= 0):
+            raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
+        self._check_generation()
+        end = self._times[0] + duration
+        while (self._times < end).any():
+            stops = np.array([self._next_stop(place, end) for place in self._places])
+            self._engine.set_rows(
+                worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
+                fields=packing.field_rows(self._places, list(self._times), list(stops)),
+            )
+            longest = [self._longest_step(place) for place in self._places]
+            self._host = None
+            try:
+                self._engine.advance(stops - self._times, longest_step=np.array(longest))
+            except Diverged as failure:
+                raise self._lost(failure) from None
+            before = self._times.copy()
+            self._times = stops
+            for place in self._places:
+                if stops[place.world] > before[place.world]:
+                    self._reach_time(place, before[place.world])
+
+    def _longest_step(self, place: packing.Place) -> float:
+        """Longest substep in s: the option's, and what goals allow (explicit springs are stable to 2 / frequency)."""
+        goals = [body.goal_stiffness for body in place.setup.bodies]
+        return min(self.options.max_step, 0.5 / math.sqrt(max([*goals, 1e-12])))
+
+    def _next_stop(self, place: packing.Place, end: float) -> float:
+        """The next time, up to ``end``, at which something in the world sets in or changes its slope."""
+        now = float(self._times[place.world])
+        setup = place.setup
+        tracks = [setup.gravity_track]
+        knots = []
+        for body in setup.bodies:
+            tracks += [body.acceleration, body.pin_motion, body.velocity_keys]
+            knots.append(body.start_time)
+            knots += [time for time, _ in body.material_track]
+        for collider in setup.colliders:
+            tracks += [collider.translations, collider.rotations, collider.vertices]
+        knots += [t for track in tracks if track is not None for t in track.times]
+        return min([end, *(float(t) for t in knots if now + INSTANT < t < end)])
+
+    def _reach_time(self, place: packing.Place, before: float) -> None:
+        """What sets in at the world's present time, after ``before``: bodies, velocities, materials."""
+        now = float(self._times[place.world]) + INSTANT
+        for i, body in enumerate(place.setup.bodies):
+            number = int(self._first_body[place.world]) + i
+            if not self._started[number] and body.start_time <= now:
+                self._started[number] = True
+                if not body.rigid:
+                    added, wave_speed = packing.particles(
+                        place, i, int(self._offsets[number]), self._material_choice(place, i, now)
+                    )
+                    self._engine.add(added, wave_speed=wave_speed)
+                self._host = None
+            if self._started[number]:
+                if any(before + INSTANT < time <= now for time, _ in body.material_track):
+                    self._change_material(place, i, now)
+                keys = body.velocity_keys
+                if keys is not None and any(before + INSTANT < t <= now for t in keys.times):
+                    self._set_velocity(place, i, keys.at(now))
+
+    @staticmethod
+    def _material_choice(place: packing.Place, body_index: int, now: float) -> NDArray[np.int32]:
+        """Material of each particle at time ``now``, counted as in ``material_index``."""
+        body = place.setup.bodies[body_index]
+        past = [index for time, index in body.material_track if time <= now]
+        if past:
+            return np.full(body.count, past[-1], dtype=np.int32)
+        return np.zeros(body.count, dtype=np.int32) if body.material_index is None else body.material_index
+
+    def material_choice(self, world: int, index: int) -> NDArray[np.int32]:
+        """Present material of each particle of body ``index``, counted as in ``material_index``."""
+        return self._material_choice(self._places[world], index, float(self._times[world]) + INSTANT)
+
+    def _rows_of(self, state: State, number: int) -> NDArray[np.bool_]:
+        ids = np.asarray(state["ids"], dtype=np.int64)
+        return (ids >= self._offsets[number]) & (ids < self._offsets[number + 1])
+
+    def _change_material(self, place: packing.Place, body_index: int, now: float) -> None:
+        """Let the body's particles be of another material from now on; what they remember of the old one is lost."""
+        choice = self._material_choice(place, body_index, now)
+        number = int(self._first_body[place.world]) + body_index
+        state = self._engine.state()
+        mine = self._rows_of(state, number)
+        order = np.asarray(state["ids"])[mine] - self._offsets[number]
+        constants, wave_speed = packing.stiffness(place.setup.bodies[body_index], choice, place.cells)
+        state["constants"][mine, 1:3] = constants[order]
+        state["material"][mine] = packing.first_material(place, body_index) + choice[order]
+        state["memory"][mine] = 0.0
+        self._engine.replace(state)
+        self._engine.raise_wave_speed(place.world, wave_speed)
+        self._host = None
+
+    def _set_velocity(self, place: packing.Place, body_index: int, velocity: Array) -> None:
+        """Give the body as a whole the velocity in m/s."""
+        number = int(self._first_body[place.world]) + body_index
+        state = self._engine.state()
+        mine = self._rows_of(state, number)
+        mean = np.average(state["v"][mine], axis=0, weights=state["constants"][mine, 0])
+        state["v"][mine] += (velocity * place.cells.scale - mean).astype(np.float32)
+        self._engine.replace(state)
+        fastest = float(np.linalg.norm(state["v"][mine], axis=1).max())
+        self._engine.raise_speed(place.world, fastest)
+        self._host = None
+
+    def _lost(self, failure: Diverged) -> SimulationError:
+        place = self._places[failure.world]
+        time = float(self._times[failure.world])
+        where = f" of world {failure.world}" if len(self) > 1 else ""
+        soft = place.soft
+        index = failure.field - place.first_field
+        body = place.setup.bodies[soft[index] if 0 <= index < len(soft) else 0]
+        return SimulationError(
+            f"body {body.name!r}{where} became unstable after t = {time:g} s, and substeps shortened {2**6} times did "
+            f"not help: check its density and Young's modulus, what hits it and how fast, or lower the solver option "
+            f"cfl_elastic ({self.options.cfl_elastic:g})"
+        )
+
+    def _check_generation(self) -> None:
+        if self._generation != runtime.generation():
+            raise SimulationError(
+                "the compute runtime was restarted with other options after this world was made: make a new world and "
+                "restore its checkpoint"
+            )
+
+    # ---- state --------------------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """The engine's state; kept until the next advance."""
+        self._check_generation()
+        if self._host is None:
+            self._host = self._engine.state()
+        return self._host
+
+    def started(self, number: int) -> bool:
+        """Whether body ``number`` of all has entered the simulation."""
+        return bool(self._started[number])
+
+    def body_number(self, world: int, index: int) -> int:
+        """Number among all bodies of body ``index`` of world ``world``. Raises InputError when there is none."""
+        if not 0 <= index < len(self.setups[world].bodies):
+            raise InputError(f"body index is {index}: give 0 to {len(self.setups[world].bodies) - 1}")
+        return int(self._first_body[world]) + index
+
+    def fitted(self, number: int, rest: Array) -> FittedGradients:
+        """The fit of deformation gradients to body ``number`` of all, whose places at rest are ``rest``."""
+        if number not in self._fits:
+            self._fits[number] = FittedGradients(rest)
+        return self._fits[number]
+
+    def gather(self, name: str, number: int, resting: Array) -> Array:
+        """Values of body ``number`` of all in the order of its particles; ``resting`` where it has not started."""
+        if not self._started[number]:
+            return resting
+        state = self.state()
+        mine = self._rows_of(state, number)
+        values = np.asarray(state[name][mine], dtype=np.float64)
+        ordered = np.empty_like(values)
+        ordered[np.asarray(state["ids"])[mine] - self._offsets[number]] = values
+        return ordered
+
+    def checkpoint(self) -> State:
+        """Everything needed to continue, as arrays for ``numpy.savez``; a restored run continues with equal bytes."""
+        state = dict(self.state())
+        del state["position"], state["field"]
+        state["format"] = np.array(CHECKPOINT_FORMAT)
+        state["times"] = self._times.copy()
+        state["started"] = self._started.copy()
+        state["offsets"] = self._offsets.astype(np.int64)
+        state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
+        state["grid"] = np.array(self.options.grid)
+        return state
+
+    def restore(self, checkpoint: Mapping[str, NDArray[np.generic]]) -> None:
+        """Take up a state that ``checkpoint`` returned in worlds of the same setups, similarity and grid."""
+        self._check_generation()
+        wanted = {"format", "times", "started", "offsets", "similarity", "grid", "keys", "control", "means"}
+        missing = wanted - set(checkpoint)
+        if missing:
+            raise InputError(f"checkpoint has no {', '.join(sorted(missing))}: it was not written by this engine")
+        if int(checkpoint["format"]) != CHECKPOINT_FORMAT:
+            raise InputError(f"checkpoint format is {int(checkpoint['format'])}: this engine reads {CHECKPOINT_FORMAT}")
+        same = (
+            np.array_equal(checkpoint["offsets"], self._offsets)
+            and np.array_equal(checkpoint["similarity"], [self.similarity.scale, *self.similarity.origin])
+            and int(checkpoint["grid"]) == self.options.grid
+            and len(checkpoint["times"]) == len(self)
+        )
+        if not same:
+            raise InputError("checkpoint is of another scene: bodies, similarity and grid must be the same")
+        self._times = np.array(checkpoint["times"], dtype=np.float64)
+        self._started = np.array(checkpoint["started"], dtype=bool)
+        self._engine = self._new_engine()
+        self._engine.restore(checkpoint)
+        self._host = None
