@@ -101,20 +101,21 @@ def rebase(
 ):
     """Find each particle's new block and express its position in that block's window. Exact: integers are shifted.
 
-    Only in worlds that want a sort: in the others it would change the order of sums.
+    Particles of worlds that want no sort stay in their blocks: moving them would change the order of sums.
     """
     for k in range(blocks):
         f = p_field[k]
-        if control[field_integers[f * FIELD_INTEGERS + WORLD] * CONTROL_ROW + STATUS] == WANTS_SORT:
-            old = p_cells[k]
-            for p in range(starts[k], starts[k + 1]):
+        old = p_cells[k]
+        moves = control[field_integers[f * FIELD_INTEGERS + WORLD] * CONTROL_ROW + STATUS] == WANTS_SORT
+        for p in range(starts[k], starts[k + 1]):
+            new = old
+            if moves:
                 xi = x[p]
-                new = ivec3(0)
                 for c in ti.static(range(3)):
                     base = old[c] * 4 - 1 + ((xi[c] - FIXED_LOW) >> FIXED_BITS)
                     new[c] = ti.min(ti.max(base >> 2, -FARTHEST_BLOCK), FARTHEST_BLOCK)
                 x[p] = xi + (old - new) * (4 * FIXED_ONE)
-                keys[p] = block_key(f, new)
+            keys[p] = block_key(f, new)
 
 
 @ti.kernel
