@@ -42,8 +42,8 @@ class BodyParticles:
     """Material of each particle (N,): 0 is ``material``, i is ``materials[i - 1]``. None: all of ``material``."""
 
     material_track: tuple[tuple[float, int], ...] = ()
-    """(time s, index), in rising order: from that time on all particles are of that material, counted as in
-    ``material_index``."""
+    """(time s, index), times rising from 0 or more: from that time on all particles are of that material, with the mass
+    and volume they have. Not of rigid bodies."""
 
     density_scale: NDArray[np.float64] | None = None
     """Factor (N,) on the density of each particle, above 0; None: 1."""
@@ -147,11 +147,7 @@ class BodyParticles:
             good = index.shape == (count,) and bool((index >= 0).all() and (index <= len(self.materials)).all())
             self._require(good, "material_index", index.shape, f"give {count} numbers from 0 to {len(self.materials)}")
             object.__setattr__(self, "material_index", index)
-        for time, index in self.material_track:
-            good = math.isfinite(time) and 0 <= index <= len(self.materials)
-            self._require(good, "material_track", (time, index), f"give seconds and 0 to {len(self.materials)}")
-        times = [time for time, _ in self.material_track]
-        self._require(times == sorted(times), "material_track", times, "give the times in rising order")
+        self._check_material_track()
         if self.pins is not None:
             pins = np.ascontiguousarray(self.pins, dtype=np.bool_)
             self._require(pins.shape == (count,), "pins", pins.shape, f"give {count}, one a particle")
@@ -166,8 +162,22 @@ class BodyParticles:
         self._require(self.name != GROUND_NAME, "name", self.name, "choose another, this one is the ground's")
         if self.rigid:
             self._require(self.surface is not None, "surface", None, "give the mesh of a rigid body")
-            held = self.pins is not None or self.goal_stiffness > 0 or bool(self.materials)
+            held = self.pins is not None or self.goal_stiffness > 0 or bool(self.materials or self.material_track)
             self._require(not held, "pins, goals and materials", "given", "leave them out of a rigid body")
+
+    def _check_material_track(self) -> None:
+        times = [time for time, _ in self.material_track]
+        rising = all(a < b for a, b in zip([-1.0, *times], times, strict=False))
+        self._require(
+            all(math.isfinite(t) and t >= 0 for t in times) and rising,
+            "material_track",
+            self.material_track,
+            "give rising times of 0 s or more, each once",
+        )
+        known = all(isinstance(i, int) and 0 <= i <= len(self.materials) for _, i in self.material_track)
+        self._require(
+            known, "material_track", self.material_track, f"give indices of materials, 0 to {len(self.materials)}"
+        )
 
     @property
     def rigid(self) -> bool:

@@ -87,7 +87,10 @@ def _effect_from_json(value: Any, where: str) -> Any:
 def scene_to_json(scene: Scene) -> dict[str, Any]:
     """The content of ``scene.json``."""
     data = {"format": FORMAT, **to_json(scene)}
-    data["effects"] = [{"name": e.name, "parameters": dict(e.parameters)} for e in scene.effects]
+    data["effects"] = [
+        {"name": e.name, "parameters": dict(e.parameters), **({"objects": list(e.objects)} if e.objects else {})}
+        for e in scene.effects
+    ]
     return data
 
 

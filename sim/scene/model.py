@@ -265,10 +265,14 @@ class SceneObject:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """A physical effect of the registry with its parameters (docs/file-formats.md)."""
+    """A physical effect of the registry with its parameters (docs/effects.md).
+
+    objects: names of the objects that it acts on; empty for all that it can act on.
+    """
 
     name: str
     parameters: tuple[tuple[str, float], ...] = ()
+    objects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,3 +341,12 @@ class Scene:
             [o.name for o in self.objects],
             "give every object a name of its own",
         )
+        present = {o.name for o in self.objects}
+        for index, effect in enumerate(self.effects):
+            for name in effect.objects:
+                _require(
+                    name in present,
+                    f"effects[{index}].objects",
+                    name,
+                    f"name some of {', '.join(sorted(present))}, or none for all",
+                )

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""Weight carried by the medium: gravity acts weaker or stronger, in its direction.
+
+Equation: a = (1 - f) g; a medium of density rho_m carries the share f = rho_m / rho_body of the weight.
+Source: Archimedes, On Floating Bodies; the medium's added mass is not in it.
+Bodies: all.
+Twice: shares add up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from ..mpm.setup import WorldSetup
+from .changes import change_forces
+from .schema import Effect, Parameter, Targets, Values
+
+
+def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
+    return change_forces(
+        setup, targets, lambda f: dataclasses.replace(f, gravity_factor=f.gravity_factor - values["fraction"])
+    )
+
+
+EFFECT = Effect(
+    name="buoyancy",
+    kind="force",
+    parameters=(
+        Parameter(
+            name="fraction",
+            unit="1",
+            low=-5.0,
+            high=10.0,
+            default=0.5,
+            description="share of the weight that is carried: 1 floats, above 1 rises, below 0 weighs more",
+        ),
+    ),
+    description=__doc__,
+    transform=_transform,
+    neutral={"fraction": 0.0},
+)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""All effects by name, and a scene's effects put into a world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import InputError
+from ..mpm.setup import WorldSetup
+from ..scene.json_fields import to_json
+from ..scene.model import Effect as SceneEffect
+from . import (
+    adhesion,
+    air_drag,
+    anisotropy,
+    buoyancy,
+    camera_pose,
+    friction,
+    gravity_tilt,
+    internal_damping,
+    magnus,
+    mass_offset,
+    plastic_yield,
+    restitution,
+    rolling_resistance,
+    sandy,
+    stiffness,
+    stiffness_gradient,
+    tether,
+    time_scale,
+    wind,
+)
+from .schema import KINDS, Effect, Parameter
+
+__all__ = ["KINDS", "Effect", "Parameter", "apply_effects", "effect", "effect_to_json", "effects"]
+
+_MODULES = (
+    air_drag,
+    wind,
+    magnus,
+    buoyancy,
+    gravity_tilt,
+    tether,
+    friction,
+    restitution,
+    rolling_resistance,
+    adhesion,
+    stiffness,
+    internal_damping,
+    plastic_yield,
+    anisotropy,
+    stiffness_gradient,
+    sandy,
+    mass_offset,
+    time_scale,
+    camera_pose,
+)
+"""In the order in which people see them."""
+
+_EFFECTS: Mapping[str, Effect] = MappingProxyType({module.EFFECT.name: module.EFFECT for module in _MODULES})
+
+
+def effects() -> Mapping[str, Effect]:
+    """All effects by name, in a fixed order: by kind, as in ``KINDS``."""
+    return _EFFECTS
+
+
+def effect(name: str) -> Effect:
+    """The effect called ``name``; InputError when there is none."""
+    if name not in _EFFECTS:
+        raise InputError(f"effect {name!r} is unknown: choose one of {', '.join(_EFFECTS)}")
+    return _EFFECTS[name]
+
+
+def apply_effects(setup: WorldSetup, scene_effects: Iterable[SceneEffect]) -> WorldSetup:
+    """``setup`` with the effects of a scene, one after the other in their order; ``setup`` itself where there are none.
+
+    Raises InputError as ``Effect.apply`` does, with the number of the effect in the scene.
+    """
+    for index, item in enumerate(scene_effects):
+        try:
+            values = dict(item.parameters)
+            if len(values) < len(item.parameters):
+                raise InputError(f"effect {item.name!r}: a parameter is given twice: give each once")
+            setup = effect(item.name).apply(setup, values, bodies=item.objects or None)
+        except InputError as error:
+            raise InputError(f"effects[{index}]: {error}") from None
+    return setup
+
+
+def effect_to_json(item: Effect) -> dict[str, Any]:
+    """What a program needs to offer the effect: names, kind, parameters, equation."""
+    return {
+        "name": item.name,
+        "kind": item.kind,
+        "summary": item.summary,
+        "parameters": [to_json(parameter) for parameter in item.parameters],
+        "neutral": dict(item.neutral),
+        "equation": item.section("Equation"),
+        "source": item.section("Source"),
+        "bodies": item.section("Bodies"),
+        "twice": item.section("Twice"),
+        "of_world": item.of_world,
+    }

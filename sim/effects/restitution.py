@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Bounce of a rigid body.
+
+Equation: v_n' = -e v_n, v_n the speed of approach at the contact.
+Source: Newton, Principia (1687), scholium to the laws of motion.
+Bodies: rigid ones; every contact of theirs. Matter that deforms bounces by its own elasticity.
+Twice: the value is set; the last one counts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from ..mpm.setup import WorldSetup
+from .changes import change_contacts, contact_with_ground, rigid_only
+from .schema import Effect, Parameter, Targets, Values
+
+
+def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
+    return change_contacts(setup, targets, lambda c: dataclasses.replace(c, restitution=values["restitution"]))
+
+
+EFFECT = Effect(
+    name="restitution",
+    kind="contact",
+    parameters=(
+        Parameter(
+            name="restitution",
+            unit="1",
+            low=0.0,
+            high=1.0,
+            default=0.7,
+            description="speed of leaving over speed of approach: 0 does not bounce, 1 loses nothing",
+        ),
+    ),
+    description=__doc__,
+    transform=_transform,
+    current=lambda setup, targets: {"restitution": contact_with_ground(setup, targets).restitution},
+    obstacle=rigid_only("so its bounce is that of its matter: use stiffness or internal_damping, or make it rigid"),
+)
