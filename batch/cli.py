@@ -15,6 +15,7 @@ from pathlib import Path
 
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics
+from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -140,6 +141,9 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
     _add_render(render)
 
+    listing = command("effects", _effects, "physical effects that a scene can have, with their parameters")
+    listing.add_argument("name", nargs="*", metavar="NAME", help="these only (default: all)")
+
     command("doctor", _doctor, "what is installed and what is missing")
     return parser
 
@@ -223,6 +227,22 @@ def _render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
     )
     terminal.line(f"frames: {options.out}" + (f"\nvideo: {options.video}" if options.video else ""))
     return 0
+
+
+def _effects(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    found = [effect(name) for name in options.name] or list(effects().values())
+    terminal({"event": "done", "effects": [effect_to_json(item) for item in found]})
+    terminal.line("\n\n".join(_effect_text(item) for item in found))
+    return 0
+
+
+def _effect_text(item: Effect) -> str:
+    lines = [f"{item.name} ({item.kind}): {item.summary}"]
+    lines += [f"    {title.lower()}: {item.section(title)}" for title in ("Equation", "Bodies", "Source")]
+    for p in item.parameters:
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        lines.append(f"    {p.name} = {p.default:g}{unit}, {p.low:g} to {p.high:g}: {p.description}")
+    return "\n".join(lines)
 
 
 def _doctor(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:

@@ -77,8 +77,23 @@ def test_help_lists_every_stage(capsys):
         main(["--help"])
     text = capsys.readouterr().out
     assert stopped.value.code == 0 and all(
-        stage in text for stage in ("run", "reconstruct", "bake", "render", "doctor")
+        stage in text for stage in ("run", "reconstruct", "bake", "render", "effects", "doctor")
     )
+
+
+def test_effects_are_listed_for_people_and_for_machines(capsys):
+    assert main(["effects"]) == 0
+    text = capsys.readouterr().out
+    assert "wind (force): " in text and "a = -k |v - w| (v - w)" in text
+    assert "wind_x = 3 m/s, -100 to 100: velocity of the air" in text
+    assert main(["effects", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["effects"]
+    assert len(listed) == 19 and {"name", "kind", "parameters", "equation"} <= set(listed[0])
+    assert {"name", "unit", "low", "high", "default"} <= set(listed[0]["parameters"][0])
+    assert main(["effects", "wind", "sandy", "--json"]) == 0
+    assert [e["name"] for e in json.loads(capsys.readouterr().out)["effects"]] == ["wind", "sandy"]
+    assert main(["effects", "gremlins"]) == 3
+    assert "gremlins" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,11 @@ def scenes(draw):
         for name in names
     )
     effects = tuple(
-        Effect(name=name, parameters=(("strength", draw(number)),))
+        Effect(
+            name=name,
+            parameters=(("strength", draw(number)),),
+            objects=tuple(draw(st.lists(st.sampled_from(names), unique=True))),
+        )
         for name in draw(st.sets(st.sampled_from(["wind", "drag"])))
     )
     return a_scene(
@@ -61,6 +65,20 @@ def scenes(draw):
 def test_what_is_saved_is_what_is_loaded(scene):
     data = json.loads(json.dumps(scene_to_json(scene)))
     assert parse_scene(data, "scene.json") == scene
+
+
+def test_effects_of_older_files_act_on_all():
+    data = scene_to_json(a_scene(effects=(Effect(name="wind"), Effect(name="magnus", objects=("cup",)))))
+    assert data["effects"] == [
+        {"name": "wind", "parameters": {}},
+        {"name": "magnus", "parameters": {}, "objects": ["cup"]},
+    ]
+    assert parse_scene(data, "scene.json").effects[0].objects == ()
+
+
+def test_an_effect_on_an_object_that_is_not_there():
+    with pytest.raises(InputError, match=r"effects\[1\].objects is 'mug': name some of cup"):
+        a_scene(effects=(Effect(name="wind"), Effect(name="magnus", objects=("cup", "mug"))))
 
 
 def write_files(root, scene):
