@@ -365,9 +365,10 @@ def test_who_an_effect_means_something_for(name, refused):
 def test_drag_adds_up_against_one_air():
     setup = put(world(body()), "air_drag", drag_per_mass=0.1)
     setup = put(setup, "wind", drag_per_mass=0.2, wind_x=3.0, wind_z=-1.0)
-    setup = put(setup, "wind", drag_per_mass=0.0, wind_x=0.0, wind_y=2.0)
+    setup = put(setup, "wind", drag_per_mass=0.0, wind_x=1.0, wind_y=2.0)
+    setup = put(setup, "wind", drag_per_mass=0.0, wind_x=0.0, wind_y=0.5, wind_z=4.0)
     forces = setup.bodies[0].forces
-    assert forces.drag == pytest.approx(0.3) and forces.wind == (3.0, 2.0, -1.0)
+    assert forces.drag == pytest.approx(0.3) and forces.wind == (4.0, 2.5, 3.0)
 
 
 def test_forces_of_a_kind_add_up():
@@ -411,6 +412,13 @@ def test_a_body_has_one_tether():
 
 
 # ---- contact --------------------------------------------------------------------------------------------------------
+
+
+def test_friction_of_two_out_of_three():
+    setup = put(world(body(), body("other"), die()), "friction", bodies=("die", "other"), friction=0.6)
+    found = {pair: setup.contact(*pair).friction for pair in [(n, GROUND_NAME) for n in ("jelly", "other", "die")]}
+    assert list(found.values()) == [0.3, 0.6, 0.6]
+    assert setup.contact("jelly", "other").friction == setup.contact("die", "other").friction == 0.6
 
 
 def test_friction_of_all_and_of_one():
@@ -508,7 +516,7 @@ def test_stiffness_goes_from_one_end_to_the_other():
 
 def test_a_gradient_leaves_the_fluid_in_a_body_alone():
     before = rich_world().bodies[2]
-    after = put(rich_world(), "stiffness_gradient").bodies[2]
+    after = put(rich_world(), "stiffness_gradient", direction_x=1.0).bodies[2]
     fluid = before.material_index == 1
     np.testing.assert_array_equal(after.stiffness_scale[fluid], before.stiffness_scale[fluid])
     assert (after.stiffness_scale[~fluid] != before.stiffness_scale[~fluid]).any()
