@@ -75,7 +75,7 @@ class Simulation:
             "potential_j": energy.potential,
             "momentum": [float(c) for c in self.world.linear_momentum()],
             "ground_gap_m": min(self.world.ground_gap(i) for i in bodies),
-            "at_walls": sum(self.world.particles_at_walls(i) for i in bodies),
+            "outside": sum(self.world.particles_outside(i) for i in bodies),
         }
 
 

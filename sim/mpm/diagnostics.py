@@ -71,6 +71,10 @@ def elastic_energy(material: ElasticMaterial, volumes: Array, deformation: Array
         # psi = integral of p dJ from J to 1 with p = K/7 (J^-7 - 1); none in tension.
         ratio = np.exp(np.minimum(memories, 0.0))
         return float(volumes @ (material.bulk_number / 7 * ((ratio**-6 - 1) / 6 + ratio - 1)))
+    fibres = 0.0
+    if material.fibre_modulus > 0:
+        along = np.linalg.norm(deformation @ np.asarray(material.fibre_axis), axis=1)
+        fibres = float(volumes @ (0.5 * material.fibre_modulus * (along - 1) ** 2))
     stretches = np.linalg.svd(deformation, compute_uv=False)
     volume_ratio = np.linalg.det(deformation)
     if material.law in (FIXED_COROTATED, SNOW):
@@ -78,11 +82,11 @@ def elastic_energy(material: ElasticMaterial, volumes: Array, deformation: Array
         density = mu * ((stretches - 1) ** 2).sum(axis=1) + 0.5 * lam * (volume_ratio - 1) ** 2
         if isinstance(material, SnowMaterial):
             density = density * np.exp(material.hardening * (1 - np.exp(memories)))
-        return float(volumes @ density)
+        return float(volumes @ density) + fibres
     strains = np.log(np.maximum(stretches, 1e-3))
     total = strains.sum(axis=1)
     if material.law == NEO_HOOKEAN:
         shear = 0.5 * mu * ((stretches**2).sum(axis=1) - 3) - mu * total
     else:
         shear = mu * (strains**2).sum(axis=1)
-    return float(volumes @ (shear + 0.5 * lam * total**2))
+    return float(volumes @ (shear + 0.5 * lam * total**2)) + fibres

@@ -540,7 +540,7 @@ class Engine:
 
 def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
     """A new array on the device with the numbers of ``values``, flat; at least one long."""
-    kind = {np.dtype(np.float32): ti.f32, np.dtype(np.int32): ti.i32}[values.dtype]
+    kind = ti.i32 if values.dtype == np.int32 else ti.f32
     array = ti.ndarray(kind, max(1, values.size))
     if values.size:
         array.from_numpy(np.ascontiguousarray(values).ravel())

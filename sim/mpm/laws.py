@@ -15,6 +15,7 @@ principal stretches s and keeps everything else, so no right singular vectors ar
     sand         Hencky strain, Drucker–Prager cone by return without dilatancy, expansion remembered and taken back
                  before pressure returns                       Klár et al. 2016; Tampubolon et al. 2017 for the latter
     fluid        p = K/7 (J^-7 - 1), never below 0; tau = -J p + 2 eta J dev D      Cole 1948, Becker and Teschner 2007
+    fibres       psi += k/2 (s - 1)^2, s = |F a|: tau += k (s - 1) / s  F a (F a)^T      Bonet and Burton 1998
     damping      tau += t (2 mu D + lambda tr D)      Kelvin–Voigt, with one retardation time t for shear and volume
 
 D is the symmetric part of the velocity gradient. ``memory`` is one number a particle, 0 at rest: ln J_P in snow, the
@@ -25,7 +26,7 @@ import taichi as ti
 
 from .constitutive import eigen_symmetric, fixed_corotated
 from .layout import Integers, Matrices, Scalars, mat3, vec3, vec4
-from .materials import DAMPED, FLUID, NEO_HOOKEAN, ROW, SAND, SNOW, STABLE_WAVENUMBER, VON_MISES
+from .materials import DAMPED, FIBRED, FLUID, NEO_HOOKEAN, ROW, SAND, SNOW, STABLE_WAVENUMBER, VON_MISES
 
 LEAST_STRETCH = 1e-3
 """Principal stretches below this (and inverted ones) count as this in logarithms."""
@@ -208,6 +209,13 @@ def respond(
     if ti.static(laws & (1 << FLUID)):
         if law == FLUID:
             tau, stiffness, viscosity = fluid(memory[p], C, fixed[1], fixed[2])
+    if ti.static(laws & FIBRED):
+        fibres = table[row + 6] * fixed[1]
+        if fibres > 0.0:
+            along = Fp @ vec3(table[row + 7], table[row + 8], table[row + 9])
+            stretch = along.norm() + 1e-12
+            tau += (fibres * (stretch - 1.0) / stretch) * along.outer_product(along)
+            stiffness += fibres * stretch * stretch
     if ti.static(laws & DAMPED):
         time = table[row + 1]
         if time > 0.0 and law != FLUID:

@@ -20,8 +20,13 @@ LAW_NAMES = ("fixed_corotated", "neo_hookean", "von_mises", "snow", "sand", "flu
 DAMPED = 1 << len(LAW_NAMES)
 """Bit in a set of laws that says that some solid in it has a damping time."""
 
-ROW = 6
-"""Numbers that a material has in the kernels' table: law, damping time in s, four of the law's own."""
+FIBRED = DAMPED << 1
+"""Bit in a set of laws that says that some solid in it has fibres."""
+
+OWN = 4
+ROW = 2 + OWN + 4
+"""Numbers that a material has in the kernels' table: law, damping time in s, four of the law's own, the fibres' modulus
+over 2 mu, their axis (3)."""
 
 STABLE_WAVENUMBER = 2.0 / 0.58
 """Largest wavenumber that the grid carries, 1/cells: waves of speed c are stable up to c dt = 0.58 cells."""
@@ -81,8 +86,8 @@ class ElasticMaterial:
 
     @property
     def wave_speed(self) -> float:
-        """Speed in m/s of longitudinal waves in the undeformed matter, sqrt((lambda + 2 mu) / rho)."""
-        return math.sqrt((self.lame_lambda + 2 * self.shear_modulus) / self.density)
+        """Speed in m/s of longitudinal waves in undeformed matter, sqrt((lambda + 2 mu + k) / rho), along fibres."""
+        return math.sqrt((self.lame_lambda + 2 * self.shear_modulus + self.fibre_modulus) / self.density)
 
     @property
     def diffusivity(self) -> float:
@@ -102,13 +107,15 @@ class ElasticMaterial:
     @property
     def laws(self) -> int:
         """Bits of this material in a set of laws."""
-        return (1 << self.law) | (DAMPED if self.damping_time > 0 and self.law != FLUID else 0)
+        damped = DAMPED if self.damping_time > 0 and self.law != FLUID else 0
+        return (1 << self.law) | damped | (FIBRED if self.fibre_modulus > 0 else 0)
 
     @property
     def row(self) -> tuple[float, ...]:
         """This material's ``ROW`` numbers in the kernels' table; the law's own are without unit."""
         own = self._own()
-        return (float(self.law), self.damping_time, *own, *(0.0,) * (ROW - 2 - len(own)))
+        fibres = self.fibre_modulus / (2 * self.shear_modulus)
+        return (float(self.law), self.damping_time, *own, *(0.0,) * (OWN - len(own)), fibres, *self.fibre_axis)
 
     def _own(self) -> tuple[float, ...]:
         return ()

@@ -222,10 +222,12 @@ class Worlds:
         number = int(self._first_body[place.world]) + body_index
         state = self._engine.state()
         mine = self._rows_of(state, number)
-        mean = np.average(state["v"][mine], axis=0, weights=state["constants"][mine, 0])
-        state["v"][mine] += (velocity * place.cells.scale - mean).astype(np.float32)
+        given = np.asarray(state["v"][mine], dtype=np.float64)
+        masses = np.asarray(state["constants"][mine, 0], dtype=np.float64)
+        given += velocity * place.cells.scale - np.average(given, axis=0, weights=masses)
+        state["v"][mine] = given.astype(np.float32)
         self._engine.replace(state)
-        fastest = float(np.linalg.norm(state["v"][mine], axis=1).max())
+        fastest = float(np.linalg.norm(given, axis=1).max())
         self._engine.raise_speed(place.world, fastest)
         self._host = None
 
