@@ -106,6 +106,7 @@ def referenced_files(scene: Scene) -> list[str]:
     """Names of all files that ``scene`` needs, photo first."""
     names = [scene.photo, scene.background]
     for item in scene.objects:
-        names += [name for name in (item.mesh, item.mask, item.shadow) if name is not None]
+        track = item.motion.vertices_file if item.motion else None
+        names += [name for name in (item.mesh, item.mask, item.shadow, track) if name is not None]
     names += [name for name in (scene.light.environment, scene.depth) if name is not None]
     return names

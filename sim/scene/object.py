@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""One thing in the photo: where it stands, of what it is made, how it begins and what acts on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .checks import finite, require, require_range
+from .control import Box, Keys, Motion, Vector, require_rising, require_surface
+from .matter import Material
+
+Matrix4 = tuple[tuple[float, float, float, float], ...]
+
+ROLES = ("dynamic", "collider")
+IDENTITY4: Matrix4 = tuple(tuple(1.0 if i == j else 0.0 for j in range(4)) for i in range(4))  # type: ignore[misc]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneObject:
+    """One thing in the photo.
+
+    name: letters, digits, ``_``, ``-`` and spaces; it names the object's files.
+    mesh, mask, shadow: files relative to the scene folder; mask and shadow may be None.
+    world_from_mesh: 4x4 similarity from the mesh file's own coordinates to world metres.
+    size_m: largest extent in metres.
+    role: ``dynamic`` moves, ``collider`` stays where it is or goes where ``motion`` takes it, and others hit it.
+    fill: matter through the whole inside (True), or only within ``shell_thickness`` m of the surface (False; None takes
+        two grid cells): a hollow body that weighs as much less.
+    velocity: m/s; spin: rad/s about the centre of mass; both at the start.
+    occlusion_order: 0 is frontmost.
+    roughness: of the surface, 0 (polished) to 1 (coarse); gives its friction where ``friction`` is None.
+    friction, static_friction: Coulomb's coefficients of the surface, 0 to 10; restitution: 0 to 1; contact_mode: one of
+        ``CONTACT_MODES``. None takes the ground's. docs/file-formats.md says how those of two surfaces combine.
+    motion: of a collider; None stands still.
+
+    Of dynamic objects only:
+    start_time: s at which the object comes into the simulation; until then it stays in place and touches nothing.
+    acceleration: keyframes of force over mass in m/s².
+    velocity_keys: keyframes of the velocity in m/s that the whole object is given at their times.
+    pins: what of the object is inside one of the boxes at rest is held in place, or goes along ``pin_motion``
+        (keyframes of the way in m).
+    goal_stiffness: pull of all matter to its place at rest, force over mass and distance in 1/s², 0 (none) to 1e6;
+        goal_damping: share of critical damping, 0 to 1.
+    """
+
+    name: str
+    mesh: str
+    world_from_mesh: Matrix4 = IDENTITY4
+    size_m: float
+    role: str = "dynamic"
+    material: Material = field(default_factory=Material)
+    fill: bool = True
+    velocity: Vector = (0.0, 0.0, 0.0)
+    spin: Vector = (0.0, 0.0, 0.0)
+    occlusion_order: int = 0
+    mask: str | None = None
+    shadow: str | None = None
+    shell_thickness: float | None = None
+    roughness: float | None = None
+    friction: float | None = None
+    static_friction: float | None = None
+    restitution: float | None = None
+    contact_mode: str | None = None
+    motion: Motion | None = None
+    start_time: float = 0.0
+    acceleration: Keys = ()
+    velocity_keys: Keys = ()
+    pins: tuple[Box, ...] = ()
+    pin_motion: Keys = ()
+    goal_stiffness: float = 0.0
+    goal_damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        allowed = (
+            bool(self.name)
+            and len(self.name) <= 64
+            and all(c.isalnum() or c in "_- " for c in self.name)
+            and self.name == self.name.strip()
+        )
+        require(allowed, "object.name", self.name, "use up to 64 letters, digits, spaces, '_' and '-'")
+        require(self.role in ROLES, f"object {self.name}: role", self.role, f"choose one of {', '.join(ROLES)}")
+        require(
+            finite(self.size_m) and self.size_m > 0, f"object {self.name}: size_m", self.size_m, "give metres above 0"
+        )
+        require(
+            finite(*self.velocity), f"object {self.name}: velocity", self.velocity, "give three finite numbers in m/s"
+        )
+        require(finite(*self.spin), f"object {self.name}: spin", self.spin, "give three finite numbers in rad/s")
+        matrix = np.asarray(self.world_from_mesh, dtype=float)
+        require(
+            matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and abs(float(np.linalg.det(matrix))) > 1e-18,
+            f"object {self.name}: world_from_mesh",
+            matrix.shape,
+            "give a finite, invertible 4x4 matrix",
+        )
+        self._check_control()
+
+    def _check_control(self) -> None:
+        where = f"object {self.name}"
+        require_range(f"{where}: shell_thickness", self.shell_thickness, 1e-6, 1e3, "metres")
+        require_range(f"{where}: roughness", self.roughness, 0.0, 1.0)
+        require_surface(where, self.friction, self.static_friction, self.restitution, self.contact_mode)
+        require_range(f"{where}: start_time", self.start_time, 0.0, 1e6, "seconds")
+        require_range(f"{where}: goal_stiffness", self.goal_stiffness, 0.0, 1e6, "1/s²")
+        require_range(f"{where}: goal_damping", self.goal_damping, 0.0, 1.0)
+        for name in ("acceleration", "velocity_keys", "pin_motion"):
+            require_rising(f"{where}: {name}", getattr(self, name))
+        held = bool(self.pins) or self.goal_stiffness > 0
+        require(held or not self.pin_motion, f"{where}: pin_motion", "given", "give pins or goal_stiffness as well")
+        if self.role == "dynamic":
+            require(self.motion is None, f"{where}: motion", "given", "only an object of role 'collider' has one")
+            return
+        for name in ("start_time", "acceleration", "velocity_keys", "pins", "goal_stiffness"):
+            require(not getattr(self, name), f"{where}: {name}", "given", "only an object of role 'dynamic' has one")
