@@ -12,15 +12,21 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+from ..sim.app.bake_estimate import estimate_bake
 from ..sim.app.bake_inputs import BakeOptions
-from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics
+from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics, with_physics
+from ..sim.app.setup_world import cost_text
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.reconstruct.pipeline import object_names
+from ..sim.scene.folder import SceneFolder, load_scene
 from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector
+from ..sim.scene.overrides import check_overrides
 from ..sim.version import VERSION
 from . import doctor, pipeline
 from .terminal import Terminal
@@ -78,6 +84,10 @@ def _add_physics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spin", type=_vector, nargs="+", action="extend", default=[], metavar="W", help="initial spin x,y,z in rad/s"
     )
+    change = "change a field of an object, its material, 'ground' or 'scene', such as cup.density=300"
+    parser.add_argument(
+        "--set", nargs="+", action="extend", default=[], dest="overrides", metavar="OBJECT.FIELD=VALUE", help=change
+    )
 
 
 def _add_bake(parser: argparse.ArgumentParser) -> None:
@@ -129,7 +139,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     bake = command("bake", _bake, "scene folder → bake folder")
     bake.add_argument("scene", type=Path, metavar="SCENE")
-    bake.add_argument("--out", type=Path, required=True, metavar="BAKE", help="the bake folder")
+    bake.add_argument("--out", type=Path, metavar="BAKE", help="the bake folder")
+    bake.add_argument("--estimate", action="store_true", help="only say what it would cost; nothing is written")
+    bake.set_defaults(wrong_usage=bake.error)
     _add_physics(bake)
     _add_bake(bake)
 
@@ -165,6 +177,15 @@ def _object_requests(options: argparse.Namespace) -> tuple[ObjectRequest, ...]:
     )
 
 
+def _physics(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "presets": options.preset,
+        "velocities": options.velocity,
+        "spins": options.spin,
+        "overrides": options.overrides,
+    }
+
+
 def _reconstruct_options(options: argparse.Namespace) -> ReconstructOptions:
     changes = {"horizon_y": options.horizon, "pitch_deg": options.pitch, "fov_deg": options.fov}
     return dataclasses.replace(ReconstructOptions(), **{k: v for k, v in changes.items() if v is not None})
@@ -188,6 +209,7 @@ def _run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled
         presets=tuple(options.preset),
         velocities=tuple(options.velocity),
         spins=tuple(options.spin),
+        overrides=tuple(options.overrides),
         reconstruct=_reconstruct_options(options),
         bake=_bake_options(options),
         render=_render_request(options),
@@ -203,18 +225,36 @@ def _run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled
 def _reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     requests, settings = _object_requests(options), _reconstruct_options(options)
     require_physics(len(requests), options.preset, options.velocity, options.spin)
+    check_overrides(object_names(requests), options.overrides)
     reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
-    set_all_physics(options.out, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    set_all_physics(options.out, **_physics(options), friction=settings.friction)
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0
 
 
 def _bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
-    folder = set_physics(options.scene, presets=options.preset, velocities=options.velocity, spins=options.spin)
+    if options.estimate:
+        return _estimate(options, terminal)
+    if options.out is None:
+        options.wrong_usage("the following arguments are required: --out (or --estimate)")
+    folder = set_physics(options.scene, **_physics(options))
     done = pipeline.bake_stage(folder, options.out, _bake_options(options), terminal, cancelled)
     terminal(done)
     terminal.line(f"bake: {options.out}")
+    return 0
+
+
+def _estimate(options: argparse.Namespace, terminal: Terminal) -> int:
+    folder = load_scene(options.scene)
+    scene = with_physics(folder.scene, **_physics(options))
+    prepared = estimate_bake(SceneFolder(root=folder.root, scene=scene), _bake_options(options))
+    for warning in prepared.warnings:
+        terminal({"event": "notice", "stage": "estimate", "message": warning})
+    cost = {"particles": prepared.particle_count, **dataclasses.asdict(prepared.cost)}
+    terminal({"event": "done", "stage": "estimate", "estimate": cost})
+    terminal.line(cost_text(prepared))
+    prepared.require_affordable()
     return 0
 
 

@@ -21,8 +21,10 @@ from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_ph
 from ..sim.errors import InputError, RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.reconstruct.pipeline import object_names
 from ..sim.scene.folder import SceneFolder
 from ..sim.scene.model import Vector
+from ..sim.scene.overrides import check_overrides
 
 RENDER_SCRIPT = Path(__file__).with_name("render.py")
 
@@ -107,6 +109,7 @@ class RunRequest:
 
     presets, velocities, spins: by object, in the order of ``objects``; what is not given is ``medium`` and at rest, so
     that the same request always gives the same video. A single preset goes to all objects.
+    overrides: ``OBJECT.FIELD=VALUE``, as ``sim/scene/overrides`` reads them.
     """
 
     photo: Path
@@ -116,6 +119,7 @@ class RunRequest:
     presets: tuple[str, ...] = ()
     velocities: tuple[Vector, ...] = ()
     spins: tuple[Vector, ...] = ()
+    overrides: tuple[str, ...] = ()
     reconstruct: ReconstructOptions = dataclasses.field(default_factory=ReconstructOptions)
     bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
     render: RenderRequest = dataclasses.field(default_factory=RenderRequest)
@@ -133,11 +137,19 @@ def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
     Everything that can be checked before the first stage is: nobody should wait for a message about the last one.
     """
     require_physics(len(request.objects), request.presets, request.velocities, request.spins)
+    check_overrides(object_names(request.objects), request.overrides)
     load_quality(request.bake.quality)
     check_render(request.render, request.video)
     scene, bake = request.work / "scene", request.work / "bake"
     reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
-    folder = set_all_physics(scene, presets=request.presets, velocities=request.velocities, spins=request.spins)
+    folder = set_all_physics(
+        scene,
+        presets=request.presets,
+        velocities=request.velocities,
+        spins=request.spins,
+        overrides=request.overrides,
+        friction=request.reconstruct.friction,
+    )
     bake_stage(folder, bake, request.bake, on_event, cancelled)
     render_stage(scene, bake, request.work / "frames", request.render, on_event, cancelled, video=request.video)
     return request.video

@@ -204,9 +204,12 @@ class _Run:
         world = self.simulation.world
         for slot, (mesh, binding, writer) in enumerate(zip(self.meshes, self.bindings, writers, strict=True)):
             body = self.simulation.body_of_object[slot]
-            if binding is None or body is None or index == 0:
+            if index == 0:
                 # Frame 1 is the scene at rest to the last bit, so that it renders as the photo.
                 writer.append(mesh.vertices)
+            elif binding is None or body is None:
+                moved = self.simulation.collider_vertices(slot)
+                writer.append(mesh.vertices if moved is None else moved)
             else:
                 writer.append(deform(binding, world.positions(body), world.deformation_gradients(body)))
         self.metrics.append(

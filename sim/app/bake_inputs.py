@@ -51,12 +51,16 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
             del fields[irrelevant]
         fields["material"].pop("preset")
         fields["mesh"] = file_hash(folder.file(item.mesh))
+        if item.motion is not None and item.motion.vertices_file is not None:
+            fields["motion"]["vertices_file"] = file_hash(folder.file(item.motion.vertices_file))
         objects.append(fields)
     content = {
         "engine": ENGINE_REVISION,
         "objects": objects,
         "ground": to_json(scene.ground),
         "gravity": scene.gravity,
+        "gravity_track": to_json(scene.gravity_track),
+        "contacts": to_json(scene.contacts),
         "effects": to_json(scene.effects),
         "options": to_json(options),
     }

@@ -18,14 +18,15 @@ class Quality:
     """How finely a scene is simulated.
 
     description: for people.
-    particles: wanted for all objects together, 500 to 20 million; the cell size follows from it.
+    particles: wanted for all moving objects together, 500 to 20 million; the cell size follows from it.
     particles_per_cell: in undeformed matter, 1 to 64; 8 is usual.
     smallest_cells: grid cells across the smallest object, at least, 2 to 256; overrules ``particles``.
-    grid: cells along each side of the engine's box; None lets the scene's extent decide.
+    grid: cells along a box four times as wide as all moving objects together, 32 to 4096; sets the cell size in
+        place of the number of particles and of ``smallest_cells``. None leaves it to them.
     """
 
     description: str
-    particles: int
+    particles: int = 30_000
     particles_per_cell: int = 8
     smallest_cells: int = 8
     grid: int | None = None
@@ -35,6 +36,10 @@ class Quality:
             raise InputError(f"particles is {self.particles}: give 500 to 20 million")
         if not 2 <= self.smallest_cells <= 256:
             raise InputError(f"smallest_cells is {self.smallest_cells}: give 2 to 256")
+        if not 1 <= self.particles_per_cell <= 64:
+            raise InputError(f"particles_per_cell is {self.particles_per_cell}: give 1 to 64; 8 is usual")
+        if self.grid is not None and not 32 <= self.grid <= 4096:
+            raise InputError(f"grid is {self.grid}: give 32 to 4096, or leave it out")
 
 
 def quality_names() -> list[str]:

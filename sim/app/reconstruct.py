@@ -16,7 +16,8 @@ from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct
 from ..scene.folder import SceneFolder, load_scene, save_scene
 from ..scene.json_fields import read_json, to_json
 from ..scene.materials import load_preset
-from ..scene.model import Vector
+from ..scene.model import Scene, Vector
+from ..scene.overrides import apply_overrides, without_physics
 from .bake_inputs import file_hash
 
 STAMP_FILE = "reconstruct.json"
@@ -89,42 +90,67 @@ def require_physics(
 
 
 def set_all_physics(
-    root: Path, *, presets: Sequence[str] = (), velocities: Sequence[Vector] = (), spins: Sequence[Vector] = ()
+    root: Path,
+    *,
+    presets: Sequence[str] = (),
+    velocities: Sequence[Vector] = (),
+    spins: Sequence[Vector] = (),
+    overrides: Sequence[str] = (),
+    friction: float = ReconstructOptions().friction,
 ) -> SceneFolder:
-    """Like ``set_physics``, but objects beyond a list become ``medium`` and are at rest, whatever they were before."""
-    count = len(load_scene(root).scene.objects)
+    """Like ``set_physics``, but what is not given becomes what it is in a new scene, whatever it was before.
+
+    Objects beyond a list become ``medium`` and are at rest; friction: the ground's. Effects stay.
+    """
+    folder = load_scene(root)
+    count = len(folder.scene.objects)
     if len(presets) != 1:
         presets = [*presets, *["medium"] * (count - len(presets))]
-    still: Vector = (0.0, 0.0, 0.0)
-    return set_physics(
-        root,
+    scene = with_physics(
+        without_physics(folder.scene, friction),
         presets=presets,
-        velocities=[*velocities, *[still] * (count - len(velocities))],
-        spins=[*spins, *[still] * (count - len(spins))],
+        velocities=velocities,
+        spins=spins,
+        overrides=overrides,
     )
+    return folder if scene == folder.scene else save_scene(root, scene)
 
 
 def set_physics(
-    root: Path, *, presets: Sequence[str] = (), velocities: Sequence[Vector] = (), spins: Sequence[Vector] = ()
+    root: Path,
+    *,
+    presets: Sequence[str] = (),
+    velocities: Sequence[Vector] = (),
+    spins: Sequence[Vector] = (),
+    overrides: Sequence[str] = (),
 ) -> SceneFolder:
+    """Change the scene folder as ``with_physics`` does; ``scene.json`` is only written when something changes."""
+    folder = load_scene(root)
+    scene = with_physics(folder.scene, presets=presets, velocities=velocities, spins=spins, overrides=overrides)
+    return folder if scene == folder.scene else save_scene(root, scene)
+
+
+def with_physics(
+    scene: Scene,
+    *,
+    presets: Sequence[str] = (),
+    velocities: Sequence[Vector] = (),
+    spins: Sequence[Vector] = (),
+    overrides: Sequence[str] = (),
+) -> Scene:
     """Give the scene's objects, in order, other materials and motions; objects beyond a list keep what they have.
 
-    A single preset goes to all objects. ``scene.json`` is only written when something changes.
-    Raises InputError for an unknown preset or more entries than objects.
+    A single preset goes to all objects. overrides: ``OBJECT.FIELD=VALUE``, carried out last (``sim/scene/overrides``).
+    Raises InputError for an unknown preset, more entries than objects, or an override that cannot be carried out.
     """
-    folder = load_scene(root)
-    scene = folder.scene
     require_physics(len(scene.objects), presets, velocities, spins)
     if len(presets) == 1:
         presets = [presets[0]] * len(scene.objects)
     changed = list(scene.objects)
     for index, preset in enumerate(presets):
-        if changed[index].material.preset != preset:
-            changed[index] = dataclasses.replace(changed[index], material=load_preset(preset))
+        changed[index] = dataclasses.replace(changed[index], material=load_preset(preset))
     for index, velocity in enumerate(velocities):
         changed[index] = dataclasses.replace(changed[index], velocity=velocity)
     for index, spin in enumerate(spins):
         changed[index] = dataclasses.replace(changed[index], spin=spin)
-    if tuple(changed) == scene.objects:
-        return folder
-    return save_scene(root, dataclasses.replace(scene, objects=tuple(changed)))
+    return apply_overrides(dataclasses.replace(scene, objects=tuple(changed)), overrides)

@@ -86,7 +86,7 @@ def reconstruct(
     options = options or ReconstructOptions()
     if not objects:
         raise InputError("objects: none given; draw a box around at least one object")
-    names = _names(objects)
+    names = object_names(objects)
     materials = [load_preset(item.preset) for item in objects]
     steps = _Steps(4 + 3 * len(objects), on_event, cancelled)
     with replacing_folder(out) as folder:
@@ -113,7 +113,8 @@ def reconstruct(
     return SceneFolder(root=out, scene=scene)
 
 
-def _names(objects: Sequence[ObjectRequest]) -> list[str]:
+def object_names(objects: Sequence[ObjectRequest]) -> list[str]:
+    """The names that ``objects`` get. Raises InputError for a name that cannot be used or occurs twice."""
     names = [item.name or f"object_{number}" for number, item in enumerate(objects, start=1)]
     for name in names:
         # The scene model holds the rule for names; ask it before any work is done, not after.

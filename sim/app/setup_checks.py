@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""What a scene must hold at the start: bodies above the ground and beside one another, on sound meshes."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import InputError
+from ..mpm.bodies import BodyParticles
+from ..mpm.colliders import Surface
+from ..scene.model import Ground
+
+Array = NDArray[np.float64]
+
+DEEPEST_CELLS = 1.0
+"""Cells that a body may stand in the ground, or two in each other, at the start: contact pushes them out gently."""
+
+TOUCHING = 0.05
+"""Share of the particle spacing below which two bodies touch and do not overlap."""
+
+
+def surface_warnings(surface: Surface, name: str) -> list[str]:
+    """What is unusual about the mesh of object ``name``. Raises InputError for one that cannot be used."""
+    # ``distance`` is younger than this file; without it, sampling refuses the meshes that it cannot fill.
+    if importlib.util.find_spec("..mpm.distance", __package__) is None:
+        return []
+    from ..mpm.distance import check_surface
+
+    return [str(warning) for warning in check_surface(surface, name=f"object {name}")]
+
+
+def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:
+    """Raise InputError when object ``name`` reaches more than ``DEEPEST_CELLS`` into the ground."""
+    normal = np.asarray(ground.normal) / np.linalg.norm(ground.normal)
+    depth = -float(((vertices - np.asarray(ground.point)) @ normal).min())
+    if depth > DEEPEST_CELLS * cell:
+        raise InputError(
+            f"object {name}: its lowest vertex is {depth:.3g} m below the ground: lift it by that much "
+            "(world_from_mesh), lower ground.point, or make it a collider"
+        )
+
+
+def overlap_warnings(bodies: Sequence[BodyParticles], spacing: float, cell: float) -> list[str]:
+    """What overlaps a little at the start. Raises InputError for bodies that are more than a cell inside each other.
+
+    A ball of the contact radius around a particle lies inside its body; where two of them meet, the bodies do. Bodies
+    that come in at different times do not count.
+    """
+    warnings = []
+    for a, b in itertools.combinations(bodies, 2):
+        if a.start_time != b.start_time:
+            continue
+        depth = _overlap(a, b, spacing)
+        if depth > DEEPEST_CELLS * cell:
+            raise InputError(
+                f"object {a.name} and object {b.name}: they overlap at the start, {depth:.2g} m deep or more: move "
+                "them apart (world_from_mesh), let one come in later (start_time), or make one a collider"
+            )
+        if depth > 0:
+            warnings.append(
+                f"{a.name} and {b.name} overlap a little at the start ({depth * 1000:.2g} mm) and will be pushed apart"
+            )
+    return warnings
+
+
+def _overlap(a: BodyParticles, b: BodyParticles, spacing: float) -> float:
+    """About how deep in m two bodies are in each other, 0 when they are not."""
+    assert a.contact_radii is not None and b.contact_radii is not None
+    boxes = [(body.positions.min(axis=0) - spacing, body.positions.max(axis=0) + spacing) for body in (a, b)]
+    if (boxes[0][1] < boxes[1][0]).any() or (boxes[1][1] < boxes[0][0]).any():
+        return 0.0
+    distance, nearest = cKDTree(b.positions).query(a.positions, distance_upper_bound=spacing)
+    near = np.isfinite(distance)
+    touching = np.zeros(a.count)
+    touching[near] = a.contact_radii[near] + b.contact_radii[nearest[near]] - distance[near]
+    inside_a = touching > TOUCHING * spacing
+    if not inside_a.any():
+        return 0.0
+    back = cKDTree(a.positions[inside_a]).query(b.positions, distance_upper_bound=spacing)[0]
+    layers = min(_thickness(a.positions, inside_a), _thickness(b.positions, np.isfinite(back)))
+    # One layer of particles reaches the other body's first layer only: no deeper than their balls do.
+    return float(touching.max()) if layers <= 1.5 * spacing else layers
+
+
+def _thickness(positions: Array, marked: NDArray[np.bool_]) -> float:
+    """How far the marked particle that is deepest among the marked is from the others."""
+    if marked.all():
+        return float(np.ptp(positions, axis=0).max())
+    return float(cKDTree(positions[~marked]).query(positions[marked])[0].max())

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""From a scene and its meshes to the engine's world: bodies, colliders, contacts, tracks, effects. No Taichi.
+
+Everything that can be wrong with a scene is found here, before the engine starts, and named by object and field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..mpm.bodies import BodyParticles
+from ..mpm.colliders import Collider, Surface
+from ..mpm.estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from ..mpm.options import SolverOptions
+from ..mpm.sampling import InteriorSample, sample_interior
+from ..mpm.setup import WorldSetup
+from ..mpm.tracks import Track
+from ..scene.folder import SceneFolder
+from ..scene.meshes import ObjectMesh
+from ..scene.model import Effect, Keys, Motion, SceneObject
+from ..scene.units import Similarity
+from ..scene.vertex_tracks import load_vertex_track
+from .bake_inputs import BakeOptions
+from .collider_motion import vertices_at
+from .engine_material import engine_material
+from .quality import load_quality
+from .setup_checks import overlap_warnings, require_above_ground, surface_warnings
+from .setup_contacts import contact_table
+from .setup_resolution import resolve
+from .shell import SHELL_CELLS, keep_shell
+
+JUMP = 1e-3
+"""Share of its size by which a collider's motion may begin off the place of its mesh."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedWorld:
+    """All that the engine is told, and what the user should hear before it starts.
+
+    body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
+    cost: of the whole bake, estimated.
+    """
+
+    setup: WorldSetup
+    solver: SolverOptions
+    similarity: Similarity
+    body_of_object: tuple[int | None, ...]
+    collider_of_object: tuple[int | None, ...]
+    warnings: tuple[str, ...]
+    cost: Estimate
+    stable_step: float
+
+    @property
+    def particle_count(self) -> int:
+        """Particles of all bodies."""
+        return sum(body.count for body in self.setup.bodies)
+
+    def require_affordable(self) -> None:
+        """Raise InputError when the bake would take too long or more memory than there is."""
+        on_host = self.solver.arch in ("cpu", "metal")
+        refuse_excess(self.cost, self.particle_count, available_memory() if on_host else None)
+
+
+def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: BakeOptions) -> PreparedWorld:
+    """The world of the scene in ``folder``, whose objects have ``meshes``.
+
+    Raises InputError for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that
+    stand in the ground or in each other, and for what no machine could compute.
+    """
+    scene = folder.scene
+    moving = [i for i, item in enumerate(scene.objects) if item.role == "dynamic"]
+    still = [i for i, item in enumerate(scene.objects) if item.role == "collider"]
+    if not moving:
+        raise InputError("objects: none has the role 'dynamic', so nothing would move")
+    warnings: list[str] = []
+    for item, mesh in zip(scene.objects, meshes, strict=True):
+        warnings += surface_warnings(_surface(mesh), item.name)
+    quality = load_quality(options.quality)
+    solver, similarity = resolve(
+        [scene.objects[i].name for i in moving], [meshes[i] for i in moving], scene.ground, quality, options.arch
+    )
+    cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
+    for i in moving:
+        require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
+    bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
+    warnings += overlap_warnings(bodies, spacing, cell)
+    colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
+    warnings += [text for collider in colliders for text in _jump(collider)]
+    setup = WorldSetup(
+        bodies=bodies,
+        ground=scene.ground,
+        gravity=scene.gravity,
+        gravity_track=_track(scene.gravity_track),
+        colliders=colliders,
+        contacts=contact_table(scene),
+    )
+    setup = _with_effects(setup, scene.effects)
+    step = stable_step(setup.bodies, cell, solver)
+    duration = (options.frames - 1) / options.fps
+    count = sum(body.count for body in setup.bodies)
+    body_index = {scene_index: index for index, scene_index in enumerate(moving)}
+    collider_index = {scene_index: index for index, scene_index in enumerate(still)}
+    return PreparedWorld(
+        setup=setup,
+        solver=solver,
+        similarity=similarity,
+        body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
+        collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
+        warnings=tuple(warnings),
+        cost=estimate(count, len(setup.bodies), step, duration, options.arch),
+        stable_step=step,
+    )
+
+
+def _with_effects(setup: WorldSetup, effects: tuple[Effect, ...]) -> WorldSetup:
+    if not effects:
+        return setup
+    try:
+        from ..effects.registry import apply_effects
+    except ModuleNotFoundError as error:
+        if not (error.name or "").endswith(("effects", "effects.registry")):
+            raise
+        raise InputError(
+            f"effects: {effects[0].name!r} is not simulated by this version; remove it from scene.json"
+        ) from None
+    return apply_effects(setup, effects)
+
+
+def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int) -> BodyParticles:
+    if item.material.law == "rigid" and (item.pins or item.goal_stiffness > 0):
+        raise InputError(
+            f"object {item.name}: has pins or goal_stiffness and the law 'rigid': choose another law or leave them "
+            "out; role 'collider' with motion holds or leads a rigid thing"
+        )
+    try:
+        sample = sample_interior(mesh.vertices, mesh.faces, spacing, seed=seed)
+        if not item.fill:
+            thickness = SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness
+            sample = keep_shell(sample, mesh, thickness, spacing)
+    except InputError as error:
+        raise InputError(f"object {item.name}: {error}") from None
+    return BodyParticles(
+        name=item.name,
+        positions=sample.positions,
+        volumes=sample.volumes,
+        contact_radii=sample.contact_radii,
+        material=engine_material(item.material),
+        surface=_surface(mesh),
+        velocity=item.velocity,
+        spin=item.spin,
+        start_time=item.start_time,
+        acceleration=_track(item.acceleration),
+        velocity_keys=_track(item.velocity_keys),
+        pins=_pins(item, sample),
+        pin_motion=_track(item.pin_motion),
+        goal_stiffness=item.goal_stiffness,
+        goal_damping=item.goal_damping,
+    )
+
+
+def _pins(item: SceneObject, sample: InteriorSample) -> NDArray[np.bool_] | None:
+    """Which particles lie in a box of pins; None without boxes. Raises InputError for a box that holds none."""
+    if not item.pins:
+        return None
+    pinned = np.zeros(len(sample.positions), dtype=np.bool_)
+    for i, box in enumerate(item.pins):
+        inside = ((sample.positions >= box.low) & (sample.positions <= box.high)).all(axis=1)
+        if not inside.any():
+            low, high = sample.positions.min(axis=0), sample.positions.max(axis=0)
+            raise InputError(
+                f"object {item.name}: pins[{i}] from {box.low} to {box.high} holds none of its matter, which is "
+                f"between {low.round(4).tolist()} and {high.round(4).tolist()}: move or enlarge the box"
+            )
+        pinned |= inside
+    return pinned
+
+
+def _collider(folder: SceneFolder, item: SceneObject, mesh: ObjectMesh) -> Collider:
+    motion = item.motion or Motion()
+    vertices = None
+    if motion.vertices_file is not None:
+        times, values = load_vertex_track(folder.file(motion.vertices_file), len(mesh.vertices))
+        vertices = Track(times=times, values=values)
+    return Collider(
+        name=item.name,
+        surface=_surface(mesh),
+        translations=_track(motion.translations),
+        rotations=_track(motion.rotations),
+        pivot=motion.pivot,
+        vertices=vertices,
+    )
+
+
+def _jump(collider: Collider) -> list[str]:
+    """Frame 1 shows every mesh where it stands; a motion that begins elsewhere jumps after it."""
+    rest = collider.surface.vertices
+    off = float(np.abs(vertices_at(collider, 0.0) - rest).max())
+    if off <= JUMP * float(np.ptp(rest, axis=0).max()):
+        return []
+    return [f"{collider.name}: its motion begins {off:.2g} m from where its mesh stands, so it jumps after frame 1"]
+
+
+def _surface(mesh: ObjectMesh) -> Surface:
+    return Surface(vertices=mesh.vertices, faces=mesh.faces)
+
+
+def _track(keys: Keys) -> Track | None:
+    if not keys:
+        return None
+    return Track(times=np.array([key.time_s for key in keys]), values=np.array([key.value for key in keys]))
+
+
+def cost_text(prepared: PreparedWorld) -> str:
+    """What the bake will take, in a line for people."""
+    cost = prepared.cost
+    return (
+        f"about {_duration(cost.seconds)} of computing and {cost.bytes / 2**20:.0f} MiB: {prepared.particle_count} "
+        f"particles, {cost.substeps} time steps of {prepared.stable_step * 1e6:.0f} µs, cells of "
+        f"{prepared.solver.cell_size(prepared.similarity) * 1000:.2g} mm"
+    )
+
+
+def _duration(seconds: float) -> str:
+    for limit, size, unit in ((120.0, 1.0, "s"), (7200.0, 60.0, "min"), (172800.0, 3600.0, "h")):
+        if seconds < limit:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:.3g} days"
