@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
-from ..mpm.colliders import Surface
+from ..mpm.colliders import Collider, Surface
 from ..scene.model import Ground
 
 Array = NDArray[np.float64]
@@ -25,14 +25,44 @@ TOUCHING = 0.05
 """Share of the particle spacing below which two bodies touch and do not overlap."""
 
 
-def surface_warnings(surface: Surface, name: str) -> list[str]:
+def surface_warnings(surface: Surface, name: str, cell: float) -> list[str]:
     """What is unusual about the mesh of object ``name``. Raises InputError for one that cannot be used."""
-    # ``distance`` is younger than this file; without it, sampling refuses the meshes that it cannot fill.
-    if importlib.util.find_spec("..mpm.distance", __package__) is None:
+    if not _have_distance():
         return []
     from ..mpm.distance import check_surface
 
-    return [str(warning) for warning in check_surface(surface, name=f"object {name}")]
+    return [str(warning) for warning in check_surface(surface, name=f"object {name}", cell_size=cell)]
+
+
+def collider_warnings(bodies: Sequence[BodyParticles], colliders: Sequence[Collider], cell: float) -> list[str]:
+    """What stands a little in a collider. Raises InputError for a body more than a cell deep in one."""
+    warnings: list[str] = []
+    if not _have_distance():
+        return warnings
+    from ..mpm.distance import overlap, signed_distance
+
+    for body, collider in itertools.product(bodies, colliders):
+        surface = collider.surface.vertices
+        low, high = body.positions.min(axis=0) - cell, body.positions.max(axis=0) + cell
+        # One that comes in later meets the collider wherever that has got to by then.
+        if body.start_time > 0 or (surface.max(axis=0) < low).any() or (surface.min(axis=0) > high).any():
+            continue
+        # No finer than the lattice of a large collider bears; bodies and colliders are then judged more coarsely.
+        spacing = max(cell, float(np.ptp(surface, axis=0).max()) / 200)
+        depth = overlap(body.positions, signed_distance(collider.surface, spacing, margin=0.0))
+        if depth > DEEPEST_CELLS * spacing:
+            raise InputError(
+                f"object {body.name}: is {depth:.2g} m deep in object {collider.name} at the start: move them apart "
+                "(world_from_mesh), or let it come in later (start_time)"
+            )
+        if depth > TOUCHING * spacing:
+            warnings.append(f"{body.name} stands {depth * 1000:.2g} mm in {collider.name} and will be pushed out")
+    return warnings
+
+
+def _have_distance() -> bool:
+    # ``distance`` is younger than this file; without it, sampling refuses the meshes that it cannot fill.
+    return importlib.util.find_spec("..mpm.distance", __package__) is not None
 
 
 def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:

@@ -29,7 +29,7 @@ from .bake_inputs import BakeOptions
 from .collider_motion import vertices_at
 from .engine_material import engine_material
 from .quality import load_quality
-from .setup_checks import overlap_warnings, require_above_ground, surface_warnings
+from .setup_checks import collider_warnings, overlap_warnings, require_above_ground, surface_warnings
 from .setup_contacts import contact_table
 from .setup_resolution import resolve
 from .shell import SHELL_CELLS, keep_shell
@@ -78,18 +78,19 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     if not moving:
         raise InputError("objects: none has the role 'dynamic', so nothing would move")
     warnings: list[str] = []
-    for item, mesh in zip(scene.objects, meshes, strict=True):
-        warnings += surface_warnings(_surface(mesh), item.name)
     quality = load_quality(options.quality)
     solver, similarity = resolve(
         [scene.objects[i].name for i in moving], [meshes[i] for i in moving], scene.ground, quality, options.arch
     )
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
+    for item, mesh in zip(scene.objects, meshes, strict=True):
+        warnings += surface_warnings(_surface(mesh), item.name, cell)
     for i in moving:
         require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
     bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
     warnings += overlap_warnings(bodies, spacing, cell)
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
+    warnings += collider_warnings(bodies, colliders, cell)
     warnings += [text for collider in colliders for text in _jump(collider)]
     setup = WorldSetup(
         bodies=bodies,

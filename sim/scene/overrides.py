@@ -56,7 +56,9 @@ def without_physics(scene: Scene, friction: float) -> Scene:
         scene,
         objects=tuple(SceneObject(**shape) for shape in shapes),
         ground=Ground(point=scene.ground.point, normal=scene.ground.normal, friction=friction),
-        **{f.name: f.default for f in dataclasses.fields(Scene) if f.name in SCENE_FIELDS},
+        gravity=Scene.gravity,
+        gravity_track=(),
+        contacts=(),
     )
 
 

@@ -20,7 +20,7 @@ from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import Cancelled, InputError, SimulationError
 from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.meshes import load_object_mesh
-from physgen.sim.scene.model import Effect, Light, Material
+from physgen.sim.scene.model import Effect, Key, Light, Material, Motion
 
 QUICK = BakeOptions(frames=6, fps=24.0, quality="preview")
 
@@ -56,6 +56,18 @@ def test_a_ball_of_clay_is_dented_and_its_skin_follows(ball_scene, tmp_path):
     assert np.abs(last - middle).max() < 0.01 * rest[2]
     assert np.isfinite(cache.sample(5)).all() and cache.sample(5)[:, 2].min() > -0.002
     assert np.ptp(cache.sample(5), axis=0).max() < 2 * rest.max()
+
+
+def test_a_moving_collider_is_baked_where_it_goes(ball_scene, tmp_path):
+    folder = ball_scene(count=2, velocity=(0.0, 0.0, 0.0))
+    keys = (Key(time_s=0.0, value=(0.0, 0.0, 0.0)), Key(time_s=1.0, value=(0.0, 2.4, 0.0)))
+    wall = dataclasses.replace(folder.scene.objects[1], role="collider", motion=Motion(translations=keys))
+    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(folder.scene.objects[0], wall)))
+    notices = []
+    bake(folder.root, tmp_path / "bake", dataclasses.replace(QUICK, frames=3), notices.append)
+    cache = Pc2Reader(tmp_path / "bake" / "ball1.pc2")
+    np.testing.assert_allclose(cache.sample(2) - cache.sample(0), np.tile([0.0, 0.2, 0.0], (642, 1)), atol=1e-6)
+    assert any("about" in n.get("message", "") and "MiB" in n.get("message", "") for n in notices), "what it will cost"
 
 
 def test_nothing_changed_nothing_done(ball_scene, tmp_path):

@@ -63,6 +63,7 @@ def test_vectors_may_start_with_a_minus():
 @pytest.mark.parametrize(
     "arguments",
     [[], ["run"], ["run", "p.jpg", "--out", "v.mp4"], ["run", "p.jpg", "--box", "1,2,3", "--out", "v.mp4"], ["dance"],
+     ["bake", "s"],
      ["bake", "s", "--out", "b", "--preset", "unobtainium"], ["run", "p.jpg", "--box", "0,0,nan,4", "--out", "v.mp4"]],
 )  # fmt: skip
 def test_wrong_usage_is_exit_2(arguments, capsys):
@@ -110,6 +111,8 @@ def test_effects_are_listed_for_people_and_for_machines(capsys):
         (["run", "{photo}", "--box", "1,1,9,9", "--out", "{tmp}/v.mp4", "--velocity", "0,0,1", "0,0,2"], "velocity"),
         (["reconstruct", "{photo}", "--box", "110,90,210,190", "--out", "."], "."),
         (["reconstruct", "{photo}", "--box", "110,90,210,190", "--size", "1", "2", "--out", "{tmp}/s"], "--size"),
+        (["reconstruct", "{photo}", "--box", "110,90,210,190", "--set", "mug.fill=0", "--out", "{tmp}/s"], "'mug'"),
+        (["run", "{photo}", "--box", "1,1,9,9", "--set", "object_1.density=-1", "--out", "{tmp}/v.mp4"], "density"),
     ],
 )
 def test_bad_input_is_exit_3_and_names_itself(arguments, words, tmp_path, photo):
@@ -145,6 +148,17 @@ def test_stages_one_by_one(tmp_path, photo):
     assert code == 0, errors
     assert [e["done"] for e in events if e["event"] == "progress"][-1] == 4
     first = load_manifest(bake)
+
+    # What it would cost is said without a bake, and nothing is written.
+    said = (scene / "scene.json").read_bytes()
+    heavy = ["--preset", "hard", "--set", "ball.density=700", "--frames", "4", "--quality", "preview", "--json"]
+    code, events, errors = physgen("bake", scene, "--estimate", *heavy)
+    assert code == 0, errors
+    cost = events[-1]["estimate"]
+    assert cost["particles"] == first.particles and cost["substeps"] > 0 and cost["bytes"] > 2**20
+    assert (scene / "scene.json").read_bytes() == said
+    code, events, errors = physgen("bake", scene, "--estimate", "--set", "ball.velocity=0,0,1e7")
+    assert code == 3 and "hours" in errors and "velocity" in errors
     mesh_time = (scene / ball.mesh).stat().st_mtime_ns
 
     # Another material: no reconstruction, another bake.

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""What a run is said to cost: the time step of theory, refusal by hours and by memory, memory found portably."""
+
+import numpy as np
+import pytest
+from physgen.sim.errors import InputError
+from physgen.sim.mpm import estimate as module
+from physgen.sim.mpm.bodies import BodyParticles
+from physgen.sim.mpm.colliders import Surface
+from physgen.sim.mpm.estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
+from physgen.sim.mpm.options import SolverOptions
+from physgen.sim.mpm.tracks import Track
+
+POINTS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)])
+SOFT = ElasticMaterial(density=1000.0, youngs_modulus=1e6, poisson_ratio=0.25)
+
+
+def a_body(**changes):
+    return BodyParticles(**{"name": "a", "positions": POINTS, "volumes": np.ones(8), "material": SOFT, **changes})
+
+
+def test_the_time_step_is_that_of_the_fastest_wave_or_particle():
+    options = SolverOptions()
+    wave = 0.4 * 0.01 / np.sqrt(1200.0)
+    assert stable_step([a_body()], 0.01, options) == pytest.approx(wave)
+    fibres = ElasticMaterial(density=1000.0, youngs_modulus=1e6, poisson_ratio=0.25, fibre_modulus=3.6e6)
+    assert stable_step([a_body(material=fibres)], 0.01, options) == pytest.approx(wave / 2)
+    assert stable_step([a_body(stiffness_scale=np.full(8, 4.0))], 0.01, options) == pytest.approx(wave / 2)
+    assert stable_step([a_body(velocity=(0, 0, 100.0))], 0.01, options) == pytest.approx(0.2 * 0.01 / 100)
+    thrown = Track(times=np.array([1.0]), values=np.array([[0.0, 0.0, 200.0]]))
+    assert stable_step([a_body(velocity_keys=thrown)], 0.01, options) == pytest.approx(0.2 * 0.01 / 200)
+    skin = Surface(vertices=POINTS, faces=np.array([[0, 1, 2]]))
+    rigid = a_body(material=RigidMaterial(density=500.0), surface=skin)
+    assert stable_step([rigid], 0.01, options) == options.max_step
+
+
+def test_cost_grows_with_particles_duration_and_substeps(monkeypatch):
+    monkeypatch.setattr(module, "_cores", lambda: 2)
+    cost = estimate(1_000_000, 2, 1e-4, 2.0, "cpu")
+    assert (cost.substeps, cost.particle_substeps) == (20_000, 2e10)
+    assert cost.seconds == pytest.approx(2e10 / 5e6, rel=0.01)
+    assert cost.bytes > 400e6 and estimate(0, 1, 1e-4, 2.0, "cuda").bytes < 300 * 2**20
+    with pytest.raises(InputError, match=r"time step.*velocity"):
+        estimate(10, 1, 0.0, 1.0, "cpu")
+
+
+def test_too_long_or_too_large_is_refused_with_a_way_out():
+    def cost(hours, gib):
+        return Estimate(substeps=9, particle_substeps=9.0, seconds=hours * 3600, bytes=int(gib * 2**30))
+
+    refuse_excess(cost(1, 1), 9, 2 * 2**30)
+    refuse_excess(cost(1, 100), 9, None)
+    with pytest.raises(InputError, match=r"72 hours.*more than 48.*coarser quality"):
+        refuse_excess(cost(72, 1), 9, None)
+    with pytest.raises(InputError, match=r"3 GiB.*2 GiB are available.*coarser quality"):
+        refuse_excess(cost(1, 3), 9, 2 * 2**30)
+
+
+def test_available_memory_is_plausible_here():
+    found = available_memory()
+    assert found is None or 2**26 < found < 2**46
+
+
+def test_memory_on_linux_is_the_lesser_of_machine_and_group(tmp_path):
+    (tmp_path / "meminfo").write_text("MemTotal: 16 kB\nMemAvailable:    8000 kB\n")
+    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 8000 * 1024
+    (tmp_path / "memory.max").write_text("max\n")
+    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 8000 * 1024
+    (tmp_path / "memory.max").write_text("5000\n")
+    (tmp_path / "memory.current").write_text("1000\n")
+    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 4000
