@@ -6,6 +6,7 @@ Everything that can be wrong with a scene is found here, before the engine start
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,7 +44,7 @@ class PreparedWorld:
     """All that the engine is told, and what the user should hear before it starts.
 
     body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
-    cost: of the whole bake, estimated.
+    cost: of the whole bake, estimated for ``arch``; stable_step, duration: in s, what it was estimated from.
     """
 
     setup: WorldSetup
@@ -54,6 +55,8 @@ class PreparedWorld:
     warnings: tuple[str, ...]
     cost: Estimate
     stable_step: float
+    duration: float
+    arch: str
 
     @property
     def particle_count(self) -> int:
@@ -62,8 +65,13 @@ class PreparedWorld:
 
     def require_affordable(self) -> None:
         """Raise InputError when the bake would take too long or more memory than there is."""
-        on_host = self.solver.arch in ("cpu", "metal")
+        on_host = self.arch in ("cpu", "metal")
         refuse_excess(self.cost, self.particle_count, available_memory() if on_host else None)
+
+    def on(self, arch: str) -> PreparedWorld:
+        """The same, with the cost on another architecture."""
+        cost = estimate(self.particle_count, len(self.setup.bodies), self.stable_step, self.duration, arch)
+        return dataclasses.replace(self, arch=arch, cost=cost)
 
 
 def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: BakeOptions) -> PreparedWorld:
@@ -115,6 +123,8 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
         warnings=tuple(warnings),
         cost=estimate(count, len(setup.bodies), step, duration, options.arch),
         stable_step=step,
+        duration=duration,
+        arch=options.arch,
     )
 
 

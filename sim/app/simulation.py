@@ -92,7 +92,9 @@ def build_world(
     progress.notice(cost_text(prepared))
     world = _start(prepared, progress)
     if world.arch != options.arch:
-        progress.notice(f"{options.arch} is not available here; simulating on {world.arch}")
+        prepared = prepared.on(world.arch)
+        prepared.require_affordable()
+        progress.notice(f"{options.arch} is not available here; simulating on {world.arch}, {cost_text(prepared)}")
     bodies = prepared.setup.bodies
     return Simulation(
         world=world,

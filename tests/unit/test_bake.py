@@ -208,6 +208,19 @@ def test_what_cannot_be_simulated_is_refused(ball_scene, tmp_path, changes, word
         bake(folder.root, tmp_path / "bake", QUICK)
 
 
+@pytest.mark.parametrize(
+    ("item", "words"),
+    [({"preset": "wood"}, "rigid"), ({"friction": 0.1}, "surfaces"), ({"goal_stiffness": 1.0}, "goal")],
+)
+def test_what_the_engine_cannot_do_yet_is_refused_by_name(ball_scene, tmp_path, item, words):
+    preset = item.pop("preset", "soft")
+    folder = ball_scene(preset=preset)
+    changed = dataclasses.replace(folder.scene.objects[0], **item)
+    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(changed,)))
+    with pytest.raises(InputError, match=words):
+        bake(folder.root, tmp_path / "bake", QUICK)
+
+
 def test_an_open_mesh_is_refused_by_its_objects_name(ball_scene, tmp_path):
     import trimesh
 

@@ -181,7 +181,26 @@ def test_bodies_in_each_other_are_refused(world, distance, outcome):
     assert bool(warnings) == (outcome == "warned")
 
 
-@pytest.mark.skipif(importlib.util.find_spec("physgen.sim.mpm.distance") is None, reason="sim/mpm/distance is to come")
+needs_distance = pytest.mark.skipif(
+    importlib.util.find_spec("physgen.sim.mpm.distance") is None, reason="sim/mpm/distance is to come"
+)
+
+
+@needs_distance
+@pytest.mark.parametrize("kind", ["thin", "self-intersecting"])
+def test_odd_meshes_are_told_by_name(world, kind):
+    folder = world()
+    mesh = trimesh.creation.box((0.1, 0.1, 0.002))
+    if kind == "self-intersecting":
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
+        mesh = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.04, 0, 0))])
+    mesh.apply_translation((0, 0, 0.06))
+    mesh.export(folder.root / "meshes/ball0.glb")
+    quality = dataclasses.replace(OPTIONS, quality="preview")
+    assert any("ball0" in warning for warning in estimate_bake(folder, quality).warnings)
+
+
+@needs_distance
 def test_a_body_in_a_collider_is_refused(world):
     with pytest.raises(InputError, match=r"object ball0.*deep in object wall"):
         estimate_bake(world(extra=(a_wall(world_from_mesh=away(0.03)),)), OPTIONS)
@@ -250,3 +269,8 @@ def test_the_papers_profile_has_256_cells_over_the_box(world):
     folder = world()
     mesh = load_object_mesh(folder, folder.scene.objects[0])
     assert cell_size([mesh], load_quality("papers")) == pytest.approx(BOX_BODIES * 2 * RADIUS / 256)
+
+
+def test_a_fall_back_to_the_processor_is_estimated_anew(world):
+    fast = estimate_bake(world(), dataclasses.replace(OPTIONS, arch="cuda"))
+    assert fast.on("cpu").cost.seconds > fast.cost.seconds and fast.on("cuda").cost == fast.cost
