@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""The impulses between solids that touch: projected Gauss-Seidel from the impulses of the last substep.
+
+For each contact with gap phi, normal n from b to a, relative velocity u = u_n n + u_t (after the substep, a's less b's):
+
+    u_n >= -e u_n(before)  where it comes in faster than gravity would bring it, and phi is closed within the substep
+    u_n >= -phi / dt       elsewhere, phi > 0;  u_n >= 0 elsewhere
+    lambda_n >= 0, complementary;  |lambda_t| <= mu lambda_n, opposed to u_t where equal;  |lambda_r| <= lever lambda_n
+
+Depth is taken out by velocities of its own (``PUSH_V``) that move the solids but are not kept, so that it makes no
+energy.
+"""
+
+import taichi as ti
+
+from .layout import Integers
+from .rigid_math import Doubles, dvec3, load3, load33, store3
+from .solid_layout import (
+    ADHESION,
+    ADHESION_REACH,
+    ARM_A,
+    ARM_B,
+    BOTH_WAYS,
+    BOUNCE,
+    CONTACT,
+    DRIFT,
+    FRICTION,
+    GAP,
+    GRAVITY,
+    IMPULSE,
+    INVERSE_MASS,
+    KINETIC,
+    KN,
+    KR,
+    KT,
+    LEVER,
+    MEMORY,
+    MODE,
+    NORMAL,
+    NUMBERS,
+    PAIRS,
+    PLACE,
+    PULL,
+    PUSH,
+    PUSH_IMPULSE,
+    PUSH_V,
+    PUSH_W,
+    RECOVERY,
+    REPORT,
+    RESTITUTION,
+    ROLL,
+    ROW,
+    RUB,
+    SEPARATE,
+    SLIP,
+    SLOTS,
+    SOLID,
+    STATIC_FRICTION,
+    STICKY,
+    TARGET,
+    TOUCHED,
+    UNIFORM,
+    V_BEFORE,
+    W_BEFORE,
+    WORLD,
+    J,
+    L,
+    V,
+    W,
+)
+
+SWEEPS = 60
+"""Gauss-Seidel sweeps at most; they end when nothing changes any more."""
+
+SETTLED = 1e-5
+"""Share of the speed that gravity gives in a substep below which a change is nothing."""
+
+QUICK = 3.0
+"""Times the speed that gravity gives in a substep above which a solid bounces."""
+
+ENGAGE = 0.02
+"""Cells within which a surface that does not let go takes hold."""
+
+SHARE = 0.2
+"""Share of the depth that one substep takes out."""
+
+
+@ti.func
+def cross_product_matrix_column(arm, inverse_inertia, axis):
+    """Velocity at ``arm`` along all axes from an impulse of 1 along ``axis`` there, by turning alone."""
+    return (inverse_inertia @ arm.cross(axis)).cross(arm)
+
+
+@ti.func
+def kick(i, row_v, row_w, impulse, moment, solid_numbers: Doubles, solids: Doubles):
+    """Add an impulse and an angular impulse to the velocities at ``row_v`` and ``row_w`` of solid ``i``."""
+    for c in ti.static(range(3)):
+        solids[i * SOLID + row_v + c] += solid_numbers[i * NUMBERS + INVERSE_MASS] * impulse[c]
+    turn = load33(solids, i * SOLID + J) @ moment
+    for c in ti.static(range(3)):
+        solids[i * SOLID + row_w + c] += turn[c]
+
+
+@ti.func
+def adhere(w, dt, p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, pair_numbers: Doubles,
+           counts: Integers, contacts: Doubles):
+    """Pull the solids of pair ``p`` together: a force of adhesion times reduced mass, shared by their contacts."""
+    a, b, other = pairs[p * PAIRS], pairs[p * PAIRS + 1], pairs[p * PAIRS + 2]
+    row = pairs[p * PAIRS + 3] * CONTACT
+    pull, within = pair_numbers[row + ADHESION], pair_numbers[row + ADHESION_REACH]
+    if pull > 0.0 and counts[p] > 0:
+        sharing = 0
+        for d in range(2):
+            q = ti.select(d == 0, p, other)
+            if q >= 0:
+                for s in range(counts[q]):
+                    if contacts[(q * SLOTS + s) * ROW + GAP] < within:
+                        sharing += 1
+        inverse = solid_numbers[a * NUMBERS + INVERSE_MASS]
+        if b >= 0:
+            inverse += solid_numbers[b * NUMBERS + INVERSE_MASS]
+        for s in range(counts[p]):
+            c = (p * SLOTS + s) * ROW
+            if contacts[c + GAP] < within:
+                size = dt * pull / (inverse * sharing)
+                impulse = -size * load3(contacts, c + NORMAL)
+                contacts[c + PULL] = size
+                for d in range(2):
+                    i = ti.select(d == 0, a, b)
+                    if i >= 0:
+                        j = ti.select(d == 0, impulse, -impulse)
+                        arm = load3(contacts, c + ti.select(d == 0, ARM_A, ARM_B))
+                        kick(i, V, W, j, arm.cross(j), solid_numbers, solids)
+
+
+@ti.func
+def prepare(w, dt, p, world_numbers: Doubles, solid_numbers: Doubles, solids: Doubles, pairs: Integers,
+            pair_numbers: Doubles, counts: Integers, contacts: Doubles):
+    """Effective masses, targets and friction of the contacts of pair ``p``; the velocities are those before impulses."""
+    a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
+    law = pairs[p * PAIRS + 3] * CONTACT
+    mode = ti.cast(pair_numbers[law + MODE], ti.i32)
+    weight = load3(world_numbers, w * WORLD + GRAVITY).norm() + pair_numbers[law + ADHESION]
+    weight += load3(solid_numbers, a * NUMBERS + UNIFORM).norm()
+    fall = dt * weight + 1e-6
+    recovery = world_numbers[w * WORLD + RECOVERY]
+    inverse = solid_numbers[a * NUMBERS + INVERSE_MASS]
+    Ja = load33(solids, a * SOLID + J)
+    Jb = Ja * 0
+    if b >= 0:
+        inverse += solid_numbers[b * NUMBERS + INVERSE_MASS]
+        Jb = load33(solids, b * SOLID + J)
+    for s in range(counts[p]):
+        c = (p * SLOTS + s) * ROW
+        ra, rb, n = load3(contacts, c + ARM_A), load3(contacts, c + ARM_B), load3(contacts, c + NORMAL)
+        least = dvec3(0.0)
+        for k in ti.static(range(3)):
+            smaller = True
+            for m in ti.static(range(3)):
+                if ti.static(m != k):
+                    smaller = smaller and ti.abs(n[k]) <= ti.abs(n[m])
+            if smaller and least.norm() == 0.0:
+                least[k] = 1
+        t1 = n.cross(least)
+        t1 /= t1.norm()
+        t2 = n.cross(t1)
+        K = inverse * dvec3(1.0)
+        k12 = ti.cast(0.0, ti.f64)
+        for k in range(3):
+            axis = ti.select(k == 0, n, ti.select(k == 1, t1, t2))
+            answer = cross_product_matrix_column(ra, Ja, axis) + cross_product_matrix_column(rb, Jb, axis)
+            gain = answer.dot(axis)
+            K += gain * dvec3(ti.select(k == 0, 1, 0), ti.select(k == 1, 1, 0), ti.select(k == 2, 1, 0))
+            if k == 1:
+                k12 = answer.dot(t2)
+        contacts[c + KN] = K[0]
+        contacts[c + KT] = (K[1] + K[2]) / 2 + ti.sqrt(((K[1] - K[2]) / 2) ** 2 + k12 * k12)
+        both = Ja + Jb
+        rows = ti.abs(both) @ dvec3(1.0)
+        contacts[c + KR] = rows.max()
+        drift = load3(contacts, c + DRIFT)
+        u = load3(solids, a * SOLID + V) + load3(solids, a * SOLID + W).cross(ra) - drift
+        before = load3(solids, a * SOLID + V_BEFORE) + load3(solids, a * SOLID + W_BEFORE).cross(ra) - drift
+        if b >= 0:
+            u -= load3(solids, b * SOLID + V) + load3(solids, b * SOLID + W).cross(rb)
+            before -= load3(solids, b * SOLID + V_BEFORE) + load3(solids, b * SOLID + W_BEFORE).cross(rb)
+        closing = u.dot(n)
+        gap = contacts[c + GAP]
+        target = -ti.max(gap, 0) / dt
+        restitution = pair_numbers[law + RESTITUTION]
+        if mode == SEPARATE and restitution > 0.0 and closing < -QUICK * fall and gap + dt * closing < 0.0:
+            target = -restitution * closing
+            contacts[c + BOUNCE] = 1
+        push = ti.cast(0.0, ti.f64)
+        if gap < 0.0:
+            push = ti.min(-SHARE * gap / dt, recovery)
+        sliding = before - before.dot(n) * n
+        friction = pair_numbers[law + ti.select(sliding.norm() < fall, STATIC_FRICTION, KINETIC)]
+        if mode != SEPARATE and gap < ENGAGE:
+            contacts[c + BOTH_WAYS] = 1
+            if gap > 0.0:
+                target = ti.max(-SHARE * gap / dt, -recovery)
+        if mode == SLIP:
+            friction = 0
+        if mode == STICKY:
+            friction = ti.select(gap < ENGAGE, 1e30, 0.0)
+        contacts[c + TARGET] = target
+        contacts[c + PUSH] = push
+        contacts[c + FRICTION] = friction
+
+
+@ti.func
+def warm(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, counts: Integers, contacts: Doubles):
+    """Start from the impulses of the last substep."""
+    for s in range(counts[p]):
+        c = (p * SLOTS + s) * ROW
+        n = load3(contacts, c + NORMAL)
+        rub, roll = load3(contacts, c + RUB), load3(contacts, c + ROLL)
+        rub -= rub.dot(n) * n
+        roll -= roll.dot(n) * n
+        if contacts[c + BOTH_WAYS] < 0.5:
+            contacts[c + IMPULSE] = ti.max(contacts[c + IMPULSE], 0)
+        store3(contacts, c + RUB, rub)
+        store3(contacts, c + ROLL, roll)
+        impulse = contacts[c + IMPULSE] * n + rub
+        for d in range(2):
+            i = pairs[p * PAIRS + d]
+            if i >= 0:
+                sign = ti.select(d == 0, 1, -1)
+                arm = load3(contacts, c + ti.select(d == 0, ARM_A, ARM_B))
+                kick(i, V, W, sign * impulse, sign * (arm.cross(impulse) + roll), solid_numbers, solids)
+
+
+@ti.func
+def sweep(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, pair_numbers: Doubles, counts: Integers,
+          contacts: Doubles):
+    """One Gauss-Seidel sweep over the contacts of pair ``p``; returns the largest change of velocity in it."""
+    worst = ti.cast(0.0, ti.f64)
+    a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
+    if counts[p] > 0:
+        lever = pair_numbers[pairs[p * PAIRS + 3] * CONTACT + LEVER]
+        ma = solid_numbers[a * NUMBERS + INVERSE_MASS]
+        mb = ma * 0
+        Ja = load33(solids, a * SOLID + J)
+        Jb = Ja * 0
+        va, wa = load3(solids, a * SOLID + V), load3(solids, a * SOLID + W)
+        pa, qa = load3(solids, a * SOLID + PUSH_V), load3(solids, a * SOLID + PUSH_W)
+        vb, wb, pb, qb = dvec3(0.0), dvec3(0.0), dvec3(0.0), dvec3(0.0)
+        if b >= 0:
+            mb = solid_numbers[b * NUMBERS + INVERSE_MASS]
+            Jb = load33(solids, b * SOLID + J)
+            vb, wb = load3(solids, b * SOLID + V), load3(solids, b * SOLID + W)
+            pb, qb = load3(solids, b * SOLID + PUSH_V), load3(solids, b * SOLID + PUSH_W)
+        for s in range(counts[p]):
+            c = (p * SLOTS + s) * ROW
+            ra, rb, n = load3(contacts, c + ARM_A), load3(contacts, c + ARM_B), load3(contacts, c + NORMAL)
+            # Along the surface and against rolling, within what the present normal impulse allows.
+            size = ti.max(contacts[c + IMPULSE], 0)
+            u = va + wa.cross(ra) - vb - wb.cross(rb) - load3(contacts, c + DRIFT)
+            old = load3(contacts, c + RUB)
+            new = old - (u - u.dot(n) * n) / contacts[c + KT]
+            most = contacts[c + FRICTION] * size
+            if contacts[c + FRICTION] > 1e20:
+                most = 1e30
+            if new.norm() > most:
+                new *= most / new.norm()
+            store3(contacts, c + RUB, new)
+            change = new - old
+            worst = ti.max(worst, change.norm() * contacts[c + KT])
+            turn = dvec3(0.0)
+            if lever > 0.0:
+                rolling = wa - wb
+                held = load3(contacts, c + ROLL)
+                now = held - (rolling - rolling.dot(n) * n) / ti.max(contacts[c + KR], 1e-300)
+                if now.norm() > lever * size:
+                    now *= lever * size / now.norm()
+                store3(contacts, c + ROLL, now)
+                turn = now - held
+            va += ma * change
+            wa += Ja @ (ra.cross(change) + turn)
+            vb -= mb * change
+            wb -= Jb @ (rb.cross(change) + turn)
+            # Along the normal.
+            u = va + wa.cross(ra) - vb - wb.cross(rb) - load3(contacts, c + DRIFT)
+            before = contacts[c + IMPULSE]
+            after = before + (contacts[c + TARGET] - u.dot(n)) / contacts[c + KN]
+            if contacts[c + BOTH_WAYS] < 0.5:
+                after = ti.max(after, 0)
+            contacts[c + IMPULSE] = after
+            worst = ti.max(worst, ti.abs(after - before) * contacts[c + KN])
+            change = (after - before) * n
+            va += ma * change
+            wa += Ja @ ra.cross(change)
+            vb -= mb * change
+            wb -= Jb @ rb.cross(change)
+            # Out of the depth.
+            if contacts[c + PUSH] > 0.0:
+                u = pa + qa.cross(ra) - pb - qb.cross(rb)
+                before = contacts[c + PUSH_IMPULSE]
+                after = ti.max(before + (contacts[c + PUSH] - u.dot(n)) / contacts[c + KN], 0)
+                contacts[c + PUSH_IMPULSE] = after
+                change = (after - before) * n
+                pa += ma * change
+                qa += Ja @ ra.cross(change)
+                pb -= mb * change
+                qb -= Jb @ rb.cross(change)
+        store3(solids, a * SOLID + V, va)
+        store3(solids, a * SOLID + W, wa)
+        store3(solids, a * SOLID + PUSH_V, pa)
+        store3(solids, a * SOLID + PUSH_W, qa)
+        if b >= 0:
+            store3(solids, b * SOLID + V, vb)
+            store3(solids, b * SOLID + W, wb)
+            store3(solids, b * SOLID + PUSH_V, pb)
+            store3(solids, b * SOLID + PUSH_W, qb)
+    return worst
+
+
+@ti.func
+def finish(w, p, solids: Doubles, pairs: Integers, counts: Integers, contacts: Doubles, memory: Doubles,
+           world_report: Doubles):
+    """Angular momentum from the impulses of pair ``p``, and its contacts into the memory."""
+    for s in range(SLOTS):
+        m = (p * SLOTS + s) * MEMORY
+        memory[m + 10] = 0
+        if s < counts[p]:
+            c = (p * SLOTS + s) * ROW
+            n = load3(contacts, c + NORMAL)
+            rub, roll = load3(contacts, c + RUB), load3(contacts, c + ROLL)
+            impulse = (contacts[c + IMPULSE] - contacts[c + PULL]) * n + rub
+            acts = contacts[c + IMPULSE] != 0.0 or contacts[c + PULL] != 0.0 or contacts[c + PUSH_IMPULSE] != 0.0
+            for d in range(2):
+                i = pairs[p * PAIRS + d]
+                if i >= 0 and acts:
+                    sign = ti.select(d == 0, 1, -1)
+                    arm = load3(contacts, c + ti.select(d == 0, ARM_A, ARM_B))
+                    gain = sign * (arm.cross(impulse) + roll)
+                    for k in ti.static(range(3)):
+                        solids[i * SOLID + L + k] += gain[k]
+                    bounced = contacts[c + BOUNCE] > 0.5
+                    solids[i * SOLID + TOUCHED] = ti.max(solids[i * SOLID + TOUCHED], ti.select(bounced, 2, 1))
+            store3(memory, m, load3(contacts, c + PLACE))
+            memory[m + 3] = ti.select(contacts[c + BOUNCE] > 0.5, 0, contacts[c + IMPULSE])
+            store3(memory, m + 4, ti.select(contacts[c + BOUNCE] > 0.5, 0, 1) * rub)
+            store3(memory, m + 7, ti.select(contacts[c + BOUNCE] > 0.5, 0, 1) * roll)
+            memory[m + 10] = 1
+            world_report[w * REPORT] += 1
+            world_report[w * REPORT + 1] = ti.max(world_report[w * REPORT + 1], -contacts[c + GAP])
