@@ -11,9 +11,9 @@ orientation follows the angular velocity at the middle of the substep. Arrays ar
 import taichi as ti
 
 from .layout import Integers, Scalars
-from .rigid_contact import find_contacts
+from .rigid_contact import find_contacts, gather_points
 from .rigid_math import Doubles, dvec3, dvec4, load3, load33, matrix_of, store3, store33, turned
-from .rigid_solve import SETTLED, SWEEPS, adhere, finish, prepare, sweep, warm
+from .rigid_solve import SETTLED, SWEEPS, finish, prepare, sweep, warm
 from .solid_layout import (
     ACCELERATION,
     BLEND,
@@ -67,36 +67,42 @@ def predict(w, dt, world_spans: Integers, solids: Doubles):
 
 
 @ti.func
-def act(w, i, dt, world_numbers: Doubles, solid_numbers: Doubles, solids: Doubles, impulses: Doubles):
+def act(w, i, dt, world_numbers: Doubles, solid_kinds: Integers, solid_numbers: Doubles, solids: Doubles, impulses: Doubles):
     """Forces on solid ``i`` over ``dt`` and the impulses that matter gave it, which are used up."""
     r, n = i * SOLID, i * NUMBERS
     inverse = solid_numbers[n + INVERSE_MASS]
     velocity, spin = load3(solids, r + V), load3(solids, r + W)
     store3(solids, r + V_BEFORE, velocity)
     store3(solids, r + W_BEFORE, spin)
-    wind = load3(solid_numbers, n + WIND)
-    relative = velocity - wind
-    # Lift turns the velocity about the spin, drag shortens it: both exactly, hence stable at any strength.
-    angle = solid_numbers[n + LIFT] * dt * spin.norm()
-    if angle != 0.0:
-        axis = spin / spin.norm()
-        along = axis.dot(relative) * axis
-        relative = along + ti.cos(angle) * (relative - along) + ti.sin(angle) * axis.cross(relative)
-    velocity = wind + relative / (1 + solid_numbers[n + DRAG] * dt * relative.norm())
-    gravity = load3(world_numbers, w * WORLD + GRAVITY)
-    pull = solid_numbers[n + GRAVITY_FACTOR] * gravity + load3(solid_numbers, n + UNIFORM)
-    tether = load3(solid_numbers, n + TETHER_ANCHOR) - load3(solids, r + X)
-    reach = tether.norm()
-    stretch = reach - solid_numbers[n + TETHER_LENGTH]
-    if reach > 0.0 and (stretch > 0.0 or solid_numbers[n + TETHER_STRING] < 0.5):
-        pull += solid_numbers[n + TETHER_STIFFNESS] * stretch / reach * tether
-    given, turn = load3(impulses, 6 * i), load3(impulses, 6 * i + 3)
-    velocity += dt * pull + inverse * given
-    momentum = load3(solids, r + L) + turn
-    store3(solids, r + V, velocity)
-    store3(solids, r + L, momentum)
-    store3(solids, r + W, load33(solids, r + J) @ momentum)
-    solids[r + TOUCHED] = ti.select(given.norm() + turn.norm() > 0.0, 1, 0)
+    store3(solids, r + PUSH_V, dvec3(0.0))
+    store3(solids, r + PUSH_W, dvec3(0.0))
+    solids[r + TOUCHED] = 0
+    if solid_kinds[i * KINDS + KIND] == DYNAMIC:
+        wind = load3(solid_numbers, n + WIND)
+        relative = velocity - wind
+        # Lift turns the velocity about the spin, drag shortens it: both exactly, hence stable at any strength.
+        angle = solid_numbers[n + LIFT] * dt * spin.norm()
+        if angle != 0.0:
+            axis = spin / spin.norm()
+            along = axis.dot(relative) * axis
+            relative = along + ti.cos(angle) * (relative - along) + ti.sin(angle) * axis.cross(relative)
+        velocity = wind + relative / (1 + solid_numbers[n + DRAG] * dt * relative.norm())
+        gravity = load3(world_numbers, w * WORLD + GRAVITY)
+        pull = solid_numbers[n + GRAVITY_FACTOR] * gravity + load3(solid_numbers, n + UNIFORM)
+        tether = load3(solid_numbers, n + TETHER_ANCHOR) - load3(solids, r + X)
+        reach = tether.norm()
+        stretch = reach - solid_numbers[n + TETHER_LENGTH]
+        if reach > 0.0 and (stretch > 0.0 or solid_numbers[n + TETHER_STRING] < 0.5):
+            pull += solid_numbers[n + TETHER_STIFFNESS] * stretch / reach * tether
+        given, turn = load3(impulses, 6 * i), load3(impulses, 6 * i + 3)
+        velocity += dt * pull + inverse * given
+        momentum = load3(solids, r + L) + turn
+        store3(solids, r + V, velocity)
+        store3(solids, r + L, momentum)
+        store3(solids, r + W, load33(solids, r + J) @ momentum)
+        solids[r + TOUCHED] = ti.select(given.norm() + turn.norm() > 0.0, 1, 0)
+    for c in range(6):
+        impulses[6 * i + c] = 0
 
 
 @ti.func
@@ -138,12 +144,11 @@ def move(w, i, dt, world_numbers: Doubles, solid_kinds: Integers, solid_numbers:
 
 
 @ti.func
-def advance_solids(
+def push_and_search(
     w,
     dt,
     world_spans: Integers,
     world_numbers: Doubles,
-    world_report: Doubles,
     solid_kinds: Integers,
     solid_numbers: Doubles,
     solids: Doubles,
@@ -159,29 +164,19 @@ def advance_solids(
     counts: Integers,
     contacts: Doubles,
     memory: Doubles,
+    reaches: Doubles,
     scores: Doubles,
     chosen: Integers,
 ):
-    """All solids of world ``w`` over ``dt`` (f64, s). Serial; worlds do not know of each other.
+    """First half of a substep of world ``w``: what acts on its solids over ``dt`` (f64, s), and where they touch.
 
     impulses, six a solid: momentum and angular momentum about the centre of mass that matter gave it in this substep,
     kg cells/s and kg cells²/s. Set to 0 here.
     """
-    first, end = world_spans[w * SPANS], world_spans[w * SPANS + 1]
-    first_pair, end_pair = world_spans[w * SPANS + 2], world_spans[w * SPANS + 3]
-    for i in range(first, end):
-        solids[i * SOLID + TOUCHED] = 0
-        store3(solids, i * SOLID + PUSH_V, dvec3(0.0))
-        store3(solids, i * SOLID + PUSH_W, dvec3(0.0))
-        if solid_kinds[i * KINDS + KIND] == DYNAMIC:
-            act(w, i, dt, world_numbers, solid_numbers, solids, impulses)
-        else:
-            store3(solids, i * SOLID + V_BEFORE, load3(solids, i * SOLID + V))
-            store3(solids, i * SOLID + W_BEFORE, load3(solids, i * SOLID + W))
-        for c in range(6):
-            impulses[6 * i + c] = 0
-    for p in range(first_pair, end_pair):
-        find_contacts(
+    for i in range(world_spans[w * SPANS], world_spans[w * SPANS + 1]):
+        act(w, i, dt, world_numbers, solid_kinds, solid_numbers, solids, impulses)
+    for p in range(world_spans[w * SPANS + 2], world_spans[w * SPANS + 3]):
+        gather_points(
             w,
             p,
             dt,
@@ -197,16 +192,50 @@ def advance_solids(
             distances,
             pairs,
             pair_numbers,
-            counts,
-            contacts,
-            memory,
+            reaches,
             scores,
             chosen,
         )
+        find_contacts(
+            w,
+            p,
+            world_numbers,
+            solid_kinds,
+            solid_numbers,
+            solids,
+            points,
+            shape_numbers,
+            shape_dims,
+            distances,
+            pairs,
+            counts,
+            contacts,
+            memory,
+            reaches,
+            chosen,
+        )
+
+
+@ti.func
+def solve_and_move(
+    w,
+    dt,
+    world_spans: Integers,
+    world_numbers: Doubles,
+    world_report: Doubles,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    pairs: Integers,
+    pair_numbers: Doubles,
+    counts: Integers,
+    contacts: Doubles,
+    memory: Doubles,
+):
+    """Second half: the impulses between the solids of world ``w`` that touch, and their motion over ``dt``."""
+    first_pair, end_pair = world_spans[w * SPANS + 2], world_spans[w * SPANS + 3]
     for c in range(REPORT):
         world_report[w * REPORT + c] = 0
-    for p in range(first_pair, end_pair):
-        adhere(w, dt, p, solid_numbers, solids, pairs, pair_numbers, counts, contacts)
     for p in range(first_pair, end_pair):
         prepare(w, dt, p, world_numbers, solid_numbers, solids, pairs, pair_numbers, counts, contacts)
     for p in range(first_pair, end_pair):
@@ -222,20 +251,18 @@ def advance_solids(
     world_report[w * REPORT + 2] = sweeps
     for p in range(first_pair, end_pair):
         finish(w, p, solids, pairs, counts, contacts, memory, world_report)
-    for i in range(first, end):
+    for i in range(world_spans[w * SPANS], world_spans[w * SPANS + 1]):
         kind = solid_kinds[i * KINDS + KIND]
         if kind == DYNAMIC or kind == KINEMATIC:
             move(w, i, dt, world_numbers, solid_kinds, solid_numbers, solids)
 
 
 @ti.kernel
-def advance_worlds(
+def search_worlds(
     worlds: ti.i32,
-    substeps: ti.i32,
     steps: Doubles,
     world_spans: Integers,
     world_numbers: Doubles,
-    world_report: Doubles,
     solid_kinds: Integers,
     solid_numbers: Doubles,
     solids: Doubles,
@@ -251,33 +278,71 @@ def advance_worlds(
     counts: Integers,
     contacts: Doubles,
     memory: Doubles,
+    reaches: Doubles,
     scores: Doubles,
     chosen: Integers,
 ):
-    """``substeps`` substeps of worlds without other matter, each with its own step (``steps``, s)."""
+    """``push_and_search`` in all worlds, ``steps[w]`` seconds in world w. Kernels of their own compile much faster than
+    the same code in a larger one: Taichi's passes take time in proportion to the square of a kernel's length."""
+    ti.loop_config(serialize=True)
     for w in range(worlds):
-        for _ in range(substeps):
-            advance_solids(
-                w,
-                steps[w],
-                world_spans,
-                world_numbers,
-                world_report,
-                solid_kinds,
-                solid_numbers,
-                solids,
-                impulses,
-                clusters,
-                cluster_starts,
-                points,
-                shape_numbers,
-                shape_dims,
-                distances,
-                pairs,
-                pair_numbers,
-                counts,
-                contacts,
-                memory,
-                scores,
-                chosen,
-            )
+        push_and_search(
+            w,
+            steps[w],
+            world_spans,
+            world_numbers,
+            solid_kinds,
+            solid_numbers,
+            solids,
+            impulses,
+            clusters,
+            cluster_starts,
+            points,
+            shape_numbers,
+            shape_dims,
+            distances,
+            pairs,
+            pair_numbers,
+            counts,
+            contacts,
+            memory,
+            reaches,
+            scores,
+            chosen,
+        )
+
+
+@ti.kernel
+def move_worlds(
+    worlds: ti.i32,
+    steps: Doubles,
+    world_spans: Integers,
+    world_numbers: Doubles,
+    world_report: Doubles,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    pairs: Integers,
+    pair_numbers: Doubles,
+    counts: Integers,
+    contacts: Doubles,
+    memory: Doubles,
+):
+    """``solve_and_move`` in all worlds."""
+    ti.loop_config(serialize=True)
+    for w in range(worlds):
+        solve_and_move(
+            w,
+            steps[w],
+            world_spans,
+            world_numbers,
+            world_report,
+            solid_kinds,
+            solid_numbers,
+            solids,
+            pairs,
+            pair_numbers,
+            counts,
+            contacts,
+            memory,
+        )

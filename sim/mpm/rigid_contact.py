@@ -112,27 +112,35 @@ def distance_to(
 
 
 @ti.func
-def patch(points: Scalars, p, facing):
-    """The place of point ``p``'s patch whose outer normal is nearest to ``facing`` (unit vector); a's frame."""
+def box_distance(shape, local, shape_numbers: Scalars, shape_dims: Integers):
+    """How far a point is at least from ``shape``: outside its lattice from there, inside 0; height over a plane, -1."""
+    far = local[2]
+    if shape >= 0:
+        far = outside_box(shape, local, shape_numbers, shape_dims).norm()
+    return far
+
+
+@ti.func
+def patch(points: Scalars, p, facing, limit):
+    """The place of point ``p``'s patch whose outer normal is nearest to ``facing`` (unit vector, or 0), the point itself
+    where that is farther away than ``limit``; and the point's normal. In a's frame."""
     r = p * POINT
     place = dvec3(points[r], points[r + 1], points[r + 2])
     n = dvec3(points[r + 3], points[r + 4], points[r + 5])
     t = dvec3(points[r + 6], points[r + 7], points[r + 8])
-    s = n.cross(t)
-    fall = ti.cast(0.0, ti.f64)
     way = dvec3(0.0)
-    for k in ti.static(range(2)):
+    for k in range(2):
         radius = ti.cast(points[r + 9 + k], ti.f64)
-        axis = ti.select(k == 0, t, s)
+        axis = ti.select(k == 0, t, n.cross(t))
         tilt = facing.dot(axis)
-        if radius > 0.0:
-            way += radius * tilt * axis
-            fall += radius * (1 - ti.sqrt(ti.max(1 - tilt * tilt, 0)))
-    return place, way - fall * n
+        way += radius * tilt * axis - radius * (1 - ti.sqrt(ti.max(1 - tilt * tilt, 0))) * n
+    if way.norm() < limit:
+        place += way
+    return place, n
 
 
 @ti.func
-def find_contacts(
+def gather_points(
     w,
     p,
     dt,
@@ -148,170 +156,177 @@ def find_contacts(
     distances: Scalars,
     pairs: Integers,
     pair_numbers: Doubles,
-    counts: Integers,
-    contacts: Doubles,
-    memory: Doubles,
+    reaches: Doubles,
     scores: Doubles,
     chosen: Integers,
 ):
-    """The contacts of pair ``p``, with the impulses that they had in the last substep."""
+    """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none; -1 in ``reaches`` says that
+    there are none at all, else it is how far (cells) the points may be from the other surface."""
     a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
-    other = pairs[p * PAIRS + 2]
-    count = 0
-    sure = 0
     centre = load3(solids, a * SOLID + X)
-    turn = load33(solids, a * SOLID + R)
     origin, axes = frame_of(w, b, world_numbers, solids)
-    relative = axes.transpose() @ turn
     shift = axes.transpose() @ (centre - origin)
     radius = solid_numbers[a * NUMBERS + RADIUS]
-    spacing = solid_numbers[a * NUMBERS + SPACING]
     velocity = load3(solids, a * SOLID + V)
     speed = load3(solids, a * SOLID + W).norm() * radius
     awake = solid_kinds[a * KINDS + KIND] != WAITING
     clusters_end = solid_kinds[a * KINDS + HULL_END]
+    shape = -1
     if b >= 0:
         velocity -= load3(solids, b * SOLID + V)
         speed += load3(solids, b * SOLID + W).norm() * (shift.norm() + radius)
         awake = awake and solid_kinds[b * KINDS + KIND] != WAITING
         clusters_end = solid_kinds[a * KINDS + CLUSTERS_END]
+        shape = solid_kinds[b * KINDS + SHAPE]
     reach = SPEEDING * dt * (speed + velocity.norm()) + REACH
     reach = ti.max(reach, pair_numbers[pairs[p * PAIRS + 3] * CONTACT + ADHESION_REACH])
-    bulge = solid_numbers[a * NUMBERS + BULGE]
-    near = awake
-    if awake:
-        if b < 0:
-            near = shift[2] < radius + reach
-        else:
-            far = outside_box(solid_kinds[b * KINDS + SHAPE], shift, shape_numbers, shape_dims)
-            near = far.norm() < radius + reach
-    if near:
-        base = w * BINS * CHOSEN
+    far = box_distance(shape, shift, shape_numbers, shape_dims)
+    reaches[p] = -1
+    if awake and far < radius + reach:
+        reaches[p] = reach
+        reach += solid_numbers[a * NUMBERS + BULGE]
+        relative = axes.transpose() @ load33(solids, a * SOLID + R)
+        base = p * BINS * CHOSEN
         for k in range(BINS * CHOSEN):
             scores[base + k] = -1e30
             chosen[base + k] = -1
         for c in range(solid_kinds[a * KINDS + CLUSTERS], clusters_end):
-            middle = relative @ dvec3(clusters[4 * c], clusters[4 * c + 1], clusters[4 * c + 2]) + shift
-            least = middle[2]
-            if b >= 0:
-                away = outside_box(solid_kinds[b * KINDS + SHAPE], middle, shape_numbers, shape_dims).norm()
-                least = away
-                if away == 0.0:
-                    least = distance_to(b, middle, solid_kinds, solids, shape_numbers, shape_dims, distances)[0][3]
-            if least < reach + bulge + clusters[4 * c + 3]:
-                for i in range(cluster_starts[c], cluster_starts[c + 1]):
-                    r = i * POINT
-                    local = relative @ dvec3(points[r], points[r + 1], points[r + 2]) + shift
-                    there = distance_to(b, local, solid_kinds, solids, shape_numbers, shape_dims, distances)[0]
-                    if there[3] < reach + bulge:
-                        g = ti.abs(dvec3(there[0], there[1], there[2]))
-                        axis = ti.select(g[0] > g[1], ti.select(g[0] > g[2], 0, 2), ti.select(g[1] > g[2], 1, 2))
-                        side = ti.select(axis == 0, there[0], ti.select(axis == 1, there[1], there[2]))
-                        u = ti.select(axis == 0, local[1], local[0])
-                        v = ti.select(axis == 2, local[1], local[2])
-                        first = base + (2 * axis + ti.select(side > 0.0, 1, 0)) * CHOSEN
-                        deep = -DEPTH_COUNTS * there[3]
-                        for k in range(CHOSEN):
-                            ku = ti.select(k < 4, 2 * (k & 1) - 1, ti.select(k < 6, 2 * (k & 1) - 1, 0))
-                            kv = ti.select(k < 4, (k & 2) - 1, ti.select(k < 6, 0, 2 * (k & 1) - 1))
-                            value = (ku * u + kv * v) * ti.select(k < 4, 0.70710678, 1.0) + deep
-                            if k == CHOSEN - 1:
-                                value = deep
-                            # A little more, lest rounding decides between points that are as good as each other.
-                            if value > scores[first + k] + 1e-6:
-                                scores[first + k] = value
-                                chosen[first + k] = i
+            # The cluster's middle comes first, as if it were a point, and tells whether the points need a look.
+            first_point = cluster_starts[c]
+            last = first_point
+            i = first_point - 1
+            while i < last:
+                whole = i < first_point
+                r = ti.max(i, 0) * POINT
+                place = dvec3(points[r], points[r + 1], points[r + 2])
+                if whole:
+                    place = dvec3(clusters[4 * c], clusters[4 * c + 1], clusters[4 * c + 2])
+                local = relative @ place + shift
+                there = distance_to(b, local, solid_kinds, solids, shape_numbers, shape_dims, distances)[0]
+                if whole:
+                    away = box_distance(shape, local, shape_numbers, shape_dims)
+                    if ti.select(shape >= 0 and away > 0.0, away, there[3]) < reach + clusters[4 * c + 3]:
+                        last = cluster_starts[c + 1]
+                elif there[3] < reach:
+                    g = ti.abs(dvec3(there[0], there[1], there[2]))
+                    axis = ti.select(g[0] > g[1], ti.select(g[0] > g[2], 0, 2), ti.select(g[1] > g[2], 1, 2))
+                    side = ti.select(axis == 0, there[0], ti.select(axis == 1, there[1], there[2]))
+                    u = ti.select(axis == 0, local[1], local[0])
+                    v = ti.select(axis == 2, local[1], local[2])
+                    first = base + (2 * axis + ti.select(side > 0.0, 1, 0)) * CHOSEN
+                    for k in range(CHOSEN):
+                        # Diagonals, then axes, then depth alone.
+                        sign = 2 * (k & 1) - 1
+                        ku = ti.select(k < 6, sign, 0)
+                        kv = ti.select(k < 4, (k & 2) - 1, ti.select(k < 6, 0, sign))
+                        value = (ku * u + kv * v) * ti.select(k < 4, 0.70710678, 1.0)
+                        value = ti.select(k < CHOSEN - 1, value, 0) - DEPTH_COUNTS * there[3]
+                        # A little more, lest rounding decides between points that are as good as each other.
+                        if value > scores[first + k] + 1e-6:
+                            scores[first + k] = value
+                            chosen[first + k] = i
+                i += 1
+
+
+@ti.func
+def find_contacts(
+    w,
+    p,
+    world_numbers: Doubles,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    points: Scalars,
+    shape_numbers: Scalars,
+    shape_dims: Integers,
+    distances: Scalars,
+    pairs: Integers,
+    counts: Integers,
+    contacts: Doubles,
+    memory: Doubles,
+    reaches: Doubles,
+    chosen: Integers,
+):
+    """The contacts of pair ``p`` from its chosen points, with the impulses that they had in the last substep."""
+    a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
+    count = 0
+    sure = 0
+    reach = reaches[p]
+    if reach >= 0.0:
+        centre = load3(solids, a * SOLID + X)
+        origin, axes = frame_of(w, b, world_numbers, solids)
+        relative = axes.transpose() @ load33(solids, a * SOLID + R)
+        shift = axes.transpose() @ (centre - origin)
+        spacing = solid_numbers[a * NUMBERS + SPACING]
         step = spacing
         if b >= 0:
             step = ti.cast(shape_numbers[4 * solid_kinds[b * KINDS + SHAPE] + 3], ti.f64)
+        base = p * BINS * CHOSEN
         for turn_number in range(2 * BINS * CHOSEN):
             # First the contacts whose normal is certain, then those at edges of both, which borrow one from those.
             k = turn_number % (BINS * CHOSEN)
             last_turn = turn_number >= BINS * CHOSEN
             i = chosen[base + k]
             if i >= 0 and count < SLOTS:
-                place = dvec3(points[i * POINT], points[i * POINT + 1], points[i * POINT + 2])
-                own = relative @ dvec3(points[i * POINT + 3], points[i * POINT + 4], points[i * POINT + 5])
-                normal = dvec3(0.0)
-                certain = False
+                place, own = dvec3(0.0), dvec3(0.0)
+                normal, gradient = dvec3(0.0), dvec3(0.0)
                 gap, change = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
                 # The patch faces b's surface where b's gradient is the patch's own normal reversed: two steps.
                 for step_number in range(3):
-                    local = relative @ place + shift
-                    gradient = dvec3(0.0, 0.0, 1.0)
-                    if b < 0:
-                        gap = local[2]
-                    else:
-                        gradient = dvec3(0.0)
-                        for n in range(7):
-                            e = dvec3(
-                                ti.select(n // 2 == 0, 1.0, 0.0),
-                                ti.select(n // 2 == 1, 1.0, 0.0),
-                                ti.select(n // 2 == 2, 1.0, 0.0),
-                            )
-                            e *= ti.select(n % 2 == 0, -step, step)
-                            there, rate = distance_to(
-                                b, local + e, solid_kinds, solids, shape_numbers, shape_dims, distances
-                            )
-                            gradient += there[3] / (2 * step * step) * e
-                            if n == 6:
-                                gap, change = there[3], rate
-                    if step_number == 0:
-                        normal = gradient
-                    else:
-                        normal = normal / ti.max(normal.norm(), 1e-9) + gradient / ti.max(gradient.norm(), 1e-9)
+                    place, own = patch(points, i, -(relative.transpose() @ normal), PATCH_LIMIT * spacing)
+                    gradient = dvec3(0.0)
+                    for n in range(7):
+                        e = dvec3(0.0)
+                        for c in ti.static(range(3)):
+                            e[c] = ti.select(n // 2 == c, ti.select(n % 2 == 0, -step, step), 0)
+                        local = relative @ place + shift + e
+                        there, rate = distance_to(
+                            b, local, solid_kinds, solids, shape_numbers, shape_dims, distances
+                        )
+                        gradient += there[3] / (2 * step * step) * e
+                        gap, change = there[3], rate
+                    normal = ti.select(step_number == 0, 0, 1) * normal + gradient / ti.max(gradient.norm(), 1e-9)
                     normal /= ti.max(normal.norm(), 1e-9)
-                    if step_number < 2:
-                        corner, way = patch(points, i, -(relative.transpose() @ normal))
-                        far = way.norm()
-                        if far < PATCH_LIMIT * spacing:
-                            place = corner + way
-                        else:
-                            place = corner
-                    else:
-                        normal = gradient / ti.max(gradient.norm(), 1e-9)
-                        certain = gradient.norm() > SHARP
-                        if not certain and -own.dot(normal) > 0.4 and points[i * POINT + 11] > 0.5:
-                            normal = -own
-                            certain = True
-                local = relative @ place + shift
+                normal = gradient / ti.max(gradient.norm(), 1e-9)
+                own = relative @ own
+                certain = gradient.norm() > SHARP
+                if not certain and -own.dot(normal) > 0.4 and points[i * POINT + 11] > 0.5:
+                    normal = -own
+                    certain = True
                 fresh = gap < reach and (certain or last_turn)
                 if fresh or gap >= reach:
                     chosen[base + k] = -1
-                if not certain and fresh:
+                normal = axes @ normal
+                world = axes @ (relative @ place + shift) + origin
+                if fresh and not certain:
                     alike = ti.cast(0.5, ti.f64)
                     raw = normal
                     for s in range(sure):
-                        stated = axes.transpose() @ load3(contacts, (p * SLOTS + s) * ROW + NORMAL)
+                        stated = load3(contacts, (p * SLOTS + s) * ROW + NORMAL)
                         if stated.dot(raw) > alike:
                             alike = stated.dot(raw)
                             normal = stated
-                for s in range(count):
-                    row = (p * SLOTS + s) * ROW
-                    if (load3(contacts, row + PLACE) - local).norm() < APART * spacing and (
-                        load3(contacts, row + NORMAL).dot(axes @ normal) > 0.9
-                    ):
-                        fresh = False
-                world = axes @ local + origin
-                if other >= 0 and other < p:
-                    for s in range(counts[ti.max(other, 0)]):
-                        row = (other * SLOTS + s) * ROW
-                        if (load3(contacts, row + ARM_B) + centre - world).norm() < APART * spacing and (
-                            load3(contacts, row + NORMAL).dot(axes @ normal) < -0.9
-                        ):
-                            fresh = False
+                for d in range(2):
+                    q = ti.select(d == 0, p, pairs[p * PAIRS + 2])
+                    if q >= 0 and q <= p:
+                        for s in range(ti.select(d == 0, count, counts[ti.max(q, 0)])):
+                            row = (q * SLOTS + s) * ROW
+                            away = load3(contacts, row + ti.select(d == 0, ARM_A, ARM_B)) + centre - world
+                            along = load3(contacts, row + NORMAL).dot(normal) * ti.select(d == 0, 1, -1)
+                            if away.norm() < APART * spacing and along > 0.9:
+                                fresh = False
                 if fresh:
                     row = (p * SLOTS + count) * ROW
                     for n in range(ROW):
                         contacts[row + n] = 0
+                    local = axes.transpose() @ (world - origin)
                     store3(contacts, row + ARM_A, world - centre)
                     store3(contacts, row + ARM_B, world - origin)
-                    store3(contacts, row + NORMAL, axes @ normal)
+                    store3(contacts, row + NORMAL, normal)
                     store3(contacts, row + PLACE, local)
                     contacts[row + GAP] = gap
-                    if b >= 0:
-                        rate = solid_numbers[ti.max(b, 0) * NUMBERS + BLEND_RATE]
-                        store3(contacts, row + DRIFT, -change * rate * (axes @ normal))
+                    rate = solid_numbers[ti.max(b, 0) * NUMBERS + BLEND_RATE]
+                    store3(contacts, row + DRIFT, -change * rate * normal)
                     recall(p, row, local, spacing, contacts, memory)
                     count += 1
                     if certain:

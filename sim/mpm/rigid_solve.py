@@ -105,38 +105,6 @@ def kick(i, row_v, row_w, impulse, moment, solid_numbers: Doubles, solids: Doubl
 
 
 @ti.func
-def adhere(w, dt, p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, pair_numbers: Doubles,
-           counts: Integers, contacts: Doubles):
-    """Pull the solids of pair ``p`` together: a force of adhesion times reduced mass, shared by their contacts."""
-    a, b, other = pairs[p * PAIRS], pairs[p * PAIRS + 1], pairs[p * PAIRS + 2]
-    row = pairs[p * PAIRS + 3] * CONTACT
-    pull, within = pair_numbers[row + ADHESION], pair_numbers[row + ADHESION_REACH]
-    if pull > 0.0 and counts[p] > 0:
-        sharing = 0
-        for d in range(2):
-            q = ti.select(d == 0, p, other)
-            if q >= 0:
-                for s in range(counts[q]):
-                    if contacts[(q * SLOTS + s) * ROW + GAP] < within:
-                        sharing += 1
-        inverse = solid_numbers[a * NUMBERS + INVERSE_MASS]
-        if b >= 0:
-            inverse += solid_numbers[b * NUMBERS + INVERSE_MASS]
-        for s in range(counts[p]):
-            c = (p * SLOTS + s) * ROW
-            if contacts[c + GAP] < within:
-                size = dt * pull / (inverse * sharing)
-                impulse = -size * load3(contacts, c + NORMAL)
-                contacts[c + PULL] = size
-                for d in range(2):
-                    i = ti.select(d == 0, a, b)
-                    if i >= 0:
-                        j = ti.select(d == 0, impulse, -impulse)
-                        arm = load3(contacts, c + ti.select(d == 0, ARM_A, ARM_B))
-                        kick(i, V, W, j, arm.cross(j), solid_numbers, solids)
-
-
-@ti.func
 def prepare(w, dt, p, world_numbers: Doubles, solid_numbers: Doubles, solids: Doubles, pairs: Integers,
             pair_numbers: Doubles, counts: Integers, contacts: Doubles):
     """Effective masses, targets and friction of the contacts of pair ``p``; the velocities are those before impulses."""
@@ -153,18 +121,21 @@ def prepare(w, dt, p, world_numbers: Doubles, solid_numbers: Doubles, solids: Do
     if b >= 0:
         inverse += solid_numbers[b * NUMBERS + INVERSE_MASS]
         Jb = load33(solids, b * SOLID + J)
+    # The adhesion, a force of so much times the reduced mass, is shared by the contacts in its reach.
+    pull, within = pair_numbers[law + ADHESION], pair_numbers[law + ADHESION_REACH]
+    sharing = 0
+    for d in range(2):
+        q = pairs[p * PAIRS + 2]
+        if d == 0:
+            q = p
+        if q >= 0 and pull > 0.0:
+            for s in range(counts[q]):
+                if contacts[(q * SLOTS + s) * ROW + GAP] < within:
+                    sharing += 1
     for s in range(counts[p]):
         c = (p * SLOTS + s) * ROW
         ra, rb, n = load3(contacts, c + ARM_A), load3(contacts, c + ARM_B), load3(contacts, c + NORMAL)
-        least = dvec3(0.0)
-        for k in ti.static(range(3)):
-            smaller = True
-            for m in ti.static(range(3)):
-                if ti.static(m != k):
-                    smaller = smaller and ti.abs(n[k]) <= ti.abs(n[m])
-            if smaller and least.norm() == 0.0:
-                least[k] = 1
-        t1 = n.cross(least)
+        t1 = n.cross(ti.select(ti.abs(n[0]) < 0.6, dvec3(1.0, 0.0, 0.0), dvec3(0.0, 1.0, 0.0)))
         t1 /= t1.norm()
         t2 = n.cross(t1)
         K = inverse * dvec3(1.0)
@@ -210,11 +181,13 @@ def prepare(w, dt, p, world_numbers: Doubles, solid_numbers: Doubles, solids: Do
         contacts[c + TARGET] = target
         contacts[c + PUSH] = push
         contacts[c + FRICTION] = friction
+        if pull > 0.0 and gap < within:
+            contacts[c + PULL] = dt * pull / (inverse * sharing)
 
 
 @ti.func
 def warm(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, counts: Integers, contacts: Doubles):
-    """Start from the impulses of the last substep."""
+    """Start from the impulses of the last substep; adhesion."""
     for s in range(counts[p]):
         c = (p * SLOTS + s) * ROW
         n = load3(contacts, c + NORMAL)
@@ -225,7 +198,7 @@ def warm(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, counts: In
             contacts[c + IMPULSE] = ti.max(contacts[c + IMPULSE], 0)
         store3(contacts, c + RUB, rub)
         store3(contacts, c + ROLL, roll)
-        impulse = contacts[c + IMPULSE] * n + rub
+        impulse = (contacts[c + IMPULSE] - contacts[c + PULL]) * n + rub
         for d in range(2):
             i = pairs[p * PAIRS + d]
             if i >= 0:

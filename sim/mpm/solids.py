@@ -18,7 +18,7 @@ from .bodies import BodyParticles, Vector
 from .colliders import Collider, Surface
 from .contacts import GROUND_NAME, MODES
 from .distance import DistanceLattice, mass_properties
-from .rigid import advance_worlds
+from .rigid import move_worlds, search_worlds
 from .setup import WorldSetup
 from .solid_shapes import NO_POINTS, PointSet, lattice_of, points_of, tables
 
@@ -30,10 +30,9 @@ RECOVERY_HEIGHT = 0.02
 LEAST_RECOVERY = 1.0
 """Cells a second at which it is pushed out without gravity."""
 
-ARGUMENTS = (
+SEARCH = (
     "world_spans",
     "world_numbers",
-    "world_report",
     "solid_kinds",
     "solid_numbers",
     "solids",
@@ -49,10 +48,26 @@ ARGUMENTS = (
     "counts",
     "contacts",
     "memory",
+    "reaches",
     "scores",
     "chosen",
 )
-"""The arrays in the order in which ``rigid.advance_solids`` takes them."""
+"""The arrays in the order in which ``rigid.push_and_search`` takes them."""
+
+MOVE = (
+    "world_spans",
+    "world_numbers",
+    "world_report",
+    "solid_kinds",
+    "solid_numbers",
+    "solids",
+    "pairs",
+    "pair_numbers",
+    "counts",
+    "contacts",
+    "memory",
+)
+"""The arrays in the order in which ``rigid.solve_and_move`` takes them."""
 
 CHANGING = ("solids", "solid_kinds", "solid_numbers", "world_numbers", "memory")
 """The arrays that a checkpoint holds."""
@@ -203,8 +218,9 @@ class Solids:
         self._put("counts", np.zeros(len(pairs)), ti.i32)
         self._put("contacts", np.zeros(len(pairs) * at.SLOTS * at.ROW), ti.f64)
         self._put("memory", np.zeros(len(pairs) * at.SLOTS * at.MEMORY), ti.f64)
-        self._put("scores", np.zeros(worlds * at.BINS * at.CHOSEN), ti.f64)
-        self._put("chosen", np.zeros(worlds * at.BINS * at.CHOSEN), ti.i32)
+        self._put("reaches", np.zeros(len(pairs)), ti.f64)
+        self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
+        self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
         self._put_shapes({i: [solid.lattices[0]] for i, solid in enumerate(self._solids) if solid.lattices})
 
     def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
@@ -307,9 +323,14 @@ class Solids:
         return len(self._solids)
 
     @property
-    def arguments(self) -> tuple[ti.Ndarray, ...]:
-        """The arrays as ``rigid.advance_solids`` takes them, from ``world_spans`` on."""
-        return tuple(self.arrays[name] for name in ARGUMENTS)
+    def search_arguments(self) -> tuple[ti.Ndarray, ...]:
+        """The arrays as ``rigid.push_and_search`` takes them."""
+        return tuple(self.arrays[name] for name in SEARCH)
+
+    @property
+    def move_arguments(self) -> tuple[ti.Ndarray, ...]:
+        """The arrays as ``rigid.solve_and_move`` takes them."""
+        return tuple(self.arrays[name] for name in MOVE)
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
@@ -406,7 +427,9 @@ class Solids:
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise InputError(f"dt is {dt!r}: give seconds above 0")
         self._put("steps", steps, ti.f64)
-        advance_worlds(len(self.setups), substeps, self.arrays["steps"], *self.arguments)
+        for _ in range(substeps):
+            search_worlds(len(self.setups), self.arrays["steps"], *self.search_arguments)
+            move_worlds(len(self.setups), self.arrays["steps"], *self.move_arguments)
         self._host.clear()
 
     # ---- state --------------------------------------------------------------------------------------------------
