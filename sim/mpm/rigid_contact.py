@@ -71,8 +71,8 @@ APART = 0.3
 PATCH_LIMIT = 0.75
 """Share of the spacing that the contact may lie from the surface point that stands for its patch."""
 
-SHARP = 0.9
-"""Where the smoothed gradient is shorter than this, b has an edge, and a's own normal is the better one."""
+SHARP = 0.995
+"""Where the smoothed gradient is shorter than this, b has an edge near by, and its direction is not certain."""
 
 
 @ti.func
@@ -290,7 +290,9 @@ def find_contacts(
                 normal = gradient / ti.max(gradient.norm(), 1e-9)
                 own = relative @ own
                 certain = gradient.norm() > SHARP
-                if not certain and -own.dot(normal) > 0.4 and points[i * POINT + 11] > 0.5:
+                r = i * POINT
+                flat = points[r + 11] > 0.5 and points[r + 9] == 0.0 and points[r + 10] == 0.0
+                if flat and -own.dot(normal) > 0.4:
                     normal = -own
                     certain = True
                 fresh = gap < reach and (certain or last_turn)

@@ -304,7 +304,7 @@ def finish(w, p, solids: Doubles, pairs: Integers, counts: Integers, contacts: D
             n = load3(contacts, c + NORMAL)
             rub, roll = load3(contacts, c + RUB), load3(contacts, c + ROLL)
             impulse = (contacts[c + IMPULSE] - contacts[c + PULL]) * n + rub
-            acts = contacts[c + IMPULSE] != 0.0 or contacts[c + PULL] != 0.0 or contacts[c + PUSH_IMPULSE] != 0.0
+            acts = impulse.norm() > 0.0 or roll.norm() > 0.0 or contacts[c + PUSH_IMPULSE] > 0.0
             for d in range(2):
                 i = pairs[p * PAIRS + d]
                 if i >= 0 and acts:

@@ -10,9 +10,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import trimesh
+from physgen.sim.mpm import runtime
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.materials import ElasticMaterial
+from physgen.sim.mpm.colliders import Surface
+from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
 from physgen.sim.mpm.options import SolverOptions
+from physgen.sim.mpm.setup import WorldSetup
+from physgen.sim.mpm.solids import Solids
 from physgen.sim.scene.units import Similarity
 
 GRID = 64
@@ -70,3 +75,71 @@ def box() -> BoxFactory:
 def cell() -> float:
     """Side of a grid cell in metres under ``options`` and ``similarity``."""
     return CELL
+
+
+def rigid_box(
+    *,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    size: tuple[float, float, float] = (0.2, 0.2, 0.2),
+    rotation: np.ndarray | None = None,
+    density: float = 1000.0,
+    name: str = "box",
+    **fields: object,
+) -> BodyParticles:
+    """Rigid box about ``center``; its particles are cubes that fill it, which gives it the exact inertia of a cube."""
+    n = 8
+    index = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    turn = np.eye(3) if rotation is None else rotation
+    mesh = trimesh.creation.box(size)
+    return BodyParticles(
+        name=name,
+        positions=(((index + 0.5) / n - 0.5) * np.asarray(size)) @ turn.T + np.asarray(center),
+        volumes=np.full(n**3, np.prod(size) / n**3),
+        material=RigidMaterial(density=density),
+        surface=Surface(vertices=np.asarray(mesh.vertices) @ turn.T + np.asarray(center), faces=np.asarray(mesh.faces)),
+        **fields,
+    )
+
+
+def rigid_ball(
+    *,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    radius: float = 0.1,
+    density: float = 1000.0,
+    subdivisions: int = 4,
+    name: str = "ball",
+    **fields: object,
+) -> BodyParticles:
+    """Rigid ball of six particles, placed such that its moment of inertia is 2/5 m r² exactly."""
+    volume = 4 / 3 * np.pi * radius**3 / 6
+    arm = np.sqrt(1.5 * (0.4 * radius**2 - volume ** (2 / 3) / 6))
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return BodyParticles(
+        name=name,
+        positions=np.concatenate([np.eye(3), -np.eye(3)]) * arm + np.asarray(center),
+        volumes=np.full(6, volume),
+        material=RigidMaterial(density=density),
+        surface=Surface(vertices=np.asarray(mesh.vertices) + np.asarray(center), faces=np.asarray(mesh.faces)),
+        **fields,
+    )
+
+
+@pytest.fixture
+def box_body() -> BoxFactory:
+    return rigid_box
+
+
+@pytest.fixture
+def ball_body() -> BoxFactory:
+    return rigid_ball
+
+
+@pytest.fixture
+def solids() -> Callable[..., Solids]:
+    """A factory of solids: worlds of 32 cells a metre around the origin."""
+
+    def make(*setups: WorldSetup) -> Solids:
+        runtime.ensure_started(SolverOptions(grid=GRID))
+        return Solids(setups, [1.0 / CELL] * len(setups), [(-1.0, -1.0, -1.0)] * len(setups))
+
+    return make
