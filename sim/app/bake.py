@@ -160,8 +160,8 @@ class _Run:
             raise InputError(
                 f"{self.out}: cannot be written ({reason}); free space and run again to continue"
             ) from error
-        if self.metrics and self.metrics[-1].get("at_walls"):
-            progress.notice("matter has reached the walls of the simulated box, which hold it there")
+        if self.metrics and self.metrics[-1].get("outside"):
+            progress.notice("matter has left the box around the scene; it flies on, and the camera may not see it")
         progress.report(self.manifest.frames)
         return self._save("complete", self.manifest.frames)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.registry import apply_effects
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface
@@ -23,7 +24,7 @@ from ..mpm.setup import WorldSetup
 from ..mpm.tracks import Track
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
-from ..scene.model import Effect, Keys, Motion, SceneObject
+from ..scene.model import Keys, Motion, SceneObject
 from ..scene.units import Similarity
 from ..scene.vertex_tracks import load_vertex_track
 from .bake_inputs import BakeOptions
@@ -108,7 +109,7 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
         colliders=colliders,
         contacts=contact_table(scene),
     )
-    setup = _with_effects(setup, scene.effects)
+    setup = apply_effects(setup, scene.effects)
     step = stable_step(setup.bodies, cell, solver)
     duration = (options.frames - 1) / options.fps
     count = sum(body.count for body in setup.bodies)
@@ -126,20 +127,6 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
         duration=duration,
         arch=options.arch,
     )
-
-
-def _with_effects(setup: WorldSetup, effects: tuple[Effect, ...]) -> WorldSetup:
-    if not effects:
-        return setup
-    try:
-        from ..effects.registry import apply_effects
-    except ModuleNotFoundError as error:
-        if not (error.name or "").endswith(("effects", "effects.registry")):
-            raise
-        raise InputError(
-            f"effects: {effects[0].name!r} is not simulated by this version; remove it from scene.json"
-        ) from None
-    return apply_effects(setup, effects)
 
 
 def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int) -> BodyParticles:

@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..events import StageProgress
-from ..mpm.forces import NO_FORCES
-from ..mpm.setup import WorldSetup
 from ..mpm.world import World
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
@@ -82,15 +79,24 @@ def build_world(
 ) -> Simulation:
     """The scene's world, ready to run, after saying what it will cost and what is odd about it.
 
-    Raises InputError as ``setup_world.prepare_world`` does, for a bake that would take too long or too much memory, and
-    for what the engine does not simulate.
+    Raises InputError as ``setup_world.prepare_world`` does, and for a bake that would take too long or too much memory.
     """
     prepared = prepare_world(folder, meshes, options)
     for warning in prepared.warnings:
         progress.notice(warning)
     prepared.require_affordable()
     progress.notice(cost_text(prepared))
-    world = _start(prepared, progress)
+    setup = prepared.setup
+    world = World(
+        bodies=setup.bodies,
+        ground=setup.ground,
+        gravity=setup.gravity,
+        gravity_track=setup.gravity_track,
+        colliders=setup.colliders,
+        contacts=setup.contacts,
+        similarity=prepared.similarity,
+        options=prepared.solver,
+    )
     if world.arch != options.arch:
         prepared = prepared.on(world.arch)
         prepared.require_affordable()
@@ -101,44 +107,3 @@ def build_world(
         prepared=prepared,
         rest_positions=tuple(None if i is None else bodies[i].positions for i in prepared.body_of_object),
     )
-
-
-def _start(prepared: PreparedWorld, progress: StageProgress) -> World:
-    """The engine's world. What the engine cannot do yet is refused, never silently left out."""
-    setup = prepared.setup
-    _refuse_beyond_engine(setup)
-    if setup.colliders:
-        progress.notice("this version collides with the ground only; objects of role 'collider' are passed through")
-    return World(
-        bodies=setup.bodies,
-        ground=setup.ground,
-        gravity=setup.gravity,
-        similarity=prepared.similarity,
-        options=prepared.solver,
-    )
-
-
-def _refuse_beyond_engine(setup: WorldSetup) -> None:
-    ground = setup.ground
-    if setup.gravity_track is not None or setup.contacts.pairs:
-        raise InputError(
-            "gravity_track, contacts and surfaces of objects: not simulated by this version; leave them out"
-        )
-    if ground is not None and ground.static_friction is not None:
-        raise InputError("ground.static_friction: not simulated by this version; leave it out")
-    for body in setup.bodies:
-        asked = {
-            "material.law 'rigid'": body.rigid,
-            "material.fibre_modulus": getattr(body.material, "fibre_modulus", 0.0) > 0,
-            "acceleration": body.acceleration is not None,
-            "velocity_keys": body.velocity_keys is not None,
-            "pins": body.pins is not None,
-            "goal_stiffness": body.goal_stiffness > 0,
-            "effects": body.forces != NO_FORCES
-            or bool(body.materials)
-            or body.density_scale is not None
-            or body.stiffness_scale is not None,
-        }
-        for name, given in asked.items():
-            if given:
-                raise InputError(f"object {body.name}: {name} is not simulated by this version; leave it out")

@@ -31,6 +31,7 @@ from .layout import (
     CONTROL_ROW,
     ELAPSED,
     FIELD_INTEGERS,
+    FIRST_SOLID,
     FIRST_TOUCH,
     FIXED_ONE,
     FULL,
@@ -45,6 +46,8 @@ from .layout import (
     SEPARATE,
     SLIDING,
     SLIP,
+    SOLID_SPEED,
+    SOLIDS,
     SPEED,
     SPREAD,
     STEP,
@@ -52,6 +55,7 @@ from .layout import (
     TOUCH_ROW,
     WINDOW_NODES,
     WORLD,
+    WORLD_INTEGERS,
     WORLD_ROW,
     Cells,
     Doubles,
@@ -61,6 +65,8 @@ from .layout import (
     vec3,
     vec4,
 )
+from .obstacles import PUSH, single3, solid_distance, solid_give, solid_velocity
+from .solid_layout import SOLID, X
 from .transfer import PIN, add_windows_where, anchor_place, load_window, weights
 
 RECOVERY = 0.2
@@ -123,7 +129,9 @@ def press(
 @ti.func
 def solve_contact(
     near_blocks: ti.i32,
+    most_solids: ti.i32,
     near_p: Integers,
+    near_worlds: Integers,
     p_cells: Cells,
     p_field: Integers,
     starts: Integers,
@@ -142,22 +150,36 @@ def solve_contact(
     nodes: Vectors4,
     scattered: Vectors4,
     touched: Integers,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    shape_numbers: Scalars,
+    shape_dims: Integers,
+    distances: Scalars,
+    touching: Scalars,
+    pushes: Scalars,
 ):
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
 
-    touched: per particle block 1 where something was scattered.
+    touched: per particle block 1 where something was scattered. pushes: what each block does to each solid of its
+    world, see ``obstacles``; touching: mass (kg) in contact with each solid in the last substep.
     """
     for ss in range(near_blocks * SPREAD):
         if ss % SPREAD == 0:
-            k = near_p[ss // SPREAD]
+            s = ss // SPREAD
+            k = near_p[s]
             f = p_field[k]
             w = field_integers[f * FIELD_INTEGERS + WORLD]
             c = w * CONTROL_ROW
+            near_worlds[s] = w
             touched[k] = 0
+            for n in range(most_solids * PUSH):
+                pushes[s * most_solids * PUSH + n] = 0.0
             if control[c + PHASE] == FULL:
                 dt = ti.cast(control[c + STEP], ti.f32)
                 # Particles farther away cannot touch in this substep.
-                reach = REACH_FACTOR * ti.cast(control[c + SPEED], ti.f32) * dt + LEAST_REACH
+                fastest = ti.max(control[c + SPEED], control[c + SOLID_SPEED])
+                reach = REACH_FACTOR * ti.cast(fastest, ti.f32) * dt + LEAST_REACH
                 recovery = worlds[w * WORLD_ROW + RECOVERY_SPEED]
                 has_plane = worlds[w * WORLD_ROW + HAS_PLANE] > 0.5
                 plane = vec3(
@@ -165,23 +187,43 @@ def solve_contact(
                     worlds[w * WORLD_ROW + PLANE_NORMAL + 1],
                     worlds[w * WORLD_ROW + PLANE_NORMAL + 2],
                 )
-                offset = worlds[w * WORLD_ROW + PLANE_OFFSET]
                 first_touch = field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
                 has_anchors = field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
+                first_solid = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
+                solid_count = world_integers[w * WORLD_INTEGERS + SOLIDS]
                 first_node = ti.cast(p_cells[k] * 4 - 1, ti.f32)
-                level = plane.dot(first_node) - offset
+                level = plane.dot(first_node) - worlds[w * WORLD_ROW + PLANE_OFFSET]
                 time = ti.cast(control[c + ELAPSED], ti.f32) + dt
                 for p in range(starts[k], starts[k + 1]):
                     gp = ti.cast(x[p], ti.f32) * (1.0 / FIXED_ONE)
                     fixed = constants[p]
                     past = reaction[p]
                     old = dt * vec3(past[0], past[1], past[2])
-                    phi = 1e9
-                    normal = plane
-                    surface_velocity = vec3(0.0)
-                    touch = first_touch * TOUCH_ROW
+                    # The nearest surface and the next: distance, normal, rate of swelling, obstacle.
+                    phi, second = 1e9, 1e9
+                    normal, second_normal = plane, plane
+                    swelling, second_swelling = 0.0, 0.0
+                    obstacle, second_obstacle = 0, 0
                     if has_plane:
                         phi = level + plane.dot(gp) - fixed[3]
+                    for o in range(solid_count):
+                        found, along, rate = solid_distance(
+                            first_solid + o,
+                            first_node + gp,
+                            reach + fixed[3] + 0.5,
+                            solid_kinds,
+                            solid_numbers,
+                            solids,
+                            shape_numbers,
+                            shape_dims,
+                            distances,
+                        )
+                        found -= fixed[3]
+                        if found < phi:
+                            second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
+                            phi, normal, swelling, obstacle = found, along, rate, o + 1
+                        elif found < second:
+                            second, second_normal, second_swelling, second_obstacle = found, along, rate, o + 1
                     pinned = False
                     if has_anchors:
                         pinned = anchors[p][3] == PIN
@@ -203,17 +245,41 @@ def solve_contact(
                             share = ti.max(past[3], 0.02)
                         velocity = vec3(u[0], u[1], u[2])
                         new = vec3(0.0)
+                        here = first_node + gp
                         if pinned:
                             place, rate = anchor_place(f, time, anchors[p], fields)
-                            back = RECOVERY * (place - rate * dt - first_node - gp) / dt
+                            back = RECOVERY * (place - rate * dt - here) / dt
                             size = back.norm()
                             if size > recovery:
                                 back *= recovery / size
                             new = old + (rate + back - velocity) / share
                         else:
+                            surface = swelling * normal
+                            give = 0.0
+                            if obstacle > 0:
+                                i = first_solid + obstacle - 1
+                                surface += solid_velocity(i, here, solids)
+                                give = touching[i] * solid_give(i, here, solid_kinds, solid_numbers, solids)
                             new = press(
-                                old, velocity - surface_velocity, phi, normal, share, dt, recovery, touch, touches
+                                old,
+                                velocity - surface,
+                                phi,
+                                normal,
+                                share + give,
+                                dt,
+                                recovery,
+                                (first_touch + obstacle) * TOUCH_ROW,
+                                touches,
                             )
+                            if second < reach:
+                                surface = second_swelling * second_normal
+                                if second_obstacle > 0:
+                                    surface += solid_velocity(first_solid + second_obstacle - 1, here, solids)
+                                left = (velocity + share * (new - old) - surface).dot(second_normal)
+                                wanted = -second / dt
+                                if second < 0.0:
+                                    wanted = ti.min(RECOVERY * wanted, recovery)
+                                new += (ti.max(0.0, wanted - left) / (share + give)) * second_normal
                         reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
                         if new.norm_sqr() > 0.0 or old.norm_sqr() > 0.0:
                             change = fixed[0] * (new - old)
@@ -222,6 +288,14 @@ def solve_contact(
                             for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
                                 n = first + (i * 64 + j * 8 + m)
                                 scattered[n] = scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
+                            if obstacle > 0 and not pinned:
+                                row = (s * most_solids + obstacle - 1) * PUSH
+                                given = -fixed[0] * new
+                                turn = (here - single3(solids, (first_solid + obstacle - 1) * SOLID + X)).cross(given)
+                                for n in ti.static(range(3)):
+                                    pushes[row + n] += given[n]
+                                    pushes[row + 3 + n] += turn[n]
+                                pushes[row + 6] += mass
 
 
 @ti.func

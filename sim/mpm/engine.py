@@ -15,8 +15,11 @@ from . import layout, meeting, sorting
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
 from .materials import FIXED_COROTATED
 from .nodes import SUMS
+from .obstacles import PUSH
+from .rigid import move_worlds, search_worlds
+from .solids import Solids
 from .stepping import prime_worlds
-from .substep import substep
+from .substep import advance_grid, advance_matter, part_bodies, plan_solids, resolve_contact
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -88,8 +91,14 @@ class Engine:
     Particles are numbered by the caller (``ids``); the engine keeps them sorted by field and block.
     """
 
-    def __init__(self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: Numbers) -> None:
+    def __init__(
+        self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: Numbers, solids: Solids
+    ) -> None:
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
+        self.solids = solids
+        self._most_solids = int(numbers.world_integers[:, layout.SOLIDS].max())
+        self._steps = ti.ndarray(ti.f64, len(numbers.worlds))
+        self._touching = ti.ndarray(ti.f32, max(1, solids.count))
         self.laws = numbers.laws
         self.world_count = len(numbers.worlds)
         self.field_count = len(numbers.fields)
@@ -155,7 +164,8 @@ class Engine:
             self._p_neighbours = ti.ndarray(ti.i32, p * 27)
             self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._touched = ti.ndarray(ti.i32, p)
+            self._touched, self._near_worlds = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
+            self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
             self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
@@ -380,6 +390,7 @@ class Engine:
         self._list_contacts()
 
     def _list_contacts(self) -> None:
+        solids = self.solids.arrays
         found = meeting.list_near_blocks(
             self._p_blocks,
             self._g_blocks,
@@ -387,7 +398,14 @@ class Engine:
             self._p_field,
             self._g_neighbours,
             self._field_integers,
+            self._world_integers,
             self._worlds,
+            solids["solid_kinds"],
+            solids["solid_numbers"],
+            solids["solids"],
+            solids["shape_numbers"],
+            solids["shape_dims"],
+            solids["distances"],
             self._near_of_p,
             self._near_p,
             self._near_g,
@@ -447,6 +465,8 @@ class Engine:
         attempts = np.zeros(self.world_count, dtype=np.int64)
         while (control[:, layout.STATUS] == layout.WANTS_SORT).any():
             self._put_control(control)
+            means = self._means.to_numpy() if self._mean_fields else None
+            before = self.solids.state() if self.solids.count else None
             self._sort()
             while True:
                 prime_worlds(self.world_count, self.cfl_elastic, self.cfl_velocity, self._control)
@@ -463,6 +483,10 @@ class Engine:
                 self.retries += 1
                 # The other half of the particle arrays still holds the state from before the sort.
                 self._particles.reverse()
+                if means is not None:
+                    self._means.from_numpy(means)
+                if before is not None:
+                    self.solids.put_back(before)
                 self._group()
                 control[lost, layout.CFL_SCALE] *= 0.5
                 self._put_control(control)
@@ -474,36 +498,41 @@ class Engine:
         self._put_control(control)
 
     def _substep(self) -> int:
-        """Launch one substep of all worlds; returns how many want another one."""
+        """One substep of all worlds; returns how many want another one."""
         here = self._particles[0]
-        return int(
-            substep(
-                self.laws,
-                self.world_count,
+        material, memory = here.get("material", self._starts), here.get("memory", self._masses)
+        anchors = here.get("anchors", self._nodes)
+        solids = self.solids.arrays
+        if self.count:
+            advance_grid(
                 self._mean_fields,
-                self._p_blocks,
                 self._g_blocks,
-                self._near[0],
-                self._near[1],
-                self._meeting[0],
-                self._meeting[1],
-                self._meet_p_count,
-                self.cfl_elastic,
-                self.cfl_velocity,
-                self._p_cells,
-                self._p_field,
-                self._starts,
-                self._p_neighbours,
-                self._near_of_p,
-                self._near_p,
-                self._meets_p,
-                self._meet_p,
-                self._touched,
                 self._g_cells,
                 self._g_field,
                 self._g_starts,
                 self._g_neighbours,
-                self._near_g,
+                self._field_integers,
+                self._fields,
+                self._worlds,
+                self._means,
+                self._control,
+                self._scattered,
+                self._nodes,
+                self._masses,
+                self._block_sums,
+            )
+        if self._meet_p_count:
+            part_bodies(
+                self.laws,
+                self._meeting[0],
+                self._meeting[1],
+                self._meet_p_count,
+                self._p_field,
+                self._starts,
+                self._meets_p,
+                self._meet_p,
+                self._g_field,
+                self._g_neighbours,
                 self._mate,
                 self._meet,
                 self._meet_g,
@@ -511,10 +540,82 @@ class Engine:
                 self._world_integers,
                 self._worlds,
                 self._field_integers,
-                self._fields,
-                self._means,
-                self._touches,
                 self._pairs,
+                self._control,
+                here["x"],
+                here["F"],
+                material,
+                self._table,
+                memory,
+                here["volumes"],
+                self._scattered,
+                self._nodes,
+                self._sums,
+                self._masses,
+            )
+        if self.solids.count:
+            plan_solids(self.world_count, solids["world_spans"], self._control, self._steps, solids["solids"])
+        if self._near[0]:
+            resolve_contact(
+                self.world_count,
+                self.solids.count,
+                self._near[0],
+                self._near[1],
+                self._most_solids,
+                self._p_cells,
+                self._p_field,
+                self._starts,
+                self._p_neighbours,
+                self._near_p,
+                self._near_worlds,
+                self._touched,
+                self._g_field,
+                self._g_neighbours,
+                self._near_g,
+                self._world_integers,
+                self._worlds,
+                self._field_integers,
+                self._fields,
+                self._touches,
+                self._control,
+                here["x"],
+                here["constants"],
+                here["reaction"],
+                anchors,
+                self._window,
+                self._scattered,
+                self._nodes,
+                self._sums,
+                self._masses,
+                solids["solid_kinds"],
+                solids["solid_numbers"],
+                solids["solids"],
+                solids["impulses"],
+                solids["shape_numbers"],
+                solids["shape_dims"],
+                solids["distances"],
+                self._touching,
+                self._pushes,
+            )
+        if self.solids.count:
+            search_worlds(self.world_count, self._steps, *self.solids.search_arguments)
+            move_worlds(self.world_count, self._steps, *self.solids.move_arguments)
+        return int(
+            advance_matter(
+                self.laws,
+                self.world_count,
+                self._p_blocks,
+                self.cfl_elastic,
+                self.cfl_velocity,
+                self._p_cells,
+                self._p_field,
+                self._starts,
+                self._p_neighbours,
+                self._near_of_p,
+                self._world_integers,
+                self._worlds,
+                self._field_integers,
+                self._fields,
                 self._control,
                 here["x"],
                 here["v"],
@@ -522,18 +623,17 @@ class Engine:
                 here["F"],
                 here["constants"],
                 here["reaction"],
-                here.get("material", self._starts),
+                material,
                 self._table,
-                here.get("memory", self._masses),
-                here.get("volumes", self._masses),
-                here.get("anchors", self._nodes),
+                memory,
+                anchors,
                 self._window,
                 self._scattered,
                 self._nodes,
-                self._sums,
-                self._masses,
-                self._block_sums,
                 self._report,
+                solids["solid_kinds"],
+                solids["solid_numbers"],
+                solids["solids"],
             )
         )
 

@@ -9,23 +9,30 @@ from .layout import (
     FIELD_INTEGERS,
     FIELDS,
     FIRST_FIELD,
+    FIRST_SOLID,
     HAS_ANCHORS,
     HAS_PLANE,
     PLANE_NORMAL,
     PLANE_OFFSET,
+    SOLIDS,
     WORLD,
     WORLD_INTEGERS,
     WORLD_ROW,
     Cells,
+    Doubles,
     Integers,
     Keys,
     Scalars,
     vec3,
 )
+from .obstacles import solid_distance
 from .sorting import block_key, slot_of
 
 HALF_SIDE = 3.0
 """Half the side in cells of the cube that a block's particles stay in before the next sort (window 0.5 to 6.5)."""
+
+HALF_DIAGONAL = 5.2
+"""Half that cube's diagonal."""
 
 NEAR = 2.75
 """Cells around that cube in which an obstacle counts as near: drift of particles and solids, a radius and some."""
@@ -39,7 +46,14 @@ def list_near_blocks(
     p_field: Integers,
     g_neighbours: Integers,
     field_integers: Integers,
+    world_integers: Integers,
     worlds: Scalars,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    shape_numbers: Scalars,
+    shape_dims: Integers,
+    distances: Scalars,
     near: Integers,
     near_p: Integers,
     near_g: Integers,
@@ -60,6 +74,21 @@ def list_near_blocks(
             normal = vec3(worlds[row + PLANE_NORMAL], worlds[row + PLANE_NORMAL + 1], worlds[row + PLANE_NORMAL + 2])
             half = HALF_SIDE * (ti.abs(normal[0]) + ti.abs(normal[1]) + ti.abs(normal[2]))
             is_near = is_near or normal.dot(centre) - worlds[row + PLANE_OFFSET] - half < NEAR
+        first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
+        for i in range(first, first + world_integers[w * WORLD_INTEGERS + SOLIDS]):
+            if not is_near:
+                phi, _, _ = solid_distance(
+                    i,
+                    centre,
+                    HALF_DIAGONAL + NEAR,
+                    solid_kinds,
+                    solid_numbers,
+                    solids,
+                    shape_numbers,
+                    shape_dims,
+                    distances,
+                )
+                is_near = phi < HALF_DIAGONAL + NEAR
         near[k] = -1
         if is_near:
             near[k] = found[0]

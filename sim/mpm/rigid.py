@@ -67,7 +67,9 @@ def predict(w, dt, world_spans: Integers, solids: Doubles):
 
 
 @ti.func
-def act(w, i, dt, world_numbers: Doubles, solid_kinds: Integers, solid_numbers: Doubles, solids: Doubles, impulses: Doubles):
+def act(
+    w, i, dt, world_numbers: Doubles, solid_kinds: Integers, solid_numbers: Doubles, solids: Doubles, impulses: Doubles
+):
     """Forces on solid ``i`` over ``dt`` and the impulses that matter gave it, which are used up."""
     r, n = i * SOLID, i * NUMBERS
     inverse = solid_numbers[n + INVERSE_MASS]
@@ -286,30 +288,31 @@ def search_worlds(
     the same code in a larger one: Taichi's passes take time in proportion to the square of a kernel's length."""
     ti.loop_config(serialize=True)
     for w in range(worlds):
-        push_and_search(
-            w,
-            steps[w],
-            world_spans,
-            world_numbers,
-            solid_kinds,
-            solid_numbers,
-            solids,
-            impulses,
-            clusters,
-            cluster_starts,
-            points,
-            shape_numbers,
-            shape_dims,
-            distances,
-            pairs,
-            pair_numbers,
-            counts,
-            contacts,
-            memory,
-            reaches,
-            scores,
-            chosen,
-        )
+        if steps[w] > 0.0:
+            push_and_search(
+                w,
+                steps[w],
+                world_spans,
+                world_numbers,
+                solid_kinds,
+                solid_numbers,
+                solids,
+                impulses,
+                clusters,
+                cluster_starts,
+                points,
+                shape_numbers,
+                shape_dims,
+                distances,
+                pairs,
+                pair_numbers,
+                counts,
+                contacts,
+                memory,
+                reaches,
+                scores,
+                chosen,
+            )
 
 
 @ti.kernel
@@ -331,18 +334,19 @@ def move_worlds(
     """``solve_and_move`` in all worlds."""
     ti.loop_config(serialize=True)
     for w in range(worlds):
-        solve_and_move(
-            w,
-            steps[w],
-            world_spans,
-            world_numbers,
-            world_report,
-            solid_kinds,
-            solid_numbers,
-            solids,
-            pairs,
-            pair_numbers,
-            counts,
-            contacts,
-            memory,
-        )
+        if steps[w] > 0.0:
+            solve_and_move(
+                w,
+                steps[w],
+                world_spans,
+                world_numbers,
+                world_report,
+                solid_kinds,
+                solid_numbers,
+                solids,
+                pairs,
+                pair_numbers,
+                counts,
+                contacts,
+                memory,
+            )

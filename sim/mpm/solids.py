@@ -317,6 +317,10 @@ class Solids:
                 return i
         raise InputError(f"world {w} has no rigid body or collider {name!r}")
 
+    def name(self, i: int) -> str:
+        """Name of the solid in row ``i`` of the arrays."""
+        return self._solids[i].name
+
     @property
     def count(self) -> int:
         """Solids of all worlds."""
@@ -456,6 +460,11 @@ class Solids:
         for name in CHANGING:
             self.arrays[name].from_numpy(np.ascontiguousarray(state[name]))
         self._keys_done = np.array(state["keys_done"], dtype=np.float64)
+
+    def put_back(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Take up what ``state`` returned in the same segments of time."""
+        for name in CHANGING:
+            self.arrays[name].from_numpy(np.ascontiguousarray(state[name]))
 
     def pose(self, w: int, name: str) -> SolidPose:
         """Where the solid ``name`` of world ``w`` is and how it moves."""

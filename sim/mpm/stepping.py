@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN201, SIM109
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """How each world chooses its next substep, on the device: the host need not read anything between two sorts.
@@ -21,6 +21,7 @@ from .layout import (
     ELAPSED,
     FASTEST_FIELD,
     FIELD_INTEGERS,
+    FIRST_SOLID,
     FULL,
     IDLE,
     LONGEST_STEP,
@@ -36,6 +37,7 @@ from .layout import (
     SHORTEST_STEP,
     SOLID_DRIFT,
     SOLID_SPEED,
+    SOLIDS,
     SPEED,
     STATUS,
     STEP,
@@ -44,10 +46,13 @@ from .layout import (
     WANTS_SORT,
     WAVE_SPEED,
     WORLD,
+    WORLD_INTEGERS,
     Doubles,
     Integers,
     Scalars,
 )
+from .rigid_math import load3
+from .solid_layout import DYNAMIC, KIND, KINDS, KINEMATIC, NUMBERS, RADIUS, SOLID, V, W
 
 SAFETY = 1.5
 """Factor by which the fastest particle may speed up within a substep."""
@@ -58,6 +63,9 @@ LEAST_MARGIN = 0.1
 MOST_SOLID_DRIFT = 1.0
 """Cells that solids may move before the blocks near them are listed anew."""
 
+SOLID_LOST = 1_000_000
+"""LOST_FIELD of a world in which solid i went wrong is this plus i."""
+
 FARTHEST_STEP = 0.9
 """Cells that a particle may move in a substep; more is cut off by its window, and the substep is not to be trusted."""
 
@@ -66,6 +74,12 @@ FARTHEST_STEP = 0.9
 def not_finite(number: ti.f32):
     """Whether ``number`` is NaN or infinite, told from its bits: with fast maths a comparison may not."""
     return (ti.bit_cast(number, ti.i32) & 0x7F800000) == 0x7F800000
+
+
+@ti.func
+def double_not_finite(number: ti.f64):
+    """The same of a double."""
+    return (ti.bit_cast(number, ti.i64) >> 52) & 0x7FF == 0x7FF
 
 
 @ti.func
@@ -111,6 +125,10 @@ def review(
     field_integers: Integers,
     report: Scalars,
     control: Doubles,
+    world_integers: Integers,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
 ):
     """After a substep: gather the blocks' reports and settle what every world does next.
 
@@ -123,6 +141,16 @@ def review(
             control[c + SPEED] = 0.0
             control[c + MARGIN] = 1e9
             control[c + FASTEST_FIELD] = -1.0
+        control[c + SOLID_SPEED] = 0.0
+        first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
+        for i in range(first, first + world_integers[w * WORLD_INTEGERS + SOLIDS]):
+            kind = solid_kinds[i * KINDS + KIND]
+            if kind == DYNAMIC or kind == KINEMATIC:
+                turning = load3(solids, i * SOLID + W).norm() * solid_numbers[i * NUMBERS + RADIUS]
+                speed = load3(solids, i * SOLID + V).norm() + turning
+                if double_not_finite(speed):
+                    lose(c, SOLID_LOST + i, control)
+                control[c + SOLID_SPEED] = ti.max(control[c + SOLID_SPEED], speed)
         if control[c + PHASE] != IDLE and control[c + SCATTER] == 1.0:
             control[c + WAVE_SPEED] = 0.0
     ti.loop_config(serialize=True)

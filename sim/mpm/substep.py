@@ -1,84 +1,50 @@
 # SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
-"""One substep of all worlds as one kernel: a launch costs about 0.1 ms of Python, as much as the work on a thousand
-particles."""
+"""One substep of all worlds, as the kernels that ``engine`` launches one after the other:
+
+    advance_grid      nodes over STEP: velocities, forces
+    part_bodies       contact between bodies that deform, where several are near each other
+    resolve_contact   contact with the plane and with solids, pins; what solids feel of it
+    (rigid)           motion of the solids: ``rigid.search_worlds``, ``rigid.move_worlds``
+    advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
+
+Every world is in the phase that ``control`` says and takes its own step. A launch costs about 0.1 ms of Python, so
+there are few kernels; a compiler pass takes the square of a kernel's length, so there is more than one.
+"""
 
 import taichi as ti
 
 from .contact import apply_contact, solve_contact
-from .layout import Cells, Doubles, Integers, Matrices, Scalars, Vectors3, Vectors4
+from .layout import CONTROL_ROW, FULL, PHASE, STEP, Cells, Doubles, Integers, Matrices, Scalars, Vectors3, Vectors4
 from .nodes import advance_nodes, gather_means
+from .obstacles import gather_pushes
+from .rigid import predict
 from .separation import gather_shares, scatter_shares, separate
 from .stepping import review
 from .transfer import advance_particles
 
 
 @ti.kernel
-def substep(
-    laws: ti.template(),
-    world_count: ti.i32,
+def advance_grid(
     mean_fields: ti.i32,
-    p_blocks: ti.i32,
     g_blocks: ti.i32,
-    near_p_count: ti.i32,
-    near_g_count: ti.i32,
-    meet_g_count: ti.i32,
-    lead_count: ti.i32,
-    meet_p_count: ti.i32,
-    cfl_elastic: ti.f64,
-    cfl_velocity: ti.f64,
-    p_cells: Cells,
-    p_field: Integers,
-    starts: Integers,
-    p_neighbours: Integers,
-    near: Integers,
-    near_p: Integers,
-    meets_p: Integers,
-    meet_p: Integers,
-    touched: Integers,
     g_cells: Cells,
     g_field: Integers,
     g_starts: Integers,
     g_neighbours: Integers,
-    near_g: Integers,
-    mate: Integers,
-    meet: Integers,
-    meet_g: Integers,
-    leads: Integers,
-    world_integers: Integers,
-    worlds: Scalars,
     field_integers: Integers,
     fields: Scalars,
+    worlds: Scalars,
     means: Scalars,
-    touches: Scalars,
-    pairs: Scalars,
     control: Doubles,
-    x: Cells,
-    v: Vectors3,
-    C: Matrices,
-    F: Matrices,
-    constants: Vectors4,
-    reaction: Vectors4,
-    material: Integers,
-    table: Scalars,
-    memory: Scalars,
-    volumes: Scalars,
-    anchors: Vectors4,
-    window: Vectors4,
     scattered: Vectors4,
     nodes: Vectors4,
-    sums: Vectors4,
     masses: Scalars,
     block_sums: Scalars,
-    report: Scalars,
-) -> ti.i32:
-    """Nodes over STEP, contact, grid to particles over STEP, particles to grid with the stress of NEXT_STEP.
-
-    Every world is in the phase that ``control`` says and takes its own step. Counts of 0 leave their part out.
-    laws: the set of constitutive laws that occur; one kernel is compiled for each set.
-    Returns the number of worlds that want another substep.
-    """
+):
+    """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
     advance_nodes(
         g_blocks,
         g_cells,
@@ -95,6 +61,41 @@ def substep(
         block_sums,
     )
     gather_means(mean_fields, g_starts, field_integers, control, block_sums, means)
+
+
+@ti.kernel
+def part_bodies(
+    laws: ti.template(),
+    meet_g_count: ti.i32,
+    lead_count: ti.i32,
+    meet_p_count: ti.i32,
+    p_field: Integers,
+    starts: Integers,
+    meets_p: Integers,
+    meet_p: Integers,
+    g_field: Integers,
+    g_neighbours: Integers,
+    mate: Integers,
+    meet: Integers,
+    meet_g: Integers,
+    leads: Integers,
+    world_integers: Integers,
+    worlds: Scalars,
+    field_integers: Integers,
+    pairs: Scalars,
+    control: Doubles,
+    x: Cells,
+    F: Matrices,
+    material: Integers,
+    table: Scalars,
+    memory: Scalars,
+    volumes: Scalars,
+    scattered: Vectors4,
+    nodes: Vectors4,
+    sums: Vectors4,
+    masses: Scalars,
+):
+    """Impulses between the nodes of different bodies in the same place."""
     scatter_shares(
         laws,
         meet_p_count,
@@ -127,9 +128,67 @@ def substep(
         masses,
         nodes,
     )
+
+
+@ti.kernel
+def plan_solids(world_count: ti.i32, world_spans: Integers, control: Doubles, steps: Doubles, solids: Doubles):
+    """Steps of the worlds for the solids' kernels, 0 of idle worlds, and the velocity expected of each solid."""
+    ti.loop_config(serialize=True)
+    for w in range(world_count):
+        steps[w] = 0.0
+        if control[w * CONTROL_ROW + PHASE] == FULL:
+            steps[w] = control[w * CONTROL_ROW + STEP]
+            predict(w, steps[w], world_spans, solids)
+
+
+@ti.kernel
+def resolve_contact(
+    world_count: ti.i32,
+    solid_count: ti.i32,
+    near_p_count: ti.i32,
+    near_g_count: ti.i32,
+    most_solids: ti.i32,
+    p_cells: Cells,
+    p_field: Integers,
+    starts: Integers,
+    p_neighbours: Integers,
+    near_p: Integers,
+    near_worlds: Integers,
+    touched: Integers,
+    g_field: Integers,
+    g_neighbours: Integers,
+    near_g: Integers,
+    world_integers: Integers,
+    worlds: Scalars,
+    field_integers: Integers,
+    fields: Scalars,
+    touches: Scalars,
+    control: Doubles,
+    x: Cells,
+    constants: Vectors4,
+    reaction: Vectors4,
+    anchors: Vectors4,
+    window: Vectors4,
+    scattered: Vectors4,
+    nodes: Vectors4,
+    sums: Vectors4,
+    masses: Scalars,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    impulses: Doubles,
+    shape_numbers: Scalars,
+    shape_dims: Integers,
+    distances: Scalars,
+    touching: Scalars,
+    pushes: Scalars,
+):
+    """Impulses between particles and planes, solids and pins."""
     solve_contact(
         near_p_count,
+        most_solids,
         near_p,
+        near_worlds,
         p_cells,
         p_field,
         starts,
@@ -148,6 +207,14 @@ def substep(
         nodes,
         scattered,
         touched,
+        solid_kinds,
+        solid_numbers,
+        solids,
+        shape_numbers,
+        shape_dims,
+        distances,
+        touching,
+        pushes,
     )
     apply_contact(
         near_g_count,
@@ -162,6 +229,51 @@ def substep(
         masses,
         sums,
     )
+    if solid_count > 0:
+        gather_pushes(
+            world_count, near_p_count, most_solids, near_worlds, world_integers, control, pushes, impulses, touching
+        )
+
+
+@ti.kernel
+def advance_matter(
+    laws: ti.template(),
+    world_count: ti.i32,
+    p_blocks: ti.i32,
+    cfl_elastic: ti.f64,
+    cfl_velocity: ti.f64,
+    p_cells: Cells,
+    p_field: Integers,
+    starts: Integers,
+    p_neighbours: Integers,
+    near: Integers,
+    world_integers: Integers,
+    worlds: Scalars,
+    field_integers: Integers,
+    fields: Scalars,
+    control: Doubles,
+    x: Cells,
+    v: Vectors3,
+    C: Matrices,
+    F: Matrices,
+    constants: Vectors4,
+    reaction: Vectors4,
+    material: Integers,
+    table: Scalars,
+    memory: Scalars,
+    anchors: Vectors4,
+    window: Vectors4,
+    scattered: Vectors4,
+    nodes: Vectors4,
+    report: Scalars,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+) -> ti.i32:
+    """Particles over STEP, then onto the grid; plans what comes next. Returns how many worlds want another substep.
+
+    laws: the set of constitutive laws that occur; one kernel is compiled for each set.
+    """
     advance_particles(
         laws,
         p_blocks,
@@ -189,4 +301,17 @@ def substep(
         scattered,
         report,
     )
-    return review(world_count, p_blocks, cfl_elastic, cfl_velocity, p_field, field_integers, report, control)
+    return review(
+        world_count,
+        p_blocks,
+        cfl_elastic,
+        cfl_velocity,
+        p_field,
+        field_integers,
+        report,
+        control,
+        world_integers,
+        solid_kinds,
+        solid_numbers,
+        solids,
+    )

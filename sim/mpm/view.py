@@ -13,6 +13,7 @@ from . import diagnostics, layout
 from .bodies import BodyParticles, Vector
 from .packing import materials_of
 from .setup import WorldSetup
+from .solids import SolidPose
 
 if TYPE_CHECKING:
     from .worlds import Worlds
@@ -68,17 +69,31 @@ class WorldView:
         number, body = self._number(index), self.bodies[index]
         if not self._worlds.started(number):
             return body.positions.copy()
+        if body.rigid:
+            pose = self.pose(body.name)
+            return body.positions @ pose.rotation.T + pose.translation
         return self._worlds.cells.points_to_world(self._gather("position", index, np.zeros((body.count, 3))))
+
+    def pose(self, name: str) -> SolidPose:
+        """Where the rigid body or collider ``name`` is and how it moves."""
+        return self._worlds.pose(self._index, name)
 
     def velocities(self, index: int) -> Array:
         """Particle velocities (N, 3) of body ``index``, m/s. Zero before the body starts."""
-        number = self._number(index)
-        return self._worlds.gather("v", number, np.zeros((self.bodies[index].count, 3))) / self._scale()
+        number, body = self._number(index), self.bodies[index]
+        if body.rigid and self._worlds.started(number):
+            pose = self.pose(body.name)
+            return pose.velocity + np.cross(pose.spin, self.positions(index) - pose.center)
+        return self._worlds.gather("v", number, np.zeros((body.count, 3))) / self._scale()
 
     def velocity_gradients(self, index: int) -> Array:
         """APIC velocity gradients (N, 3, 3) of body ``index``, 1/s."""
-        number = self._number(index)
-        return self._worlds.gather("C", number, np.zeros((self.bodies[index].count, 3, 3)))
+        number, body = self._number(index), self.bodies[index]
+        if body.rigid and self._worlds.started(number):
+            x, y, z = self.pose(body.name).spin
+            turning = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            return np.asarray(np.broadcast_to(turning, (body.count, 3, 3)).copy())
+        return self._worlds.gather("C", number, np.zeros((body.count, 3, 3)))
 
     def deformation_gradients(self, index: int) -> Array:
         """Deformation gradients (N, 3, 3) of body ``index``: current from undeformed shape.
@@ -87,6 +102,9 @@ class WorldView:
         the elastic part only; see ``fitting``.
         """
         number, body = self._number(index), self.bodies[index]
+        if body.rigid:
+            turn = self.pose(body.name).rotation if self._worlds.started(number) else np.eye(3)
+            return np.asarray(np.broadcast_to(turn, (body.count, 3, 3)).copy())
         if not any(material.flows for material in materials_of(body)):
             return self.elastic_gradients(index)
         return self._worlds.fitted(number, body.positions).gradients(self.positions(index))
@@ -94,12 +112,14 @@ class WorldView:
     def elastic_gradients(self, index: int) -> Array:
         """Elastic parts (N, 3, 3) of the deformation gradients of body ``index``, which carry its stress."""
         number = self._number(index)
+        if self.bodies[index].rigid:
+            return self.deformation_gradients(index)
         return self._worlds.gather("F", number, np.broadcast_to(np.eye(3), (self.bodies[index].count, 3, 3)).copy())
 
     def memories(self, index: int) -> Array:
         """What the law remembers of each particle (N,): ln J_P of snow, ln of lost contact in sand, ln J of fluids."""
         number, body = self._number(index), self.bodies[index]
-        if not any(material.flows for material in materials_of(body)):
+        if body.rigid or not any(material.flows for material in materials_of(body)):
             return np.zeros(body.count)
         return self._worlds.gather("memory", number, np.zeros(body.count))
 
@@ -110,23 +130,32 @@ class WorldView:
 
     def linear_momentum(self) -> Array:
         """Momentum (3,) of all bodies, kg m/s."""
-        terms = [diagnostics.linear_momentum(self.bodies[i].masses, self.velocities(i)) for i in self._moving()]
+        terms = [
+            self.pose(self.bodies[i].name).momentum
+            if self.bodies[i].rigid
+            else diagnostics.linear_momentum(self.bodies[i].masses, self.velocities(i))
+            for i in self._moving()
+        ]
         return np.asarray(np.sum(terms, axis=0)) if terms else np.zeros(3)
 
     def angular_momentum(self, about: Vector = (0.0, 0.0, 0.0)) -> Array:
         """Angular momentum (3,) of all bodies about a world point, kg m²/s, with the affine velocities' part."""
-        terms = [
-            diagnostics.angular_momentum(
-                self.bodies[i].masses,
-                self.positions(i),
-                self.velocities(i),
-                self.velocity_gradients(i),
-                1.0 / self._scale(),
-                np.asarray(about, dtype=np.float64),
-            )
-            for i in self._moving()
-        ]
+        terms = [self._angular_momentum(i, np.asarray(about, dtype=np.float64)) for i in self._moving()]
         return np.asarray(np.sum(terms, axis=0)) if terms else np.zeros(3)
+
+    def _angular_momentum(self, index: int, about: Array) -> Array:
+        body = self.bodies[index]
+        if body.rigid:
+            pose = self.pose(body.name)
+            return np.asarray(pose.angular_momentum + np.cross(pose.center - about, pose.momentum))
+        return diagnostics.angular_momentum(
+            body.masses,
+            self.positions(index),
+            self.velocities(index),
+            self.velocity_gradients(index),
+            1.0 / self._scale(),
+            about,
+        )
 
     def energy(self) -> diagnostics.Energy:
         """Energies of all bodies that have started, J."""
@@ -135,6 +164,11 @@ class WorldView:
         for i in self._moving():
             body = self.bodies[i]
             masses = body.masses
+            if body.rigid:
+                pose = self.pose(body.name)
+                kinetic += pose.kinetic
+                potential -= float(masses.sum() * gravity @ pose.center)
+                continue
             kinetic += diagnostics.kinetic_energy(
                 masses, self.velocities(i), self.velocity_gradients(i), 1.0 / self._scale()
             )
@@ -162,6 +196,12 @@ class WorldView:
         assert radii is not None
         normal = np.asarray(ground.normal, dtype=np.float64)
         heights = (self.positions(index) - np.asarray(ground.point)) @ (normal / np.linalg.norm(normal))
+        if self.bodies[index].rigid:
+            surface = self.bodies[index].surface
+            assert surface is not None
+            pose = self.pose(self.bodies[index].name)
+            places = surface.vertices @ pose.rotation.T + pose.translation
+            return float(((places - np.asarray(ground.point)) @ (normal / np.linalg.norm(normal))).min())
         return float((heights - radii).min())
 
     def particles_outside(self, index: int) -> int:

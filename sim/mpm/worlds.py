@@ -23,12 +23,17 @@ from .fitting import FittedGradients
 from .options import SolverOptions
 from .placement import fit_similarity
 from .setup import WorldSetup
+from .solids import SolidPose, Solids
+from .stepping import SOLID_LOST
 from .view import WorldView
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
 
 CHECKPOINT_FORMAT = 2
+
+SOLIDS = "solids."
+"""What the names of the solids' arrays in a checkpoint begin with."""
 
 INSTANT = 1e-12
 """Times closer than this in s are the same."""
@@ -72,11 +77,18 @@ class Worlds:
         self._offsets = np.concatenate([[0], np.cumsum(counts)])
         self._started = np.zeros(len(counts), dtype=bool)
         self._times = np.zeros(len(self.setups))
+        self._solids = self._new_solids()
         self._engine = self._new_engine()
         self._host: State | None = None
+        self._poses: dict[tuple[int, str], SolidPose] = {}
         self._fits: dict[int, FittedGradients] = {}
         for place in self._places:
             self._reach_time(place, -math.inf)
+
+    def _new_solids(self) -> Solids:
+        origin = self.cells.points_to_world(np.zeros((1, 3)))[0]
+        place = (float(origin[0]), float(origin[1]), float(origin[2]))
+        return Solids(self.setups, [self.cells.scale] * len(self), [place] * len(self))
 
     def _new_engine(self) -> Engine:
         soft = [not body.rigid for setup in self.setups for body in setup.bodies]
@@ -85,6 +97,7 @@ class Worlds:
             cfl_elastic=self.options.cfl_elastic,
             cfl_velocity=self.options.cfl_velocity,
             numbers=packing.pack(self._places),
+            solids=self._solids,
         )
 
     def __len__(self) -> int:
@@ -133,6 +146,10 @@ class Worlds:
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
+            if self._solids.count:
+                for w in np.flatnonzero(stops > self._times):
+                    self._solids.set_segment(int(w), float(self._times[w]), float(stops[w]))
+            self._poses = {}
             longest = [self._longest_step(place) for place in self._places]
             self._host = None
             try:
@@ -178,7 +195,7 @@ class Worlds:
                     )
                     self._engine.add(added, wave_speed=wave_speed)
                 self._host = None
-            if self._started[number]:
+            if self._started[number] and not body.rigid:
                 if any(before + INSTANT < time <= now for time, _ in body.material_track):
                     self._change_material(place, i, now)
                 keys = body.velocity_keys
@@ -237,9 +254,11 @@ class Worlds:
         where = f" of world {failure.world}" if len(self) > 1 else ""
         soft = place.soft
         index = failure.field - place.first_field
-        body = place.setup.bodies[soft[index] if 0 <= index < len(soft) else 0]
+        name = place.setup.bodies[soft[index] if 0 <= index < len(soft) else 0].name
+        if failure.field >= SOLID_LOST:
+            name = self._solids.name(failure.field - SOLID_LOST)
         return SimulationError(
-            f"body {body.name!r}{where} became unstable after t = {time:g} s, and substeps shortened {2**6} times did "
+            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened {2**6} times did "
             f"not help: check its density and Young's modulus, what hits it and how fast, or lower the solver option "
             f"cfl_elastic ({self.options.cfl_elastic:g})"
         )
@@ -259,6 +278,13 @@ class Worlds:
         if self._host is None:
             self._host = self._engine.state()
         return self._host
+
+    def pose(self, world: int, name: str) -> SolidPose:
+        """Where the rigid body or collider ``name`` of world ``world`` is and how it moves."""
+        self._check_generation()
+        if (world, name) not in self._poses:
+            self._poses[(world, name)] = self._solids.pose(world, name)
+        return self._poses[(world, name)]
 
     def started(self, number: int) -> bool:
         """Whether body ``number`` of all has entered the simulation."""
@@ -297,6 +323,8 @@ class Worlds:
         state["offsets"] = self._offsets.astype(np.int64)
         state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
         state["grid"] = np.array(self.options.grid)
+        if self._solids.count:
+            state |= {f"{SOLIDS}{name}": values for name, values in self._solids.state().items()}
         return state
 
     def restore(self, checkpoint: Mapping[str, NDArray[np.generic]]) -> None:
@@ -318,6 +346,11 @@ class Worlds:
             raise InputError("checkpoint is of another scene: bodies, similarity and grid must be the same")
         self._times = np.array(checkpoint["times"], dtype=np.float64)
         self._started = np.array(checkpoint["started"], dtype=bool)
+        self._solids = self._new_solids()
+        if self._solids.count:
+            solids = {name.removeprefix(SOLIDS): checkpoint[name] for name in checkpoint if name.startswith(SOLIDS)}
+            self._solids.restore(solids)
         self._engine = self._new_engine()
         self._engine.restore(checkpoint)
         self._host = None
+        self._poses = {}
