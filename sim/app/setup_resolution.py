@@ -9,10 +9,9 @@ import numpy as np
 
 from ..errors import InputError
 from ..mpm.estimate import PARTICLE_BYTES, available_memory, require_memory
-from ..mpm.options import PADDING_CELLS, SolverOptions
-from ..mpm.placement import fit_similarity
+from ..mpm.options import SolverOptions
+from ..mpm.placement import centred
 from ..scene.meshes import ObjectMesh
-from ..scene.model import Ground
 from ..scene.units import Similarity
 from .quality import Quality
 
@@ -25,7 +24,7 @@ MAX_PARTICLES = 50_000_000
 
 
 def resolve(
-    names: Sequence[str], meshes: Sequence[ObjectMesh], ground: Ground, quality: Quality, arch: str
+    names: Sequence[str], meshes: Sequence[ObjectMesh], quality: Quality, arch: str
 ) -> tuple[SolverOptions, Similarity]:
     """Solver options and similarity whose cells are as fine as ``quality`` wants for these bodies.
 
@@ -33,7 +32,7 @@ def resolve(
     """
     cell = cell_size(meshes, quality)
     _refuse_absurd(names, meshes, quality, cell)
-    return _place(meshes, ground, cell, quality, arch)
+    return _place(meshes, cell, quality, arch)
 
 
 def cell_size(meshes: Sequence[ObjectMesh], quality: Quality) -> float:
@@ -62,19 +61,11 @@ def _refuse_absurd(names: Sequence[str], meshes: Sequence[ObjectMesh], quality: 
     require_memory(int(count * PARTICLE_BYTES), int(count), available_memory())
 
 
-def _place(
-    meshes: Sequence[ObjectMesh], ground: Ground, cell: float, quality: Quality, arch: str
-) -> tuple[SolverOptions, Similarity]:
-    """Where the world stands in the engine's box; the one place that knows that the box has walls.
-
-    The largest box that holds the bodies in its middle half, so that what is thrown has room.
-    """
-    points = [mesh.vertices for mesh in meshes]
-    room = 2 * float(np.ptp(np.concatenate(points), axis=0).max())
-    grid = 512 if (512 - 2 * PADDING_CELLS) * cell >= room else 1024
-    options = SolverOptions(grid=grid, particles_per_cell=quality.particles_per_cell, arch=arch)
-    longest = max(_length(mesh) for mesh in meshes)
-    return options, fit_similarity(points, ground, motion_margin=0.0, cells_across=longest / cell, options=options)
+def _place(meshes: Sequence[ObjectMesh], cell: float, quality: Quality, arch: str) -> tuple[SolverOptions, Similarity]:
+    """Where the world stands in the engine's box: the bodies in its middle. They may leave it."""
+    options = SolverOptions(grid=quality.grid or 256, particles_per_cell=quality.particles_per_cell, arch=arch)
+    points = np.concatenate([mesh.vertices for mesh in meshes])
+    return options, centred(0.5 * (points.min(axis=0) + points.max(axis=0)), cell, options)
 
 
 def _length(mesh: ObjectMesh) -> float:

@@ -89,7 +89,7 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     warnings: list[str] = []
     quality = load_quality(options.quality)
     solver, similarity = resolve(
-        [scene.objects[i].name for i in moving], [meshes[i] for i in moving], scene.ground, quality, options.arch
+        [scene.objects[i].name for i in moving], [meshes[i] for i in moving], quality, options.arch
     )
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):

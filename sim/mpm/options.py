@@ -11,12 +11,9 @@ from ..errors import InputError
 from ..scene.model import Ground
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 
-__all__ = ["ARCHITECTURES", "PADDING_CELLS", "Ground", "SolverOptions"]
+__all__ = ["ARCHITECTURES", "Ground", "SolverOptions"]
 
 ARCHITECTURES = ("cpu", "cuda", "vulkan", "metal")
-
-PADDING_CELLS = 8
-"""Cells along each side of the box that bodies should not enter: the walls stand there."""
 
 
 @dataclass(frozen=True, kw_only=True)

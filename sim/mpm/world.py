@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The engine's facade: a world of bodies, in metres, kilograms and seconds.
 
-similarity = fit_similarity([vertices], ground, options=options)
+similarity = fit_similarity([vertices], options=options)
 sample = sample_interior(vertices, faces, options.particle_spacing(similarity))
 world = World(bodies=[BodyParticles(...)], ground=ground, similarity=similarity, options=options)
 world.advance(1 / 24)

@@ -61,9 +61,8 @@ class Worlds:
             raise InputError("setups is empty: give at least one world")
         self.setups = tuple(setups)
         self.options = options or SolverOptions()
-        first = self.setups[0]
         self.similarity = similarity or fit_similarity(
-            [body.positions for body in first.bodies], first.ground, options=self.options
+            [body.positions for body in self.setups[0].bodies], options=self.options
         )
         self.cells = Similarity(
             scale=self.similarity.scale * self.options.grid / ENGINE_BOX_SIZE, origin=self.similarity.origin

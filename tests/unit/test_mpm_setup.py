@@ -11,7 +11,7 @@ import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.bodies import BodyParticles
 from physgen.sim.mpm.materials import ElasticMaterial
-from physgen.sim.mpm.options import PADDING_CELLS, Ground, SolverOptions
+from physgen.sim.mpm.options import SolverOptions
 from physgen.sim.mpm.placement import fit_similarity
 
 MATERIAL = ElasticMaterial(density=1000.0, youngs_modulus=1e6, poisson_ratio=0.25)
@@ -67,30 +67,28 @@ def test_spin_is_about_the_centre_of_mass():
     np.testing.assert_allclose(body.initial_velocity_gradient @ arm, np.cross((0, 0, 2.0), arm), atol=1e-12)
 
 
-def test_fitted_box_holds_the_bodies_their_fall_and_the_margin():
+def test_largest_body_gets_the_cells_that_were_asked_for_amid_the_box():
     options = SolverOptions(grid=128)
-    for margin in (None, 0.0, 0.4):
-        similarity = fit_similarity([CUBE], Ground(), motion_margin=margin, options=options)
-        points = np.vstack([CUBE, CUBE * [1, 1, 0]])
-        wanted = 0.5 if margin is None else margin
-        cells = similarity.points_to_engine(np.vstack([points - wanted, points + wanted])) * 64
-        assert cells.min() >= PADDING_CELLS - 1e-6
-        assert cells.max() <= 128 - PADDING_CELLS + 1e-6
-        assert 0.3 / options.cell_size(similarity) <= 32 + 1e-6
+    similarity = fit_similarity([CUBE, CUBE * 0.5], cells_across=24.0, options=options)
+    assert 0.3 / options.cell_size(similarity) == pytest.approx(24.0)
+    middle = 0.5 * (np.minimum(CUBE.min(axis=0), 0.5 * CUBE.min(axis=0)) + CUBE.max(axis=0))
+    np.testing.assert_allclose(similarity.points_to_engine(middle), 1.0)
 
 
 def test_fit_refuses_what_it_cannot_resolve():
-    with pytest.raises(InputError, match="motion_margin"):
-        fit_similarity([CUBE], None, motion_margin=50.0)
+    with pytest.raises(InputError, match="cells_across"):
+        fit_similarity([CUBE, CUBE * 0.01])
+    with pytest.raises(InputError, match="cells_across"):
+        fit_similarity([CUBE], cells_across=float("nan"))
     with pytest.raises(InputError, match="empty"):
-        fit_similarity([], None)
+        fit_similarity([])
     with pytest.raises(InputError, match="finite points"):
-        fit_similarity([np.full((4, 3), np.inf)], None)
+        fit_similarity([np.full((4, 3), np.inf)])
     with pytest.raises(InputError, match="no extent"):
-        fit_similarity([np.zeros((4, 3))], None)
+        fit_similarity([np.zeros((4, 3))])
 
 
 def test_particle_spacing_follows_from_the_grid():
     options = SolverOptions(grid=200, particles_per_cell=27)
-    similarity = fit_similarity([CUBE], Ground(), options=options)
+    similarity = fit_similarity([CUBE], options=options)
     assert options.particle_spacing(similarity) == pytest.approx(2.0 / (200 * similarity.scale) / 3)
