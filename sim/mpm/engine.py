@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -204,40 +204,42 @@ class Engine:
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
-    def add(self, added: Added, *, wave_speed: float) -> None:
-        """Take in particles; ``wave_speed`` is that of the fastest wave in them, cells/s (``bounding_speed``)."""
+    def add(self, groups: Sequence[tuple[Added, float]]) -> None:
+        """Take in particles, each group with the speed in cells/s of the fastest wave in it (``bounding_speed``)."""
         state = self._download()
-        base = np.clip(np.floor(added.x - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
-        n = len(added.x)
-        new = {
-            "x": np.rint((added.x - (4 * base - 1)) * FIXED_ONE).astype(np.int32),
-            "v": added.v.astype(np.float32),
-            "C": added.C.astype(np.float32),
-            "F": added.F.astype(np.float32),
-            "constants": added.constants.astype(np.float32),
-            "reaction": np.zeros((n, 4), dtype=np.float32),
-            "ids": added.ids.astype(np.int32),
-            "memory": np.zeros(n, dtype=np.float32),
-            "material": added.material.astype(np.int32),
-            "volumes": added.volumes.astype(np.float32),
-            "anchors": added.anchors.astype(np.float32),
-        }
-        biased = base + sorting.BIAS
-        keys = ((np.int64(added.field) << 16 | biased[:, 0]) << 16 | biased[:, 1]) << 16 | biased[:, 2]
-        merged = {name: np.concatenate([state[name], new[name]]) for name in self._names}
-        all_keys = np.concatenate([state["keys"], keys])
-        order = np.argsort(all_keys >> 48, kind="stable")
-        control = self.control()
-        world = self._field_world[added.field]
-        fastest = math.sqrt(float(np.max((added.v**2).sum(axis=1))))
-        control[world, layout.SPEED] = max(control[world, layout.SPEED], fastest)
-        control[world, layout.WAVE_SPEED] = max(control[world, layout.WAVE_SPEED], wave_speed)
+        parts = {name: [state[name]] for name in self._names}
+        all_keys = [state["keys"].astype(np.int64)]
+        control, means = self.control(), self._means.to_numpy()
+        for added, wave_speed in groups:
+            base = np.clip(np.floor(added.x - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
+            new = {
+                "x": np.rint((added.x - (4 * base - 1)) * FIXED_ONE).astype(np.int32),
+                "v": added.v.astype(np.float32),
+                "C": added.C.astype(np.float32),
+                "F": added.F.astype(np.float32),
+                "constants": added.constants.astype(np.float32),
+                "reaction": np.zeros((len(base), 4), dtype=np.float32),
+                "ids": added.ids.astype(np.int32),
+                "memory": np.zeros(len(base), dtype=np.float32),
+                "material": added.material.astype(np.int32),
+                "volumes": added.volumes.astype(np.float32),
+                "anchors": added.anchors.astype(np.float32),
+            }
+            for name in self._names:
+                parts[name].append(new[name])
+            biased = base + sorting.BIAS
+            all_keys.append(((np.int64(added.field) << 16 | biased[:, 0]) << 16 | biased[:, 1]) << 16 | biased[:, 2])
+            row = control[self._field_world[added.field]]
+            row[layout.SPEED] = max(row[layout.SPEED], math.sqrt(float(np.max((added.v**2).sum(axis=1)))))
+            row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
+            first = added.field * layout.MEAN_ROW + layout.MEAN_PLACE
+            means[first : first + 3] = np.average(added.x, axis=0, weights=added.constants[:, 0])
         self._put_control(control)
-        means = self._means.to_numpy()
-        first = added.field * layout.MEAN_ROW + layout.MEAN_PLACE
-        means[first : first + 3] = np.average(added.x, axis=0, weights=added.constants[:, 0])
         self._means.from_numpy(means)
-        self._upload({name: values[order] for name, values in merged.items()}, all_keys[order])
+        keys = np.concatenate(all_keys)
+        # Fields one after the other, whenever they started.
+        order = np.argsort(keys >> 48, kind="stable")
+        self._upload({name: np.concatenate(parts[name])[order] for name in self._names}, keys[order])
 
     def raise_speed(self, world: int, speed: float) -> None:
         """Let the next substep of ``world`` be stable for particles of this speed, cells/s."""

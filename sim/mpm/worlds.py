@@ -81,8 +81,7 @@ class Worlds:
         self._host: State | None = None
         self._poses: dict[tuple[int, str], SolidPose] = {}
         self._fits: dict[int, FittedGradients] = {}
-        for place in self._places:
-            self._reach_time(place, -math.inf)
+        self._reach_times(np.full(len(self), -math.inf))
 
     def _new_solids(self) -> Solids:
         origin = self.cells.points_to_world(np.zeros((1, 3)))[0]
@@ -157,9 +156,7 @@ class Worlds:
                 raise self._lost(failure) from None
             before = self._times.copy()
             self._times = stops
-            for place in self._places:
-                if stops[place.world] > before[place.world]:
-                    self._reach_time(place, before[place.world])
+            self._reach_times(before)
 
     def _longest_step(self, place: packing.Place) -> float:
         """Longest substep in s: the option's, and what goals allow (explicit springs are stable to 2 / frequency)."""
@@ -181,25 +178,31 @@ class Worlds:
         knots += [t for track in tracks if track is not None for t in track.times]
         return min([end, *(float(t) for t in knots if now + INSTANT < t < end)])
 
-    def _reach_time(self, place: packing.Place, before: float) -> None:
-        """What sets in at the world's present time, after ``before``: bodies, velocities, materials."""
-        now = float(self._times[place.world]) + INSTANT
-        for i, body in enumerate(place.setup.bodies):
-            number = int(self._first_body[place.world]) + i
-            if not self._started[number] and body.start_time <= now:
-                self._started[number] = True
-                if not body.rigid:
-                    added, wave_speed = packing.particles(
-                        place, i, int(self._offsets[number]), self._material_choice(place, i, now)
-                    )
-                    self._engine.add(added, wave_speed=wave_speed)
-                self._host = None
-            if self._started[number] and not body.rigid:
-                if any(before + INSTANT < time <= now for time, _ in body.material_track):
-                    self._change_material(place, i, now)
-                keys = body.velocity_keys
-                if keys is not None and any(before + INSTANT < t <= now for t in keys.times):
-                    self._set_velocity(place, i, keys.at(now))
+    def _reach_times(self, before: Array) -> None:
+        """What sets in at the worlds' present times, after the times ``before`` (W,): bodies, velocities, materials."""
+        fresh = []
+        moved = [place for place in self._places if self._times[place.world] > before[place.world]]
+        for place in moved:
+            now = float(self._times[place.world]) + INSTANT
+            for i, body in enumerate(place.setup.bodies):
+                number = int(self._first_body[place.world]) + i
+                if not self._started[number] and body.start_time <= now:
+                    self._started[number] = True
+                    if not body.rigid:
+                        choice = self._material_choice(place, i, now)
+                        fresh.append(packing.particles(place, i, int(self._offsets[number]), choice))
+        if fresh:
+            self._engine.add(fresh)
+            self._host = None
+        for place in moved:
+            now, then = float(self._times[place.world]) + INSTANT, float(before[place.world]) + INSTANT
+            for i, body in enumerate(place.setup.bodies):
+                if self._started[int(self._first_body[place.world]) + i] and not body.rigid:
+                    if any(then < time <= now for time, _ in body.material_track):
+                        self._change_material(place, i, now)
+                    keys = body.velocity_keys
+                    if keys is not None and any(then < t <= now for t in keys.times):
+                        self._set_velocity(place, i, keys.at(now))
 
     @staticmethod
     def _material_choice(place: packing.Place, body_index: int, now: float) -> NDArray[np.int32]:
