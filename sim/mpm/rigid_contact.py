@@ -65,6 +65,9 @@ SPEEDING = 1.5
 DEPTH_COUNTS = 4.0
 """Cells along the surface that a cell of depth is worth when the contacts of a pair are thinned out."""
 
+TIE = 0.02
+"""Share of the points' spacing by which a point must be better than one that was chosen before it."""
+
 APART = 0.3
 """Contacts of a pair that lie closer than this share of the points' spacing are one."""
 
@@ -187,6 +190,7 @@ def gather_points(
         reach += solid_numbers[a * NUMBERS + BULGE]
         relative = axes.transpose() @ load33(solids, a * SOLID + R)
         base = p * BINS * CHOSEN
+        tie = TIE * solid_numbers[a * NUMBERS + SPACING]
         for k in range(BINS * CHOSEN):
             scores[base + k] = -1e30
             chosen[base + k] = -1
@@ -221,8 +225,8 @@ def gather_points(
                         kv = ti.select(k < 4, (k & 2) - 1, ti.select(k < 6, 0, sign))
                         value = (ku * u + kv * v) * ti.select(k < 4, 0.70710678, 1.0)
                         value = ti.select(k < CHOSEN - 1, value, 0) - DEPTH_COUNTS * there[3]
-                        # A little more, lest rounding decides between points that are as good as each other.
-                        if value > scores[first + k] + 1e-6:
+                        # Clearly more, lest the choice wavers between points that are as good as each other.
+                        if value > scores[first + k] + tie:
                             scores[first + k] = value
                             chosen[first + k] = i
                 i += 1

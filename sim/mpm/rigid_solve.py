@@ -72,10 +72,10 @@ from .solid_layout import (
     W,
 )
 
-SWEEPS = 60
+SWEEPS = 40
 """Gauss-Seidel sweeps at most; they end when nothing changes any more."""
 
-SETTLED = 1e-5
+SETTLED = 1e-3
 """Share of the speed that gravity gives in a substep below which a change is nothing."""
 
 QUICK = 3.0

@@ -24,8 +24,12 @@ NODES = 32
 FEWEST, MOST = 24, 96
 """Limits of the nodes along the longest side."""
 
-POINTS = 20
+POINTS = 16
 """The same for the surface points."""
+
+FLAT_CELL = 2.5
+"""Flat parts keep one point in each cube of so many spacings. What they meet are corners and edges, and those have points
+of their own."""
 
 MARGIN = 2.5
 """Lattice nodes around the bounding box."""
@@ -80,8 +84,9 @@ def points_of(surface: Surface, center: Array) -> PointSet:
     points, normals = distance.surface_points(surface, spacing)
     local = points - center
     table, smooth = patches(local, normals, spacing)
-    # The patch's own place, which is the mean of its surroundings, stands for the point.
-    hull = np.zeros(len(points), dtype=bool)
+    kept = _without_flats(local, smooth & (table[:, 9:11] == 0).all(axis=1), FLAT_CELL * spacing)
+    local, table, smooth = local[kept], table[kept], smooth[kept]
+    hull = np.zeros(len(local), dtype=bool)
     try:
         hull[ConvexHull(local).vertices] = True
     except QhullError:
@@ -111,6 +116,13 @@ def points_of(surface: Surface, center: Array) -> PointSet:
         spacing=spacing,
         bulge=float(min((0.7 * spacing) ** 2 / (2 * tightest), spacing)),
     )
+
+
+def _without_flats(points: Array, flat: NDArray[np.bool_], side: float) -> NDArray[np.int64]:
+    """Indices of the points that are not flat and of the first flat one in each cube of ``side``."""
+    cells = np.floor((points[flat] - points.min(axis=0)) / side).astype(np.int64)
+    first = np.unique(cells, axis=0, return_index=True)[1]
+    return np.sort(np.concatenate([np.flatnonzero(~flat), np.flatnonzero(flat)[first]]))
 
 
 def _clusters(points: Array, chosen: NDArray[np.int64], spacing: float) -> NDArray[np.int64]:
