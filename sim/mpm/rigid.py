@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# arguments without a type are as wide as what is passed.)
 """Rigid bodies and colliders over one substep: forces, contact (``rigid_contact``, ``rigid_solve``), motion.
 
 The angular momentum is the state and the angular velocity follows from it, so that free flight keeps it exactly; the
@@ -255,7 +256,7 @@ def solve_and_move(
         finish(w, p, solids, pairs, counts, contacts, memory, world_report)
     for i in range(world_spans[w * SPANS], world_spans[w * SPANS + 1]):
         kind = solid_kinds[i * KINDS + KIND]
-        if kind == DYNAMIC or kind == KINEMATIC:
+        if kind == DYNAMIC or kind == KINEMATIC:  # noqa: SIM109 (Taichi has no tuples)
             move(w, i, dt, world_numbers, solid_kinds, solid_numbers, solids)
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# arguments without a type are as wide as what is passed.)
 """Where solids touch: surface points of one against the plane or the distance lattice of the other.
 
 A pair keeps few of its contacts: on each side of b's frame that they face, the farthest in eight directions along that
@@ -11,7 +12,7 @@ side and the deepest. Those carry the same load as all of them would, and the so
 import taichi as ti
 
 from .layout import Integers, Scalars
-from .rigid_math import Doubles, dmat3, dvec3, dvec4, load3, load33, store3
+from .rigid_math import Doubles, dvec3, dvec4, load3, load33, store3
 from .shapes import outside_box, sample_distance
 from .solid_layout import (
     ADHESION_REACH,
@@ -41,7 +42,6 @@ from .solid_layout import (
     PLANE,
     POINT,
     RADIUS,
-    ROLL,
     ROW,
     RUB,
     SHAPE,
@@ -116,7 +116,7 @@ def distance_to(
 
 @ti.func
 def box_distance(shape, local, shape_numbers: Scalars, shape_dims: Integers):
-    """How far a point is at least from ``shape``: outside its lattice from there, inside 0; height over a plane, -1."""
+    """Least distance of a point from ``shape``: outside its lattice from there, inside 0; height over a plane (-1)."""
     far = local[2]
     if shape >= 0:
         far = outside_box(shape, local, shape_numbers, shape_dims).norm()
@@ -125,8 +125,8 @@ def box_distance(shape, local, shape_numbers: Scalars, shape_dims: Integers):
 
 @ti.func
 def patch(points: Scalars, p, facing, limit):
-    """The place of point ``p``'s patch whose outer normal is nearest to ``facing`` (unit vector, or 0), the point itself
-    where that is farther away than ``limit``; and the point's normal. In a's frame."""
+    """The place of point ``p``'s patch whose outer normal is nearest to ``facing`` (unit vector, or 0), the point
+    itself where that is farther away than ``limit``; and the point's normal. In a's frame."""
     r = p * POINT
     place = dvec3(points[r], points[r + 1], points[r + 2])
     n = dvec3(points[r + 3], points[r + 4], points[r + 5])
@@ -163,8 +163,8 @@ def gather_points(
     scores: Doubles,
     chosen: Integers,
 ):
-    """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none; -1 in ``reaches`` says that
-    there are none at all, else it is how far (cells) the points may be from the other surface."""
+    """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none. ``reaches``: how far (cells)
+    the points may be from the other surface, -1 when nothing is near."""
     a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
     centre = load3(solids, a * SOLID + X)
     origin, axes = frame_of(w, b, world_numbers, solids)
@@ -276,7 +276,8 @@ def find_contacts(
                 normal, gradient = dvec3(0.0), dvec3(0.0)
                 gap, change = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
                 # The patch faces b's surface where b's gradient is the patch's own normal reversed: two steps.
-                for step_number in range(3):
+                bent = points[i * POINT + 9] > 0.0 or points[i * POINT + 10] > 0.0
+                for step_number in range(ti.select(bent, 3, 1)):
                     place, own = patch(points, i, -(relative.transpose() @ normal), PATCH_LIMIT * spacing)
                     gradient = dvec3(0.0)
                     for n in range(7):
@@ -284,9 +285,7 @@ def find_contacts(
                         for c in ti.static(range(3)):
                             e[c] = ti.select(n // 2 == c, ti.select(n % 2 == 0, -step, step), 0)
                         local = relative @ place + shift + e
-                        there, rate = distance_to(
-                            b, local, solid_kinds, solids, shape_numbers, shape_dims, distances
-                        )
+                        there, rate = distance_to(b, local, solid_kinds, solids, shape_numbers, shape_dims, distances)
                         gradient += there[3] / (2 * step * step) * e
                         gap, change = there[3], rate
                     normal = ti.select(step_number == 0, 0, 1) * normal + gradient / ti.max(gradient.norm(), 1e-9)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
-# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+# ruff: noqa: ANN001, ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# arguments without a type are as wide as what is passed.)
 """Vectors in flat arrays of doubles, and turning. Numbers that are not powers of two are single precision here."""
 
 import taichi as ti

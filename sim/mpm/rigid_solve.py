@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# arguments without a type are as wide as what is passed.)
 """The impulses between solids that touch: projected Gauss-Seidel from the impulses of the last substep.
 
 For each contact with gap phi, normal n from b to a, relative velocity u = u_n n + u_t (after the substep, a's less b's):
@@ -105,9 +106,19 @@ def kick(i, row_v, row_w, impulse, moment, solid_numbers: Doubles, solids: Doubl
 
 
 @ti.func
-def prepare(w, dt, p, world_numbers: Doubles, solid_numbers: Doubles, solids: Doubles, pairs: Integers,
-            pair_numbers: Doubles, counts: Integers, contacts: Doubles):
-    """Effective masses, targets and friction of the contacts of pair ``p``; the velocities are those before impulses."""
+def prepare(
+    w,
+    dt,
+    p,
+    world_numbers: Doubles,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    pairs: Integers,
+    pair_numbers: Doubles,
+    counts: Integers,
+    contacts: Doubles,
+):
+    """Effective masses, targets and friction of pair ``p``'s contacts; the velocities are those before impulses."""
     a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
     law = pairs[p * PAIRS + 3] * CONTACT
     mode = ti.cast(pair_numbers[law + MODE], ti.i32)
@@ -208,8 +219,15 @@ def warm(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, counts: In
 
 
 @ti.func
-def sweep(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, pair_numbers: Doubles, counts: Integers,
-          contacts: Doubles):
+def sweep(
+    p,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    pairs: Integers,
+    pair_numbers: Doubles,
+    counts: Integers,
+    contacts: Doubles,
+):
     """One Gauss-Seidel sweep over the contacts of pair ``p``; returns the largest change of velocity in it."""
     worst = ti.cast(0.0, ti.f64)
     a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
@@ -293,8 +311,9 @@ def sweep(p, solid_numbers: Doubles, solids: Doubles, pairs: Integers, pair_numb
 
 
 @ti.func
-def finish(w, p, solids: Doubles, pairs: Integers, counts: Integers, contacts: Doubles, memory: Doubles,
-           world_report: Doubles):
+def finish(
+    w, p, solids: Doubles, pairs: Integers, counts: Integers, contacts: Doubles, memory: Doubles, world_report: Doubles
+):
     """Angular momentum from the impulses of pair ``p``, and its contacts into the memory."""
     for s in range(SLOTS):
         m = (p * SLOTS + s) * MEMORY

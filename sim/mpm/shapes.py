@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# arguments without a type are as wide as what is passed.)
 """Signed distances of solids on lattices, looked up on the device. Lengths in cells, points in the solid's own frame.
 
 Shape s of all lattices: ``shape_numbers[4 s ..]`` first node xyz and spacing, ``shape_dims[4 s ..]`` nodes along x, y, z
@@ -51,7 +52,9 @@ def sample_distance(shape, point, shape_numbers: Scalars, shape_dims: Integers, 
     h0, h1 = e00 + f[1] * (e01 - e00), e10 + f[1] * (e11 - e10)
     gz0 = (d001 - d000) + f[1] * ((d011 - d010) - (d001 - d000))
     gz1 = (d101 - d100) + f[1] * ((d111 - d110) - (d101 - d100))
-    gradient = inverse * ti.Vector([h1 - h0, (e01 - e00) + f[0] * ((e11 - e10) - (e01 - e00)), gz0 + f[0] * (gz1 - gz0)])
+    gradient = inverse * ti.Vector(
+        [h1 - h0, (e01 - e00) + f[0] * ((e11 - e10) - (e01 - e00)), gz0 + f[0] * (gz1 - gz0)]
+    )
     phi = h0 + f[0] * (h1 - h0)
     far = away.norm()
     if far > 0.0:

@@ -156,9 +156,7 @@ class Solids:
     def _new_collider(self, w: int, collider: Collider) -> _Solid:
         center = collider.middle
         if collider.vertices is not None:
-            return _Solid(
-                world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS
-            )
+            return _Solid(world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS)
         return _Solid(
             world=w,
             name=collider.name,
@@ -190,7 +188,9 @@ class Solids:
             balls.append(points.balls * scale)
             starts.append(points.starts[1:] + point)
             point += len(points.rows)
-            numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = np.array([points.radius, points.spacing, points.bulge]) * scale
+            numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
+                np.array([points.radius, points.spacing, points.bulge]) * scale
+            )
             state[i, at.X : at.X + 3] = (solid.center - self.origins[solid.world]) * scale
             state[i, at.Q] = 1.0
             state[i, at.R : at.R + 9] = np.eye(3).ravel()

@@ -62,7 +62,9 @@ def test_mass_and_inertia_come_from_the_particles():
     numbers = row(plain, "cube", "solid_numbers", at.NUMBERS)
     mass = 500.0 * 0.4**3
     assert numbers[at.MASS] == pytest.approx(mass)
-    assert numbers[at.INERTIA : at.INERTIA + 9].reshape(3, 3) == pytest.approx(np.eye(3) * mass * (0.4 * SCALE) ** 2 / 6)
+    assert numbers[at.INERTIA : at.INERTIA + 9].reshape(3, 3) == pytest.approx(
+        np.eye(3) * mass * (0.4 * SCALE) ** 2 / 6
+    )
     body = cube()
     heavy = cube(density_scale=np.where(body.positions[:, 2] > 0, 2.0, 1.0))
     pose = solids(WorldSetup(bodies=(heavy,))).pose(0, "cube")
