@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Where solids touch: surface points of one against the plane or the distance lattice of the other.
 
@@ -163,8 +163,8 @@ def gather_points(
     scores: Doubles,
     chosen: Integers,
 ):
-    """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none. ``reaches``: how far (cells)
-    the points may be from the other surface, -1 when nothing is near."""
+    """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none. ``reaches``: how far
+    (cells) the points may be from the other surface, -1 when nothing is near."""
     a, b = pairs[p * PAIRS], pairs[p * PAIRS + 1]
     centre = load3(solids, a * SOLID + X)
     origin, axes = frame_of(w, b, world_numbers, solids)

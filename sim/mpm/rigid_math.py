@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Vectors in flat arrays of doubles, and turning. Numbers that are not powers of two are single precision here."""
 

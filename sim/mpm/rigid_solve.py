@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """The impulses between solids that touch: projected Gauss-Seidel from the impulses of the last substep.
 
-For each contact with gap phi, normal n from b to a, relative velocity u = u_n n + u_t (after the substep, a's less b's):
+For each contact with gap phi, normal n from b to a, relative velocity u = u_n n + u_t (a's less b's, after it):
 
     u_n >= -e u_n(before)  where it comes in faster than gravity would bring it, and phi is closed within the substep
     u_n >= -phi / dt       elsewhere, phi > 0;  u_n >= 0 elsewhere

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
-# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple, and
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Signed distances of solids on lattices, looked up on the device. Lengths in cells, points in the solid's own frame.
 
-Shape s of all lattices: ``shape_numbers[4 s ..]`` first node xyz and spacing, ``shape_dims[4 s ..]`` nodes along x, y, z
-and where its distances start in ``distances`` (C order, z fastest). Floats are as wide as the point that is passed in.
+Shape s of all lattices: ``shape_numbers[4 s ..]`` first node xyz and spacing, ``shape_dims[4 s ..]`` nodes along x, y,
+z and where its distances start in ``distances`` (C order, z fastest). Floats are as wide as the point passed in.
 """
 
 import taichi as ti

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Where the numbers of a solid, a pair and a contact stand in the flat arrays that ``rigid``'s functions read.
 
-A solid is a rigid body (DYNAMIC), a collider that moves as it is told (KINEMATIC) or one that stays (STATIC). Lengths in
-cells, seconds, kilograms, radians; world axes unless said otherwise. Imports no Taichi.
+A solid is a rigid body (DYNAMIC), a collider that moves as it is told (KINEMATIC) or one that stays (STATIC). Lengths
+in cells, seconds, kilograms, radians; world axes unless said otherwise. Imports no Taichi.
 """
 
 WAITING, DYNAMIC, KINEMATIC, STATIC = -1, 0, 1, 2

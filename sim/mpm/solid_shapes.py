@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,8 @@ POINTS = 16
 """The same for the surface points."""
 
 FLAT_CELL = 2.5
-"""Flat parts keep one point in each cube of so many spacings. What they meet are corners and edges, and those have points
-of their own."""
+"""Flat parts keep one point in each cube of so many spacings. What they meet are corners and edges, and those have
+points of their own."""
 
 MARGIN = 2.5
 """Lattice nodes around the bounding box."""
@@ -40,8 +41,8 @@ CLUSTER = 4.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointSet:
-    """Surface points in clusters: ``rows`` (N, POINT) in cluster order, ``balls`` (C, 4) around the clusters, ``starts``
-    (C + 1,) first points; the first ``hull`` clusters hold the corners of the convex hull. Units of the surface."""
+    """Surface points in clusters, in units of the surface: ``rows`` (N, POINT) in cluster order, ``balls`` (C, 4) around
+    the clusters, ``starts`` (C + 1,) first points. The first ``hull`` clusters hold the convex hull's corners."""
 
     rows: Array
     balls: Array
@@ -101,7 +102,7 @@ def points_of(surface: Surface, center: Array) -> PointSet:
     starts = np.append(breaks, len(order))
     rows = rows[order]
     balls = np.zeros((len(breaks), 4))
-    for c, (a, b) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for c, (a, b) in enumerate(pairwise(starts)):
         members = rows[a:b, :3]
         middle = 0.5 * (members.min(axis=0) + members.max(axis=0))
         balls[c] = [*middle, np.linalg.norm(members - middle, axis=1).max()]

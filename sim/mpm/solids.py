@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid bodies and colliders of several worlds on the device; metres outside, cells in the arrays (``solid_layout``)."""
+"""Rigid bodies and colliders of worlds on the device; metres outside, cells in the arrays (``solid_layout``)."""
 
 from __future__ import annotations
 
@@ -477,7 +477,8 @@ class Solids:
         velocity, spin = row[at.V : at.V + 3] / scale, row[at.W : at.W + 3].copy()
         mass = float(numbers[at.MASS])
         momentum = row[at.L : at.L + 3] / scale**2
-        gravity = self._get("world_numbers", at.WORLD)[w, at.GRAVITY : at.GRAVITY + 3] / scale
+        world = np.asarray(self._get("world_numbers", at.WORLD)[w], dtype=np.float64)
+        gravity = world[at.GRAVITY : at.GRAVITY + 3] / scale
         return SolidPose(
             rotation=rotation,
             translation=center - rotation @ solid.center,

@@ -137,7 +137,7 @@ def test_bad_input_is_named():
     setup = WorldSetup(bodies=(cube(),))
     with pytest.raises(InputError, match="give one of each"):
         Solids([setup], [1.0, 2.0], [ORIGIN])
-    with pytest.raises(InputError, match="scale is 0.0"):
+    with pytest.raises(InputError, match=r"scale is 0\.0"):
         Solids([setup], [0.0], [ORIGIN])
     world = solids(setup)
     with pytest.raises(InputError, match="no rigid body or collider 'cup'"):

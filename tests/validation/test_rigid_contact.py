@@ -165,8 +165,8 @@ def test_head_on_collision_swaps_velocities(ball_body, solids):
 
 
 def test_collision_off_the_axis_conserves_angular_momentum(box_body, ball_body, solids):
-    """A ball hits a box's edge: momentum within 1e-12. Impulses keep angular momentum as exactly; taking out depth shifts
-    centres by less than 0.01 cell, which times the momentum is what may be missing."""
+    """A ball hits a box's edge: momentum within 1e-12. Impulses keep angular momentum as exactly; taking out depth
+    shifts centres by less than 0.01 cell, which times the momentum is what may be missing."""
     bodies = (
         box_body(name="a"),
         ball_body(name="b", center=(0.3, 0.08, 0.05), velocity=(-2.0, 0.0, 0.0), spin=(0.0, 0.0, 5.0)),
