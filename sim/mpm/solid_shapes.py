@@ -41,8 +41,8 @@ CLUSTER = 4.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointSet:
-    """Surface points in clusters, in units of the surface: ``rows`` (N, POINT) in cluster order, ``balls`` (C, 4) around
-    the clusters, ``starts`` (C + 1,) first points. The first ``hull`` clusters hold the convex hull's corners."""
+    """Surface points in clusters, in units of the surface: ``rows`` (N, POINT) in cluster order, ``balls`` (C, 4)
+    around them, ``starts`` (C + 1,) first points. The first ``hull`` clusters hold the convex hull's corners."""
 
     rows: Array
     balls: Array
