@@ -17,7 +17,8 @@ from .materials import FIXED_COROTATED
 from .nodes import SUMS
 from .obstacles import PUSH
 from .rigid import move_worlds, search_worlds
-from .solids import Solids
+from .solids import MOVE, SEARCH, Solids
+from .solids_alone import advance_solids
 from .stepping import prime_worlds
 from .substep import advance_grid, advance_matter, part_bodies, plan_solids, resolve_contact
 
@@ -472,8 +473,11 @@ class Engine:
             self._sort()
             while True:
                 prime_worlds(self.world_count, self.cfl_elastic, self.cfl_velocity, self._control)
-                while self._substep() > 0:
-                    pass
+                if self.count:
+                    while self._substep() > 0:
+                        pass
+                else:
+                    self._advance_solids()
                 after = self.control()
                 lost = after[:, layout.STATUS] == layout.DIVERGED
                 if not lost.any():
@@ -498,6 +502,19 @@ class Engine:
             recovered = np.minimum(1.0, RECOVER * control[:, layout.CFL_SCALE])
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
         self._put_control(control)
+
+    def _advance_solids(self) -> None:
+        """All substeps of all worlds, none of which holds matter."""
+        solids = self.solids.arrays
+        names = dict.fromkeys((*MOVE[:3], *SEARCH, *MOVE))
+        advance_solids(
+            self.world_count,
+            self.cfl_elastic,
+            self.cfl_velocity,
+            self._world_integers,
+            self._control,
+            *(solids[name] for name in names),
+        )
 
     def _substep(self) -> int:
         """One substep of all worlds; returns how many want another one."""

@@ -191,6 +191,9 @@ class Solids:
             numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
                 np.array([points.radius, points.spacing, points.bulge]) * scale
             )
+            if isinstance(solid.source, Collider) and solid.source.vertices is not None:
+                farthest = np.linalg.norm(solid.source.vertices.values - solid.center, axis=2).max()
+                numbers[i, at.RADIUS] = float(farthest) * scale
             state[i, at.X : at.X + 3] = (solid.center - self.origins[solid.world]) * scale
             state[i, at.Q] = 1.0
             state[i, at.R : at.R + 9] = np.eye(3).ravel()

@@ -21,6 +21,7 @@ from .layout import (
     ELAPSED,
     FASTEST_FIELD,
     FIELD_INTEGERS,
+    FIELDS,
     FIRST_SOLID,
     FULL,
     IDLE,
@@ -100,8 +101,8 @@ def even_step(c: ti.i32, remaining: ti.f64, cfl_elastic: ti.f64, cfl_velocity: t
 
 
 @ti.func
-def plan(c: ti.i32, cfl_elastic: ti.f64, cfl_velocity: ti.f64, control: Doubles):
-    """Settle the next whole substep, STEP long: whether it is the last, or the last before a sort."""
+def plan(c: ti.i32, matter: ti.i32, cfl_elastic: ti.f64, cfl_velocity: ti.f64, control: Doubles):
+    """Settle the next whole substep, STEP long: whether it is the last, or (with ``matter``) the last before a sort."""
     step = control[c + STEP]
     remaining = control[c + REMAINING] - step
     last = remaining < 0.5 * step
@@ -113,6 +114,79 @@ def plan(c: ti.i32, cfl_elastic: ti.f64, cfl_velocity: ti.f64, control: Doubles)
     control[c + SCATTER] = ti.select(stop, 0.0, 1.0)
     control[c + STORE] = ti.select(stop, 1.0, 0.0)
     control[c + NEXT_STEP] = ti.select(stop, step, even_step(c, remaining, cfl_elastic, cfl_velocity, control))
+
+
+@ti.func
+def forget_reports(
+    w: ti.i32,
+    world_integers: Integers,
+    solid_kinds: Integers,
+    solid_numbers: Doubles,
+    solids: Doubles,
+    control: Doubles,
+):
+    """Before the blocks' reports are gathered: start the maxima anew, with the solids' speeds."""
+    c = w * CONTROL_ROW
+    if control[c + PHASE] == FULL:
+        control[c + SPEED] = 0.0
+        control[c + MARGIN] = 1e9
+        control[c + FASTEST_FIELD] = -1.0
+    control[c + SOLID_SPEED] = 0.0
+    first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
+    for i in range(first, first + world_integers[w * WORLD_INTEGERS + SOLIDS]):
+        kind = solid_kinds[i * KINDS + KIND]
+        if kind == DYNAMIC or kind == KINEMATIC:
+            turning = load3(solids, i * SOLID + W).norm() * solid_numbers[i * NUMBERS + RADIUS]
+            speed = load3(solids, i * SOLID + V).norm() + turning
+            if double_not_finite(speed):
+                lose(c, SOLID_LOST + i, control)
+            control[c + SOLID_SPEED] = ti.max(control[c + SOLID_SPEED], speed)
+    if control[c + PHASE] != IDLE and control[c + SCATTER] == 1.0:
+        control[c + WAVE_SPEED] = 0.0
+
+
+@ti.func
+def settle(w: ti.i32, cfl_elastic: ti.f64, cfl_velocity: ti.f64, world_integers: Integers, control: Doubles):
+    """After the reports are gathered: what world ``w`` does next. Returns 1 when it wants another substep."""
+    c = w * CONTROL_ROW
+    running = 0
+    phase = control[c + PHASE]
+    if phase != IDLE:
+        scattered = control[c + SCATTER] == 1.0
+        if phase == FULL:
+            control[c + SPEED] = ti.sqrt(control[c + SPEED])
+        if scattered:
+            control[c + WAVE_SPEED] = ti.sqrt(control[c + WAVE_SPEED])
+        lost = control[c + LOST_FIELD] >= 0.0
+        if phase == FULL:
+            step = control[c + STEP]
+            control[c + ELAPSED] += step
+            control[c + REMAINING] -= step
+            control[c + SUBSTEPS] += 1.0
+            control[c + SOLID_DRIFT] += control[c + SOLID_SPEED] * step
+            if not lost and control[c + SPEED] * step > FARTHEST_STEP:
+                lost = True
+                control[c + LOST_FIELD] = control[c + FASTEST_FIELD]
+        if lost:
+            control[c + STATUS] = DIVERGED
+            control[c + PHASE] = IDLE
+        elif not scattered:
+            # The last substep of the segment is followed by nothing; a sort by the first half of a substep.
+            over = control[c + REMAINING] < 0.5 * control[c + STEP]
+            control[c + STATUS] = ti.select(over, DONE, WANTS_SORT)
+            control[c + PHASE] = IDLE
+        else:
+            control[c + STEP] = control[c + NEXT_STEP]
+            control[c + PHASE] = FULL
+            if control[c + STEP] < control[c + SHORTEST_STEP]:
+                control[c + LOST_FIELD] = control[c + FASTEST_FIELD]
+                control[c + STATUS] = DIVERGED
+                control[c + PHASE] = IDLE
+            else:
+                running = 1
+                matter = ti.cast(world_integers[w * WORLD_INTEGERS + FIELDS] > 0, ti.i32)
+                plan(c, matter, cfl_elastic, cfl_velocity, control)
+    return running
 
 
 @ti.func
@@ -136,23 +210,7 @@ def review(
     """
     ti.loop_config(serialize=True)
     for w in range(world_count):
-        c = w * CONTROL_ROW
-        if control[c + PHASE] == FULL:
-            control[c + SPEED] = 0.0
-            control[c + MARGIN] = 1e9
-            control[c + FASTEST_FIELD] = -1.0
-        control[c + SOLID_SPEED] = 0.0
-        first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
-        for i in range(first, first + world_integers[w * WORLD_INTEGERS + SOLIDS]):
-            kind = solid_kinds[i * KINDS + KIND]
-            if kind == DYNAMIC or kind == KINEMATIC:
-                turning = load3(solids, i * SOLID + W).norm() * solid_numbers[i * NUMBERS + RADIUS]
-                speed = load3(solids, i * SOLID + V).norm() + turning
-                if double_not_finite(speed):
-                    lose(c, SOLID_LOST + i, control)
-                control[c + SOLID_SPEED] = ti.max(control[c + SOLID_SPEED], speed)
-        if control[c + PHASE] != IDLE and control[c + SCATTER] == 1.0:
-            control[c + WAVE_SPEED] = 0.0
+        forget_reports(w, world_integers, solid_kinds, solid_numbers, solids, control)
     ti.loop_config(serialize=True)
     for k in range(p_blocks):
         c = field_integers[p_field[k] * FIELD_INTEGERS + WORLD] * CONTROL_ROW
@@ -172,42 +230,7 @@ def review(
     running = 0
     ti.loop_config(serialize=True)
     for w in range(world_count):
-        c = w * CONTROL_ROW
-        phase = control[c + PHASE]
-        if phase != IDLE:
-            scattered = control[c + SCATTER] == 1.0
-            if phase == FULL:
-                control[c + SPEED] = ti.sqrt(control[c + SPEED])
-            if scattered:
-                control[c + WAVE_SPEED] = ti.sqrt(control[c + WAVE_SPEED])
-            lost = control[c + LOST_FIELD] >= 0.0
-            if phase == FULL:
-                step = control[c + STEP]
-                control[c + ELAPSED] += step
-                control[c + REMAINING] -= step
-                control[c + SUBSTEPS] += 1.0
-                control[c + SOLID_DRIFT] += control[c + SOLID_SPEED] * step
-                if not lost and control[c + SPEED] * step > FARTHEST_STEP:
-                    lost = True
-                    control[c + LOST_FIELD] = control[c + FASTEST_FIELD]
-            if lost:
-                control[c + STATUS] = DIVERGED
-                control[c + PHASE] = IDLE
-            elif not scattered:
-                # The last substep of the segment is followed by nothing; a sort by the first half of a substep.
-                over = control[c + REMAINING] < 0.5 * control[c + STEP]
-                control[c + STATUS] = ti.select(over, DONE, WANTS_SORT)
-                control[c + PHASE] = IDLE
-            else:
-                control[c + STEP] = control[c + NEXT_STEP]
-                control[c + PHASE] = FULL
-                if control[c + STEP] < control[c + SHORTEST_STEP]:
-                    control[c + LOST_FIELD] = control[c + FASTEST_FIELD]
-                    control[c + STATUS] = DIVERGED
-                    control[c + PHASE] = IDLE
-                else:
-                    running += 1
-                    plan(c, cfl_elastic, cfl_velocity, control)
+        running += settle(w, cfl_elastic, cfl_velocity, world_integers, control)
     return running
 
 

@@ -138,7 +138,7 @@ class Worlds:
             raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
         self._check_generation()
         end = self._times[0] + duration
-        while (self._times < end).any():
+        while (self._times < end - INSTANT).any():
             stops = np.array([self._next_stop(place, end) for place in self._places])
             self._engine.set_rows(
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
@@ -176,7 +176,7 @@ class Worlds:
         for collider in setup.colliders:
             tracks += [collider.translations, collider.rotations, collider.vertices]
         knots += [t for track in tracks if track is not None for t in track.times]
-        return min([end, *(float(t) for t in knots if now + INSTANT < t < end)])
+        return min([end, *(float(t) for t in knots if now + INSTANT < t < end - INSTANT)])
 
     def _reach_times(self, before: Array) -> None:
         """What sets in at the worlds' present times, after the times ``before`` (W,): bodies, velocities, materials."""
