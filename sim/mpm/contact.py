@@ -79,6 +79,9 @@ SPRING = 0.15
 """Share of a particle's depth, in velocity times substep, that an elastic contact gives back each substep: the spring
 of a layer one cell thick where waves travel 0.39 cells a substep, hence as stable as the body itself."""
 
+MOST_SLACK = 0.5
+"""Cells that are taken on trust at most before a block's particles are looked at again."""
+
 REACH_FACTOR = 1.5
 """Steps of the fastest particle within which a particle takes part in the contact."""
 
@@ -150,6 +153,7 @@ def solve_contact(
     nodes: Vectors4,
     scattered: Vectors4,
     touched: Integers,
+    slack: Scalars,
     solid_kinds: Integers,
     solid_numbers: Doubles,
     solids: Doubles,
@@ -162,7 +166,8 @@ def solve_contact(
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
 
     touched: per particle block 1 where something was scattered. pushes: what each block does to each solid of its
-    world, see ``obstacles``; touching: mass (kg) in contact with each solid in the last substep.
+    world, see ``obstacles``; touching: mass (kg) in contact with each solid in the last substep. slack: cells that
+    must be covered before any particle of the block can touch.
     """
     for ss in range(near_blocks * SPREAD):
         if ss % SPREAD == 0:
@@ -175,11 +180,14 @@ def solve_contact(
             touched[k] = 0
             for n in range(most_solids * PUSH):
                 pushes[s * most_solids * PUSH + n] = 0.0
+            dt = ti.cast(control[c + STEP], ti.f32)
+            fastest = ti.cast(ti.max(control[c + SPEED], control[c + SOLID_SPEED]), ti.f32)
             if control[c + PHASE] == FULL:
-                dt = ti.cast(control[c + STEP], ti.f32)
+                slack[k] -= 2.0 * REACH_FACTOR * fastest * dt
+            if control[c + PHASE] == FULL and slack[k] <= 0.0:
                 # Particles farther away cannot touch in this substep.
-                fastest = ti.max(control[c + SPEED], control[c + SOLID_SPEED])
-                reach = REACH_FACTOR * ti.cast(fastest, ti.f32) * dt + LEAST_REACH
+                reach = REACH_FACTOR * fastest * dt + LEAST_REACH
+                least = MOST_SLACK
                 recovery = worlds[w * WORLD_ROW + RECOVERY_SPEED]
                 has_plane = worlds[w * WORLD_ROW + HAS_PLANE] > 0.5
                 plane = vec3(
@@ -210,7 +218,7 @@ def solve_contact(
                         found, along, rate = solid_distance(
                             first_solid + o,
                             first_node + gp,
-                            reach + fixed[3] + 0.5,
+                            MOST_SLACK + reach + fixed[3],
                             solid_kinds,
                             solid_numbers,
                             solids,
@@ -227,7 +235,9 @@ def solve_contact(
                     pinned = False
                     if has_anchors:
                         pinned = anchors[p][3] == PIN
+                    least = ti.min(least, phi)
                     if phi < reach or old.norm_sqr() > 0.0 or pinned:
+                        least = 0.0
                         if touched[k] == 0:
                             touched[k] = 1
                             load_window(k, neighbours, window, nodes)
@@ -296,6 +306,7 @@ def solve_contact(
                                     pushes[row + n] += given[n]
                                     pushes[row + 3 + n] += turn[n]
                                 pushes[row + 6] += mass
+                slack[k] = least - reach
 
 
 @ti.func
@@ -319,6 +330,12 @@ def apply_contact(
             g = near_g[s]
             w = field_integers[g_field[g] * FIELD_INTEGERS + WORLD]
             if control[w * CONTROL_ROW + PHASE] == FULL:
+                any_touched = 0
+                for d in range(27):
+                    if neighbours[g * 27 + d] >= 0:
+                        any_touched += touched[neighbours[g * 27 + d]]
+                if any_touched == 0:
+                    continue
                 for i in range(BLOCK_NODES):
                     sums[s * BLOCK_NODES + i] = vec4(0.0)
                 add_windows_where(g, s, neighbours, touched, 1, scattered, sums)

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from . import layout, meeting, sorting
+from . import layout, meeting, runtime, sorting
+from .launch import Launcher, Step
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
 from .materials import FIXED_COROTATED
 from .nodes import SUMS
@@ -20,7 +23,7 @@ from .rigid import move_worlds, search_worlds
 from .solids import MOVE, SEARCH, Solids
 from .solids_alone import advance_solids
 from .stepping import prime_worlds
-from .substep import advance_grid, advance_matter, part_bodies, plan_solids, resolve_contact
+from .substep import advance_grid, advance_matter_of, part_bodies_of, plan_solids, resolve_contact
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -38,6 +41,12 @@ MOST_RETRIES = 6
 
 RECOVER = 1.25
 """Factor by which a step that had to be shortened grows again after each stretch that went well."""
+
+REPEATS = 4
+"""Substeps in a launch; worlds that need fewer stay idle for the rest."""
+
+SOLID_NAMES = {"worlds": "world_count", "pairs": "solid_pairs", "memory": "solid_memory"}
+"""What parameters of the solids' kernels are called besides the others."""
 
 LEAST_STEP = 1e-10
 """Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a lost run."""
@@ -98,6 +107,7 @@ class Engine:
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
         self.solids = solids
         self._most_solids = int(numbers.world_integers[:, layout.SOLIDS].max())
+        self._running = ti.ndarray(ti.i32, 1)
         self._steps = ti.ndarray(ti.f64, len(numbers.worlds))
         self._touching = ti.ndarray(ti.f32, max(1, solids.count))
         self.laws = numbers.laws
@@ -166,6 +176,7 @@ class Engine:
             self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._touched, self._near_worlds = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
+            self._slack = ti.ndarray(ti.f32, p)
             self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
             self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
@@ -414,6 +425,7 @@ class Engine:
             self._near_g,
         )
         self._touched.fill(0)
+        self._slack.fill(0.0)
         self._near = (int(found[0]), int(found[1]))
         if self._several:
             found = meeting.list_meeting_blocks(
@@ -474,8 +486,10 @@ class Engine:
             while True:
                 prime_worlds(self.world_count, self.cfl_elastic, self.cfl_velocity, self._control)
                 if self.count:
-                    while self._substep() > 0:
-                        pass
+                    launcher, arguments = self._launcher(), self._arguments()
+                    self._running[0] = self.world_count
+                    while self._running[0] > 0:
+                        launcher.launch(arguments)
                 else:
                     self._advance_solids()
                 after = self.control()
@@ -516,145 +530,96 @@ class Engine:
             *(solids[name] for name in names),
         )
 
-    def _substep(self) -> int:
-        """One substep of all worlds; returns how many want another one."""
-        here = self._particles[0]
-        material, memory = here.get("material", self._starts), here.get("memory", self._masses)
-        anchors = here.get("anchors", self._nodes)
-        solids = self.solids.arrays
-        if self.count:
-            advance_grid(
-                self._mean_fields,
-                self._g_blocks,
-                self._g_cells,
-                self._g_field,
-                self._g_starts,
-                self._g_neighbours,
-                self._field_integers,
-                self._fields,
-                self._worlds,
-                self._means,
-                self._control,
-                self._scattered,
-                self._nodes,
-                self._masses,
-                self._block_sums,
-            )
-        if self._meet_p_count:
-            part_bodies(
-                self.laws,
-                self._meeting[0],
-                self._meeting[1],
-                self._meet_p_count,
-                self._p_field,
-                self._starts,
-                self._meets_p,
-                self._meet_p,
-                self._g_field,
-                self._g_neighbours,
-                self._mate,
-                self._meet,
-                self._meet_g,
-                self._leads,
-                self._world_integers,
-                self._worlds,
-                self._field_integers,
-                self._pairs,
-                self._control,
-                here["x"],
-                here["F"],
-                material,
-                self._table,
-                memory,
-                here["volumes"],
-                self._scattered,
-                self._nodes,
-                self._sums,
-                self._masses,
-            )
-        if self.solids.count:
-            plan_solids(self.world_count, solids["world_spans"], self._control, self._steps, solids["solids"])
-        if self._near[0]:
-            resolve_contact(
-                self.world_count,
-                self.solids.count,
-                self._near[0],
-                self._near[1],
-                self._most_solids,
-                self._p_cells,
-                self._p_field,
-                self._starts,
-                self._p_neighbours,
-                self._near_p,
-                self._near_worlds,
-                self._touched,
-                self._g_field,
-                self._g_neighbours,
-                self._near_g,
-                self._world_integers,
-                self._worlds,
-                self._field_integers,
-                self._fields,
-                self._touches,
-                self._control,
-                here["x"],
-                here["constants"],
-                here["reaction"],
-                anchors,
-                self._window,
-                self._scattered,
-                self._nodes,
-                self._sums,
-                self._masses,
-                solids["solid_kinds"],
-                solids["solid_numbers"],
-                solids["solids"],
-                solids["impulses"],
-                solids["shape_numbers"],
-                solids["shape_dims"],
-                solids["distances"],
-                self._touching,
-                self._pushes,
-            )
-        if self.solids.count:
-            search_worlds(self.world_count, self._steps, *self.solids.search_arguments)
-            move_worlds(self.world_count, self._steps, *self.solids.move_arguments)
-        return int(
-            advance_matter(
-                self.laws,
-                self.world_count,
-                self._p_blocks,
-                self.cfl_elastic,
-                self.cfl_velocity,
-                self._p_cells,
-                self._p_field,
-                self._starts,
-                self._p_neighbours,
-                self._near_of_p,
-                self._world_integers,
-                self._worlds,
-                self._field_integers,
-                self._fields,
-                self._control,
-                here["x"],
-                here["v"],
-                here["C"],
-                here["F"],
-                here["constants"],
-                here["reaction"],
-                material,
-                self._table,
-                memory,
-                anchors,
-                self._window,
-                self._scattered,
-                self._nodes,
-                self._report,
-                solids["solid_kinds"],
-                solids["solid_numbers"],
-                solids["solids"],
-            )
+    def _launcher(self) -> Launcher:
+        """The kernels that the present lists of blocks ask for."""
+        return _launcher_of(
+            runtime.generation(), self.laws, self._meet_p_count > 0, self.solids.count > 0, self._near[0] > 0
         )
+
+    def _arguments(self) -> dict[str, Any]:
+        """What the kernels' parameters are now."""
+        here = self._particles[0]
+        solids = self.solids.arrays
+        return {
+            **{SOLID_NAMES.get(name, name): array for name, array in solids.items()},
+            **here,
+            "material": here.get("material", self._starts),
+            "memory": here.get("memory", self._masses),
+            "volumes": here.get("volumes", self._masses),
+            "anchors": here.get("anchors", self._nodes),
+            "world_count": self.world_count,
+            "mean_fields": self._mean_fields,
+            "p_blocks": self._p_blocks,
+            "g_blocks": self._g_blocks,
+            "near_p_count": self._near[0],
+            "near_g_count": self._near[1],
+            "meet_g_count": self._meeting[0],
+            "lead_count": self._meeting[1],
+            "meet_p_count": self._meet_p_count,
+            "solid_count": self.solids.count,
+            "most_solids": self._most_solids,
+            "cfl_elastic": self.cfl_elastic,
+            "cfl_velocity": self.cfl_velocity,
+            "p_cells": self._p_cells,
+            "p_field": self._p_field,
+            "starts": self._starts,
+            "p_neighbours": self._p_neighbours,
+            "near": self._near_of_p,
+            "near_p": self._near_p,
+            "near_worlds": self._near_worlds,
+            "meets_p": self._meets_p,
+            "meet_p": self._meet_p,
+            "touched": self._touched,
+            "slack": self._slack,
+            "g_cells": self._g_cells,
+            "g_field": self._g_field,
+            "g_starts": self._g_starts,
+            "g_neighbours": self._g_neighbours,
+            "near_g": self._near_g,
+            "mate": self._mate,
+            "meet": self._meet,
+            "meet_g": self._meet_g,
+            "leads": self._leads,
+            "world_integers": self._world_integers,
+            "worlds": self._worlds,
+            "field_integers": self._field_integers,
+            "fields": self._fields,
+            "means": self._means,
+            "touches": self._touches,
+            "body_pairs": self._pairs,
+            "control": self._control,
+            "steps": self._steps,
+            "running": self._running,
+            "table": self._table,
+            "window": self._window,
+            "scattered": self._scattered,
+            "nodes": self._nodes,
+            "sums": self._sums,
+            "masses": self._masses,
+            "block_sums": self._block_sums,
+            "report": self._report,
+            "touching": self._touching,
+            "pushes": self._pushes,
+        }
+
+
+@functools.lru_cache(maxsize=32)
+def _launcher_of(generation: int, laws: int, meeting: bool, solids: bool, near: bool) -> Launcher:
+    """The launcher for worlds with these ``laws`` in which bodies meet, solids are, obstacles are near.
+
+    generation: of the compute runtime, whose end is the launcher's.
+    """
+    steps: list[Step] = [(advance_grid, {})]
+    if meeting:
+        steps.append((part_bodies_of(laws), {"pairs": "body_pairs"}))
+    if solids:
+        steps.append((plan_solids, {}))
+    if near:
+        steps.append((resolve_contact, {}))
+    if solids:
+        steps += [(search_worlds, SOLID_NAMES), (move_worlds, SOLID_NAMES)]
+    steps.append((advance_matter_of(laws), {}))
+    return Launcher(steps, repeats=REPEATS)
 
 
 def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN201, ANN202
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """One substep of all worlds, as the kernels that ``engine`` launches one after the other:
@@ -10,13 +10,16 @@
     (rigid)           motion of the solids: ``rigid.search_worlds``, ``rigid.move_worlds``
     advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
 
-Every world is in the phase that ``control`` says and takes its own step. A launch costs about 0.1 ms of Python, so
-there are few kernels; a compiler pass takes the square of a kernel's length, so there is more than one.
+Every world is in the phase that ``control`` says and takes its own step. The compiler takes more than twice as long for
+a kernel of twice the length, so there are several.
 """
+
+import functools
 
 import taichi as ti
 
 from .contact import apply_contact, solve_contact
+from .launch import Kernel
 from .layout import CONTROL_ROW, FULL, PHASE, STEP, Cells, Doubles, Integers, Matrices, Scalars, Vectors3, Vectors4
 from .nodes import advance_nodes, gather_means
 from .obstacles import gather_pushes
@@ -63,71 +66,76 @@ def advance_grid(
     gather_means(mean_fields, g_starts, field_integers, control, block_sums, means)
 
 
-@ti.kernel
-def part_bodies(
-    laws: ti.template(),
-    meet_g_count: ti.i32,
-    lead_count: ti.i32,
-    meet_p_count: ti.i32,
-    p_field: Integers,
-    starts: Integers,
-    meets_p: Integers,
-    meet_p: Integers,
-    g_field: Integers,
-    g_neighbours: Integers,
-    mate: Integers,
-    meet: Integers,
-    meet_g: Integers,
-    leads: Integers,
-    world_integers: Integers,
-    worlds: Scalars,
-    field_integers: Integers,
-    pairs: Scalars,
-    control: Doubles,
-    x: Cells,
-    F: Matrices,
-    material: Integers,
-    table: Scalars,
-    memory: Scalars,
-    volumes: Scalars,
-    scattered: Vectors4,
-    nodes: Vectors4,
-    sums: Vectors4,
-    masses: Scalars,
-):
-    """Impulses between the nodes of different bodies in the same place."""
-    scatter_shares(
-        laws,
-        meet_p_count,
-        meet_p,
-        p_field,
-        starts,
-        field_integers,
-        control,
-        x,
-        F,
-        volumes,
-        material,
-        table,
-        memory,
-        scattered,
-    )
-    gather_shares(meet_g_count, meet_g, g_field, g_neighbours, field_integers, control, meets_p, scattered, sums)
-    separate(
-        lead_count,
-        leads,
-        mate,
-        meet,
-        g_field,
-        field_integers,
-        world_integers,
-        worlds,
-        pairs,
-        control,
-        sums,
-        masses,
-        nodes,
-    )
+@functools.cache
+def part_bodies_of(laws: int) -> Kernel:
+    """The kernel of contact between bodies for the set ``laws`` of constitutive laws."""
+
+    @ti.kernel
+    def part_bodies(
+        meet_g_count: ti.i32,
+        lead_count: ti.i32,
+        meet_p_count: ti.i32,
+        p_field: Integers,
+        starts: Integers,
+        meets_p: Integers,
+        meet_p: Integers,
+        g_field: Integers,
+        g_neighbours: Integers,
+        mate: Integers,
+        meet: Integers,
+        meet_g: Integers,
+        leads: Integers,
+        world_integers: Integers,
+        worlds: Scalars,
+        field_integers: Integers,
+        pairs: Scalars,
+        control: Doubles,
+        x: Cells,
+        F: Matrices,
+        material: Integers,
+        table: Scalars,
+        memory: Scalars,
+        volumes: Scalars,
+        scattered: Vectors4,
+        nodes: Vectors4,
+        sums: Vectors4,
+        masses: Scalars,
+    ):
+        """Impulses between the nodes of different bodies in the same place."""
+        scatter_shares(
+            laws,
+            meet_p_count,
+            meet_p,
+            p_field,
+            starts,
+            field_integers,
+            control,
+            x,
+            F,
+            volumes,
+            material,
+            table,
+            memory,
+            scattered,
+        )
+        gather_shares(meet_g_count, meet_g, g_field, g_neighbours, field_integers, control, meets_p, scattered, sums)
+        separate(
+            lead_count,
+            leads,
+            mate,
+            meet,
+            g_field,
+            field_integers,
+            world_integers,
+            worlds,
+            pairs,
+            control,
+            sums,
+            masses,
+            nodes,
+        )
+
+    return part_bodies
 
 
 @ti.kernel
@@ -155,6 +163,7 @@ def resolve_contact(
     near_p: Integers,
     near_worlds: Integers,
     touched: Integers,
+    slack: Scalars,
     g_field: Integers,
     g_neighbours: Integers,
     near_g: Integers,
@@ -207,6 +216,7 @@ def resolve_contact(
         nodes,
         scattered,
         touched,
+        slack,
         solid_kinds,
         solid_numbers,
         solids,
@@ -235,83 +245,86 @@ def resolve_contact(
         )
 
 
-@ti.kernel
-def advance_matter(
-    laws: ti.template(),
-    world_count: ti.i32,
-    p_blocks: ti.i32,
-    cfl_elastic: ti.f64,
-    cfl_velocity: ti.f64,
-    p_cells: Cells,
-    p_field: Integers,
-    starts: Integers,
-    p_neighbours: Integers,
-    near: Integers,
-    world_integers: Integers,
-    worlds: Scalars,
-    field_integers: Integers,
-    fields: Scalars,
-    control: Doubles,
-    x: Cells,
-    v: Vectors3,
-    C: Matrices,
-    F: Matrices,
-    constants: Vectors4,
-    reaction: Vectors4,
-    material: Integers,
-    table: Scalars,
-    memory: Scalars,
-    anchors: Vectors4,
-    window: Vectors4,
-    scattered: Vectors4,
-    nodes: Vectors4,
-    report: Scalars,
-    solid_kinds: Integers,
-    solid_numbers: Doubles,
-    solids: Doubles,
-) -> ti.i32:
-    """Particles over STEP, then onto the grid; plans what comes next. Returns how many worlds want another substep.
+@functools.cache
+def advance_matter_of(laws: int) -> Kernel:
+    """The kernel of particles for the set ``laws`` of constitutive laws; one is compiled for each set."""
 
-    laws: the set of constitutive laws that occur; one kernel is compiled for each set.
-    """
-    advance_particles(
-        laws,
-        p_blocks,
-        p_cells,
-        p_field,
-        starts,
-        p_neighbours,
-        near,
-        field_integers,
-        fields,
-        worlds,
-        control,
-        x,
-        v,
-        C,
-        F,
-        constants,
-        material,
-        table,
-        memory,
-        anchors,
-        reaction,
-        window,
-        nodes,
-        scattered,
-        report,
-    )
-    return review(
-        world_count,
-        p_blocks,
-        cfl_elastic,
-        cfl_velocity,
-        p_field,
-        field_integers,
-        report,
-        control,
-        world_integers,
-        solid_kinds,
-        solid_numbers,
-        solids,
-    )
+    @ti.kernel
+    def advance_matter(
+        world_count: ti.i32,
+        p_blocks: ti.i32,
+        cfl_elastic: ti.f64,
+        cfl_velocity: ti.f64,
+        p_cells: Cells,
+        p_field: Integers,
+        starts: Integers,
+        p_neighbours: Integers,
+        near: Integers,
+        world_integers: Integers,
+        worlds: Scalars,
+        field_integers: Integers,
+        fields: Scalars,
+        control: Doubles,
+        x: Cells,
+        v: Vectors3,
+        C: Matrices,
+        F: Matrices,
+        constants: Vectors4,
+        reaction: Vectors4,
+        material: Integers,
+        table: Scalars,
+        memory: Scalars,
+        anchors: Vectors4,
+        window: Vectors4,
+        scattered: Vectors4,
+        nodes: Vectors4,
+        report: Scalars,
+        running: Integers,
+        solid_kinds: Integers,
+        solid_numbers: Doubles,
+        solids: Doubles,
+    ):
+        """Particles over STEP, then onto the grid; plans what comes next. running[0]: how many worlds go on."""
+        advance_particles(
+            laws,
+            p_blocks,
+            p_cells,
+            p_field,
+            starts,
+            p_neighbours,
+            near,
+            field_integers,
+            fields,
+            worlds,
+            control,
+            x,
+            v,
+            C,
+            F,
+            constants,
+            material,
+            table,
+            memory,
+            anchors,
+            reaction,
+            window,
+            nodes,
+            scattered,
+            report,
+        )
+        running[0] = review(
+            world_count,
+            p_blocks,
+            cfl_elastic,
+            cfl_velocity,
+            p_field,
+            field_integers,
+            report,
+            control,
+            world_integers,
+            solid_kinds,
+            solid_numbers,
+            solids,
+        )
+
+    return advance_matter
