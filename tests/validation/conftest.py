@@ -18,12 +18,15 @@ from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
 from physgen.sim.mpm.options import SolverOptions
 from physgen.sim.mpm.setup import WorldSetup
 from physgen.sim.mpm.solids import Solids
+from physgen.sim.mpm.world import World
 from physgen.sim.scene.units import Similarity
 
 GRID = 64
 CELL = 2.0 / GRID  # metres, with the similarity below
 
 BoxFactory = Callable[..., BodyParticles]
+Block = Callable[..., BodyParticles]
+GiveMotion = Callable[[World, np.ndarray, np.ndarray], None]
 
 
 @pytest.fixture
@@ -124,6 +127,25 @@ def rigid_ball(
     )
 
 
+def lattice_block(material, size, *, cell=CELL, bottom=(0.0, 0.0, 0.0), name="block", **fields) -> BodyParticles:
+    """Box of ``size`` (3) cells of any material, 8 particles a cell, its underside's centre on ``bottom``.
+
+    A function among ``fields`` is called with the particles' places, for values that particles have of their own.
+    """
+    spacing = cell / 2
+    counts = [2 * c for c in size]
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    places = (index + 0.5) * spacing - np.array([counts[0], counts[1], 0]) * spacing / 2 + np.asarray(bottom)
+    return BodyParticles(
+        name=name,
+        positions=places,
+        volumes=np.full(len(places), spacing**3),
+        material=material,
+        contact_radii=np.full(len(places), spacing / 2),
+        **{key: value(places) if callable(value) else value for key, value in fields.items()},
+    )
+
+
 @pytest.fixture
 def box_body() -> BoxFactory:
     return rigid_box
@@ -143,3 +165,23 @@ def solids() -> Callable[..., Solids]:
         return Solids(setups, [1.0 / CELL] * len(setups), [(-1.0, -1.0, -1.0)] * len(setups))
 
     return make
+
+
+@pytest.fixture
+def block() -> Block:
+    return lattice_block
+
+
+def set_motion(world: World, velocities: np.ndarray, gradients: np.ndarray) -> None:
+    """Velocities (N, 3) in m/s and velocity gradients (N, 3, 3) for body 0, in the order of its particles."""
+    state = world.checkpoint()
+    order = state["ids"]
+    scale = world.options.grid / 2.0 * world.similarity.scale
+    state["v"] = (velocities[order] * scale).astype(np.float32)
+    state["C"] = gradients[order].astype(np.float32)
+    world.restore(state)
+
+
+@pytest.fixture
+def give_motion() -> GiveMotion:
+    return set_motion
