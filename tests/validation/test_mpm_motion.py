@@ -75,7 +75,7 @@ def test_motion_in_metres_does_not_depend_on_the_similarity_scale(box):
 
 @pytest.mark.parametrize("youngs_modulus", [2e5, 1e7])
 def test_a_throw_is_a_parabola(box, options, similarity, youngs_modulus):
-    """Range v^2 sin(2 a) / g and height (v sin a)^2 / 2g of a spinning body, within 0.5 % (Galilei, as for the fall)."""
+    """Range v^2 sin(2 a) / g and height (v sin a)^2 / 2g of a spinning body within 0.5 %, as for the fall."""
     speed, angle = 2.5, math.radians(50.0)
     velocity = (speed * math.cos(angle), 0.0, speed * math.sin(angle))
     body = box(

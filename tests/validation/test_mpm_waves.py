@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Elastic waves: how fast they travel, in matter of one kind, of several and with fibres, and how the grid's error falls.
+"""Elastic waves: their speed in matter of one kind, of several and with fibres, and how the grid's error falls.
 
 Bars vibrate in their longitudinal modes, which are known exactly. Amplitudes are 1e-3 of the wave speed: linear theory.
 """
@@ -139,9 +139,7 @@ def upper(low, high):
             4.0,
             2.0,
             {
-                "materials": (
-                    NeoHookeanMaterial(density=2 * DENSITY, youngs_modulus=4 * MODULUS, poisson_ratio=0.3),
-                ),
+                "materials": (NeoHookeanMaterial(density=2 * DENSITY, youngs_modulus=4 * MODULUS, poisson_ratio=0.3),),
                 "material_index": upper(0, 1),
             },
         ),
