@@ -51,14 +51,20 @@ WORLD_INTEGERS = 8
 GRAVITY_FACTOR, DRAG, WIND, LIFT = 0, 1, 2, 5
 TETHER_STIFFNESS, TETHER_LENGTH, TETHER_ANCHOR, TETHER_STRING = 6, 7, 8, 11
 ACCELERATION, ACCELERATION_RATE, GOAL_STIFFNESS, GOAL_DAMPING, MOTION, MOTION_RATE = 12, 15, 18, 19, 20, 23
-FIELD_ROW = 26
+# Adhesion to the plane: its acceleration and reach. PLANE_GAP: the body's least distance to the plane, which the
+# kernels find where there is adhesion; substep n reads number n % 2 of two.
+PLANE_ADHESION, PLANE_REACH, PLANE_GAP = 26, 27, 28
+FIELD_ROW = 30
+
+FAR = 1e9
+"""Cells; a distance at which nothing acts."""
 
 # Whole numbers of a field. WANTS_MEANS: whether the body's means (below) are kept; HAS_ANCHORS: pins or goals.
 WORLD, FIRST_TOUCH, WANTS_MEANS, HAS_ANCHORS = range(4)
 FIELD_INTEGERS = 4
 
-# Means of a field: mass (kg), centre of mass (cells), velocity (cells/s), angular velocity (1/s), acceleration by
-# contact (cells/s²), its mass in contact (kg).
+# Means of a field: mass (kg), centre of mass where the next substep finds it (cells), velocity (cells/s), angular
+# velocity (1/s), acceleration by contact (cells/s²), its mass in contact (kg).
 MEAN_MASS, MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN, MEAN_REACTION, MEAN_TOUCHING = 0, 1, 4, 7, 10, 13
 MEAN_ROW = 16
 

@@ -29,8 +29,13 @@ from .layout import (
     MEAN_SPIN,
     MEAN_VELOCITY,
     PHASE,
+    PLANE_ADHESION,
+    PLANE_GAP,
+    PLANE_NORMAL,
+    PLANE_REACH,
     SPREAD,
     STEP,
+    SUBSTEPS,
     TETHER_ANCHOR,
     TETHER_LENGTH,
     TETHER_STIFFNESS,
@@ -48,6 +53,7 @@ from .layout import (
     vec3,
     vec4,
 )
+from .stepping import FARTHEST_STEP, not_finite
 from .transfer import add_windows
 
 SUMS = 16
@@ -62,12 +68,26 @@ def triple(numbers: Scalars, first: ti.i32):
 
 
 @ti.func
-def steady_acceleration(f: ti.i32, w: ti.i32, time: ti.f32, worlds: Scalars, fields: Scalars, means: Scalars):
-    """Acceleration (cells/s²) of field ``f`` whatever its local velocity, ``time`` s into the segment."""
+def lift_acceleration(f: ti.i32, dt: ti.f32, fields: Scalars, means: Scalars):
+    """Mean over ``dt`` of the lift: the velocity through the air turns about the spin, and no speed is gained."""
+    row, mean = f * FIELD_ROW, f * MEAN_ROW
+    through = triple(means, mean + MEAN_VELOCITY) - triple(fields, row + WIND)
+    half = (0.5 * dt * fields[row + LIFT]) * triple(means, mean + MEAN_SPIN)
+    return (2.0 / (dt * (1.0 + half.norm_sqr()))) * half.cross(through + half.cross(through))
+
+
+@ti.func
+def steady_acceleration(
+    f: ti.i32, w: ti.i32, dt: ti.f32, worlds: Scalars, fields: Scalars, means: Scalars, control: Doubles
+):
+    """Acceleration (cells/s²) of field ``f``, the same all over it, in the substep of ``dt`` s that begins."""
     row, world, mean = f * FIELD_ROW, w * WORLD_ROW, f * MEAN_ROW
+    time = ti.cast(control[w * CONTROL_ROW + ELAPSED], ti.f32) + 0.5 * dt
     gravity = triple(worlds, world + GRAVITY) + time * triple(worlds, world + GRAVITY_RATE)
     a = fields[row + GRAVITY_FACTOR] * gravity
     a += triple(fields, row + ACCELERATION) + time * triple(fields, row + ACCELERATION_RATE)
+    if fields[row + LIFT] != 0.0:
+        a += lift_acceleration(f, dt, fields, means)
     if fields[row + TETHER_STIFFNESS] > 0.0:
         arm = triple(fields, row + TETHER_ANCHOR) - triple(means, mean + MEAN_PLACE)
         distance = arm.norm() + 1e-12
@@ -75,6 +95,10 @@ def steady_acceleration(f: ti.i32, w: ti.i32, time: ti.f32, worlds: Scalars, fie
         if fields[row + TETHER_STRING] > 0.5:
             stretch = ti.max(stretch, 0.0)
         a += (fields[row + TETHER_STIFFNESS] * stretch / distance) * arm
+    if fields[row + PLANE_ADHESION] > 0.0:
+        known = ti.cast(control[w * CONTROL_ROW + SUBSTEPS], ti.i32) & 1
+        if fields[row + PLANE_GAP + known] < fields[row + PLANE_REACH]:
+            a -= fields[row + PLANE_ADHESION] * triple(worlds, world + PLANE_NORMAL)
     return a
 
 
@@ -107,12 +131,10 @@ def advance_nodes(
             c = w * CONTROL_ROW
             if control[c + PHASE] == FULL:
                 dt = ti.cast(control[c + STEP], ti.f32)
-                time = ti.cast(control[c + ELAPSED], ti.f32) + 0.5 * dt
-                push = dt * steady_acceleration(f, w, time, worlds, fields, means)
+                push = dt * steady_acceleration(f, w, dt, worlds, fields, means, control)
                 wants_means = field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1
-                drag, lift = fields[f * FIELD_ROW + DRAG], fields[f * FIELD_ROW + LIFT]
+                drag = fields[f * FIELD_ROW + DRAG]
                 wind = triple(fields, f * FIELD_ROW + WIND)
-                turn = (dt * lift) * triple(means, f * MEAN_ROW + MEAN_SPIN)
                 for i in range(BLOCK_NODES):
                     nodes[g * BLOCK_NODES + i] = vec4(0.0)
                 add_windows(g, neighbours, scattered, nodes)
@@ -122,10 +144,10 @@ def advance_nodes(
                     if q[3] > 0.0:
                         inverse = 1.0 / q[3]
                         u = vec3(q[0], q[1], q[2]) * inverse + push
-                        if drag > 0.0 or lift != 0.0:
+                        if drag > 0.0:
                             through = u - wind
                             # Implicit in the speed, so that no drag can turn a body back.
-                            u += turn.cross(through) - through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
+                            u -= through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
                         nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
                 if wants_means:
                     add_sums(g, g_cells, triple(means, f * MEAN_ROW + MEAN_PLACE), nodes, masses, block_sums)
@@ -162,7 +184,11 @@ def gather_means(
     block_sums: Scalars,
     means: Scalars,
 ):
-    """Means of the fields that want them, from their grid blocks ``g_starts[f]`` up to ``g_starts[f + 1]``."""
+    """Means of the fields that want them, from their grid blocks ``g_starts[f]`` up to ``g_starts[f + 1]``.
+
+    The place is that at which the next substep finds the body: a force found one substep late would feed it energy.
+    Means of a substep that went wrong are not kept, lest they spoil the next attempt.
+    """
     ti.loop_config(serialize=True)
     for f in range(field_count):
         w = field_integers[f * FIELD_INTEGERS + WORLD]
@@ -185,8 +211,11 @@ def gather_means(
                 zx = total[15] - mass * shift[2] * shift[0]
                 inertia = ti.Matrix([[yy + zz, -xy, -zx], [-xy, zz + xx, -yz], [-zx, -yz, xx + yy]])
                 omega = inertia.inverse() @ spin
-                means[mean + MEAN_MASS] = ti.cast(mass, ti.f32)
-                for n in ti.static(range(3)):
-                    means[mean + MEAN_PLACE + n] += ti.cast(shift[n], ti.f32)
-                    means[mean + MEAN_VELOCITY + n] = ti.cast(velocity[n], ti.f32)
-                    means[mean + MEAN_SPIN + n] = ti.cast(omega[n], ti.f32)
+                step = control[w * CONTROL_ROW + STEP]
+                check = ti.cast(velocity.norm_sqr() + omega.norm_sqr() + shift.norm_sqr(), ti.f32)
+                if not not_finite(check) and velocity.norm() * step < FARTHEST_STEP:
+                    means[mean + MEAN_MASS] = ti.cast(mass, ti.f32)
+                    for n in ti.static(range(3)):
+                        means[mean + MEAN_PLACE + n] += ti.cast(shift[n] + step * velocity[n], ti.f32)
+                        means[mean + MEAN_VELOCITY + n] = ti.cast(velocity[n], ti.f32)
+                        means[mean + MEAN_SPIN + n] = ti.cast(omega[n], ti.f32)

@@ -145,8 +145,18 @@ def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
         row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = normal
         row[layout.PLANE_OFFSET] = normal @ place.cells.points_to_engine(np.asarray(ground.point))
         row[layout.HAS_PLANE] = 1.0
-    row[layout.RECOVERY_SPEED] = math.sqrt(2.0 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
+    row[layout.RECOVERY_SPEED] = math.sqrt(2.0 * RECOVERY_HEIGHT * scale * strongest_pull(place.setup))
     return row.astype(np.float32)
+
+
+def strongest_pull(setup: WorldSetup) -> float:
+    """The largest acceleration in m/s² that gravity or a track gives a body at any time.
+
+    Of any time, as a moment without gravity must not stop surfaces and pins from taking back what went too deep.
+    """
+    gravity = setup.gravity_track.values if setup.gravity_track is not None else np.asarray([setup.gravity])
+    tracks = [gravity] + [body.acceleration.values for body in setup.bodies if body.acceleration is not None]
+    return max(float(np.linalg.norm(values, axis=1).max()) for values in tracks)
 
 
 def field_rows(all_places: Sequence[Place], starts: Sequence[float], ends: Sequence[float]) -> NDArray[np.float32]:
@@ -179,6 +189,12 @@ def field_row(place: Place, body_index: int, start: float, end: float) -> NDArra
             row[column : column + 3] = now
             if end > start:
                 row[rate : rate + 3] = (later - now) / (end - start)
+    if place.setup.ground is not None:
+        contact = place.setup.contact(body.name, GROUND_NAME)
+        if contact.adhesion_reach > 0:
+            row[layout.PLANE_ADHESION] = contact.adhesion * scale
+            row[layout.PLANE_REACH] = contact.adhesion_reach * scale
+    row[layout.PLANE_GAP : layout.PLANE_GAP + 2] = layout.FAR
     row[layout.GOAL_STIFFNESS] = body.goal_stiffness
     row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
     return row.astype(np.float32)

@@ -20,6 +20,7 @@ from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
     ELAPSED,
+    FAR,
     FIELD_INTEGERS,
     FIELD_ROW,
     FIXED_HIGH,
@@ -35,6 +36,8 @@ from .layout import (
     MOTION_RATE,
     NEXT_STEP,
     PHASE,
+    PLANE_ADHESION,
+    PLANE_GAP,
     PLANE_NORMAL,
     PLANE_OFFSET,
     SCALARS_PER_BLOCK,
@@ -42,6 +45,7 @@ from .layout import (
     SPREAD,
     STEP,
     STORE,
+    SUBSTEPS,
     WINDOW_NODES,
     WORLD,
     WORLD_ROW,
@@ -242,6 +246,8 @@ def advance_particles(
             goal = 0.0
             if field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1:
                 goal = fields[f * FIELD_ROW + GOAL_STIFFNESS]
+            adheres = fields[f * FIELD_ROW + PLANE_ADHESION] > 0.0
+            gap = FAR
             speed2 = 0.0
             stiffness = 0.0
             sum2 = 0.0
@@ -324,6 +330,9 @@ def advance_particles(
                 else:
                     vp = v[p]
                     Cp = C[p]
+                if adheres:
+                    here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    gap = ti.min(gap, level + normal.dot(here) - fixed[3])
                 if scatter:
                     if goal > 0.0:
                         vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, fields, control, anchors)
@@ -359,6 +368,12 @@ def advance_particles(
                             for m in ti.static(range(3)):
                                 n = first + (i * 64 + j * 8 + m)
                                 scattered[n] = scattered[n] + w[m][2] * (bj + float(m) * cj)
+            if adheres and phase != IDLE:
+                # The next whole substep reads this; the number that the present one has read waits for the one after.
+                now = ti.cast(control[c + SUBSTEPS], ti.i32) & 1
+                following = ti.select(gather, 1 - now, now)
+                fields[f * FIELD_ROW + PLANE_GAP + 1 - following] = FAR
+                ti.atomic_min(fields[f * FIELD_ROW + PLANE_GAP + following], gap)
             margin = ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest)
             r = k * SCALARS_PER_BLOCK
             if gather:

@@ -159,9 +159,9 @@ class Worlds:
             self._reach_times(before)
 
     def _longest_step(self, place: packing.Place) -> float:
-        """Longest substep in s: the option's, and what goals allow (explicit springs are stable to 2 / frequency)."""
-        goals = [body.goal_stiffness for body in place.setup.bodies]
-        return min(self.options.max_step, 0.5 / math.sqrt(max([*goals, 1e-12])))
+        """Longest substep in s: the option's, and what springs allow (explicit ones are stable to 2 / frequency)."""
+        springs = [body.goal_stiffness + body.forces.tether_stiffness for body in place.setup.bodies]
+        return min(self.options.max_step, 0.5 / math.sqrt(max([*springs, 1e-12])))
 
     def _next_stop(self, place: packing.Place, end: float) -> float:
         """The next time, up to ``end``, at which something in the world sets in or changes its slope."""
