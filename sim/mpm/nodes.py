@@ -143,11 +143,14 @@ def advance_nodes(
                     masses[g * BLOCK_NODES + i] = q[3]
                     if q[3] > 0.0:
                         inverse = 1.0 / q[3]
-                        u = vec3(q[0], q[1], q[2]) * inverse + push
+                        u = vec3(q[0], q[1], q[2]) * inverse
+                        slower = vec3(0.0)
                         if drag > 0.0:
-                            through = u - wind
-                            # Implicit in the speed, so that no drag can turn a body back.
-                            u -= through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
+                            # Exact for drag alone, so that none can turn a body back; with half of the other forces
+                            # before and half after, the terminal velocity is right to the second order too.
+                            through = u + 0.5 * push - wind
+                            slower = through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
+                        u += push - slower
                         nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
                 if wants_means:
                     add_sums(g, g_cells, triple(means, f * MEAN_ROW + MEAN_PLACE), nodes, masses, block_sums)

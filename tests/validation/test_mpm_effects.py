@@ -53,21 +53,24 @@ def center(worlds: Worlds, world: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("drag", [0.5, 8.0])
 def test_air_drag_leads_to_the_terminal_velocity(box, options, similarity, drag):
-    """v = V tanh(g t / V) with V = sqrt(g / k), within dt g at all times, and V itself within dt k V."""
+    """v = V tanh(r t), V = sqrt(g / k), r = sqrt(g k), at all times and in the end, within (r dt)² and 1e-4 of V: the
+    drag is exact for itself and stands between two halves of gravity, which is of second order (Strang)."""
     setup = WorldSetup(bodies=(box(cells=(3, 3, 3)),))
     worlds = under(setup, [effect("air_drag", drag_per_mass=drag)], similarity, options)
-    terminal = math.sqrt(G / drag)
+    terminal, rate = math.sqrt(G / drag), math.sqrt(G * drag)
+    allowed = terminal * ((rate * STEP) ** 2 + 1e-4)
     for _ in range(5):
         worlds.advance(0.1)
-        expected = [0.0, 0.0, -terminal * math.tanh(G * worlds.time() / terminal)]
-        assert np.abs(mean_velocity(worlds) - expected).max() < STEP * G
+        expected = [0.0, 0.0, -terminal * math.tanh(rate * worlds.time())]
+        assert np.abs(mean_velocity(worlds) - expected).max() < allowed
     if drag > 1:
         worlds.advance(0.3)
-        assert -mean_velocity(worlds)[2] == pytest.approx(terminal, rel=STEP * drag * terminal)
+        assert abs(mean_velocity(worlds)[2] + terminal) < allowed
 
 
 def test_wind_takes_a_body_along(box, options, similarity):
-    """Without gravity w - v = w / (1 + k |w| t), within dt k w², and the drift w t - ln(1 + k |w| t) / k along w."""
+    """Without gravity w - v = w / (1 + k |w| t), within 1e-4 of w as the drag is exact for itself, and the drift w t -
+    ln(1 + k |w| t) / k along w, within that and dt/2 of the change of velocity (symplectic Euler)."""
     wind, drag = np.array([3.0, -1.0, 2.0]), 2.0
     setup = WorldSetup(bodies=(box(cells=(3, 3, 3)),), gravity=NO_GRAVITY)
     blow = effect("wind", drag_per_mass=drag, wind_x=3.0, wind_y=-1.0, wind_z=2.0)
@@ -76,9 +79,9 @@ def test_wind_takes_a_body_along(box, options, similarity):
     for _ in range(4):
         worlds.advance(0.05)
         t, rate = worlds.time(), drag * strength
-        assert np.abs(mean_velocity(worlds) - wind * (1 - 1 / (1 + rate * t))).max() < STEP * rate * strength
+        assert np.abs(mean_velocity(worlds) - wind * (1 - 1 / (1 + rate * t))).max() < 1e-4 * strength
         drift = wind * (t - math.log(1 + rate * t) / rate)
-        assert np.abs(center(worlds) - start - drift).max() < STEP * rate * strength * t
+        assert np.abs(center(worlds) - start - drift).max() < strength * (STEP / 2 + 1e-4 * t)
 
 
 @pytest.mark.parametrize("lift, spin", [(1.0, 8.0), (-2.0, 5.0), (5.0, 40.0)])
