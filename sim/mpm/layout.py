@@ -54,7 +54,8 @@ ACCELERATION, ACCELERATION_RATE, GOAL_STIFFNESS, GOAL_DAMPING, MOTION, MOTION_RA
 # Adhesion to the plane: its acceleration and reach. PLANE_GAP: the body's least distance to the plane, which the
 # kernels find where there is adhesion; substep n reads number n % 2 of two.
 PLANE_ADHESION, PLANE_REACH, PLANE_GAP = 26, 27, 28
-FIELD_ROW = 30
+SUNK_LIMIT = 30
+FIELD_ROW = 31
 
 FAR = 1e9
 """Cells; a distance at which nothing acts."""

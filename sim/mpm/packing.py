@@ -23,6 +23,10 @@ from .transfer import GOAL, PIN
 
 Array = NDArray[np.float64]
 
+DEEPEST, DEEPEST_ELASTIC = 0.05, 0.25
+"""Depth in cells below which no particle sinks, should the contact solve not have held it; an elastic contact is a
+spring, which carries a load only as far as it is pressed in."""
+
 RECOVERY_HEIGHT = 0.02
 """Cells that a particle which starts in the ground could fly up when it is pushed out."""
 
@@ -195,6 +199,8 @@ def field_row(place: Place, body_index: int, start: float, end: float) -> NDArra
             row[layout.PLANE_ADHESION] = contact.adhesion * scale
             row[layout.PLANE_REACH] = contact.adhesion_reach * scale
     row[layout.PLANE_GAP : layout.PLANE_GAP + 2] = layout.FAR
+    elastic = place.setup.contact(body.name, GROUND_NAME).restitution > 0
+    row[layout.SUNK_LIMIT] = DEEPEST_ELASTIC if elastic else DEEPEST
     row[layout.GOAL_STIFFNESS] = body.goal_stiffness
     row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
     return row.astype(np.float32)

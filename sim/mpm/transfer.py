@@ -46,6 +46,7 @@ from .layout import (
     STEP,
     STORE,
     SUBSTEPS,
+    SUNK_LIMIT,
     WINDOW_NODES,
     WORLD,
     WORLD_ROW,
@@ -64,9 +65,6 @@ from .layout import (
 
 PIN, GOAL = 1.0, 2.0
 """Kinds of anchors."""
-
-SUNK_LIMIT = 0.05
-"""Depth in cells below which no particle sinks, should the contact solve not have held it."""
 
 
 @ti.func
@@ -310,7 +308,7 @@ def advance_particles(
                     if touching:
                         if on_plane:
                             phi = level + normal.dot(gp) - fixed[3]
-                            floor = ti.min(phi, -SUNK_LIMIT)
+                            floor = ti.min(phi, -fields[f * FIELD_ROW + SUNK_LIMIT])
                             moved = phi + normal.dot(step)
                             if moved < floor:
                                 step += (floor - moved) * normal
