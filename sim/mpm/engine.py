@@ -465,7 +465,8 @@ class Engine:
     def advance(self, durations: Array, *, longest_step: Array) -> None:
         """Advance every world by its duration (W,) in s, 0 to let it be, in substeps of at most ``longest_step`` (W,).
 
-        Raises Diverged when a world goes wrong and shorter steps do not help; the others may then be anywhere.
+        Raises Diverged when a world goes wrong and shorter steps do not help. All worlds are then as they were when
+        they were last sorted, ELAPSED s after the call.
         """
         control = self.control()
         control[:, layout.LONGEST_STEP] = longest_step
@@ -497,10 +498,6 @@ class Engine:
                 if not lost.any():
                     break
                 attempts[lost] += 1
-                if attempts.max() > MOST_RETRIES:
-                    world = int(np.argmax(attempts))
-                    raise Diverged(world, int(after[world, layout.LOST_FIELD]))
-                self.retries += 1
                 # The other half of the particle arrays still holds the state from before the sort.
                 self._particles.reverse()
                 if means is not None:
@@ -508,6 +505,11 @@ class Engine:
                 if before is not None:
                     self.solids.put_back(before)
                 self._group()
+                if attempts.max() > MOST_RETRIES:
+                    self._put_control(control)
+                    world = int(np.argmax(attempts))
+                    raise Diverged(world, int(after[world, layout.LOST_FIELD]))
+                self.retries += 1
                 control[lost, layout.CFL_SCALE] *= 0.5
                 self._put_control(control)
             sorted_now = control[:, layout.STATUS] == layout.WANTS_SORT

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, SimulationError
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
-from . import packing, runtime
+from . import layout, packing, runtime
 from .checks import check_start
 from .engine import Diverged, Engine
 from .fitting import FittedGradients
@@ -153,6 +153,7 @@ class Worlds:
             try:
                 self._engine.advance(stops - self._times, longest_step=np.array(longest))
             except Diverged as failure:
+                self._times = self._times + self._engine.control()[:, layout.ELAPSED]
                 raise self._lost(failure) from None
             before = self._times.copy()
             self._times = stops

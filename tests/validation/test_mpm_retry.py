@@ -83,7 +83,6 @@ def test_what_no_substep_can_save_is_an_error_that_names_the_body(torn):
     assert bad.time == pytest.approx(good.time)
 
 
-@pytest.mark.xfail(strict=True, reason="the wrecked state stays in the engine: 4.9 cells off, with finite numbers")
 def test_a_world_that_is_lost_shows_its_last_good_state(torn, cell):
     """Nothing may have moved by more than a cell, which the fall takes 0.06 s for: the time says that all is well."""
     good, bad, _ = torn
