@@ -259,9 +259,6 @@ def solve_contact(
                         if pinned:
                             place, rate = anchor_place(f, time, anchors[p], fields)
                             back = RECOVERY * (place - rate * dt - here) / dt
-                            size = back.norm()
-                            if size > recovery:
-                                back *= recovery / size
                             new = old + (rate + back - velocity) / share
                         else:
                             surface = swelling * normal
