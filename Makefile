@@ -30,6 +30,7 @@ lint: setup
 
 benchmark: setup
 	$(BIN)/python benchmarks/mpm.py
+	$(BIN)/python benchmarks/worlds.py
 	$(BIN)/python benchmarks/demo.py
 
 clean:

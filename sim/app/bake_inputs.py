@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..scene.folder import SceneFolder
 from ..scene.json_fields import to_json
 
-ENGINE_REVISION = 2
+ENGINE_REVISION = 3
 """Raised with every change of the engine or the skinning that changes what a scene does."""
 
 

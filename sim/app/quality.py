@@ -38,8 +38,8 @@ class Quality:
             raise InputError(f"smallest_cells is {self.smallest_cells}: give 2 to 256")
         if not 1 <= self.particles_per_cell <= 64:
             raise InputError(f"particles_per_cell is {self.particles_per_cell}: give 1 to 64; 8 is usual")
-        if self.grid is not None and not 32 <= self.grid <= 4096:
-            raise InputError(f"grid is {self.grid}: give 32 to 4096, or leave it out")
+        if self.grid is not None and not (32 <= self.grid <= 1024 and self.grid % 4 == 0):
+            raise InputError(f"grid is {self.grid}: give a multiple of 4 from 32 to 1024, or leave it out")
 
 
 def quality_names() -> list[str]:

@@ -61,8 +61,8 @@ class PreparedWorld:
 
     @property
     def particle_count(self) -> int:
-        """Particles of all bodies."""
-        return sum(body.count for body in self.setup.bodies)
+        """Particles of all bodies that deform."""
+        return _soft_count(self.setup)
 
     def require_affordable(self) -> None:
         """Raise InputError when the bake would take too long or more memory than there is."""
@@ -112,7 +112,7 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     setup = apply_effects(setup, scene.effects)
     step = stable_step(setup.bodies, cell, solver)
     duration = (options.frames - 1) / options.fps
-    count = sum(body.count for body in setup.bodies)
+    count = _soft_count(setup)
     body_index = {scene_index: index for index, scene_index in enumerate(moving)}
     collider_index = {scene_index: index for index, scene_index in enumerate(still)}
     return PreparedWorld(
@@ -127,6 +127,11 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
         duration=duration,
         arch=options.arch,
     )
+
+
+def _soft_count(setup: WorldSetup) -> int:
+    """Particles that the engine moves; those of rigid bodies only tell their mass and carry their mesh."""
+    return sum(body.count for body in setup.bodies if not body.rigid)
 
 
 def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int) -> BodyParticles:

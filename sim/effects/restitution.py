@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Bounce of a rigid body.
+"""How much of an impact comes back.
 
 Equation: v_n' = -e v_n, v_n the speed of approach at the contact.
 Source: Newton, Principia (1687), scholium to the laws of motion.
-Bodies: rigid ones; every contact of theirs. Matter that deforms bounces by its own elasticity.
+Bodies: all. Of matter that deforms, which bounces by its own elasticity, e is the share of its outermost layer's
+    energy that comes back.
 Twice: the value is set; the last one counts.
 """
 

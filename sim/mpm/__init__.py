@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """MLS-MPM engine; ``world.World`` is the way in.
 
-``sampling``, ``bodies``, ``options``, ``placement`` and ``diagnostics`` import no Taichi.
+What describes a world imports no Taichi: ``setup`` and all that it is made of, ``sampling``, ``placement``,
+``distance``, ``estimate``, ``checks``, ``diagnostics``, ``fitting``.
 """
 
 import os

@@ -16,8 +16,8 @@ is known far below a cell:
 Where the pair's restitution e is above 0, the share e of a_n comes from a spring on the depth instead, which gives back
 the energy of the layer that the inelastic condition stops.
 
-Of the surfaces around a particle the nearest is treated so; the next one only pushes. A pin is a surface that holds
-the particle from all sides.
+Of the surfaces around a particle the nearest is treated so; the next one only pushes, anew in each substep. A pin is
+a surface that holds the particle from all sides.
 
 One projected Jacobi sweep a substep, started from the impulses of the last substep, which the particles have already
 added to the grid. The sweep divides by the row sums of the contact matrix W M^-1 W^T (the share of contacting mass at
@@ -65,8 +65,7 @@ from .layout import (
     vec3,
     vec4,
 )
-from .obstacles import PUSH, single3, solid_distance, solid_give, solid_velocity
-from .solid_layout import SOLID, X
+from .obstacles import PUSH, add_push, solid_distance, solid_give, solid_velocity
 from .transfer import PIN, add_windows_where, anchor_place, load_window, weights
 
 RECOVERY = 0.2
@@ -255,6 +254,7 @@ def solve_contact(
                             share = ti.max(past[3], 0.02)
                         velocity = vec3(u[0], u[1], u[2])
                         new = vec3(0.0)
+                        beside = vec3(0.0)
                         here = first_node + gp
                         if pinned:
                             place, rate = anchor_place(f, time, anchors[p], fields)
@@ -286,23 +286,22 @@ def solve_contact(
                                 wanted = -second / dt
                                 if second < 0.0:
                                     wanted = ti.min(RECOVERY * wanted, recovery)
-                                new += (ti.max(0.0, wanted - left) / (share + give)) * second_normal
+                                beside = (ti.max(0.0, wanted - left) / (share + give)) * second_normal
                         reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
-                        if new.norm_sqr() > 0.0 or old.norm_sqr() > 0.0:
-                            change = fixed[0] * (new - old)
-                            mass = ti.select(new.norm_sqr() > 0.0, fixed[0], 0.0)
+                        if (new + beside).norm_sqr() > 0.0 or old.norm_sqr() > 0.0:
+                            change = fixed[0] * (new + beside - old)
+                            mass = ti.select((new + beside).norm_sqr() > 0.0, fixed[0], 0.0)
                             q = vec4(change[0], change[1], change[2], mass)
                             for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
                                 n = first + (i * 64 + j * 8 + m)
                                 scattered[n] = scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
                             if obstacle > 0 and not pinned:
                                 row = (s * most_solids + obstacle - 1) * PUSH
-                                given = -fixed[0] * new
-                                turn = (here - single3(solids, (first_solid + obstacle - 1) * SOLID + X)).cross(given)
-                                for n in ti.static(range(3)):
-                                    pushes[row + n] += given[n]
-                                    pushes[row + 3 + n] += turn[n]
-                                pushes[row + 6] += mass
+                                add_push(first_solid + obstacle - 1, row, here, -fixed[0] * new, mass, solids, pushes)
+                            if second_obstacle > 0 and beside.norm_sqr() > 0.0:
+                                row = (s * most_solids + second_obstacle - 1) * PUSH
+                                given = -fixed[0] * beside
+                                add_push(first_solid + second_obstacle - 1, row, here, given, mass, solids, pushes)
                 slack[k] = least - reach
 
 

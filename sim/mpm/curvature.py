@@ -3,8 +3,8 @@
 
 A ball that touches the ground with the points of a mesh only is a polyhedron: it loses speed at every edge it rolls
 over. A quadric is fitted around each point; where it fits, the point stands for a patch of that quadric, and the place
-of the patch that faces the partner is what touches (``rigid.patch``). Where it does not fit, at edges and corners, the
-point stands for itself.
+of the patch that faces the partner is what touches (``rigid_contact.patch``). Where it does not fit, at edges and
+corners, the point stands for itself.
 """
 
 from __future__ import annotations

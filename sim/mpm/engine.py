@@ -121,7 +121,6 @@ class Engine:
         self._names += ("anchors",) if anchored else ()
         self._several = several
         self.count = 0
-        self.sorts = 0
         self.retries = 0
         self._table = _upload_new(numbers.table)
         self._world_integers = _upload_new(numbers.world_integers)
@@ -325,7 +324,6 @@ class Engine:
             self._keys,
         )
         self._group()
-        self.sorts += 1
 
     def _group(self) -> None:
         """Lists, neighbours and permutation for the blocks named in ``_keys``."""

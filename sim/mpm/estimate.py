@@ -100,7 +100,8 @@ def stable_step(bodies: Sequence[BodyParticles], cell: float, options: SolverOpt
                 wave = max(wave, _wave_cells(material, body, cell))
         keys = 0.0 if body.velocity_keys is None else float(np.linalg.norm(body.velocity_keys.values, axis=1).max())
         speed = max(speed, keys, float(np.linalg.norm(body.initial_velocities, axis=1).max()))
-    step = options.max_step
+    goals = max((body.goal_stiffness for body in bodies), default=0.0)
+    step = min(options.max_step, 0.5 / math.sqrt(max(goals, 1e-12)))
     if wave > 0:
         step = min(step, options.cfl_elastic / wave)
     if speed > 0:
@@ -112,7 +113,7 @@ def _wave_cells(material: ElasticMaterial, body: BodyParticles, cell: float) -> 
     """Speed in cells/s of the wave that bounds the substep of ``material`` in ``body``."""
     softer = 1.0 if body.density_scale is None else 1.0 / float(body.density_scale.min())
     stiffer = 1.0 if body.stiffness_scale is None else float(body.stiffness_scale.max())
-    squared = material.wave_speed**2 + material.fibre_modulus / material.density
+    squared = material.wave_speed**2
     diffusivity = material.diffusivity * stiffer * softer / cell**2
     return bounding_speed(math.sqrt(squared * stiffer * softer) / cell, diffusivity)
 

@@ -65,13 +65,13 @@ WORLD, FIRST_TOUCH, WANTS_MEANS, HAS_ANCHORS = range(4)
 FIELD_INTEGERS = 4
 
 # Means of a field: mass (kg), centre of mass where the next substep finds it (cells), velocity (cells/s), angular
-# velocity (1/s), acceleration by contact (cells/s²), its mass in contact (kg).
-MEAN_MASS, MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN, MEAN_REACTION, MEAN_TOUCHING = 0, 1, 4, 7, 10, 13
-MEAN_ROW = 16
+# velocity (1/s).
+MEAN_MASS, MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN = 0, 1, 4, 7
+MEAN_ROW = 10
 
 # How a field meets an obstacle (its world's plane is obstacle 0, solid i is obstacle i + 1), or another field.
-STICKING, SLIDING, MODE, ADHESION, REACH, RESTITUTION = range(6)
-TOUCH_ROW = 6
+STICKING, SLIDING, MODE, RESTITUTION = range(4)
+TOUCH_ROW = 4
 SEPARATE, SLIP, STICKY = range(3)
 """Numbers of ``contacts.MODES``."""
 

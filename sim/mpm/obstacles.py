@@ -92,8 +92,18 @@ def solid_give(i: ti.i32, place: vec3, solid_kinds: Integers, solid_numbers: Dou
         arm = place - single3(solids, i * SOLID + X)
         trace = solids[i * SOLID + J] + solids[i * SOLID + J + 4] + solids[i * SOLID + J + 8]
         give = ti.cast(solid_numbers[i * NUMBERS + INVERSE_MASS], ti.f32)
-        give += 0.5 * arm.norm_sqr() * ti.cast(trace, ti.f32)
+        give += arm.norm_sqr() * ti.cast(trace, ti.f32)
     return give
+
+
+@ti.func
+def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, mass: ti.f32, solids: Doubles, pushes: Scalars):
+    """Note in ``pushes[row]`` that solid ``i`` was given the impulse ``given`` at ``place`` by ``mass`` in contact."""
+    turn = (place - single3(solids, i * SOLID + X)).cross(given)
+    for n in ti.static(range(3)):
+        pushes[row + n] += given[n]
+        pushes[row + 3 + n] += turn[n]
+    pushes[row + 6] += mass
 
 
 @ti.func

@@ -19,6 +19,7 @@ from .contacts import GROUND_NAME, MODES, SurfaceContact
 from .engine import ONLY_ELASTIC, Added, Numbers
 from .materials import ROW, ElasticMaterial, RigidMaterial, bounding_speed
 from .setup import WorldSetup
+from .solids import LEAST_RECOVERY, RECOVERY_HEIGHT
 from .transfer import GOAL, PIN
 
 Array = NDArray[np.float64]
@@ -26,9 +27,6 @@ Array = NDArray[np.float64]
 DEEPEST, DEEPEST_ELASTIC = 0.05, 0.25
 """Depth in cells below which no particle sinks, should the contact solve not have held it; an elastic contact is a
 spring, which carries a load only as far as it is pressed in."""
-
-RECOVERY_HEIGHT = 0.02
-"""Cells that a particle which starts in the ground could fly up when it is pushed out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,10 +72,16 @@ def first_material(place: Place, body: int) -> int:
     return place.first_material + sum(1 + len(place.setup.bodies[i].materials) for i in before)
 
 
+def laws_of(setup: WorldSetup) -> int:
+    """The set of laws that the matter of a world follows; that of the simplest kernel where it holds only solids."""
+    soft = [body for body in setup.bodies if not body.rigid]
+    return functools.reduce(operator.or_, (m.laws for body in soft for m in materials_of(body)), 0) or ONLY_ELASTIC
+
+
 def pack(all_places: Sequence[Place]) -> Numbers:
     """All that stays the same for the whole run; rows of worlds and fields are those at time 0."""
     bodies = [place.setup.bodies[i] for place in all_places for i in place.soft]
-    laws = functools.reduce(operator.or_, (m.laws for body in bodies for m in materials_of(body)), 0) or ONLY_ELASTIC
+    laws = functools.reduce(operator.or_, (laws_of(place.setup) for place in all_places))
     table = [m.row for body in bodies for m in materials_of(body)] or [(0.0,) * ROW]
     touches: list[tuple[float, ...]] = []
     pairs: list[tuple[float, ...]] = []
@@ -126,8 +130,6 @@ def touch_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]:
         contact.sticking,
         contact.friction,
         float(MODES.index(contact.mode)),
-        cells.length(contact.adhesion),
-        cells.length(contact.adhesion_reach),
         contact.restitution,
     )
 
@@ -149,7 +151,8 @@ def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
         row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = normal
         row[layout.PLANE_OFFSET] = normal @ place.cells.points_to_engine(np.asarray(ground.point))
         row[layout.HAS_PLANE] = 1.0
-    row[layout.RECOVERY_SPEED] = math.sqrt(2.0 * RECOVERY_HEIGHT * scale * strongest_pull(place.setup))
+    fall = math.sqrt(2.0 * RECOVERY_HEIGHT * scale * strongest_pull(place.setup))
+    row[layout.RECOVERY_SPEED] = max(fall, LEAST_RECOVERY)
     return row.astype(np.float32)
 
 

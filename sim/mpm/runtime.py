@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import sys
 
 import taichi as ti
 
@@ -16,7 +15,8 @@ from .options import SolverOptions
 logger = logging.getLogger(__name__)
 
 _GENERATION = 0
-_ACTIVE: tuple[str, int, str] | None = None
+_ASKED: tuple[str, int, str] | None = None
+_ARCH = "cpu"
 
 
 def ensure_started(options: SolverOptions) -> tuple[str, int]:
@@ -26,11 +26,12 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
     change of architecture, thread count or cache folder restarts Taichi, which loses the arrays of earlier worlds; a
     world compares its generation before each use.
     """
-    global _ACTIVE, _GENERATION
+    global _ASKED, _ARCH, _GENERATION
     folder = "" if options.cache_folder is None else str(options.cache_folder)
     wanted = (_available(options.arch), options.threads, folder)
-    if wanted == _ACTIVE and ti.lang.impl.get_runtime().prog is not None:
-        return wanted[0], _GENERATION
+    asked = wanted
+    if asked == _ASKED and ti.lang.impl.get_runtime().prog is not None:
+        return _ARCH, _GENERATION
     arguments: dict[str, object] = {
         "arch": getattr(ti, wanted[0]),
         "default_fp": ti.f32,
@@ -53,7 +54,7 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
         logger.warning("Taichi could not start on %s (%s); computing on the CPU", wanted[0], error)
         _start({**arguments, "arch": ti.cpu})
         wanted = ("cpu", options.threads, folder)
-    _ACTIVE = wanted
+    _ASKED, _ARCH = asked, wanted[0]
     _GENERATION += 1
     return wanted[0], _GENERATION
 
@@ -74,12 +75,12 @@ def _available(arch: str) -> str:
     """``arch``, or "cpu" with a logged reason where this build or machine has none."""
     if arch == "cpu":
         return arch
-    probes = {
-        "cuda": ti.lang.misc.is_arch_supported,
-        "vulkan": ti.lang.misc.is_arch_supported,
-        "metal": ti.lang.misc.is_arch_supported,
-    }
-    if (arch == "metal" and sys.platform != "darwin") or not probes[arch](getattr(ti, arch)):
+    if arch == "metal":
+        logger.warning(
+            "solver option arch 'metal': has no double precision, which the clock needs; computing on the CPU"
+        )
+        return "cpu"
+    if not ti.lang.misc.is_arch_supported(getattr(ti, arch)):
         logger.warning("solver option arch %r: not available here; computing on the CPU", arch)
         return "cpu"
     return arch

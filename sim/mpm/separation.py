@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN201, SIM102, SIM109
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Contact between bodies that deform: each has its own nodes, and nodes in the same place exchange impulses.
@@ -57,7 +57,7 @@ from .layout import (
     vec3,
     vec4,
 )
-from .materials import FLUID, ROW
+from .materials import FLUID, ROW, SAND, SNOW
 from .transfer import add_windows_where, weights
 
 LEAST_SHARE = 0.0026
@@ -106,13 +106,15 @@ def scatter_shares(
                     scattered[k * WINDOW_NODES + i] = vec4(0.0)
                 for p in range(starts[k], starts[k + 1]):
                     volume = volumes[p]
-                    if ti.static(laws & (1 << FLUID)):
-                        if ti.cast(table[material[p] * ROW], ti.i32) == FLUID:
-                            volume *= ti.exp(memory[p])
-                        else:
-                            volume *= ti.max(F[p].determinant(), 0.0)
-                    else:
+                    law = 0
+                    if ti.static(laws & ((1 << FLUID) | (1 << SNOW) | (1 << SAND))):
+                        law = ti.cast(table[material[p] * ROW], ti.i32)
+                    if law != FLUID:
                         volume *= ti.max(F[p].determinant(), 0.0)
+                    if ti.static(laws & ((1 << FLUID) | (1 << SNOW) | (1 << SAND))):
+                        # What these laws remember is the ln of the volume that F does not tell.
+                        if law == FLUID or law == SNOW or law == SAND:
+                            volume *= ti.exp(memory[p])
                     gp = ti.cast(x[p], ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)

@@ -29,7 +29,6 @@ V_BEFORE = 52  # V when the substep began (3)
 W_BEFORE = 55  # (3)
 TOUCHED = 58  # 1 when something pushed the solid in this substep, 2 when it bounced
 BLEND = 59  # share of the second lattice in a collider that deforms
-STATE_END = 60
 
 # ---- per solid, constant between segments: ``solid_numbers`` f64 ---------------------------------------------------
 NUMBERS = 48

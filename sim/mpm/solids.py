@@ -127,7 +127,6 @@ class Solids:
         self._baked: dict[tuple[int, float], DistanceLattice] = {}
         self._segments: dict[int, tuple[float, float]] = {}
         self._keys_done = np.full(len(setups), -np.inf)
-        self._host: dict[str, NDArray[np.generic]] = {}
         self.arrays: dict[str, ti.Ndarray] = {}
         spans = []
         for w, setup in enumerate(self.setups):
@@ -437,7 +436,6 @@ class Solids:
         for _ in range(substeps):
             search_worlds(len(self.setups), self.arrays["steps"], *self.search_arguments)
             move_worlds(len(self.setups), self.arrays["steps"], *self.move_arguments)
-        self._host.clear()
 
     # ---- state --------------------------------------------------------------------------------------------------
 

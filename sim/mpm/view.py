@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What can be seen of one world among ``Worlds``: places, velocities, deformation, energies. World SI units."""
+"""What can be seen of one world: places, velocities, deformation, energies. World SI units."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from .setup import WorldSetup
 from .solids import SolidPose
 
 if TYPE_CHECKING:
-    from .worlds import Worlds
+    from .group import Group
 
 Array = NDArray[np.float64]
 
 
 class WorldView:
-    """World ``index`` of ``worlds``, to look at."""
+    """World ``index`` of ``group``, to look at."""
 
-    def __init__(self, worlds: Worlds, index: int) -> None:
-        self._worlds = worlds
-        self._index = index
+    def __init__(self, group: Group, index: int) -> None:
+        self.group = group
+        self.index = index
 
     @property
     def setup(self) -> WorldSetup:
         """What the world holds."""
-        return self._worlds.setups[self._index]
+        return self.group.setups[self.index]
 
     @property
     def bodies(self) -> tuple[BodyParticles, ...]:
@@ -41,59 +41,59 @@ class WorldView:
     @property
     def time(self) -> float:
         """Simulated time in s."""
-        return self._worlds.time(self._index)
+        return self.group.time(self.index)
 
     @property
     def substeps(self) -> int:
         """Substeps taken since the world was made."""
-        return int(self._worlds.control(self._index)[layout.SUBSTEPS])
+        return int(self.group.control(self.index)[layout.SUBSTEPS])
 
     @property
     def stable_step(self) -> float:
         """Longest substep in s that the present state allows."""
-        return self._worlds.stable_step(self._index)
+        return self.group.stable_step(self.index)
 
     # ---- state --------------------------------------------------------------------------------------------------
 
     def _number(self, index: int) -> int:
-        return self._worlds.body_number(self._index, index)
+        return self.group.body_number(self.index, index)
 
     def _gather(self, name: str, index: int, resting: Array) -> Array:
-        return self._worlds.gather(name, self._number(index), resting)
+        return self.group.gather(name, self._number(index), resting)
 
     def _scale(self) -> float:
-        return self._worlds.cells.scale
+        return self.group.cells.scale
 
     def positions(self, index: int) -> Array:
         """Particle positions (N, 3) of body ``index``, world metres, in the order in which they were given."""
         number, body = self._number(index), self.bodies[index]
-        if not self._worlds.started(number):
+        if not self.group.started(number):
             return body.positions.copy()
         if body.rigid:
             pose = self.pose(body.name)
             return body.positions @ pose.rotation.T + pose.translation
-        return self._worlds.cells.points_to_world(self._gather("position", index, np.zeros((body.count, 3))))
+        return self.group.cells.points_to_world(self._gather("position", index, np.zeros((body.count, 3))))
 
     def pose(self, name: str) -> SolidPose:
         """Where the rigid body or collider ``name`` is and how it moves."""
-        return self._worlds.pose(self._index, name)
+        return self.group.pose(self.index, name)
 
     def velocities(self, index: int) -> Array:
         """Particle velocities (N, 3) of body ``index``, m/s. Zero before the body starts."""
         number, body = self._number(index), self.bodies[index]
-        if body.rigid and self._worlds.started(number):
+        if body.rigid and self.group.started(number):
             pose = self.pose(body.name)
             return pose.velocity + np.cross(pose.spin, self.positions(index) - pose.center)
-        return self._worlds.gather("v", number, np.zeros((body.count, 3))) / self._scale()
+        return self.group.gather("v", number, np.zeros((body.count, 3))) / self._scale()
 
     def velocity_gradients(self, index: int) -> Array:
         """APIC velocity gradients (N, 3, 3) of body ``index``, 1/s."""
         number, body = self._number(index), self.bodies[index]
-        if body.rigid and self._worlds.started(number):
+        if body.rigid and self.group.started(number):
             x, y, z = self.pose(body.name).spin
             turning = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             return np.asarray(np.broadcast_to(turning, (body.count, 3, 3)).copy())
-        return self._worlds.gather("C", number, np.zeros((body.count, 3, 3)))
+        return self.group.gather("C", number, np.zeros((body.count, 3, 3)))
 
     def deformation_gradients(self, index: int) -> Array:
         """Deformation gradients (N, 3, 3) of body ``index``: current from undeformed shape.
@@ -103,30 +103,30 @@ class WorldView:
         """
         number, body = self._number(index), self.bodies[index]
         if body.rigid:
-            turn = self.pose(body.name).rotation if self._worlds.started(number) else np.eye(3)
+            turn = self.pose(body.name).rotation if self.group.started(number) else np.eye(3)
             return np.asarray(np.broadcast_to(turn, (body.count, 3, 3)).copy())
         if not any(material.flows for material in materials_of(body)):
             return self.elastic_gradients(index)
-        return self._worlds.fitted(number, body.positions).gradients(self.positions(index))
+        return self.group.fitted(number, body.positions).gradients(self.positions(index))
 
     def elastic_gradients(self, index: int) -> Array:
         """Elastic parts (N, 3, 3) of the deformation gradients of body ``index``, which carry its stress."""
         number = self._number(index)
         if self.bodies[index].rigid:
             return self.deformation_gradients(index)
-        return self._worlds.gather("F", number, np.broadcast_to(np.eye(3), (self.bodies[index].count, 3, 3)).copy())
+        return self.group.gather("F", number, np.broadcast_to(np.eye(3), (self.bodies[index].count, 3, 3)).copy())
 
     def memories(self, index: int) -> Array:
         """What the law remembers of each particle (N,): ln J_P of snow, ln of lost contact in sand, ln J of fluids."""
         number, body = self._number(index), self.bodies[index]
         if body.rigid or not any(material.flows for material in materials_of(body)):
             return np.zeros(body.count)
-        return self._worlds.gather("memory", number, np.zeros(body.count))
+        return self.group.gather("memory", number, np.zeros(body.count))
 
     # ---- diagnostics --------------------------------------------------------------------------------------------
 
     def _moving(self) -> list[int]:
-        return [i for i in range(len(self.bodies)) if self._worlds.started(self._number(i))]
+        return [i for i in range(len(self.bodies)) if self.group.started(self._number(i))]
 
     def linear_momentum(self) -> Array:
         """Momentum (3,) of all bodies, kg m/s."""
@@ -178,7 +178,7 @@ class WorldView:
 
     def _elastic_energy(self, index: int) -> float:
         body = self.bodies[index]
-        choice = self._worlds.material_choice(self._index, index)
+        choice = self.group.material_choice(self.index, index)
         volumes = body.volumes if body.stiffness_scale is None else body.volumes * body.stiffness_scale
         gradients, memories = self.elastic_gradients(index), self.memories(index)
         return sum(
@@ -206,6 +206,6 @@ class WorldView:
 
     def particles_outside(self, index: int) -> int:
         """Particles of body ``index`` that have left the box of the profile; they fly on, outside as inside."""
-        cells = self._worlds.cells.points_to_engine(self.positions(index))
-        outside = (cells < 0.0) | (cells > self._worlds.options.grid)
+        cells = self.group.cells.points_to_engine(self.positions(index))
+        outside = (cells < 0.0) | (cells > self.group.options.grid)
         return int(outside.any(axis=1).sum())

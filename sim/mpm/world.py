@@ -56,7 +56,9 @@ class World(WorldView):
             colliders=tuple(colliders),
             contacts=contacts or ContactTable(),
         )
-        super().__init__(Worlds([setup], similarity=similarity, options=options), 0)
+        self._worlds = Worlds([setup], similarity=similarity, options=options)
+        first = self._worlds[0]
+        super().__init__(first.group, first.index)
 
     @property
     def similarity(self) -> Similarity:
@@ -70,7 +72,7 @@ class World(WorldView):
 
     @property
     def arch(self) -> str:
-        """Where the engine computes: "cpu", "cuda", "vulkan" or "metal"."""
+        """Where the engine computes: "cpu", "cuda" or "vulkan"."""
         return self._worlds.arch
 
     @property

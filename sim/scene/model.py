@@ -115,7 +115,8 @@ class Ground:
 
     friction: Coulomb's kinetic coefficient, 0 (ice) and up; 0.4 is wood on wood.
     static_friction: Coulomb's static coefficient, not below ``friction``; None takes ``friction``.
-    restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1.
+    restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1; of matter that deforms, the share of its
+        outermost layer's energy that comes back.
     """
 
     point: Vector = (0.0, 0.0, 0.0)

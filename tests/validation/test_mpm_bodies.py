@@ -124,6 +124,10 @@ def _variants(box, cell) -> list[WorldSetup]:
                 name="b",
             ),
         )
+        if i == 2:
+            # Another set of laws, hence other kernels.
+            viscous = dataclasses.replace(bodies[0].material, damping_time=1e-4)
+            bodies = (dataclasses.replace(bodies[0], material=viscous), bodies[1])
         setups.append(WorldSetup(bodies=bodies, ground=Ground(friction=0.2 * i), gravity=(0.0, 0.5 * i, -9.81)))
     return setups
 
