@@ -81,6 +81,11 @@ class Worlds:
         return WorldView(group, place)
 
     @property
+    def cells(self) -> Similarity:
+        """The map from world metres to cells."""
+        return self._groups[0].cells
+
+    @property
     def arch(self) -> str:
         """Where the engine computes: "cpu", "cuda" or "vulkan"."""
         return self._groups[0].arch
@@ -94,6 +99,10 @@ class Worlds:
     def retries(self) -> int:
         """Stretches of substeps that were taken again with shorter steps because they had gone wrong."""
         return sum(group.retries for group in self._groups)
+
+    def time(self, world: int = 0) -> float:
+        """Simulated time in s of world ``world``."""
+        return self[world].time
 
     def advance(self, duration: float) -> None:
         """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
