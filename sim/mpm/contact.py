@@ -81,6 +81,10 @@ of a layer one cell thick where waves travel 0.39 cells a substep, hence as stab
 MOST_SLACK = 0.5
 """Cells that are taken on trust at most before a block's particles are looked at again."""
 
+AHEAD = 3.0
+"""Reaches from a solid within which a particle's mass counts as touching it: known one substep before it does, lest the
+first impact on a light solid be solved as if nothing else touched it."""
+
 REACH_FACTOR = 1.5
 """Steps of the fastest particle within which a particle takes part in the contact."""
 
@@ -165,7 +169,7 @@ def solve_contact(
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
 
     touched: per particle block 1 where something was scattered. pushes: what each block does to each solid of its
-    world, see ``obstacles``; touching: mass (kg) in contact with each solid in the last substep. slack: cells that
+    world, see ``obstacles``; touching: mass (kg) at each solid in the last substep. slack: cells that
     must be covered before any particle of the block can touch.
     """
     for ss in range(near_blocks * SPREAD):
@@ -217,7 +221,7 @@ def solve_contact(
                         found, along, rate = solid_distance(
                             first_solid + o,
                             first_node + gp,
-                            MOST_SLACK + reach + fixed[3],
+                            MOST_SLACK + AHEAD * reach + fixed[3],
                             solid_kinds,
                             solid_numbers,
                             solids,
@@ -226,6 +230,8 @@ def solve_contact(
                             distances,
                         )
                         found -= fixed[3]
+                        if found < AHEAD * reach:
+                            pushes[(s * most_solids + o) * PUSH + 6] += fixed[0]
                         if found < phi:
                             second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
                             phi, normal, swelling, obstacle = found, along, rate, o + 1
@@ -266,7 +272,7 @@ def solve_contact(
                             if obstacle > 0:
                                 i = first_solid + obstacle - 1
                                 surface += solid_velocity(i, here, solids)
-                                give = touching[i] * solid_give(i, here, solid_kinds, solid_numbers, solids)
+                                give = touching[i] * solid_give(i, here, normal, solid_kinds, solid_numbers, solids)
                             new = press(
                                 old,
                                 velocity - surface,
@@ -297,12 +303,12 @@ def solve_contact(
                                 scattered[n] = scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
                             if obstacle > 0 and not pinned:
                                 row = (s * most_solids + obstacle - 1) * PUSH
-                                add_push(first_solid + obstacle - 1, row, here, -fixed[0] * new, mass, solids, pushes)
+                                add_push(first_solid + obstacle - 1, row, here, -fixed[0] * new, solids, pushes)
                             if second_obstacle > 0 and beside.norm_sqr() > 0.0:
                                 row = (s * most_solids + second_obstacle - 1) * PUSH
                                 given = -fixed[0] * beside
-                                add_push(first_solid + second_obstacle - 1, row, here, given, mass, solids, pushes)
-                slack[k] = least - reach
+                                add_push(first_solid + second_obstacle - 1, row, here, given, solids, pushes)
+                slack[k] = least - AHEAD * reach
 
 
 @ti.func

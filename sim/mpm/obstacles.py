@@ -29,7 +29,7 @@ from .solid_layout import (
 )
 
 PUSH = 8
-"""Numbers that a block of particles adds to a solid: impulse (3), about its centre (3), contacting mass, spare."""
+"""Numbers that a block of particles adds to a solid: impulse (3), about its centre (3), mass at the solid, spare."""
 
 
 @ti.func
@@ -85,25 +85,25 @@ def solid_velocity(i: ti.i32, place: vec3, solids: Doubles):
 
 
 @ti.func
-def solid_give(i: ti.i32, place: vec3, solid_kinds: Integers, solid_numbers: Doubles, solids: Doubles):
-    """Bound on the velocity that solid ``i`` gains at ``place`` by an impulse of 1 on its surface, 1/kg."""
+def solid_give(i: ti.i32, place: vec3, normal: vec3, solid_kinds: Integers, solid_numbers: Doubles, solids: Doubles):
+    """Velocity along ``normal`` that solid ``i`` gains at ``place`` by an impulse of 1 there, 1/kg."""
     give = 0.0
     if solid_kinds[i * KINDS + KIND] == DYNAMIC:
-        arm = place - single3(solids, i * SOLID + X)
-        trace = solids[i * SOLID + J] + solids[i * SOLID + J + 4] + solids[i * SOLID + J + 8]
-        give = ti.cast(solid_numbers[i * NUMBERS + INVERSE_MASS], ti.f32)
-        give += arm.norm_sqr() * ti.cast(trace, ti.f32)
+        lever = (place - single3(solids, i * SOLID + X)).cross(normal)
+        turned = vec3(0.0)
+        for n in ti.static(range(3)):
+            turned[n] = single3(solids, i * SOLID + J + 3 * n).dot(lever)
+        give = ti.cast(solid_numbers[i * NUMBERS + INVERSE_MASS], ti.f32) + lever.dot(turned)
     return give
 
 
 @ti.func
-def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, mass: ti.f32, solids: Doubles, pushes: Scalars):
-    """Note in ``pushes[row]`` that solid ``i`` was given the impulse ``given`` at ``place`` by ``mass`` in contact."""
+def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, solids: Doubles, pushes: Scalars):
+    """Note in ``pushes[row]`` that solid ``i`` was given the impulse ``given`` at ``place``."""
     turn = (place - single3(solids, i * SOLID + X)).cross(given)
     for n in ti.static(range(3)):
         pushes[row + n] += given[n]
         pushes[row + 3 + n] += turn[n]
-    pushes[row + 6] += mass
 
 
 @ti.func
