@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from . import layout, meeting, runtime, sorting
 from .launch import Launcher, Step
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .materials import FIXED_COROTATED
+from .materials import FIXED_COROTATED, FLOWING, FLUID
 from .nodes import SUMS
 from .obstacles import PUSH
 from .rigid import move_worlds, search_worlds
 from .solids import MOVE, SEARCH, Solids
 from .solids_alone import advance_solids
 from .stepping import prime_worlds
-from .substep import advance_grid, advance_matter_of, part_bodies_of, plan_solids, resolve_contact
+from .substep import advance_grid_of, advance_matter_of, part_bodies_of, plan_solids, resolve_contact
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -119,6 +119,7 @@ class Engine:
         self._names = ALWAYS + (() if self.laws == ONLY_ELASTIC else MATTER)
         self._names += ("volumes",) if several else ()
         self._names += ("anchors",) if anchored else ()
+        self._names += ("slopes",) if self.laws & (1 << FLUID) else ()
         self._several = several
         self.count = 0
         self.retries = 0
@@ -163,6 +164,7 @@ class Engine:
             "material": ti.i32,
             "volumes": ti.f32,
             "anchors": vec4,
+            "slopes": vec3,
         }
         return {name: ti.ndarray(kinds[name], self._capacity) for name in self._names}
 
@@ -178,6 +180,9 @@ class Engine:
             self._slack = ti.ndarray(ti.f32, p)
             self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
+            flowing = bool(self.laws & FLOWING)
+            self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if flowing else 1)
+            self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if flowing else 1)
             self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
             self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
@@ -188,6 +193,7 @@ class Engine:
             self._near_g, self._mate, self._meet = (ti.ndarray(ti.i32, g) for _ in range(3))
             self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
             self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
+            self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self.laws & FLOWING else 1)
             self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
             self._block_sums = ti.ndarray(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
@@ -235,6 +241,7 @@ class Engine:
                 "material": added.material.astype(np.int32),
                 "volumes": added.volumes.astype(np.float32),
                 "anchors": added.anchors.astype(np.float32),
+                "slopes": np.zeros((len(base), 3), dtype=np.float32),
             }
             for name in self._names:
                 parts[name].append(new[name])
@@ -394,6 +401,7 @@ class Engine:
             "material": sorting.permute_integers,
             "volumes": sorting.permute_numbers,
             "anchors": sorting.permute_vectors,
+            "slopes": sorting.permute_triples,
         }
         for name in self._names:
             if name in movers:
@@ -547,6 +555,10 @@ class Engine:
             "memory": here.get("memory", self._masses),
             "volumes": here.get("volumes", self._masses),
             "anchors": here.get("anchors", self._nodes),
+            "slopes": here.get("slopes", here["v"]),
+            "past_window": self._past_window,
+            "past_scattered": self._past_scattered,
+            "past_nodes": self._past_nodes,
             "world_count": self.world_count,
             "mean_fields": self._mean_fields,
             "p_blocks": self._p_blocks,
@@ -609,7 +621,7 @@ def _launcher_of(generation: int, laws: int, meeting: bool, solids: bool, near: 
 
     generation: of the compute runtime, whose end is the launcher's.
     """
-    steps: list[Step] = [(advance_grid, {})]
+    steps: list[Step] = [(advance_grid_of(laws & FLOWING), {})]
     if meeting:
         steps.append((part_bodies_of(laws), {"pairs": "body_pairs"}))
     if solids:

@@ -17,6 +17,9 @@ FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, SNOW, SAND, FLUID = range(6)
 
 LAW_NAMES = ("fixed_corotated", "neo_hookean", "von_mises", "snow", "sand", "fluid")
 
+FLOWING = (1 << SAND) | (1 << FLUID)
+"""Laws of matter that flows."""
+
 DAMPED = 1 << len(LAW_NAMES)
 """Bit in a set of laws that says that some solid in it has a damping time."""
 

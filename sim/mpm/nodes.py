@@ -53,6 +53,7 @@ from .layout import (
     vec3,
     vec4,
 )
+from .materials import FLOWING
 from .stepping import FARTHEST_STEP, not_finite
 from .transfer import add_windows
 
@@ -104,6 +105,7 @@ def steady_acceleration(
 
 @ti.func
 def advance_nodes(
+    laws: ti.template(),
     blocks: ti.i32,
     g_cells: Cells,
     g_field: Integers,
@@ -115,6 +117,8 @@ def advance_nodes(
     control: Doubles,
     scattered: Vectors4,
     nodes: Vectors4,
+    past_scattered: Vectors4,
+    past_nodes: Vectors4,
     masses: Scalars,
     block_sums: Scalars,
 ):
@@ -152,6 +156,14 @@ def advance_nodes(
                             slower = through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
                         u += push - slower
                         nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
+                if ti.static(laws & FLOWING):
+                    for i in range(BLOCK_NODES):
+                        past_nodes[g * BLOCK_NODES + i] = vec4(0.0)
+                    add_windows(g, neighbours, past_scattered, past_nodes)
+                    for i in range(BLOCK_NODES):
+                        mass = masses[g * BLOCK_NODES + i]
+                        if mass > 0.0:
+                            past_nodes[g * BLOCK_NODES + i] = past_nodes[g * BLOCK_NODES + i] / mass
                 if wants_means:
                     add_sums(g, g_cells, triple(means, f * MEAN_ROW + MEAN_PLACE), nodes, masses, block_sums)
 

@@ -302,3 +302,10 @@ def permute_vectors(count: ti.i32, targets: Integers, old: Vectors4, new: Vector
     """Move one vector a particle to its new index."""
     for p in range(count):
         new[targets[p]] = old[p]
+
+
+@ti.kernel
+def permute_triples(count: ti.i32, targets: Integers, old: Vectors3, new: Vectors3):
+    """Move one vector of three a particle to its new index."""
+    for p in range(count):
+        new[targets[p]] = old[p]

@@ -29,41 +29,52 @@ from .stepping import review
 from .transfer import advance_particles
 
 
-@ti.kernel
-def advance_grid(
-    mean_fields: ti.i32,
-    g_blocks: ti.i32,
-    g_cells: Cells,
-    g_field: Integers,
-    g_starts: Integers,
-    g_neighbours: Integers,
-    field_integers: Integers,
-    fields: Scalars,
-    worlds: Scalars,
-    means: Scalars,
-    control: Doubles,
-    scattered: Vectors4,
-    nodes: Vectors4,
-    masses: Scalars,
-    block_sums: Scalars,
-):
-    """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
-    advance_nodes(
-        g_blocks,
-        g_cells,
-        g_field,
-        g_neighbours,
-        field_integers,
-        fields,
-        worlds,
-        means,
-        control,
-        scattered,
-        nodes,
-        masses,
-        block_sums,
-    )
-    gather_means(mean_fields, g_starts, field_integers, control, block_sums, means)
+@functools.cache
+def advance_grid_of(flowing: int) -> Kernel:
+    """The kernel of nodes for worlds with the laws ``flowing`` of matter that flows (0: none)."""
+
+    @ti.kernel
+    def advance_grid(
+        mean_fields: ti.i32,
+        g_blocks: ti.i32,
+        g_cells: Cells,
+        g_field: Integers,
+        g_starts: Integers,
+        g_neighbours: Integers,
+        field_integers: Integers,
+        fields: Scalars,
+        worlds: Scalars,
+        means: Scalars,
+        control: Doubles,
+        scattered: Vectors4,
+        nodes: Vectors4,
+        past_scattered: Vectors4,
+        past_nodes: Vectors4,
+        masses: Scalars,
+        block_sums: Scalars,
+    ):
+        """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
+        advance_nodes(
+            flowing,
+            g_blocks,
+            g_cells,
+            g_field,
+            g_neighbours,
+            field_integers,
+            fields,
+            worlds,
+            means,
+            control,
+            scattered,
+            nodes,
+            past_scattered,
+            past_nodes,
+            masses,
+            block_sums,
+        )
+        gather_means(mean_fields, g_starts, field_integers, control, block_sums, means)
+
+    return advance_grid
 
 
 @functools.cache
@@ -278,6 +289,10 @@ def advance_matter_of(laws: int) -> Kernel:
         window: Vectors4,
         scattered: Vectors4,
         nodes: Vectors4,
+        slopes: Vectors3,
+        past_window: Vectors4,
+        past_scattered: Vectors4,
+        past_nodes: Vectors4,
         report: Scalars,
         running: Integers,
         solid_kinds: Integers,
@@ -310,6 +325,10 @@ def advance_matter_of(laws: int) -> Kernel:
             window,
             nodes,
             scattered,
+            slopes,
+            past_window,
+            past_nodes,
+            past_scattered,
             report,
         )
         running[0] = review(
