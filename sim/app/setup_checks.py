@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 from collections.abc import Sequence
 
@@ -14,6 +13,8 @@ from scipy.spatial import cKDTree
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface
+from ..mpm.distance import overlap, signed_distance
+from ..mpm.soundness import check_surface
 from ..scene.model import Ground
 
 Array = NDArray[np.float64]
@@ -27,20 +28,12 @@ TOUCHING = 0.05
 
 def surface_warnings(surface: Surface, name: str, cell: float) -> list[str]:
     """What is unusual about the mesh of object ``name``. Raises InputError for one that cannot be used."""
-    if not _have_distance():
-        return []
-    from ..mpm.distance import check_surface
-
     return [str(warning) for warning in check_surface(surface, name=f"object {name}", cell_size=cell)]
 
 
 def collider_warnings(bodies: Sequence[BodyParticles], colliders: Sequence[Collider], cell: float) -> list[str]:
     """What stands a little in a collider. Raises InputError for a body more than a cell deep in one."""
     warnings: list[str] = []
-    if not _have_distance():
-        return warnings
-    from ..mpm.distance import overlap, signed_distance
-
     for body, collider in itertools.product(bodies, colliders):
         surface = collider.surface.vertices
         low, high = body.positions.min(axis=0) - cell, body.positions.max(axis=0) + cell
@@ -58,11 +51,6 @@ def collider_warnings(bodies: Sequence[BodyParticles], colliders: Sequence[Colli
         if depth > TOUCHING * spacing:
             warnings.append(f"{body.name} stands {depth * 1000:.2g} mm in {collider.name} and will be pushed out")
     return warnings
-
-
-def _have_distance() -> bool:
-    # ``distance`` is younger than this file; without it, sampling refuses the meshes that it cannot fill.
-    return importlib.util.find_spec("..mpm.distance", __package__) is not None
 
 
 def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:

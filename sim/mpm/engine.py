@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,16 +12,16 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from . import layout, meeting, runtime, sorting
-from .launch import Launcher, Step
+from .launch import Launcher
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .materials import FIXED_COROTATED, FLOWING, FLUID
+from .materials import FLOWING, FLUID, ONLY_ELASTIC
 from .nodes import SUMS
 from .obstacles import PUSH
-from .rigid import move_worlds, search_worlds
+from .packed import Added, Numbers
 from .solids import MOVE, SEARCH, Solids
 from .solids_alone import advance_solids
 from .stepping import prime_worlds
-from .substep import advance_grid_of, advance_matter_of, part_bodies_of, plan_solids, resolve_contact
+from .substep_launch import SOLID_NAMES, substep_launcher
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -34,19 +32,11 @@ ALWAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
 MATTER = ("memory", "material")
 """Arrays that only laws other than fixed-corotated elasticity need."""
 
-ONLY_ELASTIC = 1 << FIXED_COROTATED
-
 MOST_RETRIES = 6
 """Times that a stretch of substeps is tried again with half the step, before the run is given up."""
 
 RECOVER = 1.25
 """Factor by which a step that had to be shortened grows again after each stretch that went well."""
-
-REPEATS = 4
-"""Substeps in a launch; worlds that need fewer stay idle for the rest."""
-
-SOLID_NAMES = {"worlds": "world_count", "pairs": "solid_pairs", "memory": "solid_memory"}
-"""What parameters of the solids' kernels are called besides the others."""
 
 LEAST_STEP = 1e-10
 """Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a lost run."""
@@ -63,36 +53,6 @@ class Diverged(Exception):
         super().__init__(f"world {world}, field {field}")
         self.world = world
         self.field = field
-
-
-@dataclass(frozen=True, kw_only=True)
-class Numbers:
-    """What the kernels know of the worlds and their fields, packed as ``layout`` says; see ``packing``."""
-
-    laws: int
-    table: NDArray[np.float32]
-    world_integers: NDArray[np.int32]
-    worlds: NDArray[np.float32]
-    field_integers: NDArray[np.int32]
-    fields: NDArray[np.float32]
-    touches: NDArray[np.float32]
-    pairs: NDArray[np.float32]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Added:
-    """Particles to add to field ``field``, N of them, as ``transfer.advance_particles`` describes them."""
-
-    field: int
-    x: Array
-    v: Array
-    C: Array
-    F: Array
-    constants: Array
-    ids: NDArray[np.int32]
-    material: NDArray[np.int32]
-    volumes: Array
-    anchors: Array
 
 
 class Engine:
@@ -540,7 +500,7 @@ class Engine:
 
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks ask for."""
-        return _launcher_of(
+        return substep_launcher(
             runtime.generation(), self.laws, self._meet_p_count > 0, self.solids.count > 0, self._near[0] > 0
         )
 
@@ -613,25 +573,6 @@ class Engine:
             "touching": self._touching,
             "pushes": self._pushes,
         }
-
-
-@functools.lru_cache(maxsize=32)
-def _launcher_of(generation: int, laws: int, meeting: bool, solids: bool, near: bool) -> Launcher:
-    """The launcher for worlds with these ``laws`` in which bodies meet, solids are, obstacles are near.
-
-    generation: of the compute runtime, whose end is the launcher's.
-    """
-    steps: list[Step] = [(advance_grid_of(laws & FLOWING), {})]
-    if meeting:
-        steps.append((part_bodies_of(laws), {"pairs": "body_pairs"}))
-    if solids:
-        steps.append((plan_solids, {}))
-    if near:
-        steps.append((resolve_contact, {}))
-    if solids:
-        steps += [(search_worlds, SOLID_NAMES), (move_worlds, SOLID_NAMES)]
-    steps.append((advance_matter_of(laws), {}))
-    return Launcher(steps, repeats=REPEATS)
 
 
 def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

@@ -15,6 +15,9 @@ from ..errors import InputError
 FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, SNOW, SAND, FLUID = range(6)
 """Numbers of the laws in the kernels; law i has the bit 1 << i in a set of laws."""
 
+ONLY_ELASTIC = 1 << FIXED_COROTATED
+"""The set of laws of worlds that hold nothing but fixed-corotated solids, for which the kernels are simplest."""
+
 LAW_NAMES = ("fixed_corotated", "neo_hookean", "von_mises", "snow", "sand", "fluid")
 
 FLOWING = (1 << SAND) | (1 << FLUID)

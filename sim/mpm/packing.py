@@ -16,8 +16,8 @@ from ..scene.units import Similarity
 from . import layout
 from .bodies import BodyParticles
 from .contacts import GROUND_NAME, MODES, SurfaceContact
-from .engine import ONLY_ELASTIC, Added, Numbers
-from .materials import ROW, ElasticMaterial, RigidMaterial, bounding_speed
+from .materials import ONLY_ELASTIC, ROW, ElasticMaterial, RigidMaterial, bounding_speed
+from .packed import Added, Numbers
 from .setup import WorldSetup
 from .solids import LEAST_RECOVERY, RECOVERY_HEIGHT
 from .transfer import GOAL, PIN

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from . import distance
 from .colliders import Surface
+from .contact_points import surface_points
 from .curvature import PATCH, patches
-from .distance import DistanceLattice
+from .distance import DistanceLattice, signed_distance
 from .solid_layout import POINT
 
 Array = NDArray[np.float64]
@@ -76,13 +76,13 @@ def spacing_of(vertices: Array, nodes: int) -> float:
 def lattice_of(surface: Surface, *, margin: float = 0.0) -> DistanceLattice:
     """Distances to ``surface`` on a lattice of the usual fineness, ``margin`` farther out than need be."""
     spacing = spacing_of(surface.vertices, NODES)
-    return distance.signed_distance(surface, spacing, margin=MARGIN * spacing + margin)
+    return signed_distance(surface, spacing, margin=MARGIN * spacing + margin)
 
 
 def points_of(surface: Surface, center: Array) -> PointSet:
     """Points of ``surface`` relative to ``center`` (3,), those of its convex hull first."""
     spacing = spacing_of(surface.vertices, POINTS)
-    points, normals = distance.surface_points(surface, spacing)
+    points, normals = surface_points(surface, spacing)
     local = points - center
     table, smooth = patches(local, normals, spacing)
     kept = _without_flats(local, smooth & (table[:, 9:11] == 0).all(axis=1), FLAT_CELL * spacing)

@@ -17,7 +17,8 @@ from . import solid_layout as at
 from .bodies import BodyParticles, Vector
 from .colliders import Collider, Surface
 from .contacts import GROUND_NAME, MODES
-from .distance import DistanceLattice, mass_properties
+from .distance import DistanceLattice
+from .mass import mass_properties
 from .rigid import move_worlds, search_worlds
 from .setup import WorldSetup
 from .solid_shapes import NO_POINTS, PointSet, lattice_of, points_of, tables

@@ -375,3 +375,35 @@ def _dot(a: list[Array], b: list[Array]) -> Array:
 
 def _cross(a: list[Array], b: list[Array]) -> list[Array]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def bounding_box(mesh: Array) -> tuple[Array, Array]:
+    """Low corner and extent of a mesh's bounding box. Raises InputError where it is flat."""
+    low = mesh.min(axis=(0, 1))
+    extent = mesh.max(axis=(0, 1)) - low
+    if not extent.min() > 1e-12 * extent.max():
+        raise InputError(
+            f"mesh has no volume (bounding box {extent[0]:g} x {extent[1]:g} x {extent[2]:g}): give it thickness"
+        )
+    return low, extent
+
+
+def bounding_faces(points: Array, triangles: Faces) -> Boundary:
+    """The faces that bound the inside, outward. Raises InputError where the mesh is not closed or has no volume."""
+    found = boundary(points, triangles, check_closed(triangles))
+    extent = np.ptp(points[triangles].reshape(-1, 3), axis=0)
+    volume = signed_volume(points, found.triangles)
+    if not abs(volume) > 1e-9 * face_normals(points[triangles])[1].sum() ** 1.5:
+        raise InputError(
+            f"mesh has no volume (bounding box {extent[0]:g} x {extent[1]:g} x {extent[2]:g}, volume {volume:g}): "
+            "give it thickness"
+        )
+    return found
+
+
+def checked_places(points: NDArray[np.floating]) -> Array:
+    """``points`` as (N, 3) doubles. Raises InputError for another shape or numbers that are not finite."""
+    places = np.asarray(points, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1:] != (3,) or not np.isfinite(places).all():
+        raise InputError(f"points have shape {places.shape}: give finite (N, 3)")
+    return places

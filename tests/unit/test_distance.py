@@ -13,17 +13,10 @@ from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.mpm import distance
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.distance import (
-    DistanceLattice,
-    MassProperties,
-    check_surface,
-    mass_properties,
-    overlap,
-    signed_distance,
-    solid_mass_properties,
-    surface_points,
-    thin_share,
-)
+from physgen.sim.mpm.contact_points import surface_points
+from physgen.sim.mpm.distance import DistanceLattice, overlap, signed_distance
+from physgen.sim.mpm.mass import MassProperties, mass_properties, solid_mass_properties
+from physgen.sim.mpm.soundness import check_surface, thin_share
 from scipy.spatial import cKDTree
 
 EPS32 = float(np.finfo(np.float32).eps)

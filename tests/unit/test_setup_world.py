@@ -2,7 +2,6 @@
 """From a scene to the engine's world, without the engine: what reaches it, and what is refused before it starts."""
 
 import dataclasses
-import importlib.util
 import math
 
 import numpy as np
@@ -181,12 +180,6 @@ def test_bodies_in_each_other_are_refused(world, distance, outcome):
     assert bool(warnings) == (outcome == "warned")
 
 
-needs_distance = pytest.mark.skipif(
-    importlib.util.find_spec("physgen.sim.mpm.distance") is None, reason="sim/mpm/distance is to come"
-)
-
-
-@needs_distance
 @pytest.mark.parametrize("kind", ["thin", "self-intersecting"])
 def test_odd_meshes_are_told_by_name(world, kind):
     folder = world()
@@ -200,7 +193,6 @@ def test_odd_meshes_are_told_by_name(world, kind):
     assert any("ball0" in warning for warning in estimate_bake(folder, quality).warnings)
 
 
-@needs_distance
 def test_a_body_in_a_collider_is_refused(world):
     with pytest.raises(InputError, match=r"object ball0.*deep in object wall"):
         estimate_bake(world(extra=(a_wall(world_from_mesh=away(0.03)),)), OPTIONS)
