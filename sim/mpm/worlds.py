@@ -107,7 +107,8 @@ class Worlds:
     def advance(self, duration: float) -> None:
         """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
 
-        Raises SimulationError that names the body when a world goes wrong and shorter substeps do not help.
+        Raises SimulationError that names the body when a world goes wrong and shorter substeps do not help; the others
+        are then at their own ``time``, before or at the end.
         """
         if not (math.isfinite(duration) and duration >= 0):
             raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
