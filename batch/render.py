@@ -23,7 +23,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -165,6 +165,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(options, stream, cancelled)
 
 
-if __name__ == "__main__":
+def leave(code: int) -> NoReturn:
+    """End the process with ``code``.
+
+    Blender as a Python module crashes now and then while Python takes it down, after all work is done and said; a
+    farm would take that for a failed render. So Python does not take it down.
+    """
+    bpy: Any = sys.modules.get("bpy")
+    if bpy is not None and not bpy.app.binary_path:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     # SystemExit would leave Blender's own exit code at 0 unless it is raised at the very end of the script.
-    sys.exit(main())
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    leave(main())
