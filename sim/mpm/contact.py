@@ -66,7 +66,7 @@ from .layout import (
     vec4,
 )
 from .obstacles import PUSH, add_push, solid_distance, solid_give, solid_velocity
-from .transfer import PIN, add_windows_where, anchor_place, load_window, weights
+from .transfer import PIN, anchor_place, load_window, sum_chosen_windows, weights
 
 RECOVERY = 0.2
 """Share of a particle's depth that one substep may take back."""
@@ -338,9 +338,7 @@ def apply_contact(
                         any_touched += touched[neighbours[g * 27 + d]]
                 if any_touched == 0:
                     continue
-                for i in range(BLOCK_NODES):
-                    sums[s * BLOCK_NODES + i] = vec4(0.0)
-                add_windows_where(g, s, neighbours, touched, 1, scattered, sums)
+                sum_chosen_windows(g, s, neighbours, touched, scattered, sums)
                 for i in range(BLOCK_NODES):
                     n = g * BLOCK_NODES + i
                     if masses[n] > 0.0:

@@ -55,7 +55,7 @@ from .layout import (
 )
 from .materials import FLOWING
 from .stepping import FARTHEST_STEP, not_finite
-from .transfer import add_windows
+from .transfer import sum_windows
 
 SUMS = 16
 """Numbers that a grid block adds to its field's means: mass, mass x place (3), momentum (3), angular momentum (3) and
@@ -139,9 +139,7 @@ def advance_nodes(
                 wants_means = field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1
                 drag = fields[f * FIELD_ROW + DRAG]
                 wind = triple(fields, f * FIELD_ROW + WIND)
-                for i in range(BLOCK_NODES):
-                    nodes[g * BLOCK_NODES + i] = vec4(0.0)
-                add_windows(g, neighbours, scattered, nodes)
+                sum_windows(g, neighbours, scattered, nodes)
                 for i in range(BLOCK_NODES):
                     q = nodes[g * BLOCK_NODES + i]
                     masses[g * BLOCK_NODES + i] = q[3]
@@ -157,9 +155,7 @@ def advance_nodes(
                         u += push - slower
                         nodes[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
                 if ti.static(laws & FLOWING):
-                    for i in range(BLOCK_NODES):
-                        past_nodes[g * BLOCK_NODES + i] = vec4(0.0)
-                    add_windows(g, neighbours, past_scattered, past_nodes)
+                    sum_windows(g, neighbours, past_scattered, past_nodes)
                     for i in range(BLOCK_NODES):
                         mass = masses[g * BLOCK_NODES + i]
                         if mass > 0.0:

@@ -58,7 +58,7 @@ from .layout import (
     vec4,
 )
 from .materials import FLUID, ROW, SAND, SNOW
-from .transfer import add_windows_where, weights
+from .transfer import sum_chosen_windows, weights
 
 LEAST_SHARE = 0.0026
 """Share below which a body is too far off (1.25 cells) for the node to say anything about it."""
@@ -151,9 +151,7 @@ def gather_shares(
             g = meet_g[s]
             w = field_integers[g_field[g] * FIELD_INTEGERS + WORLD]
             if control[w * CONTROL_ROW + PHASE] == FULL:
-                for i in range(BLOCK_NODES):
-                    sums[s * BLOCK_NODES + i] = vec4(0.0)
-                add_windows_where(g, s, g_neighbours, meets_p, 1, scattered, sums)
+                sum_chosen_windows(g, s, g_neighbours, meets_p, scattered, sums)
 
 
 @ti.func

@@ -68,8 +68,8 @@ PIN, GOAL = 1.0, 2.0
 """Kinds of anchors."""
 
 KEPT = 0.9
-"""Share that a particle of sand or fluid keeps, each substep, of the velocity and spin that the grid cannot carry (see
-``past_at``; Fei et al. 2021). The transfers then damp a tenth of what they damp without; 1 would keep all noise."""
+"""Share that a particle of sand or fluid keeps, each substep, of the velocity and spin that the grid cannot carry (Fei
+et al. 2021). The transfers then damp a tenth of what they damp without; 1 would keep all noise."""
 
 LEVELLED = 0.02
 """Share that goes, each substep, of the ln J of a fluid's particle that the grid cannot carry: pressures that cancel
@@ -106,44 +106,90 @@ def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vector
 
 
 @ti.func
-def add_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
-    """Add the windows of the 27 particle blocks around grid block ``g`` to its nodes."""
-    for d in range(27):
-        k = neighbours[g * 27 + d]
-        if k >= 0:
-            di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
-            il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
-            jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
-            ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
-            shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
-            for i in range(il, ih):
-                for j in range(jl, jh):
-                    for m in range(ml, mh):
-                        n = g * BLOCK_NODES + i * 16 + j * 4 + m
-                        nodes[n] = nodes[n] + window[i * 64 + j * 8 + m + shift]
+def add_window(k: ti.i32, d: ti.i32, s: ti.i32, window: Vectors4, sums: Vectors4):
+    """Add what the window of particle block ``k`` has of the block that it is neighbour ``d`` of to slot ``s``."""
+    di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
+    il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
+    jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
+    ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
+    shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
+    for i in range(il, ih):
+        for j in range(jl, jh):
+            for m in range(ml, mh):
+                n = s * BLOCK_NODES + i * 16 + j * 4 + m
+                sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
 
 
 @ti.func
-def add_windows_where(
-    g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, least: ti.i32, window: Vectors4, sums: Vectors4
-):
-    """``add_windows`` for the particle blocks whose number in ``chosen`` is ``least`` or more, into slot ``s``."""
+def sum_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """The nodes of grid block ``g``: the sum of the windows of the 27 particle blocks around it."""
+    for i in range(BLOCK_NODES):
+        nodes[g * BLOCK_NODES + i] = vec4(0.0)
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        if k >= 0:
+            add_window(k, d, g, window, nodes)
+
+
+@ti.func
+def sum_chosen_windows(g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, window: Vectors4, sums: Vectors4):
+    """The same into slot ``s`` of ``sums``, of the particle blocks that have a 1 in ``chosen``."""
+    for i in range(BLOCK_NODES):
+        sums[s * BLOCK_NODES + i] = vec4(0.0)
     for d in range(27):
         k = neighbours[g * 27 + d]
         wanted = False
         if k >= 0:
-            wanted = chosen[k] >= least
+            wanted = chosen[k] == 1
         if wanted:
-            di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
-            il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
-            jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
-            ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
-            shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
-            for i in range(il, ih):
-                for j in range(jl, jh):
-                    for m in range(ml, mh):
-                        n = s * BLOCK_NODES + i * 16 + j * 4 + m
-                        sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
+            add_window(k, d, s, window, sums)
+
+
+@ti.func
+def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
+    """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis."""
+    w = weights(fx)
+    A = vec4(0.0)
+    B0 = vec4(0.0)
+    B1 = vec4(0.0)
+    B2 = vec4(0.0)
+    for i in ti.static(range(3)):
+        Ai = vec4(0.0)
+        B1i = vec4(0.0)
+        B2i = vec4(0.0)
+        for j in ti.static(range(3)):
+            Aj = vec4(0.0)
+            B2j = vec4(0.0)
+            for m in ti.static(range(3)):
+                u = window[first + (i * 64 + j * 8 + m)] * w[m][2]
+                Aj += u
+                if ti.static(m > 0):
+                    B2j += float(m) * u
+            Ai += w[j][1] * Aj
+            B2i += w[j][1] * B2j
+            if ti.static(j > 0):
+                B1i += (float(j) * w[j][1]) * Aj
+        A += w[i][0] * Ai
+        B1 += w[i][0] * B1i
+        B2 += w[i][0] * B2i
+        if ti.static(i > 0):
+            B0 += (float(i) * w[i][0]) * Ai
+    return A, B0 - fx[0] * A, B1 - fx[1] * A, B2 - fx[2] * A
+
+
+@ti.func
+def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: Vectors4):
+    """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
+    w = weights(fx)
+    for i in ti.static(range(3)):
+        bi = b4 + float(i) * c0
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            bj = wij * (bi + float(j) * c1)
+            cj = wij * c2
+            for m in ti.static(range(3)):
+                n = first + (i * 64 + j * 8 + m)
+                window[n] = window[n] + w[m][2] * (bj + float(m) * cj)
 
 
 @ti.func
@@ -184,39 +230,6 @@ def goal_step(
 
 
 @ti.func
-def past_at(first: ti.i32, fx: vec3, past_window: Vectors4):
-    """What the particles had on the grid before the forces of this substep: velocity and ln J at ``fx``, and the slopes
-    of both (four numbers an axis, 1/cell). What a particle has besides, the grid cannot carry."""
-    w = weights(fx)
-    A = vec4(0.0)
-    B0 = vec4(0.0)
-    B1 = vec4(0.0)
-    B2 = vec4(0.0)
-    for i in ti.static(range(3)):
-        Ai = vec4(0.0)
-        B1i = vec4(0.0)
-        B2i = vec4(0.0)
-        for j in ti.static(range(3)):
-            Aj = vec4(0.0)
-            B2j = vec4(0.0)
-            for m in ti.static(range(3)):
-                u = past_window[first + (i * 64 + j * 8 + m)] * w[m][2]
-                Aj += u
-                if ti.static(m > 0):
-                    B2j += float(m) * u
-            Ai += w[j][1] * Aj
-            B2i += w[j][1] * B2j
-            if ti.static(j > 0):
-                B1i += (float(j) * w[j][1]) * Aj
-        A += w[i][0] * Ai
-        B1 += w[i][0] * B1i
-        B2 += w[i][0] * B2i
-        if ti.static(i > 0):
-            B0 += (float(i) * w[i][0]) * Ai
-    return A, 4.0 * (B0 - fx[0] * A), 4.0 * (B1 - fx[1] * A), 4.0 * (B2 - fx[2] * A)
-
-
-@ti.func
 def scatter_past(
     first: ti.i32,
     fx: vec3,
@@ -228,21 +241,12 @@ def scatter_past(
     past_scattered: Vectors4,
 ):
     """Momentum without any force, and mass times ln J (``packing``), to the window."""
-    w = weights(fx)
     q = mass * (velocity - C @ fx)
     b4 = vec4(q[0], q[1], q[2], mass * (packing - slope.dot(fx)))
     c0 = mass * vec4(C[0, 0], C[1, 0], C[2, 0], slope[0])
     c1 = mass * vec4(C[0, 1], C[1, 1], C[2, 1], slope[1])
     c2 = mass * vec4(C[0, 2], C[1, 2], C[2, 2], slope[2])
-    for i in ti.static(range(3)):
-        bi = b4 + float(i) * c0
-        for j in ti.static(range(3)):
-            wij = w[i][0] * w[j][1]
-            bj = wij * (bi + float(j) * c1)
-            cj = wij * c2
-            for m in ti.static(range(3)):
-                n = first + (i * 64 + j * 8 + m)
-                past_scattered[n] = past_scattered[n] + w[m][2] * (bj + float(m) * cj)
+    spread(first, fx, b4, c0, c1, c2, past_scattered)
 
 
 @ti.func
@@ -288,7 +292,7 @@ def advance_particles(
     anchors: place in cells that a pin or goal holds the particle at, and 1 (pin), 2 (goal) or 0.
     reaction: contact acceleration of the last substep (cells/s^2) and the share of contacting mass at the particle.
     slopes: slope of ln J around fluid particles, 1/cell. past_window, past_nodes, past_scattered: velocity or momentum
-    without the forces, and ln J, of matter that flows; only where ``laws`` has such matter, see ``past_at``. Its ``v``
+    without the forces, and ln J, of matter that flows; only where ``laws`` has such matter. Its ``v``
     and ``C`` are stored every substep. It still moves with the grid's velocity, so contacts hold as for all matter.
     report, 8 numbers a block: largest |v|^2, largest c^2, least distance to the window's limits in cells, 1 spare,
     sum of |v|^2 (not finite when the simulation is lost), 3 spare.
@@ -358,36 +362,8 @@ def advance_particles(
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
-                    w = weights(fx)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
-                    A = vec4(0.0)
-                    B0 = vec4(0.0)
-                    B1 = vec4(0.0)
-                    B2 = vec4(0.0)
-                    for i in ti.static(range(3)):
-                        Ai = vec4(0.0)
-                        B1i = vec4(0.0)
-                        B2i = vec4(0.0)
-                        for j in ti.static(range(3)):
-                            Aj = vec4(0.0)
-                            B2j = vec4(0.0)
-                            for m in ti.static(range(3)):
-                                u = window[first + (i * 64 + j * 8 + m)] * w[m][2]
-                                Aj += u
-                                if ti.static(m > 0):
-                                    B2j += float(m) * u
-                            Ai += w[j][1] * Aj
-                            B2i += w[j][1] * B2j
-                            if ti.static(j > 0):
-                                B1i += (float(j) * w[j][1]) * Aj
-                        A += w[i][0] * Ai
-                        B1 += w[i][0] * B1i
-                        B2 += w[i][0] * B2i
-                        if ti.static(i > 0):
-                            B0 += (float(i) * w[i][0]) * Ai
-                    B0 -= fx[0] * A
-                    B1 -= fx[1] * A
-                    B2 -= fx[2] * A
+                    A, B0, B1, B2 = interpolate(first, fx, window)
                     for r in ti.static(range(3)):
                         vp[r] = A[r]
                         Cp[r, 0] = 4.0 * B0[r]
@@ -402,20 +378,21 @@ def advance_particles(
                     if ti.static(laws & FLOWING):
                         if flows:
                             speed2 = ti.max(speed2, vp.dot(vp))
-                            past, past0, past1, past2 = past_at(first, fx, past_window)
+                            # What a particle has besides what the grid had before the forces, the grid cannot carry.
+                            past, past0, past1, past2 = interpolate(first, fx, past_window)
                             vp += KEPT * (v[p] - vec3(past[0], past[1], past[2]))
                             # Only the spin of C: angular momentum needs it, and no stress feels it.
                             kept = C[p]
-                            a01 = 0.5 * KEPT * ((kept[0, 1] - past1[0]) - (kept[1, 0] - past0[1]))
-                            a02 = 0.5 * KEPT * ((kept[0, 2] - past2[0]) - (kept[2, 0] - past0[2]))
-                            a12 = 0.5 * KEPT * ((kept[1, 2] - past2[1]) - (kept[2, 1] - past1[2]))
+                            a01 = 0.5 * KEPT * ((kept[0, 1] - 4.0 * past1[0]) - (kept[1, 0] - 4.0 * past0[1]))
+                            a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
+                            a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
                             Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
                             v[p] = vp
                             C[p] = Cp
                             if ti.static(laws & (1 << FLUID)):
                                 if law == FLUID:
                                     memory[p] -= LEVELLED * (packing - past[3])
-                                    slope = vec3(past0[3], past1[3], past2[3])
+                                    slope = 4.0 * vec3(past0[3], past1[3], past2[3])
                                     if store:
                                         slopes[p] = slope
                     if touching:
@@ -462,7 +439,6 @@ def advance_particles(
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
-                    w = weights(fx)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
                     if touching:
                         # Start the contact solve from the forces of the last substep.
@@ -473,15 +449,7 @@ def advance_particles(
                     c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
                     c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
                     c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
-                    for i in ti.static(range(3)):
-                        bi = b4 + float(i) * c0
-                        for j in ti.static(range(3)):
-                            wij = w[i][0] * w[j][1]
-                            bj = wij * (bi + float(j) * c1)
-                            cj = wij * c2
-                            for m in ti.static(range(3)):
-                                n = first + (i * 64 + j * 8 + m)
-                                scattered[n] = scattered[n] + w[m][2] * (bj + float(m) * cj)
+                    spread(first, fx, b4, c0, c1, c2, scattered)
                     if ti.static(laws & FLOWING):
                         if flows:
                             packing = 0.0
