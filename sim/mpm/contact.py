@@ -62,6 +62,7 @@ from .layout import (
     Integers,
     Scalars,
     Vectors4,
+    triple,
     vec3,
     vec4,
 )
@@ -93,6 +94,15 @@ HOLD = 0.1
 
 
 @ti.func
+def parting_speed(gap: ti.f32, dt: ti.f32, recovery: ti.f32):
+    """Least speed of parting of surfaces ``gap`` cells apart: they may just meet; depth is taken back gently."""
+    speed = -gap / dt
+    if gap < 0.0:
+        speed = ti.min(RECOVERY * speed, recovery)
+    return speed
+
+
+@ti.func
 def coulomb(wanted: vec3, normal_size: ti.f32, sticking: ti.f32, sliding: ti.f32):
     """The tangential impulse ``wanted`` to hold the surfaces together, as far as friction on ``normal_size`` allows."""
     size = wanted.norm()
@@ -116,9 +126,7 @@ def press(
 ):
     """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away."""
     v_n = velocity.dot(normal)
-    wanted = -phi / dt
-    if phi < 0.0:
-        wanted = ti.min(RECOVERY * wanted, recovery)
+    wanted = parting_speed(phi, dt, recovery)
     old_n = old.dot(normal)
     elastic = touches[touch + RESTITUTION]
     new_n = (1.0 - elastic) * (old_n + (wanted - v_n) / share) + elastic * (SPRING * ti.max(0.0, -phi) / (dt * share))
@@ -137,7 +145,6 @@ def solve_contact(
     near_blocks: ti.i32,
     most_solids: ti.i32,
     near_p: Integers,
-    near_worlds: Integers,
     p_cells: Cells,
     p_field: Integers,
     starts: Integers,
@@ -179,7 +186,6 @@ def solve_contact(
             f = p_field[k]
             w = field_integers[f * FIELD_INTEGERS + WORLD]
             c = w * CONTROL_ROW
-            near_worlds[s] = w
             touched[k] = 0
             for n in range(most_solids * PUSH):
                 pushes[s * most_solids * PUSH + n] = 0.0
@@ -193,11 +199,7 @@ def solve_contact(
                 least = MOST_SLACK
                 recovery = worlds[w * WORLD_ROW + RECOVERY_SPEED]
                 has_plane = worlds[w * WORLD_ROW + HAS_PLANE] > 0.5
-                plane = vec3(
-                    worlds[w * WORLD_ROW + PLANE_NORMAL],
-                    worlds[w * WORLD_ROW + PLANE_NORMAL + 1],
-                    worlds[w * WORLD_ROW + PLANE_NORMAL + 2],
-                )
+                plane = triple(worlds, w * WORLD_ROW + PLANE_NORMAL)
                 first_touch = field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
                 has_anchors = field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
                 first_solid = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
@@ -289,9 +291,7 @@ def solve_contact(
                                 if second_obstacle > 0:
                                     surface += solid_velocity(first_solid + second_obstacle - 1, here, solids)
                                 left = (velocity + share * (new - old) - surface).dot(second_normal)
-                                wanted = -second / dt
-                                if second < 0.0:
-                                    wanted = ti.min(RECOVERY * wanted, recovery)
+                                wanted = parting_speed(second, dt, recovery)
                                 beside = (ti.max(0.0, wanted - left) / (share + give)) * second_normal
                         reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
                         if (new + beside).norm_sqr() > 0.0 or old.norm_sqr() > 0.0:

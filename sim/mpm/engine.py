@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The substep loop and the arrays on the device. Lengths in cells; ``worlds`` converts from and to SI units."""
+"""The substep loop and the arrays on the device. Lengths in cells; ``packing`` and ``view`` convert."""
 
 from __future__ import annotations
 
@@ -136,8 +136,7 @@ class Engine:
             self._p_neighbours = ti.ndarray(ti.i32, p * 27)
             self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._touched, self._near_worlds = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._slack = ti.ndarray(ti.f32, p)
+            self._touched, self._slack = ti.ndarray(ti.i32, p), ti.ndarray(ti.f32, p)
             self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
             flowing = bool(self.laws & FLOWING)
@@ -205,8 +204,7 @@ class Engine:
             }
             for name in self._names:
                 parts[name].append(new[name])
-            biased = base + sorting.BIAS
-            all_keys.append(((np.int64(added.field) << 16 | biased[:, 0]) << 16 | biased[:, 1]) << 16 | biased[:, 2])
+            all_keys.append(_block_keys(np.int64(added.field), base))
             row = control[self._field_world[added.field]]
             row[layout.SPEED] = max(row[layout.SPEED], math.sqrt(float(np.max((added.v**2).sum(axis=1)))))
             row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
@@ -219,26 +217,22 @@ class Engine:
         order = np.argsort(keys >> 48, kind="stable")
         self._upload({name: np.concatenate(parts[name])[order] for name in self._names}, keys[order])
 
-    def raise_speed(self, world: int, speed: float) -> None:
-        """Let the next substep of ``world`` be stable for particles of this speed, cells/s."""
+    def expect(self, world: int, *, speed: float = 0.0, wave_speed: float = 0.0) -> None:
+        """Let the next substep of ``world`` be stable for particles and waves of these speeds, cells/s."""
         control = self.control()
-        control[world, layout.SPEED] = max(control[world, layout.SPEED], speed)
-        self._put_control(control)
-
-    def raise_wave_speed(self, world: int, wave_speed: float) -> None:
-        """Let the next substep of ``world`` be stable for waves of this speed, cells/s."""
-        control = self.control()
-        control[world, layout.WAVE_SPEED] = max(control[world, layout.WAVE_SPEED], wave_speed)
+        row = control[world]
+        row[layout.SPEED] = max(row[layout.SPEED], speed)
+        row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
         self._put_control(control)
 
     def _download(self) -> State:
         """The particles in engine order, with the block key of each under "keys"."""
         n = self.count
         state: State = {name: self._particles[0][name].to_numpy()[:n] for name in self._names}
-        cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64) + sorting.BIAS
+        cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64)
         fields = self._p_field.to_numpy()[: self._p_blocks].astype(np.int64)
         starts = self._starts.to_numpy()[: self._p_blocks + 1]
-        keys = ((fields << 16 | cells[:, 0]) << 16 | cells[:, 1]) << 16 | cells[:, 2]
+        keys = _block_keys(fields, cells)
         state["keys"] = np.repeat(keys, np.diff(starts)) if n else np.zeros(0, dtype=np.int64)
         return state
 
@@ -256,12 +250,11 @@ class Engine:
         self._group()
 
     def state(self) -> State:
-        """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells, "field" (n,)."""
+        """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells."""
         state = self._download()
         keys = state["keys"].astype(np.int64)
         cells = np.stack([(keys >> shift & 0xFFFF) - sorting.BIAS for shift in (32, 16, 0)], axis=1)
         state["position"] = 4 * cells - 1 + state["x"].astype(np.float64) / FIXED_ONE
-        state["field"] = keys >> 48
         state["control"] = self.control()
         state["means"] = self._means.to_numpy()
         return state
@@ -416,17 +409,16 @@ class Engine:
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
-    def stable_step(self, world: int) -> float:
-        """Longest stable substep in seconds of ``world`` for its state as last reported."""
-        row = self.control()[world]
-        scale, fastest = row[layout.CFL_SCALE], max(row[layout.SPEED], row[layout.SOLID_SPEED])
-        return float(
-            min(
-                row[layout.LONGEST_STEP],
-                scale * self.cfl_elastic / max(row[layout.WAVE_SPEED], 1e-30),
-                scale * self.cfl_velocity / max(fastest, 1e-30),
-            )
-        )
+    def stable_steps(self) -> Array:
+        """Longest stable substep in s of each world (W,) for its state as last reported."""
+        return self._stable_steps(self.control())
+
+    def _stable_steps(self, control: Array) -> Array:
+        scale = control[:, layout.CFL_SCALE]
+        fastest = np.maximum(control[:, layout.SPEED], control[:, layout.SOLID_SPEED])
+        wave = scale * self.cfl_elastic / np.maximum(control[:, layout.WAVE_SPEED], 1e-30)
+        step = np.minimum(control[:, layout.LONGEST_STEP], wave)
+        return np.asarray(np.minimum(step, scale * self.cfl_velocity / np.maximum(fastest, 1e-30)))
 
     def advance(self, durations: Array, *, longest_step: Array) -> None:
         """Advance every world by its duration (W,) in s, 0 to let it be, in substeps of at most ``longest_step`` (W,).
@@ -441,9 +433,7 @@ class Engine:
         control[:, layout.PHASE] = layout.IDLE
         control[:, layout.LOST_FIELD] = -1.0
         control[:, layout.STATUS] = np.where(durations > 0, layout.WANTS_SORT, layout.DONE)
-        self._put_control(control)
-        for world in range(self.world_count):
-            control[world, layout.SHORTEST_STEP] = max(LEAST_STEP, 1e-3 * self.stable_step(world))
+        control[:, layout.SHORTEST_STEP] = np.maximum(LEAST_STEP, 1e-3 * self._stable_steps(control))
         attempts = np.zeros(self.world_count, dtype=np.int64)
         while (control[:, layout.STATUS] == layout.WANTS_SORT).any():
             self._put_control(control)
@@ -538,7 +528,6 @@ class Engine:
             "p_neighbours": self._p_neighbours,
             "near": self._near_of_p,
             "near_p": self._near_p,
-            "near_worlds": self._near_worlds,
             "meets_p": self._meets_p,
             "meet_p": self._meet_p,
             "touched": self._touched,
@@ -573,6 +562,12 @@ class Engine:
             "touching": self._touching,
             "pushes": self._pushes,
         }
+
+
+def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keys (n,) of the blocks (n, 3) of the fields, as ``sorting.block_key`` packs them."""
+    x, y, z = (blocks + sorting.BIAS).T
+    return np.asarray(((fields << 16 | x) << 16 | y) << 16 | z)
 
 
 def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

@@ -13,7 +13,7 @@ from ..errors import InputError, SimulationError
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import layout, packing, runtime
 from .checks import check_start
-from .engine import Diverged, Engine
+from .engine import MOST_RETRIES, Diverged, Engine
 from .fitting import FittedGradients
 from .options import SolverOptions
 from .setup import WorldSetup
@@ -99,7 +99,7 @@ class Group:
 
     def stable_step(self, world: int) -> float:
         """Longest substep in s that the present state of world ``world`` allows."""
-        return min(self._engine.stable_step(world), self._longest_step(self._places[world]))
+        return min(float(self._engine.stable_steps()[world]), self._longest_step(self._places[world]))
 
     @property
     def device_bytes(self) -> int:
@@ -151,15 +151,15 @@ class Group:
         now = float(self._times[place.world])
         setup = place.setup
         tracks = [setup.gravity_track]
-        knots = []
+        single = []
         for body in setup.bodies:
             tracks += [body.acceleration, body.pin_motion, body.velocity_keys]
-            knots.append(body.start_time)
-            knots += [time for time, _ in body.material_track]
+            single += [body.start_time, *(time for time, _ in body.material_track)]
         for collider in setup.colliders:
             tracks += [collider.translations, collider.rotations, collider.vertices]
-        knots += [t for track in tracks if track is not None for t in track.times]
-        return min([end, *(float(t) for t in knots if now + INSTANT < t < end - INSTANT)])
+        knots = [t for t in single if now + INSTANT < t < end - INSTANT]
+        knots += [t for track in tracks if track is not None for t in track.knots(now + INSTANT, end - INSTANT)]
+        return min([end, *knots])
 
     def _reach_times(self, before: Array) -> None:
         """What sets in at the worlds' present times, after the times ``before`` (W,): bodies, velocities, materials."""
@@ -216,7 +216,7 @@ class Group:
         state["material"][mine] = packing.first_material(place, body_index) + choice[order]
         state["memory"][mine] = 0.0
         self._engine.replace(state)
-        self._engine.raise_wave_speed(place.world, wave_speed)
+        self._engine.expect(place.world, wave_speed=wave_speed)
         self._host = None
 
     def _set_velocity(self, place: packing.Place, body_index: int, velocity: Array) -> None:
@@ -230,7 +230,7 @@ class Group:
         state["v"][mine] = given.astype(np.float32)
         self._engine.replace(state)
         fastest = float(np.linalg.norm(given, axis=1).max())
-        self._engine.raise_speed(place.world, fastest)
+        self._engine.expect(place.world, speed=fastest)
         self._host = None
 
     def _lost(self, failure: Diverged) -> SimulationError:
@@ -244,8 +244,8 @@ class Group:
         if failure.field >= SOLID_LOST:
             name = self._solids.name(failure.field - SOLID_LOST)
         return SimulationError(
-            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened {2**6} times did "
-            f"not help: check its density and Young's modulus, what hits it and how fast, or lower the solver option "
+            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened to 1/{2**MOST_RETRIES} "
+            f"did not help: check its density and Young's modulus, what hits it and how fast, or lower the solver option "
             f"cfl_elastic ({self.options.cfl_elastic:g})"
         )
 
@@ -302,7 +302,7 @@ class Group:
     def checkpoint(self) -> State:
         """Everything needed to continue, as arrays for ``numpy.savez``; a restored run continues with equal bytes."""
         state = dict(self.state())
-        del state["position"], state["field"]
+        del state["position"]
         state["format"] = np.array(CHECKPOINT_FORMAT)
         state["times"] = self._times.copy()
         state["started"] = self._started.copy()

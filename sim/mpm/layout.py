@@ -1,4 +1,7 @@
 # SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Numbers and array types that every kernel of the engine agrees on.
 
 Lengths in kernels are counted in grid cells. Particles are grouped in blocks of 4x4x4 cells by the lowest of the three
@@ -64,10 +67,10 @@ FAR = 1e9
 WORLD, FIRST_TOUCH, WANTS_MEANS, HAS_ANCHORS = range(4)
 FIELD_INTEGERS = 4
 
-# Means of a field: mass (kg), centre of mass where the next substep finds it (cells), velocity (cells/s), angular
+# Means of a field: centre of mass where the next substep finds it (cells), velocity (cells/s), angular
 # velocity (1/s).
-MEAN_MASS, MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN = 0, 1, 4, 7
-MEAN_ROW = 10
+MEAN_PLACE, MEAN_VELOCITY, MEAN_SPIN = 0, 3, 6
+MEAN_ROW = 9
 
 # How a field meets an obstacle (its world's plane is obstacle 0, solid i is obstacle i + 1), or another field.
 STICKING, SLIDING, MODE, RESTITUTION = range(4)
@@ -100,3 +103,9 @@ Vectors3 = ti.types.ndarray(dtype=vec3, ndim=1)
 Vectors4 = ti.types.ndarray(dtype=vec4, ndim=1)
 Cells = ti.types.ndarray(dtype=ivec3, ndim=1)
 Matrices = ti.types.ndarray(dtype=mat3, ndim=1)
+
+
+@ti.func
+def triple(numbers: Scalars, first: ti.i32):
+    """The three numbers from ``first`` on."""
+    return vec3(numbers[first], numbers[first + 1], numbers[first + 2])

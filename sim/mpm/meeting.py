@@ -23,7 +23,7 @@ from .layout import (
     Integers,
     Keys,
     Scalars,
-    vec3,
+    triple,
 )
 from .obstacles import solid_distance
 from .sorting import block_key, slot_of
@@ -71,7 +71,7 @@ def list_near_blocks(
         is_near = field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
         centre = ti.cast(p_cells[k] * 4, ti.f32) + 2.5
         if worlds[row + HAS_PLANE] > 0.5:
-            normal = vec3(worlds[row + PLANE_NORMAL], worlds[row + PLANE_NORMAL + 1], worlds[row + PLANE_NORMAL + 2])
+            normal = triple(worlds, row + PLANE_NORMAL)
             half = HALF_SIDE * (ti.abs(normal[0]) + ti.abs(normal[1]) + ti.abs(normal[2]))
             is_near = is_near or normal.dot(centre) - worlds[row + PLANE_OFFSET] - half < NEAR
         first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]

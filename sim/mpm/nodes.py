@@ -23,7 +23,6 @@ from .layout import (
     GRAVITY_FACTOR,
     GRAVITY_RATE,
     LIFT,
-    MEAN_MASS,
     MEAN_PLACE,
     MEAN_ROW,
     MEAN_SPIN,
@@ -50,6 +49,7 @@ from .layout import (
     Scalars,
     Vectors4,
     ivec3,
+    triple,
     vec3,
     vec4,
 )
@@ -60,12 +60,6 @@ from .transfer import sum_windows
 SUMS = 16
 """Numbers that a grid block adds to its field's means: mass, mass x place (3), momentum (3), angular momentum (3) and
 the six second moments xx, yy, zz, xy, yz, zx, places counted from the field's last centre of mass."""
-
-
-@ti.func
-def triple(numbers: Scalars, first: ti.i32):
-    """The three numbers from ``first`` on."""
-    return vec3(numbers[first], numbers[first + 1], numbers[first + 2])
 
 
 @ti.func
@@ -225,7 +219,6 @@ def gather_means(
                 step = control[w * CONTROL_ROW + STEP]
                 check = ti.cast(velocity.norm_sqr() + omega.norm_sqr() + shift.norm_sqr(), ti.f32)
                 if not not_finite(check) and velocity.norm() * step < FARTHEST_STEP:
-                    means[mean + MEAN_MASS] = ti.cast(mass, ti.f32)
                     for n in ti.static(range(3)):
                         means[mean + MEAN_PLACE + n] += ti.cast(shift[n] + step * velocity[n], ti.f32)
                         means[mean + MEAN_VELOCITY + n] = ti.cast(velocity[n], ti.f32)

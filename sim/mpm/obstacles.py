@@ -6,7 +6,20 @@
 
 import taichi as ti
 
-from .layout import CONTROL_ROW, FIRST_SOLID, FULL, PHASE, SOLIDS, WORLD_INTEGERS, Doubles, Integers, Scalars, vec3
+from .layout import (
+    CONTROL_ROW,
+    FIELD_INTEGERS,
+    FIRST_SOLID,
+    FULL,
+    PHASE,
+    SOLIDS,
+    WORLD,
+    WORLD_INTEGERS,
+    Doubles,
+    Integers,
+    Scalars,
+    vec3,
+)
 from .shapes import sample_distance
 from .solid_layout import (
     BLEND,
@@ -111,7 +124,9 @@ def gather_pushes(
     world_count: ti.i32,
     near_blocks: ti.i32,
     most_solids: ti.i32,
-    near_worlds: Integers,
+    near_p: Integers,
+    p_field: Integers,
+    field_integers: Integers,
     world_integers: Integers,
     control: Doubles,
     pushes: Scalars,
@@ -129,7 +144,7 @@ def gather_pushes(
                     impulses[6 * i + n] = 0.0
     ti.loop_config(serialize=True)
     for s in range(near_blocks):
-        w = near_worlds[s]
+        w = field_integers[p_field[near_p[s]] * FIELD_INTEGERS + WORLD]
         if control[w * CONTROL_ROW + PHASE] == FULL:
             first = world_integers[w * WORLD_INTEGERS + FIRST_SOLID]
             for o in range(world_integers[w * WORLD_INTEGERS + SOLIDS]):

@@ -23,7 +23,7 @@ less of their surroundings than faces do and count as rounded, by about a third 
 
 import taichi as ti
 
-from .contact import HOLD, RECOVERY, SPRING, coulomb
+from .contact import HOLD, SPRING, coulomb, parting_speed
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -222,12 +222,10 @@ def exchange(
         ua, ub = nodes[na], nodes[nb]
         relative = vec3(ua[0] - ub[0], ua[1] - ub[1], ua[2] - ub[2])
         closing = relative.dot(normal)
-        allowed = gap / dt
-        if gap < 0.0:
-            allowed = -ti.min(-RECOVERY * allowed, recovery)
+        wanted = parting_speed(gap, dt, recovery)
         mode = ti.cast(pairs[pair + MODE], ti.i32)
         elastic = pairs[pair + RESTITUTION]
-        push = (1.0 - elastic) * ti.max(0.0, closing - allowed) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
+        push = (1.0 - elastic) * ti.max(0.0, closing + wanted) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
         touching = push > 0.0
         if mode != SEPARATE and gap < HOLD:
             push = closing

@@ -172,7 +172,6 @@ def resolve_contact(
     starts: Integers,
     p_neighbours: Integers,
     near_p: Integers,
-    near_worlds: Integers,
     touched: Integers,
     slack: Scalars,
     g_field: Integers,
@@ -208,7 +207,6 @@ def resolve_contact(
         near_p_count,
         most_solids,
         near_p,
-        near_worlds,
         p_cells,
         p_field,
         starts,
@@ -252,7 +250,17 @@ def resolve_contact(
     )
     if solid_count > 0:
         gather_pushes(
-            world_count, near_p_count, most_solids, near_worlds, world_integers, control, pushes, impulses, touching
+            world_count,
+            near_p_count,
+            most_solids,
+            near_p,
+            p_field,
+            field_integers,
+            world_integers,
+            control,
+            pushes,
+            impulses,
+            touching,
         )
 
 

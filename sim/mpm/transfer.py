@@ -59,6 +59,7 @@ from .layout import (
     Vectors4,
     ivec3,
     mat3,
+    triple,
     vec3,
     vec4,
 )
@@ -328,11 +329,7 @@ def advance_particles(
                             past_scattered[k * WINDOW_NODES + i] = vec4(0.0)
             touching = near[k] >= 0
             on_plane = touching and worlds[world * WORLD_ROW + HAS_PLANE] > 0.5
-            normal = vec3(
-                worlds[world * WORLD_ROW + PLANE_NORMAL],
-                worlds[world * WORLD_ROW + PLANE_NORMAL + 1],
-                worlds[world * WORLD_ROW + PLANE_NORMAL + 2],
-            )
+            normal = triple(worlds, world * WORLD_ROW + PLANE_NORMAL)
             first_node = ti.cast(p_cells[k] * 4 - 1, ti.f32)
             level = normal.dot(first_node) - worlds[world * WORLD_ROW + PLANE_OFFSET]
             goal = 0.0
