@@ -55,8 +55,7 @@ def collider_warnings(bodies: Sequence[BodyParticles], colliders: Sequence[Colli
 
 def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:
     """Raise InputError when object ``name`` reaches more than ``DEEPEST_CELLS`` into the ground."""
-    normal = np.asarray(ground.normal) / np.linalg.norm(ground.normal)
-    depth = -float(((vertices - np.asarray(ground.point)) @ normal).min())
+    depth = -float(ground.heights(vertices).min())
     if depth > DEEPEST_CELLS * cell:
         raise InputError(
             f"object {name}: its lowest vertex is {depth:.3g} m below the ground: lift it by that much "

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .colliders import Surface
 from .contacts import GROUND_NAME
 from .forces import NO_FORCES, BodyForces
-from .materials import ElasticMaterial, RigidMaterial
+from .materials import ElasticMaterial, RigidMaterial, bounding_speed
 from .tracks import Track
 
 Vector = tuple[float, float, float]
@@ -183,6 +183,20 @@ class BodyParticles:
     def rigid(self) -> bool:
         """Whether the body moves as one."""
         return isinstance(self.material, RigidMaterial)
+
+    def bounding_speed(self, material: ElasticMaterial, scale: float) -> float:
+        """Speed in cells/s of the wave in ``material`` that bounds the substep, with ``scale`` cells a metre."""
+        stiffer = 1.0 if self.stiffness_scale is None else float(self.stiffness_scale.max())
+        lighter = 1.0 if self.density_scale is None else float(self.density_scale.min())
+        return bounding_speed(
+            scale * material.wave_speed * math.sqrt(stiffer / lighter),
+            scale**2 * material.diffusivity * stiffer / lighter,
+        )
+
+    @property
+    def spring_step(self) -> float:
+        """Longest substep in s that goals and the tether allow: explicit springs are stable to 2 / frequency."""
+        return 0.5 / math.sqrt(max(self.goal_stiffness + self.forces.tether_stiffness, 1e-12))
 
     def _require(self, condition: bool, field: str, value: object, remedy: str) -> None:
         if not condition:

@@ -30,9 +30,7 @@ def check_start(setup: WorldSetup, cells: Similarity) -> None:
             )
         if setup.ground is not None:
             assert body.contact_radii is not None
-            normal = np.asarray(setup.ground.normal, dtype=np.float64)
-            heights = (body.positions - np.asarray(setup.ground.point)) @ (normal / np.linalg.norm(normal))
-            gap = float((heights - body.contact_radii).min())
+            gap = float((setup.ground.heights(body.positions) - body.contact_radii).min())
             if gap < -DEEPEST_START / cells.scale:
                 raise InputError(
                     f"body {body.name!r}: positions reach {-gap:g} m below the ground: lift the body by that much"

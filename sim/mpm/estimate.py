@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import InputError
 from .bodies import BodyParticles
-from .materials import ElasticMaterial, bounding_speed
+from .materials import ElasticMaterial
 from .options import SolverOptions
 
 CPU_RATE = 2.5e6
@@ -97,25 +97,15 @@ def stable_step(bodies: Sequence[BodyParticles], cell: float, options: SolverOpt
     for body in bodies:
         for material in (body.material, *body.materials):
             if isinstance(material, ElasticMaterial):
-                wave = max(wave, _wave_cells(material, body, cell))
+                wave = max(wave, body.bounding_speed(material, 1.0 / cell))
         keys = 0.0 if body.velocity_keys is None else float(np.linalg.norm(body.velocity_keys.values, axis=1).max())
         speed = max(speed, keys, float(np.linalg.norm(body.initial_velocities, axis=1).max()))
-    goals = max((body.goal_stiffness for body in bodies), default=0.0)
-    step = min(options.max_step, 0.5 / math.sqrt(max(goals, 1e-12)))
+    step = min([options.max_step, *(body.spring_step for body in bodies)])
     if wave > 0:
         step = min(step, options.cfl_elastic / wave)
     if speed > 0:
         step = min(step, options.cfl_velocity * cell / speed)
     return step
-
-
-def _wave_cells(material: ElasticMaterial, body: BodyParticles, cell: float) -> float:
-    """Speed in cells/s of the wave that bounds the substep of ``material`` in ``body``."""
-    softer = 1.0 if body.density_scale is None else 1.0 / float(body.density_scale.min())
-    stiffer = 1.0 if body.stiffness_scale is None else float(body.stiffness_scale.max())
-    squared = material.wave_speed**2
-    diffusivity = material.diffusivity * stiffer * softer / cell**2
-    return bounding_speed(math.sqrt(squared * stiffer * softer) / cell, diffusivity)
 
 
 def refuse_excess(cost: Estimate, particles: int, available: int | None) -> None:

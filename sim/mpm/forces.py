@@ -6,6 +6,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import InputError
 
 Vector = tuple[float, float, float]
@@ -61,6 +64,21 @@ class BodyForces:
             vector = getattr(self, name)
             if len(vector) != 3 or not all(math.isfinite(c) for c in vector):
                 raise InputError(f"force {name} is {vector!r}: give three finite numbers")
+
+    def in_cells(self, scale: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The fields in their order as 12 numbers for the kernels, ``scale`` cells a metre counted from ``origin``."""
+        return np.array(
+            [
+                self.gravity_factor,
+                self.drag / scale,
+                *(np.asarray(self.wind) * scale),
+                self.lift,
+                self.tether_stiffness,
+                self.tether_length * scale,
+                *((np.asarray(self.tether_anchor) - origin) * scale),
+                float(self.tether_string),
+            ]
+        )
 
 
 NO_FORCES = BodyForces()

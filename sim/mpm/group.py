@@ -127,8 +127,8 @@ class Group:
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
             if self._solids.count:
-                for w in np.flatnonzero(stops > self._times):
-                    self._solids.set_segment(int(w), float(self._times[w]), float(stops[w]))
+                moving = np.flatnonzero(stops > self._times)
+                self._solids.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
             self._poses = {}
             longest = [self._longest_step(place) for place in self._places]
             self._host = None
@@ -142,9 +142,8 @@ class Group:
             self._reach_times(before)
 
     def _longest_step(self, place: packing.Place) -> float:
-        """Longest substep in s: the option's, and what springs allow (explicit ones are stable to 2 / frequency)."""
-        springs = [body.goal_stiffness + body.forces.tether_stiffness for body in place.setup.bodies]
-        return min(self.options.max_step, 0.5 / math.sqrt(max([*springs, 1e-12])))
+        """Longest substep in s whatever the waves: the option's, and what springs allow."""
+        return min([self.options.max_step, *(body.spring_step for body in place.setup.bodies)])
 
     def _next_stop(self, place: packing.Place, end: float) -> float:
         """The next time, up to ``end``, at which something in the world sets in or changes its slope."""
@@ -244,9 +243,9 @@ class Group:
         if failure.field >= SOLID_LOST:
             name = self._solids.name(failure.field - SOLID_LOST)
         return SimulationError(
-            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened to 1/{2**MOST_RETRIES} "
-            f"did not help: check its density and Young's modulus, what hits it and how fast, or lower the solver option "
-            f"cfl_elastic ({self.options.cfl_elastic:g})"
+            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened to "
+            f"1/{2**MOST_RETRIES} did not help: check its density and Young's modulus, what hits it and how fast, or "
+            f"lower the solver option cfl_elastic ({self.options.cfl_elastic:g})"
         )
 
     def _check_generation(self) -> None:

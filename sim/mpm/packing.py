@@ -16,7 +16,7 @@ from ..scene.units import Similarity
 from . import layout
 from .bodies import BodyParticles
 from .contacts import GROUND_NAME, MODES, SurfaceContact
-from .materials import ONLY_ELASTIC, ROW, ElasticMaterial, RigidMaterial, bounding_speed
+from .materials import ONLY_ELASTIC, ROW, ElasticMaterial, RigidMaterial
 from .packed import Added, Numbers
 from .setup import WorldSetup
 from .solids import LEAST_RECOVERY, RECOVERY_HEIGHT
@@ -146,10 +146,8 @@ def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
     ground = place.setup.ground
     row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = (0.0, 0.0, 1.0)
     if ground is not None:
-        normal = np.asarray(ground.normal, dtype=np.float64)
-        normal = normal / np.linalg.norm(normal)
-        row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = normal
-        row[layout.PLANE_OFFSET] = normal @ place.cells.points_to_engine(np.asarray(ground.point))
+        row[layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = ground.unit_normal
+        row[layout.PLANE_OFFSET] = ground.unit_normal @ place.cells.points_to_engine(np.asarray(ground.point))
         row[layout.HAS_PLANE] = 1.0
     fall = math.sqrt(2.0 * RECOVERY_HEIGHT * scale * strongest_pull(place.setup))
     row[layout.RECOVERY_SPEED] = max(fall, LEAST_RECOVERY)
@@ -175,18 +173,8 @@ def field_rows(all_places: Sequence[Place], starts: Sequence[float], ends: Seque
 def field_row(place: Place, body_index: int, start: float, end: float) -> NDArray[np.float32]:
     """Numbers of one field for the segment of time from ``start`` to ``end`` in s."""
     body, scale = place.setup.bodies[body_index], place.cells.scale
-    forces = body.forces
     row = np.zeros(layout.FIELD_ROW)
-    row[layout.GRAVITY_FACTOR] = forces.gravity_factor
-    row[layout.DRAG] = forces.drag / scale
-    row[layout.WIND : layout.WIND + 3] = np.asarray(forces.wind) * scale
-    row[layout.LIFT] = forces.lift
-    row[layout.TETHER_STIFFNESS] = forces.tether_stiffness
-    row[layout.TETHER_LENGTH] = forces.tether_length * scale
-    row[layout.TETHER_ANCHOR : layout.TETHER_ANCHOR + 3] = place.cells.points_to_engine(
-        np.asarray(forces.tether_anchor, dtype=np.float64)
-    )
-    row[layout.TETHER_STRING] = float(forces.tether_string)
+    row[layout.GRAVITY_FACTOR : layout.TETHER_STRING + 1] = body.forces.in_cells(scale, np.asarray(place.cells.origin))
     for track, column, rate in (
         (body.acceleration, layout.ACCELERATION, layout.ACCELERATION_RATE),
         (body.pin_motion, layout.MOTION, layout.MOTION_RATE),
@@ -196,14 +184,12 @@ def field_row(place: Place, body_index: int, start: float, end: float) -> NDArra
             row[column : column + 3] = now
             if end > start:
                 row[rate : rate + 3] = (later - now) / (end - start)
-    if place.setup.ground is not None:
-        contact = place.setup.contact(body.name, GROUND_NAME)
-        if contact.adhesion_reach > 0:
-            row[layout.PLANE_ADHESION] = contact.adhesion * scale
-            row[layout.PLANE_REACH] = contact.adhesion_reach * scale
+    contact = place.setup.contact(body.name, GROUND_NAME)
+    if contact.adhesion_reach > 0 and place.setup.ground is not None:
+        row[layout.PLANE_ADHESION] = contact.adhesion * scale
+        row[layout.PLANE_REACH] = contact.adhesion_reach * scale
     row[layout.PLANE_GAP : layout.PLANE_GAP + 2] = layout.FAR
-    elastic = place.setup.contact(body.name, GROUND_NAME).restitution > 0
-    row[layout.SUNK_LIMIT] = DEEPEST_ELASTIC if elastic else DEEPEST
+    row[layout.SUNK_LIMIT] = DEEPEST_ELASTIC if contact.restitution > 0 else DEEPEST
     row[layout.GOAL_STIFFNESS] = body.goal_stiffness
     row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
     return row.astype(np.float32)
@@ -249,12 +235,5 @@ def stiffness(body: BodyParticles, choice: NDArray[np.int32], cells: Similarity)
     bulk = np.array([m.bulk_number for m in every])[choice] * factor
     volumes = body.volumes * scale**3
     constants = np.column_stack([cells.modulus(1.0) * shear * volumes, cells.modulus(1.0) * bulk * volumes])
-    lighter = 1.0 if body.density_scale is None else float(body.density_scale.min())
-    fastest = max(
-        bounding_speed(
-            cells.length(every[i].wave_speed) * math.sqrt(float(factor.max()) / lighter),
-            scale**2 * every[i].diffusivity * float(factor.max()) / lighter,
-        )
-        for i in np.unique(choice)
-    )
+    fastest = max(body.bounding_speed(every[i], scale) for i in np.unique(choice))
     return constants, fastest

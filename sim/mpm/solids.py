@@ -136,8 +136,7 @@ class Solids:
             self._solids += [self._new_collider(w, collider) for collider in setup.colliders]
             spans.append((first, len(self._solids)))
         self._pack(spans)
-        for w in range(len(self.setups)):
-            self.set_segment(w, 0.0, 1.0)
+        self.set_segments(dict.fromkeys(range(len(self.setups)), (0.0, 1.0)))
 
     # ---- packing ------------------------------------------------------------------------------------------------
 
@@ -229,16 +228,10 @@ class Solids:
     def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
         properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
         inertia = np.asarray(properties.inertia) * scale**2
-        forces = body.forces
         numbers[at.INVERSE_MASS], numbers[at.MASS] = 1 / properties.mass, properties.mass
         numbers[at.INERTIA : at.INERTIA + 9] = inertia.ravel()
         numbers[at.INVERSE_INERTIA : at.INVERSE_INERTIA + 9] = np.linalg.inv(inertia).ravel()
-        numbers[at.GRAVITY_FACTOR] = forces.gravity_factor
-        numbers[at.DRAG], numbers[at.LIFT] = forces.drag / scale, forces.lift
-        numbers[at.WIND : at.WIND + 3] = np.asarray(forces.wind) * scale
-        numbers[at.TETHER_STIFFNESS], numbers[at.TETHER_LENGTH] = forces.tether_stiffness, forces.tether_length * scale
-        numbers[at.TETHER_ANCHOR : at.TETHER_ANCHOR + 3] = (np.asarray(forces.tether_anchor) - origin) * scale
-        numbers[at.TETHER_STRING] = float(forces.tether_string)
+        numbers[at.GRAVITY_FACTOR : at.TETHER_STRING + 1] = body.forces.in_cells(scale, origin)
         state[at.V : at.V + 3] = np.asarray(body.velocity) * scale
         state[at.W : at.W + 3] = body.spin
         state[at.L : at.L + 3] = inertia @ np.asarray(body.spin)
@@ -282,12 +275,11 @@ class Solids:
         for w, setup in enumerate(self.setups):
             axes, offset = np.eye(3), 0.0
             if setup.ground is not None:
-                normal = np.asarray(setup.ground.normal, dtype=np.float64)
-                normal = normal / np.linalg.norm(normal)
+                normal = setup.ground.unit_normal
                 first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
                 first /= np.linalg.norm(first)
                 axes = np.stack([first, np.cross(normal, first), normal])
-                offset = float(normal @ (np.asarray(setup.ground.point) - self.origins[w])) * self.scales[w]
+                offset = -float(setup.ground.heights(self.origins[w])) * self.scales[w]
             numbers[w, at.PLANE : at.PLANE + 9] = axes.ravel()
             numbers[w, at.OFFSET] = offset
         return numbers
@@ -342,45 +334,59 @@ class Solids:
     # ---- time ---------------------------------------------------------------------------------------------------
 
     def set_segment(self, w: int, start: float, end: float) -> None:
-        """Make world ``w`` ready for the time from ``start`` to ``end`` in s, over which nothing bends: gravity, poses
-        and velocities of colliders, uniform accelerations, bodies that start and velocities given at ``start``."""
-        if not (math.isfinite(start) and math.isfinite(end) and end > start):
-            raise InputError(f"segment is {start!r} to {end!r}: give finite seconds in rising order")
-        if not 0 <= w < len(self.setups):
-            raise InputError(f"world is {w}: give 0 to {len(self.setups) - 1}")
-        setup, scale = self.setups[w], self.scales[w]
+        """``set_segments`` of world ``w`` alone."""
+        self.set_segments({w: (start, end)})
+
+    def set_segments(self, segments: Mapping[int, tuple[float, float]]) -> None:
+        """Make the worlds named ready, each for its time from start to end in s, over which nothing bends: gravity,
+        poses and speeds of colliders, uniform accelerations, bodies that start and velocities given at the start."""
         world = self._get("world_numbers", at.WORLD)
-        world[w, at.GRAVITY : at.GRAVITY + 3] = np.asarray(setup.gravity_at(0.5 * (start + end))) * scale
-        weight = float(np.linalg.norm(world[w, at.GRAVITY : at.GRAVITY + 3]))
-        world[w, at.RECOVERY] = max(math.sqrt(2 * RECOVERY_HEIGHT * weight), LEAST_RECOVERY)
+        for w, (start, end) in segments.items():
+            if not (math.isfinite(start) and math.isfinite(end) and end > start):
+                raise InputError(f"segment is {start!r} to {end!r}: give finite seconds in rising order")
+            if not 0 <= w < len(self.setups):
+                raise InputError(f"world is {w}: give 0 to {len(self.setups) - 1}")
+            gravity = np.asarray(self.setups[w].gravity_at(0.5 * (start + end))) * self.scales[w]
+            world[w, at.GRAVITY : at.GRAVITY + 3] = gravity
+            flight = math.sqrt(2 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
+            world[w, at.RECOVERY] = max(flight, LEAST_RECOVERY)
         kinds, numbers = self._get("solid_kinds", at.KINDS), self._get("solid_numbers", at.NUMBERS)
         state = self._get("solids", at.SOLID)
         changed: dict[int, list[DistanceLattice]] = {}
         for i, solid in enumerate(self._solids):
-            if solid.world != w:
+            if solid.world not in segments:
                 continue
+            start, end = segments[solid.world]
             if isinstance(solid.source, BodyParticles):
-                body = solid.source
-                starts = body.start_time <= start + 1e-12
-                kinds[i, at.KIND] = at.DYNAMIC if starts else at.WAITING
-                if body.acceleration is not None:
-                    numbers[i, at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
-                if body.velocity_keys is not None and starts:
-                    due = [k for k, t in enumerate(body.velocity_keys.times) if self._keys_done[w] < t <= start + 1e-12]
-                    if due:
-                        state[i, at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
+                self._set_body(solid, start, end, kinds[i], numbers[i], state[i])
             elif solid.source.vertices is not None:
                 changed |= self._set_deforming(i, start, end, state[i], numbers[i])
             elif kinds[i, at.KIND] == at.KINEMATIC:
                 self._set_pose(solid, start, end, state[i])
-        self._keys_done[w] = start + 1e-12
-        self._segments[w] = (start, end)
+        for w, (start, end) in segments.items():
+            self._keys_done[w] = start + 1e-12
+            self._segments[w] = (start, end)
         self._put("world_numbers", world, ti.f64)
         self._put("solid_kinds", kinds, ti.i32)
         self._put("solid_numbers", numbers, ti.f64)
         self._put("solids", state, ti.f64)
         if changed:
             self._put_shapes(changed)
+
+    def _set_body(
+        self, solid: _Solid, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
+    ) -> None:
+        body, scale = solid.source, self.scales[solid.world]
+        assert isinstance(body, BodyParticles)
+        starts = body.start_time <= start + 1e-12
+        kinds[at.KIND] = at.DYNAMIC if starts else at.WAITING
+        if body.acceleration is not None:
+            numbers[at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
+        if body.velocity_keys is not None and starts:
+            done = self._keys_done[solid.world]
+            due = [k for k, t in enumerate(body.velocity_keys.times) if done < t <= start + 1e-12]
+            if due:
+                state[at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
 
     def _set_pose(self, solid: _Solid, start: float, end: float, state: Array) -> None:
         collider = solid.source
@@ -457,10 +463,9 @@ class Solids:
                 raise InputError(f"checkpoint has no {name}: it was not written by this engine")
             if name in CHANGING and state[name].shape != self.arrays[name].shape:
                 raise InputError(f"checkpoint is of another scene: {name} has shape {state[name].shape}")
-        for w, (start, end) in enumerate(np.asarray(state["segments"], dtype=np.float64)):
-            self.set_segment(w, float(start), float(end))
-        for name in CHANGING:
-            self.arrays[name].from_numpy(np.ascontiguousarray(state[name]))
+        times = np.asarray(state["segments"], dtype=np.float64)
+        self.set_segments({w: (float(start), float(end)) for w, (start, end) in enumerate(times)})
+        self.put_back(state)
         self._keys_done = np.array(state["keys_done"], dtype=np.float64)
 
     def put_back(self, state: Mapping[str, NDArray[np.generic]]) -> None:

@@ -192,17 +192,13 @@ class WorldView:
         ground = self.setup.ground
         if ground is None:
             return math.inf
-        radii = self.bodies[index].contact_radii
-        assert radii is not None
-        normal = np.asarray(ground.normal, dtype=np.float64)
-        heights = (self.positions(index) - np.asarray(ground.point)) @ (normal / np.linalg.norm(normal))
-        if self.bodies[index].rigid:
-            surface = self.bodies[index].surface
-            assert surface is not None
-            pose = self.pose(self.bodies[index].name)
-            places = surface.vertices @ pose.rotation.T + pose.translation
-            return float(((places - np.asarray(ground.point)) @ (normal / np.linalg.norm(normal))).min())
-        return float((heights - radii).min())
+        body = self.bodies[index]
+        if body.rigid:
+            assert body.surface is not None
+            pose = self.pose(body.name)
+            return float(ground.heights(body.surface.vertices @ pose.rotation.T + pose.translation).min())
+        assert body.contact_radii is not None
+        return float((ground.heights(self.positions(index)) - body.contact_radii).min())
 
     def particles_outside(self, index: int) -> int:
         """Particles of body ``index`` that have left the box of the profile; they fly on, outside as inside."""

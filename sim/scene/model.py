@@ -148,6 +148,16 @@ class Ground:
             "give 0 to 1",
         )
 
+    @property
+    def unit_normal(self) -> NDArray[np.float64]:
+        """``normal`` (3,) of length 1 to the last digit."""
+        normal = np.asarray(self.normal, dtype=np.float64)
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    def heights(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Heights (...) of ``points`` (..., 3) over the plane, metres."""
+        return np.asarray((np.asarray(points, dtype=np.float64) - np.asarray(self.point)) @ self.unit_normal)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
