@@ -100,7 +100,8 @@ def render_stage(
         command += ["--frames", request.frames]
     if video is not None:
         command += ["--video", str(video.resolve())]
-    return run_stage(command, on_event, cancelled, failure=RenderError)
+    # Blender crashes now and then when a video or a process ends; whole frames are kept, so it is tried once more.
+    return run_stage(command, on_event, cancelled, failure=RenderError, restarts=1)
 
 
 @dataclass(frozen=True, kw_only=True)

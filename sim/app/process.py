@@ -33,13 +33,44 @@ def child_environment() -> dict[str, str]:
 
 
 def run_stage(
-    command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled, *, failure: type[PhysGenError] = SimulationError
+    command: Sequence[str],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+    *,
+    failure: type[PhysGenError] = SimulationError,
+    restarts: int = 0,
 ) -> Event:
     """Run ``command`` to its end, pass its events on and return its final ``done`` event.
 
+    restarts: how often the stage is started again, with a notice, after it crashed; for stages that keep what they
+    finished and go on from there.
     Raises the PhysGenError that the stage reported; Cancelled when ``cancelled()`` became true; ``failure`` with
     the last lines of its output when it died without a word.
     """
+    while True:
+        final, code, tail = _run_once(command, on_event, cancelled)
+        if restarts == 0 or final is not None or not _crashed(code):
+            break
+        restarts -= 1
+        on_event({"event": "notice", "message": f"the process crashed (code {code}); it goes on where it was"})
+    if final is not None and final.get("event") == "error":
+        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
+    if code != 0 or final is None:
+        words = "\n".join(tail).strip() or "it said nothing"
+        raise failure(f"the process ended with code {code}: {words}")
+    return final
+
+
+def _crashed(code: int) -> bool:
+    """Whether a process with this exit code ended by a fault of its own, not by somebody who killed it."""
+    faults = {getattr(signal, name, None) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGFPE", "SIGILL")}
+    return -code in faults or (os.name == "nt" and code & 0xF0000000 == 0xC0000000)
+
+
+def _run_once(
+    command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
+) -> tuple[Event | None, int, deque[str]]:
+    """The final event of ``command`` if it gave one, its exit code and the last lines of its chatter."""
     flags = 0x00000200 | 0x08000000 if os.name == "nt" else 0  # new process group, no console window
     # Own session: Ctrl-C reaches this process alone, which then asks the stage to stop in good order.
     process = subprocess.Popen(
@@ -65,12 +96,7 @@ def run_stage(
         _stop(process)
         for reader in readers:
             reader.join(timeout=5)
-    if final is not None and final.get("event") == "error":
-        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
-    if process.returncode != 0 or final is None:
-        words = "\n".join(tail).strip() or "it said nothing"
-        raise failure(f"the process ended with code {process.returncode}: {words}")
-    return final
+    return final, process.returncode, tail
 
 
 def _relay(

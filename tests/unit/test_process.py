@@ -45,6 +45,31 @@ def test_a_stage_that_ends_well_without_a_result_is_an_error():
         run_stage(stage("pass"), print, lambda: False, failure=RenderError)
 
 
+def test_a_stage_that_crashes_is_started_again_as_often_as_allowed(tmp_path):
+    code = f"""
+        import os, pathlib, signal
+        with open({str(tmp_path / "starts")!r}, "a") as starts: starts.write("x")
+        if pathlib.Path({str(tmp_path / "starts")!r}).stat().st_size < 3: os.kill(os.getpid(), signal.SIGSEGV)
+        print('{{"event": "done", "value": 7}}')
+    """
+    with pytest.raises(RenderError, match="code -11"):
+        run_stage(stage(code), print, lambda: False, failure=RenderError, restarts=1)
+    events = []
+    assert run_stage(stage(code), events.append, lambda: False, failure=RenderError, restarts=1)["value"] == 7
+    assert (tmp_path / "starts").stat().st_size == 3 and events == [], "the third start worked at once"
+
+
+def test_a_stage_that_was_killed_is_not_started_again(tmp_path):
+    code = f"""
+        import os
+        with open({str(tmp_path / "starts")!r}, "a") as starts: starts.write("x")
+        os.kill(os.getpid(), 9)
+    """
+    with pytest.raises(RenderError, match="code -9"):
+        run_stage(stage(code), print, lambda: False, failure=RenderError, restarts=1)
+    assert (tmp_path / "starts").stat().st_size == 1
+
+
 def test_a_deaf_stage_is_killed(monkeypatch):
     monkeypatch.setattr(process, "CANCEL_GRACE_S", 0.5)
     pids = []
