@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: MIT
+"""Capture folders (``physgen-capture/1``): what was observed of a real motion, and what the modeller believes.
+
+docs/file-formats.md describes the files for other programs.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ..atomic import replacing, write_json
+from ..errors import InputError
+from ..scene.folder import inside
+from ..scene.json_fields import parse, read_json, to_json
+from ..scene.meshes import read_mesh
+
+FORMAT = "physgen-capture/1"
+CAPTURE_FILE = "capture.json"
+STIFFNESSES = ("soft", "medium", "hard")
+ROLES = ("fit", "predict")
+
+MAX_TRIAL_BYTES = 512 * 2**20
+"""A trial's arrays together; a larger file is refused before it is read."""
+
+Vector = tuple[float, float, float]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """The believed ground plane. normal: any length; friction: Coulomb's coefficient; restitution: None if unknown."""
+
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    friction: float = 0.5
+    restitution: float | None = None
+
+    def __post_init__(self) -> None:
+        if math.hypot(*self.normal) < 1e-9:
+            raise InputError(f"normal is {list(self.normal)}: give a direction, not three zeros")
+        if not 0 <= self.friction <= 10:
+            raise InputError(f"friction is {self.friction!r}: give 0 to 10")
+        if self.restitution is not None and not 0 <= self.restitution <= 1:
+            raise InputError(f"restitution is {self.restitution!r}: give 0 to 1, or null where it is not known")
+
+    @property
+    def unit_normal(self) -> Array:
+        """(3,), of length 1."""
+        normal = np.asarray(self.normal, dtype=np.float64)
+        return normal / np.linalg.norm(normal)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectBelief:
+    """What is believed of an object. density in kg/m³, Young's modulus in Pa (None with ``hard``: a rigid body)."""
+
+    name: str
+    mesh: str
+    density_kg_m3: float
+    stiffness: str
+    youngs_modulus_pa: float | None = None
+    poisson_ratio: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("name is empty: name the object")
+        if self.stiffness not in STIFFNESSES:
+            raise InputError(f"stiffness is {self.stiffness!r}: give {', '.join(STIFFNESSES)}")
+        if not 1e-3 <= self.density_kg_m3 <= 1e5:
+            raise InputError(f"density_kg_m3 is {self.density_kg_m3!r}: give 0.001 to 100000")
+        if self.youngs_modulus_pa is None and self.stiffness != "hard":
+            raise InputError(f"youngs_modulus_pa is null: give it for a {self.stiffness} object, or call it hard")
+        if self.youngs_modulus_pa is not None and not 1 <= self.youngs_modulus_pa <= 1e13:
+            raise InputError(f"youngs_modulus_pa is {self.youngs_modulus_pa!r}: give 1 to 1e13, or null if rigid")
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise InputError(f"poisson_ratio is {self.poisson_ratio!r}: give 0 to below 0.5")
+
+    @property
+    def rigid(self) -> bool:
+        """Whether it is modelled as a body that does not deform."""
+        return self.youngs_modulus_pa is None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A pinhole camera with OpenCV axes (x right, y down, z forward); pixels, and metres in ``world_from_camera``."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: tuple[tuple[float, float, float, float], ...]
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"width and height are {self.width} and {self.height}: give pixels")
+        if not (self.fx > 0 and self.fy > 0):
+            raise InputError(f"fx and fy are {self.fx!r} and {self.fy!r}: give focal lengths in pixels, above 0")
+        matrix = np.asarray(self.world_from_camera, dtype=np.float64)
+        if matrix.shape != (4, 4):
+            raise InputError(f"world_from_camera has shape {matrix.shape}: give 4 rows of 4 numbers")
+        turn = matrix[:3, :3]
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-9):
+            raise InputError("world_from_camera: give a rotation and a shift; this scales or shears")
+        if np.linalg.det(turn) < 0:
+            raise InputError("world_from_camera mirrors: its axes are left-handed; flip one of them")
+
+    @property
+    def matrix(self) -> Array:
+        """world_from_camera, (4, 4)."""
+        return np.asarray(self.world_from_camera, dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureObject:
+    """An object: what is believed of it, and its mesh in its rest frame, (V, 3) in m and (F, 3) vertex indices."""
+
+    belief: ObjectBelief
+    vertices: Array
+    faces: NDArray[np.int64]
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.belief.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One take. T frames, K tracked points.
+
+    times: (T,) s, rising. points: (T, K, 3) m, world, NaN where not seen; or pixels: (T, K, 2); the other is None.
+    object_index: (K,) object of a point. rest_points: (K, 3) m, in the object's rest frame.
+    predict_times: (P,) s, after the last frame; only of a ``predict`` trial.
+    """
+
+    name: str
+    role: str
+    times: Array
+    points: Array | None
+    pixels: Array | None
+    object_index: NDArray[np.int64]
+    rest_points: Array
+    predict_times: Array | None = None
+
+    @property
+    def observed(self) -> Array:
+        """points or pixels, whichever there is: (T, K, 3) or (T, K, 2)."""
+        found = self.points if self.points is not None else self.pixels
+        assert found is not None
+        return found
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(T, K): where a point was seen."""
+        return np.asarray(np.isfinite(self.observed).all(axis=2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """A loaded capture. gravity in m/s², believed; noise_sigma of one coordinate: m with points, pixels with pixels.
+
+    warnings: what looks wrong but does not stop a diagnosis.
+    """
+
+    gravity: Vector
+    ground: Ground
+    objects: tuple[CaptureObject, ...]
+    noise_sigma: float
+    camera: Camera | None
+    trials: tuple[Trial, ...]
+    root: Path | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def fit_trials(self) -> tuple[Trial, ...]:
+        """The complete takes."""
+        return tuple(t for t in self.trials if t.role == "fit")
+
+    @property
+    def predict_trials(self) -> tuple[Trial, ...]:
+        """The takes of which only the first frames are shown."""
+        return tuple(t for t in self.trials if t.role == "predict")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TrialEntry:
+    name: str
+    file: str
+    role: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CaptureFile:
+    format: str
+    gravity: Vector
+    ground: Ground
+    objects: tuple[ObjectBelief, ...]
+    noise_sigma: float
+    trials: tuple[_TrialEntry, ...]
+    camera: Camera | None = None
+
+
+def load_capture(root: Path) -> Capture:
+    """Read and check the capture folder ``root``.
+
+    Raises InputError, with file, field, value and remedy, for anything malformed. What can go on is in ``warnings``.
+    """
+    from .capture_checks import check_capture
+
+    path = root / CAPTURE_FILE
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else None
+        raise InputError(f"{path}: format is {found!r}: this program reads {FORMAT!r}")
+    file = parse(_CaptureFile, data, str(path))
+    if not file.objects or not file.trials:
+        raise InputError(f"{path}: needs at least one object and one trial")
+    if not file.noise_sigma > 0:
+        raise InputError(f"{path}: noise_sigma is {file.noise_sigma!r}: give the standard deviation of a coordinate")
+    _refuse_twins(path, "objects", [o.name for o in file.objects])
+    _refuse_twins(path, "trials", [t.name for t in file.trials])
+    objects = []
+    for belief in file.objects:
+        mesh = read_mesh(inside(root, belief.mesh))
+        objects.append(
+            CaptureObject(
+                belief=belief,
+                vertices=np.asarray(mesh.vertices, dtype=np.float64),
+                faces=np.asarray(mesh.faces, dtype=np.int64),
+            )
+        )
+    trials = [_load_trial(root, entry, len(objects)) for entry in file.trials]
+    if file.camera is None and any(t.pixels is not None for t in trials):
+        raise InputError(f"{path}: camera is missing, and there are trials of pixels: give the camera")
+    if len({t.pixels is None for t in trials}) > 1:
+        raise InputError(f"{path}: some trials have points and others pixels: make two captures of them")
+    if not any(t.role == "fit" for t in trials):
+        raise InputError(f"{path}: no trial has the role 'fit': there is nothing to learn from")
+    capture = Capture(
+        gravity=file.gravity,
+        ground=file.ground,
+        objects=tuple(objects),
+        noise_sigma=file.noise_sigma,
+        camera=file.camera,
+        trials=tuple(trials),
+        root=root,
+    )
+    return check_capture(capture)
+
+
+def save_capture(capture: Capture, root: Path) -> None:
+    """Write ``capture`` as a new folder ``root``, whole or not at all; InputError when it is there already."""
+    if root.exists():
+        raise InputError(f"{root}: is there already; choose another folder")
+    with replacing(root) as partial:
+        partial.mkdir(parents=True)
+        entries = []
+        for item in capture.objects:
+            target = inside(partial, item.belief.mesh)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            trimesh.Trimesh(item.vertices, item.faces, process=False).export(target)
+        for trial in capture.trials:
+            name = f"{trial.name}.npz"
+            np.savez(inside(partial, name), **_trial_arrays(trial))  # type: ignore[arg-type]
+            entries.append(_TrialEntry(name=trial.name, file=name, role=trial.role))
+        file = _CaptureFile(
+            format=FORMAT,
+            gravity=capture.gravity,
+            ground=capture.ground,
+            objects=tuple(item.belief for item in capture.objects),
+            noise_sigma=capture.noise_sigma,
+            trials=tuple(entries),
+            camera=capture.camera,
+        )
+        data = to_json(file)
+        if capture.camera is None:
+            del data["camera"]
+        write_json(partial / CAPTURE_FILE, data)
+
+
+def _trial_arrays(trial: Trial) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {
+        "times": trial.times,
+        ("points" if trial.points is not None else "pixels"): trial.observed,
+        "object_index": trial.object_index,
+        "rest_points": trial.rest_points,
+    }
+    if trial.predict_times is not None:
+        arrays["predict_times"] = trial.predict_times
+    return arrays
+
+
+def _refuse_twins(path: Path, what: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path}: {what}: two are called {name!r}: give each its own name")
+
+
+def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
+    path = inside(root, entry.file)
+    where = f"{path} (trial {entry.name!r})"
+    if entry.role not in ROLES:
+        raise InputError(f"{where}: role is {entry.role!r}: give {' or '.join(ROLES)}")
+    arrays = read_arrays(path)
+    times = _array(arrays, "times", (None,), where)
+    frames = len(times)
+    if frames < 3:
+        raise InputError(f"{where}: has {frames} frames; a motion needs at least 3")
+    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+        bad = int(np.flatnonzero(~(np.diff(times) > 0))[0]) + 1 if np.isfinite(times).all() else 0
+        raise InputError(f"{where}: times[{bad}] is {times[bad]!r}: give finite seconds in rising order")
+    if ("points" in arrays) == ("pixels" in arrays):
+        raise InputError(f"{where}: give either points or pixels")
+    kind, size = ("points", 3) if "points" in arrays else ("pixels", 2)
+    observed = _array(arrays, kind, (frames, None, size), where)
+    count = observed.shape[1]
+    if count == 0:
+        raise InputError(f"{where}: {kind} has no points: track at least one")
+    if np.isinf(observed).any():
+        raise InputError(f"{where}: {kind} has infinite numbers: write NaN where a point was not seen")
+    # A point half seen is not seen.
+    observed = np.where(np.isfinite(observed).all(axis=2, keepdims=True), observed, np.nan)
+    if not np.isfinite(observed).any():
+        raise InputError(f"{where}: no point was seen in any frame; leave this trial out")
+    index = _array(arrays, "object_index", (count,), where)
+    if (index != np.round(index)).any() or index.min() < 0 or index.max() >= objects:
+        raise InputError(f"{where}: object_index goes from {index.min():g} to {index.max():g}: give 0 to {objects - 1}")
+    rest = _array(arrays, "rest_points", (count, 3), where)
+    if not np.isfinite(rest).all():
+        raise InputError(f"{where}: rest_points are not finite: every point needs its place on the mesh")
+    wanted = None
+    if entry.role == "predict":
+        wanted = _array(arrays, "predict_times", (None,), where)
+        if not np.isfinite(wanted).all() or not (np.diff(wanted) > 0).all() or (len(wanted) and wanted[0] <= times[-1]):
+            raise InputError(f"{where}: predict_times: give rising seconds after the last frame, {times[-1]:g} s")
+    return Trial(
+        name=entry.name,
+        role=entry.role,
+        times=times,
+        points=observed if kind == "points" else None,
+        pixels=observed if kind == "pixels" else None,
+        object_index=index.astype(np.int64),
+        rest_points=rest,
+        predict_times=wanted,
+    )
+
+
+def read_arrays(path: Path) -> Mapping[str, NDArray[Any]]:
+    """All arrays of the ``.npz`` at ``path``; never unpickles.
+
+    Raises InputError when it is missing, too large once unpacked, or no archive of plain arrays.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+        if size > MAX_TRIAL_BYTES:
+            raise InputError(f"{path}: holds {size >> 20} MiB, more than {MAX_TRIAL_BYTES >> 20}; shorten the take")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, MemoryError, NotImplementedError) as error:
+        raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from None
+    except Exception as error:  # zlib and numpy's header parser fail in whatever way the garbage leads them to
+        raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from error
+
+
+def _array(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], where: str) -> Array:
+    if name not in arrays:
+        raise InputError(f"{where}: {name} is missing")
+    value = arrays[name]
+    if value.dtype.kind not in "fiub":
+        raise InputError(f"{where}: {name} holds {value.dtype}, not numbers")
+    if value.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise InputError(f"{where}: {name} has shape {value.shape}: expected {wanted}")
+    return np.asarray(value, dtype=np.float64)
