@@ -28,7 +28,7 @@ from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector
 from ..sim.scene.overrides import check_overrides
 from ..sim.version import VERSION
-from . import doctor, pipeline
+from . import diagnosis, doctor, pipeline
 from .terminal import Terminal
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
@@ -152,6 +152,10 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all)")
     render.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
     _add_render(render)
+
+    diagnosis.add_diagnose(
+        command("diagnose", diagnosis.run_diagnose, "capture of a real motion → which effect the simulation lacks")
+    )
 
     listing = command("effects", _effects, "physical effects that a scene can have, with their parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="these only (default: all)")

@@ -34,7 +34,7 @@ class CandidateFit:
 
     effects: names, as in ``sim.effects``; () for the nominal model itself.
     parameters: effect → parameter of that effect's schema → estimate. These numbers go to ``Effect.apply`` as they are.
-    beliefs: what the nominal model has anyway (``friction``, ``restitution``, ``youngs_modulus_pa``, …), where refitted.
+    beliefs: what the nominal model has anyway (``friction``, ``restitution``, ``youngs_modulus_pa``), where refitted.
     log_evidence: log probability in nats of all fit takes given this candidate, with states, beliefs and parameters
         integrated out (Laplace) and the freedom of its parameters thereby paid for. Comparable between all candidates
         of one capture: the same data, the same noise.
@@ -84,8 +84,9 @@ class Fits(Protocol):
     """All candidates fitted to one capture.
 
     nominal: the model as believed. refitted: the same with its own parameters fitted. candidates: one or two effects.
-    floor_rms_m: distance in m that noise alone leaves on data that no fit saw. believed_rms_m: of ``nominal`` there.
+    floor_rms_m: distance in m that noise alone leaves on data that no fit saw.
     numerics_rms_m: how far the nominal model's prediction moves when its resolution or time step is changed.
+    last_residual_rms_m: distance there in m when the nominal model's last seen residual is carried forward.
     """
 
     nominal: CandidateFit
@@ -93,6 +94,7 @@ class Fits(Protocol):
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
     numerics_rms_m: float
+    last_residual_rms_m: float
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""

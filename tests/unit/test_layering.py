@@ -12,7 +12,7 @@ import pytest
 from physgen.sim.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
-MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians")
+MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians", "sim/diagnose/rigid", "sim/diagnose/soft")
 FORBIDDEN = {"sim": ("physgen_addon", "batch"), "physgen_addon/bridge": ("batch",)}
 
 

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: MIT
+"""The whole diagnosis: capture → fits → verdict → engine's word → diagnosis (docs/diagnosis.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..effects.registry import effects
+from ..errors import InputError
+from ..events import IsCancelled, OnEvent, ignore, never
+from .analysis import Array, CandidateFit, Discrepancy, Fits
+from .capture import Capture
+from .confirm import Confirmation, confirm
+from .diagnosis import NONE, UNKNOWN, Diagnosis, Gap, RankedEffect, TrialArrays
+from .evidence import Weighed, Weighing, kind_of, weigh
+from .experiments import next_experiment
+from .gap import bootstrap_interval, controls_of, measured_gap
+from .places import where_of
+from .summary import summary_of
+
+RIGID_WEIGHING = Weighing()
+SOFT_WEIGHING = Weighing()
+
+CONFIRMED_TAKES = 2
+"""Takes that the engine runs again: each costs seconds, and the second tells chance from confirmation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseOptions:
+    """How a capture is diagnosed.
+
+    budget_s: seconds of computing that the fits aim to stay below, 10 to 86400; the confirmation comes on top.
+    effects: names of the candidates; None for all that can act on these objects.
+    confirm: whether the engine runs the verdict again.
+    """
+
+    budget_s: float = 300.0
+    effects: tuple[str, ...] | None = None
+    confirm: bool = True
+
+    def __post_init__(self) -> None:
+        if not 10 <= self.budget_s <= 86400:
+            raise InputError(f"budget is {self.budget_s!r} s: give 10 s to 24 h")
+        known = [n for n, e in effects().items() if n != "sandy"]
+        for name in self.effects or ():
+            if name not in known:
+                raise InputError(f"effects names {name!r}: choose from {', '.join(known)}")
+        if self.effects is not None and not self.effects:
+            raise InputError("effects is empty: name at least one, or leave it out for all")
+
+
+def diagnose(
+    capture: Capture,
+    options: DiagnoseOptions | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Diagnosis:
+    """What ``capture`` shows.
+
+    Raises InputError for a capture that cannot be diagnosed, SimulationError when the nominal model itself diverges,
+    Cancelled when ``cancelled()`` became true.
+    """
+    options = options or DiagnoseOptions()
+    started = time.monotonic()
+    fits, weighing = _fit(capture, options, on_event, cancelled)
+    weighed = weigh(fits, weighing)
+    warnings = list(capture.warnings)
+    verdict, found = weighed.verdict, _found(fits, weighed)
+    gap = measured_gap(capture, fits, found)
+    nominal_points, found_points = fits.simulate(fits.nominal), fits.simulate(found)
+    gap = dataclasses.replace(
+        gap, closed_fraction_ci95=bootstrap_interval(capture, nominal_points, found_points, found, gap)
+    )
+    confirmations: list[Confirmation] = []
+    if options.confirm and len(capture.objects) == 1 and verdict.effect not in (NONE, UNKNOWN):
+        confirmations, notes = _confirm(capture, fits, found, nominal_points, found_points, on_event, cancelled)
+        warnings += notes
+        if confirmations and all(math.isfinite(c.numerics_rms_m) for c in confirmations):
+            gap = dataclasses.replace(gap, numerics_rms_m=float(np.mean([c.numerics_rms_m for c in confirmations])))
+    discrepancies = fits.discrepancy(None if verdict.effect in (NONE, UNKNOWN) else found)
+    ranked = _ranking(fits, weighed, gap)
+    kinds = {item.name: item.kind for item in ranked}
+    predictions = fits.predict(fits.nominal), fits.predict(found)
+    return Diagnosis(
+        verdict=verdict,
+        effects=ranked,
+        gap=gap,
+        controls=controls_of(fits, weighed, found),
+        next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable),
+        where=where_of(capture, discrepancies),
+        trials=_arrays(capture, discrepancies, nominal_points, found_points, *predictions),
+        summary=summary_of(verdict, gap, found),
+        warnings=tuple(warnings),
+        seconds=round(time.monotonic() - started, 2),
+        confirmation=_confirmation_json(confirmations),
+    )
+
+
+def _fit(
+    capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelled: IsCancelled
+) -> tuple[Fits, Weighing]:
+    # Taichi is imported only when something is fitted.
+    rigid = [item.belief.rigid for item in capture.objects]
+    if all(rigid):
+        from .rigid import fit_rigid
+
+        fits: Fits = fit_rigid(
+            capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s
+        )
+        return fits, RIGID_WEIGHING
+    if len(capture.objects) > 1:
+        soft = capture.objects[rigid.index(False)].name
+        raise InputError(
+            f"object {soft!r} deforms and is not alone: a capture holds either rigid objects or one that deforms; "
+            "make a capture of it alone"
+        )
+    from .soft import fit_soft
+
+    fits = fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
+    return fits, SOFT_WEIGHING
+
+
+def _found(fits: Fits, weighed: Weighed) -> CandidateFit:
+    """The fit that predicts ``after``: the verdict's; for ``none`` and ``unknown`` the model with its own re-fitted."""
+    name = weighed.verdict.effect
+    if name in (NONE, UNKNOWN):
+        return fits.refitted
+    return weighed.best[name]
+
+
+def _confirm(
+    capture: Capture,
+    fits: Fits,
+    found: CandidateFit,
+    nominal_points: Mapping[str, Array],
+    found_points: Mapping[str, Array],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> tuple[list[Confirmation], list[str]]:
+    results: list[Confirmation] = []
+    for trial in capture.fit_trials[:CONFIRMED_TAKES]:
+        on_event({"event": "notice", "stage": "diagnose", "message": f"the engine runs {trial.name} again"})
+        try:
+            results.append(
+                confirm(
+                    capture,
+                    trial,
+                    fits.nominal,
+                    found,
+                    nominal_points[trial.name],
+                    found_points[trial.name],
+                    cancelled,
+                )
+            )
+        except InputError as error:
+            return results, [f"the engine could not run {trial.name} again: {error}"]
+    against = [c.trial for c in results if not c.confirmed]
+    if not against:
+        return results, []
+    return results, [f"the engine does not confirm the verdict on {', '.join(against)}"]
+
+
+def _confirmation_json(items: list[Confirmation]) -> Mapping[str, Any]:
+    return {"takes": [dataclasses.asdict(c) | {"confirmed": c.confirmed} for c in items]} if items else {}
+
+
+def _ranking(fits: Fits, weighed: Weighed, gap: Gap) -> tuple[RankedEffect, ...]:
+    room = gap.before_rms_m - gap.noise_floor_rms_m
+    items = []
+    for name, probability in weighed.probabilities.items():
+        fit = weighed.best.get(name)
+        if fit is None:
+            items.append(RankedEffect(name=name, kind=kind_of(name), probability=probability))
+            continue
+        closed = (gap.before_rms_m - fit.heldout_rms_m) / room if room > 0 else math.nan
+        items.append(
+            RankedEffect(
+                name=name,
+                kind=kind_of(name),
+                probability=probability,
+                parameters=fit.parameters.get(name, {}),
+                heldout_rms_m=fit.heldout_rms_m,
+                closed_fraction=closed,
+            )
+        )
+    verdict = weighed.verdict
+    for name in verdict.effects[1:]:
+        # The second of two causes: its numbers are of the fit of both.
+        fit = weighed.best[verdict.effect]
+        items = [
+            dataclasses.replace(item, parameters=fit.parameters[name], heldout_rms_m=fit.heldout_rms_m)
+            if item.name == name
+            else item
+            for item in items
+        ]
+    return tuple(sorted(items, key=lambda item: -item.probability))
+
+
+def _arrays(
+    capture: Capture,
+    discrepancies: Mapping[str, Discrepancy],
+    nominal: Mapping[str, Array],
+    found: Mapping[str, Array],
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+) -> dict[str, TrialArrays]:
+    result = {}
+    for trial in capture.trials:
+        d = discrepancies[trial.name]
+        result[trial.name] = TrialArrays(
+            times=trial.times,
+            frame_score=d.frame_score,
+            point_score=d.point_score,
+            residual=d.residual,
+            nominal=nominal[trial.name],
+            found=found[trial.name],
+            before=before.get(trial.name),
+            after=after.get(trial.name),
+        )
+    return result

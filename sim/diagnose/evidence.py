@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""From fitted candidates to probabilities: which effect, or none, or one that nobody here knows.
+
+Two questions are kept apart. Which of the known candidates explains the takes best is answered by their evidence, in
+which every extra parameter is paid for. Whether the best one explains them at all is answered by what it leaves over:
+
+    p(c) = w_c a(m_c),   w_c = prior_c exp(L_c / T) / sum,   p(unknown) = 1 - sum p(c)
+
+with the log evidence L_c in nats, a temperature T > 1 because takes of one recording share what the model gets wrong,
+the misfit m_c of the fit and a(m), how probable the right candidate would leave a misfit of m (a logistic curve in
+ln m). The constants were set on captures of known cause made by other simulators (docs/diagnosis.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..effects.registry import effects
+from .analysis import CandidateFit, Fits
+from .diagnosis import NONE, UNKNOWN, Verdict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighing:
+    """Constants of the decision.
+
+    temperature: T above, at least 1.
+    enough: misfit at which the chance that the right candidate leaves that much is one half.
+    sharpness: slope of that curve in ln m.
+    prior_none: prior probability that nothing is missing; the effects share the rest.
+    alternative: an effect is named beside the verdict from this share of the verdict's probability on.
+    """
+
+    temperature: float = 4.0
+    enough: float = 2.0
+    sharpness: float = 8.0
+    prior_none: float = 0.3
+    alternative: float = 0.1
+
+
+TWINS: Mapping[str, tuple[str, ...]] = {
+    "time_scale": ("buoyancy",),
+    "buoyancy": ("time_scale",),
+    "air_drag": ("wind",),
+}
+"""Effects that are the same motion for a rigid body, or contain it: whoever is named, so is the other."""
+
+TWIN_SHARE = 0.01
+"""A twin is named from this share of the verdict's probability on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighed:
+    """probabilities: by single name, ``none`` and ``unknown`` among them, together 1. best: fit behind each name."""
+
+    verdict: Verdict
+    probabilities: Mapping[str, float]
+    best: Mapping[str, CandidateFit]
+
+
+def weigh(fits: Fits, weighing: Weighing) -> Weighed:
+    """Verdict and probabilities. A candidate of two effects counts for the first of its effects."""
+    candidates = [fits.refitted, *fits.candidates]
+    weights = _weights(candidates, weighing)
+    adequate = [_adequacy(c.misfit, weighing) for c in candidates]
+    probabilities: dict[str, float] = {}
+    best: dict[str, tuple[float, CandidateFit]] = {}
+    for fit, weight, chance in zip(candidates, weights, adequate, strict=True):
+        name = fit.effects[0] if fit.effects else NONE
+        probability = float(weight * chance)
+        probabilities[name] = probabilities.get(name, 0.0) + probability
+        if name not in best or probability > best[name][0]:
+            best[name] = (probability, fit)
+    probabilities[UNKNOWN] = max(0.0, 1.0 - sum(probabilities.values()))
+    total = sum(probabilities.values())
+    probabilities = {name: p / total for name, p in probabilities.items()}
+    found = {name: fit for name, (_, fit) in best.items()}
+    return Weighed(verdict=_verdict(probabilities, found, weighing), probabilities=probabilities, best=found)
+
+
+def _weights(candidates: Sequence[CandidateFit], weighing: Weighing) -> list[float]:
+    singles = max(1, sum(len(c.effects) == 1 for c in candidates))
+    logs = []
+    for fit in candidates:
+        # A second cause is as improbable beside the first as the first is by itself.
+        each = (1 - weighing.prior_none) / singles
+        prior = each ** len(fit.effects) if fit.effects else weighing.prior_none
+        usable = fit.log_evidence if math.isfinite(fit.log_evidence) else -math.inf
+        logs.append(math.log(prior) + usable / weighing.temperature)
+    highest = max(logs)
+    if not math.isfinite(highest):
+        return [1.0 / len(candidates)] * len(candidates)
+    raw = np.exp(np.array(logs) - highest)
+    return [float(w) for w in raw / raw.sum()]
+
+
+def _adequacy(misfit: float, weighing: Weighing) -> float:
+    if not math.isfinite(misfit) or misfit <= 0:
+        return 0.0
+    exponent = weighing.sharpness * math.log(misfit / weighing.enough)
+    return 1.0 / (1.0 + math.exp(min(max(exponent, -60.0), 60.0)))
+
+
+def _verdict(probabilities: Mapping[str, float], best: Mapping[str, CandidateFit], weighing: Weighing) -> Verdict:
+    name = max(probabilities, key=lambda n: probabilities[n])
+    top = probabilities[name]
+    ranked = sorted(probabilities, key=lambda n: -probabilities[n])
+    others = [
+        n
+        for n in ranked
+        if n not in (name, UNKNOWN, NONE)
+        and probabilities[n] >= top * (TWIN_SHARE if n in TWINS.get(name, ()) else weighing.alternative)
+    ]
+    if name in (NONE, UNKNOWN):
+        return Verdict(effect=name, probability=top, alternatives=tuple(others))
+    return Verdict(effect=name, probability=top, alternatives=tuple(others), effects=best[name].effects)
+
+
+def kind_of(name: str) -> str:
+    """Kind of the effect ``name``; "none" and "unknown" are kinds of their own."""
+    return name if name in (NONE, UNKNOWN) else effects()[name].kind
