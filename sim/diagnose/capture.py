@@ -320,7 +320,7 @@ def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
         raise InputError(f"{where}: has {frames} frames; a motion needs at least 3")
     if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
         bad = int(np.flatnonzero(~(np.diff(times) > 0))[0]) + 1 if np.isfinite(times).all() else 0
-        raise InputError(f"{where}: times[{bad}] is {times[bad]!r}: give finite seconds in rising order")
+        raise InputError(f"{where}: times[{bad}] is {float(times[bad])!r}: give finite seconds in rising order")
     if ("points" in arrays) == ("pixels" in arrays):
         raise InputError(f"{where}: give either points or pixels")
     kind, size = ("points", 3) if "points" in arrays else ("pixels", 2)

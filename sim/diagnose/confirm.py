@@ -32,7 +32,9 @@ from .analysis import CandidateFit
 from .capture import Array, Capture, CaptureObject, Trial
 from .projection import observed_distance
 
-RIGID_HORIZON_S = 1.0
+HORIZON_S = 1.0
+"""How long a rigid body, or one that touches nothing, is followed."""
+
 SOFT_CONTACT_S = 0.08
 """How long after the first touch a deforming body is followed: its first impact."""
 
@@ -102,11 +104,11 @@ def _horizon(capture: Capture, item: CaptureObject, trial: Trial, points: Array)
     """Number of frames that are simulated."""
     times = trial.times - trial.times[0]
     if item.belief.rigid:
-        return max(3, int(np.searchsorted(times, RIGID_HORIZON_S, side="right")))
+        return max(3, int(np.searchsorted(times, HORIZON_S, side="right")))
     heights = (points - np.asarray(capture.ground.point)) @ capture.ground.unit_normal
     low = np.nanmin(heights, axis=1)
     touching = np.flatnonzero(low < 0.1 * float(np.ptp(item.vertices, axis=0).max()))
-    touch = times[touching[0]] if len(touching) else 0.0
+    touch = times[touching[0]] if len(touching) else HORIZON_S
     return min(len(times), max(3, int(np.searchsorted(times, touch + SOFT_CONTACT_S, side="right"))))
 
 

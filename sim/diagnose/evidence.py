@@ -42,6 +42,9 @@ class Weighing:
     alternative: float = 0.1
 
 
+VOCABULARY = 18
+"""Effects that share the prior: all of them, whichever were tried."""
+
 TWINS: Mapping[str, tuple[str, ...]] = {
     "time_scale": ("buoyancy",),
     "buoyancy": ("time_scale",),
@@ -83,11 +86,10 @@ def weigh(fits: Fits, weighing: Weighing) -> Weighed:
 
 
 def _weights(candidates: Sequence[CandidateFit], weighing: Weighing) -> list[float]:
-    singles = max(1, sum(len(c.effects) == 1 for c in candidates))
     logs = []
     for fit in candidates:
         # A second cause is as improbable beside the first as the first is by itself.
-        each = (1 - weighing.prior_none) / singles
+        each = (1 - weighing.prior_none) / VOCABULARY
         prior = each ** len(fit.effects) if fit.effects else weighing.prior_none
         usable = fit.log_evidence if math.isfinite(fit.log_evidence) else -math.inf
         logs.append(math.log(prior) + usable / weighing.temperature)

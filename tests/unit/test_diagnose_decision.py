@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""From fits to a verdict: evidence, misfit, alternatives, gap, places, words, files."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from physgen.sim.diagnose import diagnosis as files
+from physgen.sim.diagnose.analysis import CandidateFit, Discrepancy, Estimate, Interval
+from physgen.sim.diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, Gap, TrialArrays, Verdict, Where
+from physgen.sim.diagnose.evidence import Weighing, weigh
+from physgen.sim.diagnose.experiments import next_experiment
+from physgen.sim.diagnose.places import where_of
+from physgen.sim.diagnose.summary import summary_of
+from physgen.sim.errors import InputError
+
+from .test_capture import a_capture, a_trial
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Found:
+    """Fits with made-up numbers."""
+
+    nominal: CandidateFit
+    refitted: CandidateFit
+    candidates: tuple[CandidateFit, ...]
+    floor_rms_m: float = 0.001
+    numerics_rms_m: float = 0.0
+    last_residual_rms_m: float = 0.02
+
+
+def fit(*effects, evidence=0.0, misfit=1.0, rms=0.01):
+    parameters = {name: {"x": Estimate(value=1.0, unit="1", low=0.5, high=1.5)} for name in effects}
+    return CandidateFit(
+        effects=effects,
+        parameters=parameters,
+        log_evidence=evidence,
+        heldout_log_score=np.zeros(3),
+        heldout_rms_m=rms,
+        misfit=misfit,
+    )
+
+
+def weighed(*candidates, nominal_evidence=0.0, nominal_misfit=1.0, weighing=None):
+    nominal = fit(evidence=nominal_evidence, misfit=nominal_misfit)
+    return weigh(Found(nominal=nominal, refitted=nominal, candidates=candidates), weighing or Weighing())
+
+
+def test_a_plain_winner_wins():
+    result = weighed(fit("air_drag", evidence=500), fit("wind", evidence=0), nominal_misfit=10.0)
+    assert result.verdict.effect == "air_drag" and result.verdict.probability > 0.9
+    assert result.verdict.effects == ("air_drag",) and "friction" not in result.verdict.alternatives
+
+
+def test_nothing_missing_is_none_and_everything_bad_is_unknown():
+    assert weighed(fit("air_drag", evidence=1.0)).verdict.effect == NONE
+    bad = weighed(fit("air_drag", evidence=900, misfit=9.0), nominal_misfit=12.0)
+    assert bad.verdict.effect == UNKNOWN and bad.verdict.effects == ()
+
+
+def test_what_cannot_be_told_apart_is_named():
+    result = weighed(fit("time_scale", evidence=300.0), fit("buoyancy", evidence=297.0), nominal_misfit=5.0)
+    assert result.verdict.effect == "time_scale" and result.verdict.alternatives == ("buoyancy",)
+
+
+def test_two_causes_count_for_the_first():
+    result = weighed(fit("friction", evidence=100, misfit=4.0), fit("friction", "air_drag", evidence=900))
+    assert result.verdict.effect == "friction" and result.verdict.effects == ("friction", "air_drag")
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["air_drag", "wind", "friction", "buoyancy"]),
+            st.one_of(st.floats(-1e6, 1e6), st.just(-math.inf), st.just(math.nan)),
+            st.one_of(st.floats(1e-3, 1e4), st.just(math.nan), st.just(math.inf)),
+        ),
+        max_size=6,
+    ),
+    st.floats(-1e6, 1e6),
+    st.floats(0.1, 100),
+)
+def test_probabilities_are_probabilities(candidates, evidence, misfit):
+    result = weighed(
+        *(fit(name, evidence=e, misfit=m) for name, e, m in candidates),
+        nominal_evidence=evidence,
+        nominal_misfit=misfit,
+    )
+    values = list(result.probabilities.values())
+    assert all(0 <= p <= 1 for p in values) and sum(values) == pytest.approx(1.0)
+    assert result.probabilities[result.verdict.effect] == max(values) == result.verdict.probability
+    assert result.verdict.effect not in result.verdict.alternatives
+
+
+def test_a_better_fit_never_loses_probability():
+    probabilities = [
+        weighed(fit("wind", evidence=e), fit("air_drag", evidence=50.0)).probabilities["wind"] for e in range(0, 200, 5)
+    ]
+    assert all(b >= a for a, b in zip(probabilities, probabilities[1:], strict=False))
+
+
+def discrepancy(trial, scores):
+    count = trial.observed.shape[1]
+    return Discrepancy(
+        frame_score=scores,
+        point_score=np.tile(scores[:, None], (1, count)),
+        residual=np.zeros_like(trial.observed),
+        intervals=(
+            Interval(start_s=float(trial.times[0]), end_s=float(trial.times[10]), phase="flight"),
+            Interval(start_s=float(trial.times[10]), end_s=float(trial.times[-1]), phase="contact"),
+        ),
+        directions={"normal": 1.0, "along_velocity": 0.0, "along_gravity": 0.0, "other": 0.0},
+    )
+
+
+def test_shares_of_time_follow_the_scores():
+    capture = a_capture(a_trial())
+    scores = np.where(np.arange(20) < 10, 3.0, 1.0)
+    where = where_of(capture, {"take01": discrepancy(capture.trials[0], scores)})
+    assert [i.phase for i in where.intervals] == ["flight", "contact"]
+    # The first frame and the last stand for half a frame: 9.5 frames of 3 against 9.5 of 1.
+    assert where.intervals[0].share == pytest.approx(0.75) and where.objects[0].share == 1.0
+    assert where.direction["normal"] == 1.0
+
+
+def test_no_discrepancy_is_no_division_by_zero():
+    capture = a_capture(a_trial())
+    where = where_of(capture, {"take01": discrepancy(capture.trials[0], np.zeros(20))})
+    assert sum(i.share for i in where.intervals) == pytest.approx(1.0)
+    assert sum(where.direction.values()) == pytest.approx(1.0)
+
+
+GAP = Gap(
+    before_rms_m=0.02,
+    refitted_rms_m=0.015,
+    after_rms_m=0.004,
+    noise_floor_rms_m=0.002,
+    closed_fraction=0.889,
+    closed_fraction_ci95=(0.8, 0.93),
+    resolvable=True,
+)
+
+
+def test_the_verdict_in_words():
+    verdict = Verdict(effect="time_scale", probability=0.6, alternatives=("buoyancy",), effects=("time_scale",))
+    text = summary_of(verdict, GAP, fit("time_scale"))
+    assert "clock" in text and "buoyancy" in text and "60 %" in text and "89 %" in text
+    unsure = dataclasses.replace(GAP, resolvable=False)
+    assert "too near the noise" in summary_of(verdict, unsure, fit("time_scale"))
+    assert "explains" in summary_of(Verdict(effect=NONE, probability=0.9), GAP, fit())
+    assert "no effect known" in summary_of(Verdict(effect=UNKNOWN, probability=0.9), GAP, fit())
+
+
+def test_every_effect_has_words_and_an_experiment():
+    from physgen.sim.diagnose.evidence import kind_of
+    from physgen.sim.diagnose.summary import NAMES
+    from physgen.sim.effects.registry import effects
+
+    vocabulary = [name for name in effects() if name != "sandy"]
+    assert set(NAMES) == set(vocabulary)
+    kinds = {name: kind_of(name) for name in vocabulary}
+    for a in vocabulary:
+        for b in vocabulary:
+            if a != b:
+                verdict = Verdict(effect=a, probability=0.5, alternatives=(b,), effects=(a,))
+                assert next_experiment(verdict, kinds, resolvable=True)
+    assert next_experiment(Verdict(effect=NONE, probability=0.9), kinds, resolvable=True) is None
+
+
+def a_diagnosis(capture):
+    trial = capture.trials[0]
+    count = trial.observed.shape[1]
+    arrays = TrialArrays(
+        times=trial.times,
+        frame_score=np.ones(20),
+        point_score=np.ones((20, count)),
+        residual=np.zeros((20, count, 3)),
+        nominal=trial.observed,
+        found=trial.observed,
+        before=np.zeros((5, count, 3)),
+        after=np.zeros((5, count, 3)),
+    )
+    return Diagnosis(
+        verdict=Verdict(effect="air_drag", probability=0.9, effects=("air_drag",)),
+        effects=(files.RankedEffect(name="air_drag", kind="force", probability=0.9, heldout_rms_m=math.nan),),
+        gap=GAP,
+        controls={"wrong_effect_rms_m": math.nan, "last_residual_rms_m": 0.1},
+        next_experiment=None,
+        where=Where(objects=(), intervals=(), direction={}),
+        trials={"take01": arrays},
+        summary="Missing is air drag.",
+    )
+
+
+def test_a_diagnosis_is_written_and_read(tmp_path):
+    files.write_diagnosis(a_diagnosis(a_capture()), tmp_path)
+    report, where, prediction = files.read_diagnosis(tmp_path)
+    assert report["verdict"]["effect"] == "air_drag" and report["controls"]["wrong_effect_rms_m"] is None
+    assert where["take01.frame_score"].shape == (20,) and prediction["take01.after"].shape == (5, 8, 3)
+    (tmp_path / "report.json").write_text('{"format": "physgen-diagnosis/1", "verdict": 3}')
+    with pytest.raises(InputError, match="verdict: missing or malformed"):
+        files.read_diagnosis(tmp_path)
+    with pytest.raises(InputError, match="no such file"):
+        files.read_diagnosis(tmp_path / "nowhere")
