@@ -38,6 +38,9 @@ HORIZON_S = 1.0
 SOFT_CONTACT_S = 0.08
 """How long after the first touch a deforming body is followed: its first impact."""
 
+SOFT_LEAD_S = 0.02
+"""How long before that touch the engine takes over, where the verdict concerns contact or material."""
+
 CELLS_ACROSS = (8.0, 12.0)
 """Cells along a deforming body's longest side: coarse and fine."""
 
@@ -81,18 +84,20 @@ def confirm(
     their first frames. Raises what the engine raises.
     """
     item = capture.objects[0]
-    end = _horizon(capture, item, trial, nominal_points)
+    first, end = _stretch(capture, item, trial, nominal_points, verdict)
+    trial = _cut(trial, first, end)
+    nominal_points, verdict_points = nominal_points[first:end], verdict_points[first:end]
     rates = verdict.parameters.get("time_scale", {})
     rate = rates["rate"].value if "rate" in rates else 1.0
-    runs = [_simulate(capture, item, trial, nominal, nominal_points, end, 1.0, level) for level in range(2)]
+    runs = [_simulate(capture, item, trial, nominal, nominal_points, 1.0, level) for level in range(2)]
     if cancelled():
         raise Cancelled("cancelled while the engine confirmed the verdict")
-    runs.append(_simulate(capture, item, trial, verdict, verdict_points, end, rate, 1))
+    runs.append(_simulate(capture, item, trial, verdict, verdict_points, rate, 1))
     coarse, fine, found = runs
-    frames = slice(1, end)
+    frames = slice(1, None)
     return Confirmation(
         trial=trial.name,
-        seconds_s=float(trial.times[end - 1] - trial.times[0]),
+        seconds_s=float(trial.times[-1] - trial.times[0]),
         before_rms_m=observed_distance(capture, trial, fine, frames),
         after_rms_m=observed_distance(capture, trial, found, frames, verdict),
         numerics_rms_m=_rms(coarse[frames] - fine[frames]),
@@ -100,16 +105,28 @@ def confirm(
     )
 
 
-def _horizon(capture: Capture, item: CaptureObject, trial: Trial, points: Array) -> int:
-    """Number of frames that are simulated."""
+def _stretch(
+    capture: Capture, item: CaptureObject, trial: Trial, points: Array, verdict: CandidateFit
+) -> tuple[int, int]:
+    """Frames from first to before end that are simulated.
+
+    What a deforming body is made of shows in its first impact; its flight before would cost seconds and tell nothing.
+    """
     times = trial.times - trial.times[0]
     if item.belief.rigid:
-        return max(3, int(np.searchsorted(times, HORIZON_S, side="right")))
+        return 0, max(3, int(np.searchsorted(times, HORIZON_S, side="right")))
     heights = (points - np.asarray(capture.ground.point)) @ capture.ground.unit_normal
-    low = np.nanmin(heights, axis=1)
-    touching = np.flatnonzero(low < 0.1 * float(np.ptp(item.vertices, axis=0).max()))
+    touching = np.flatnonzero(np.nanmin(heights, axis=1) < 0.1 * float(np.ptp(item.vertices, axis=0).max()))
     touch = times[touching[0]] if len(touching) else HORIZON_S
-    return min(len(times), max(3, int(np.searchsorted(times, touch + SOFT_CONTACT_S, side="right"))))
+    end = min(len(times), max(3, int(np.searchsorted(times, touch + SOFT_CONTACT_S, side="right"))))
+    in_contact = all(effects()[name].kind in ("material", "contact") for name in verdict.effects)
+    first = int(np.searchsorted(times, touch - SOFT_LEAD_S)) if in_contact and len(touching) else 0
+    return min(first, end - 3), end
+
+
+def _cut(trial: Trial, first: int, end: int) -> Trial:
+    frames = {name: value[first:end] for name in ("points", "pixels") if (value := getattr(trial, name)) is not None}
+    return dataclasses.replace(trial, times=trial.times[first:end], **frames)
 
 
 def _simulate(
@@ -118,11 +135,10 @@ def _simulate(
     trial: Trial,
     fit: CandidateFit,
     points: Array,
-    end: int,
     rate: float,
     level: int,
 ) -> Array:
-    """Tracked points (end, K, 3) in m at the first ``end`` frames, in the engine."""
+    """Tracked points (T, K, 3) in m at the frames of ``trial``, in the engine."""
     from ..mpm.worlds import Worlds
 
     state = starting_state(trial, points, rate)
@@ -134,9 +150,9 @@ def _simulate(
     world = worlds[0]
     rest = trial.rest_points @ state.rotation.T + state.translation
     _, near = cKDTree(start).query(rest, k=min(8, len(start)))
-    out = np.empty((end, len(rest), 3))
+    out = np.empty((len(trial.times), len(rest), 3))
     clock = (trial.times - trial.times[0]) * rate
-    for frame in range(end):
+    for frame in range(len(out)):
         if frame:
             worlds.advance(float(clock[frame] - clock[frame - 1]))
         if body.rigid:

@@ -179,7 +179,7 @@ def test_millimetres_and_mirrors_are_found(tmp_path):
 
 
 def test_points_off_the_mesh_and_open_meshes_are_warned_about(tmp_path):
-    far = dataclasses.replace(a_trial(), rest_points=a_trial().rest_points + [0.2, 0, 0])
+    far = dataclasses.replace(a_trial(), rest_points=a_trial().rest_points + np.array([0.2, 0, 0]))
     save_capture(a_capture(far), tmp_path / "far")
     assert "outside the mesh" in load_capture(tmp_path / "far").warnings[0]
     opened = trimesh.Trimesh(BOX.vertices, BOX.faces[:-2], process=False)
