@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""How far the gap closes: the errors as bars, and how the error grows over a take, without and with the effect."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture, Trial
+from ..diagnosis import Diagnosis, TrialArrays
+from .axes import Scale, curve
+from .markup import Markup, Picture, element, join, label, shortened
+from .quantities import axis_unit, quantity_text, tick_text
+from .tracks import camera_plane, mean_where
+from .words import found_effects, found_label
+
+Array = NDArray[np.float64]
+
+WIDTH = 440.0
+_ROW = 42.0
+_STEPS = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """One error in m. class_: how it is filled; quiet: a control, and not a stage of the model."""
+
+    said: str
+    value: float
+    class_: str
+    quiet: bool = False
+
+
+def gap_bars(diagnosis: Diagnosis) -> list[Bar]:
+    """All errors on data that no fit saw, from the model as believed to the controls."""
+    gap, controls = diagnosis.gap, diagnosis.controls
+    found = found_effects(diagnosis.verdict)
+    bars = [
+        Bar(said="as believed", value=gap.before_rms_m, class_="nominal-fill"),
+        Bar(said="its own numbers re-fitted, nothing added", value=gap.refitted_rms_m, class_="other-fill"),
+        Bar(said=found_label(diagnosis.verdict), value=gap.after_rms_m, class_="found-fill" if found else "other-fill"),
+        Bar(said="the recording's noise alone", value=gap.noise_floor_rms_m, class_="rule-fill"),
+        Bar(said="the simulator's own resolution", value=gap.numerics_rms_m, class_="rule-fill", quiet=True),
+    ]
+    names = {
+        "wrong_effect_rms_m": "control: an effect that was rejected",
+        "last_residual_rms_m": "control: the last seen error carried on",
+    }
+    bars += [
+        Bar(said=names.get(key, key.replace("_", " ")), value=value, class_="other-fill", quiet=True)
+        for key, value in controls.items()
+    ]
+    return bars
+
+
+def bars_picture(diagnosis: Diagnosis) -> Picture:
+    """The errors as bars from zero on one scale; the mark on each is the noise."""
+    bars = gap_bars(diagnosis)
+    known = [b.value for b in bars if math.isfinite(b.value)]
+    scale = Scale(low=0.0, high=max([*known, 1e-12]), start=0.0, end=WIDTH - 70)
+    parts: list[Markup | None] = [
+        label("Mean error on motion that no fit saw", 0, 13, class_="ink strong"),
+    ]
+    y, floor = 24.0, diagnosis.gap.noise_floor_rms_m
+    for bar in bars:
+        parts.append(label(shortened(bar.said, 58), 0, y + 13, class_="quiet" if bar.quiet else "ink"))
+        height = 8.0 if bar.quiet else 12.0
+        if math.isfinite(bar.value):
+            width = max(scale(bar.value), 1.5)
+            parts.append(element("rect", x=0, y=y + 19, width=scale.end, height=height, rx=2, class_="panel"))
+            parts.append(element("rect", x=0, y=y + 19, width=width, height=height, rx=2, class_=bar.class_))
+            parts.append(label(quantity_text(bar.value, "m", digits=2), scale.end + 8, y + 18 + height))
+        else:
+            parts.append(label("not known", 0, y + 29, class_="quiet"))
+        if math.isfinite(floor):
+            at = f"M{scale(floor):.1f} {y + 17:.0f}v{height + 4:.0f}"
+            parts.append(element("path", d=at, class_="line curve", stroke_width=1.2))
+        y += _ROW
+    return Picture(
+        width=WIDTH,
+        height=y + 6,
+        title="Error before and after",
+        description="; ".join(f"{b.said} {quantity_text(b.value, 'm')}" for b in bars) + ".",
+        body=join(parts),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """Error over time since the start of a take: times (N,) s; nominal and found (N,), root mean square, in unit."""
+
+    times: Array
+    nominal: Array
+    found: Array
+    takes: int
+    unit: str
+    noise: float
+
+
+def growth(diagnosis: Diagnosis, capture: Capture) -> Growth:
+    """Mean over the complete takes (all takes where none is complete) of the error of their points."""
+    both = [(t, diagnosis.trials[t.name]) for t in capture.trials if t.name in diagnosis.trials]
+    chosen = [pair for pair in both if pair[0].role == "fit"] or both
+    in_pixels = any(t.pixels is not None for t, _ in chosen)
+    lengths = [float(t.times[-1] - t.times[0]) for t, _ in chosen]
+    times = np.linspace(0.0, max(lengths, default=1.0), _STEPS)
+    curves: dict[str, list[Array]] = {"nominal": [], "found": []}
+    for trial, arrays in chosen:
+        for name, kept in curves.items():
+            kept.append(_resampled(times, trial, _errors(name, trial, arrays, capture)))
+    means = {name: mean_where(np.stack(kept), 0) if kept else np.full(_STEPS, np.nan) for name, kept in curves.items()}
+    return Growth(
+        times=times,
+        nominal=means["nominal"],
+        found=means["found"],
+        takes=len(chosen),
+        unit="px" if in_pixels else "m",
+        noise=capture.noise_sigma * math.sqrt(2 if in_pixels else 3),
+    )
+
+
+def _errors(name: str, trial: Trial, arrays: TrialArrays, capture: Capture) -> Array:
+    """(T,) root mean square distance between the points seen and the model's."""
+    shape = trial.observed.shape
+    modelled = np.asarray(getattr(arrays, name), dtype=np.float64)
+    if modelled.shape == (*shape[:2], 3):
+        if trial.pixels is not None and capture.camera is not None:
+            modelled = camera_plane(capture.camera)(modelled)
+        apart = trial.observed - modelled
+    elif name == "nominal" and arrays.residual.shape == shape:
+        apart = arrays.residual
+    else:
+        apart = np.full(shape, np.nan)
+    with np.errstate(over="ignore"):
+        squares = (apart**2).sum(axis=2)
+    return np.sqrt(mean_where(np.where(np.isfinite(squares), squares, np.nan), 1))
+
+
+def _resampled(times: Array, trial: Trial, errors: Array) -> Array:
+    since = trial.times - trial.times[0]
+    good = np.isfinite(errors)
+    if not good.any():
+        return np.full(len(times), np.nan)
+    values = np.interp(times, since[good], errors[good])
+    return np.where((times >= since[good][0]) & (times <= since[good][-1]), values, np.nan)
+
+
+def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
+    """The error over time since the start, as simulated and with the effect."""
+    data = growth(diagnosis, capture)
+    with_found = bool(found_effects(diagnosis.verdict)) and bool(np.isfinite(data.found).any())
+    left, right, top, bottom = 40.0, WIDTH - 12, 60.0, 262.0
+    drawn = [data.nominal, data.found if with_found else data.nominal]
+    highest = max([float(d[np.isfinite(d)].max()) for d in drawn if np.isfinite(d).any()] or [0.0])
+    x = Scale(low=0.0, high=max(float(data.times[-1]), 1e-9), start=left, end=right)
+    y = Scale(low=0.0, high=max(highest * 1.05, data.noise * 1.5, 1e-12), start=bottom, end=top)
+    factor, unit = axis_unit(y.high, data.unit)
+    parts: list[Markup | None] = [
+        label("How the error grows during a take", 0, 13, class_="ink strong"),
+        label(f"in {unit}; mean of the complete takes, which the fits did see", 0, 31, class_="quiet"),
+    ]
+    for tick in y.ticks(4):
+        at = y(tick)
+        parts.append(element("line", x1=left, x2=right, y1=at, y2=at, class_="rule", stroke_width=0.8))
+        parts.append(
+            label(tick_text(float(f"{tick * factor:.6g}")), left - 7, at + 4, class_="quiet", anchor="end", size=11)
+        )
+    for tick in x.ticks(5):
+        at = x(tick)
+        parts.append(element("line", x1=at, x2=at, y1=bottom, y2=bottom + 5, class_="tick"))
+        parts.append(label(tick_text(tick), at, bottom + 18, class_="quiet", anchor="middle", size=11))
+    parts.append(label("time since the start, s", right, bottom + 34, class_="quiet", anchor="end", size=11))
+    noise = y(data.noise)
+    parts.append(
+        element("line", x1=left, x2=right, y1=noise, y2=noise, class_="tick", stroke_dasharray="2 3", stroke_width=1.2)
+    )
+    parts.append(label("noise", right, noise - 4, class_="quiet halo", anchor="end", size=11))
+    lines: list[tuple[Array, str, str, str | None]] = [(data.nominal, "nominal", "as believed", "6 3")]
+    if with_found:
+        lines.append((data.found, "found", shortened(found_label(diagnosis.verdict), 30), None))
+    at = left
+    said = []
+    for values, class_, words, dashes in lines:
+        path = curve([x(t) for t in data.times], [y(v) if math.isfinite(v) else math.nan for v in values])
+        parts.append(element("path", d=path, class_=f"line {class_}-line", stroke_width=2.2, stroke_dasharray=dashes))
+        key = element(
+            "path", d=f"M{at:.0f} 46h20", class_=f"line {class_}-line", stroke_width=2.2, stroke_dasharray=dashes
+        )
+        parts += [key, label(words, at + 26, 50)]
+        at += 26 + 7 * len(words) + 22
+        known = values[np.isfinite(values)]
+        if len(known):
+            said.append(f"{words}: {quantity_text(float(known[-1]), data.unit)} at the end")
+    if not said:
+        parts.append(
+            label("no error is known", (left + right) / 2, (top + bottom) / 2, class_="quiet", anchor="middle")
+        )
+    return Picture(
+        width=WIDTH,
+        height=bottom + 42,
+        title="Error over time since the start of a take",
+        description=f"Mean of {data.takes} takes. {'; '.join(said) or 'No error is known'}.",
+        body=join(parts),
+    )
