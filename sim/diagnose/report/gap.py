@@ -75,7 +75,7 @@ def bars_picture(diagnosis: Diagnosis) -> Picture:
             parts.append(label(quantity_text(bar.value, "m", digits=2), scale.end + 8, y + 18 + height))
         else:
             parts.append(label("not known", 0, y + 29, class_="quiet"))
-        if math.isfinite(floor):
+        if math.isfinite(floor) and math.isfinite(bar.value):
             at = f"M{scale(floor):.1f} {y + 17:.0f}v{height + 4:.0f}"
             parts.append(element("path", d=at, class_="line curve", stroke_width=1.2))
         y += _ROW

@@ -96,7 +96,9 @@ def _facts(diagnosis: Diagnosis) -> Markup:
         (
             sure.get(verdict.effect, "Probability of this cause"),
             percent_text(verdict.probability),
-            ", ".join(f"{effect_label(n)} {percent_text(chances.get(n, math.nan))}" for n in verdict.alternatives[:3]),
+            ", ".join(
+                f"{effect_label(n)} {percent_text(chances[n])}" for n in verdict.alternatives[:3] if n in chances
+            ),
         )
     ]
     if not gap.resolvable:
