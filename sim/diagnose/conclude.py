@@ -96,7 +96,7 @@ def diagnose(
         next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable),
         where=where_of(capture, discrepancies),
         trials=_arrays(capture, discrepancies, nominal_points, found_points, *predictions),
-        summary=summary_of(verdict, gap, found),
+        summary=summary_of(verdict, gap),
         warnings=tuple(warnings),
         seconds=round(time.monotonic() - started, 2),
         confirmation=_confirmation_json(confirmations),

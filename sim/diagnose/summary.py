@@ -1,38 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The verdict in words."""
+"""The verdict in a sentence or two."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
-from .analysis import CandidateFit
 from .diagnosis import NONE, UNKNOWN, Gap, Verdict
-
-NAMES: Mapping[str, str] = {
-    "air_drag": "air drag",
-    "wind": "wind",
-    "magnus": "lift from spin (Magnus)",
-    "buoyancy": "buoyancy",
-    "gravity_tilt": "a ground that is not level (tilted gravity)",
-    "tether": "an unseen spring or string",
-    "friction": "a different friction",
-    "restitution": "a different bounce (restitution)",
-    "rolling_resistance": "rolling resistance",
-    "adhesion": "adhesion to the surface",
-    "stiffness": "a different stiffness",
-    "internal_damping": "damping inside the body",
-    "plastic_yield": "lasting deformation (plastic yield)",
-    "anisotropy": "fibres: stiffer along one axis",
-    "stiffness_gradient": "stiffness that varies across the body",
-    "mass_offset": "a centre of mass that is off the middle",
-    "time_scale": "a clock that runs wrong",
-    "camera_pose": "a camera that is not where it was believed to be",
-}
+from .report.words import effect_label, found_effects, listed
 
 
-def summary_of(verdict: Verdict, gap: Gap, found: CandidateFit) -> str:
-    """One or two sentences for people."""
+def summary_of(verdict: Verdict, gap: Gap) -> str:
+    """What was found, how sure that is, what it could be instead, how far it closes the gap."""
+    others = listed([effect_label(name) for name in verdict.alternatives], "or")
     if verdict.effect == NONE:
         return f"The nominal model explains the recording to its noise ({_percent(verdict.probability)} sure)."
     if verdict.effect == UNKNOWN:
@@ -40,15 +19,11 @@ def summary_of(verdict: Verdict, gap: Gap, found: CandidateFit) -> str:
             "Something is missing from the model, and no effect known to this program closes the gap "
             f"({_percent(verdict.probability)} sure)."
         )
-        if verdict.alternatives:
-            text += f" Nearest comes {_listed(verdict.alternatives, 'or')}."
-        return text
-    causes = _listed(verdict.effects or (verdict.effect,), "and")
-    verb = "are" if len(verdict.effects) > 1 else "is"
-    text = f"Missing from the model {verb} {causes} ({_percent(verdict.probability)} sure)"
-    if verdict.alternatives:
-        text += f"; the data cannot rule out {_listed(verdict.alternatives, 'or')}"
-    text += "."
+        return f"{text} Nearest comes {others}." if others else text
+    causes = [effect_label(name) for name in found_effects(verdict)]
+    opening = "The cause of the gap is" if len(causes) == 1 else "The causes of the gap are"
+    text = f"{opening} {listed(causes, 'and')} ({_percent(verdict.probability)} sure)"
+    text += f"; the data cannot rule out {others}." if others else "."
     if not gap.resolvable:
         return text + " The gap is too near the noise to say how much of it this closes."
     if math.isfinite(gap.closed_fraction):
@@ -60,8 +35,3 @@ def summary_of(verdict: Verdict, gap: Gap, found: CandidateFit) -> str:
 def _percent(value: float) -> str:
     shown = round(100 * value)
     return "over 99 %" if shown >= 100 else "under 1 %" if shown < 1 else f"{shown} %"
-
-
-def _listed(names: tuple[str, ...], word: str) -> str:
-    texts = [NAMES.get(name, name) for name in names]
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
