@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""``physgen track``: its arguments, and what it does with them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...atomic import replacing
+from ...errors import InputError
+from ...events import Event, IsCancelled, OnEvent, ignore, never
+from ...scene.folder import SceneFolder, load_scene
+from ..capture import Capture, Trial, load_capture, save_capture
+from .options import Take, TrackOptions
+from .tracking import track_videos
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``physgen track``, to which ``command`` answers."""
+    defaults = TrackOptions()
+    parser.add_argument("videos", type=Path, nargs="+", metavar="VIDEO", help="a take each: MP4, MOV, AVI …")
+    parser.add_argument("--scene", type=Path, required=True, metavar="SCENE", help="scene folder that the videos show")
+    parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="the capture folder, a new one")
+    objects = "names of the objects to track (default: all that move)"
+    parser.add_argument("--objects", nargs="+", action="extend", default=[], metavar="NAME", help=objects)
+    start = "first frame that counts, from 0, one for all or one a video; it shows the scene as it is (default 0)"
+    parser.add_argument("--start-frame", type=int, nargs="+", action="extend", default=[], metavar="N", help=start)
+    end = "last frame that counts, one for all or one a video (default: the last)"
+    parser.add_argument("--end-frame", type=int, nargs="+", action="extend", default=[], metavar="N", help=end)
+    fps = "frames a second at which it was really filmed, one for all or one a video (default: the file's own times)"
+    parser.add_argument("--fps-override", type=float, nargs="+", action="extend", default=[], metavar="FPS", help=fps)
+    predict = (
+        "withhold what a video shows later than SECONDS after its first frame, to be predicted: of the last video, or "
+        "of the one called NAME (its file name without suffix)"
+    )
+    parser.add_argument(
+        "--predict-from", nargs="+", action="extend", default=[], metavar="[NAME=]SECONDS", help=predict
+    )
+    withheld = "folder for what predict trials withhold (default: it is dropped)"
+    parser.add_argument("--withheld", type=Path, metavar="DIR", help=withheld)
+    density = f"points sought on each object at a time (default {defaults.density})"
+    parser.add_argument("--density", type=int, default=defaults.density, metavar="N", help=density)
+    contrast = f"grey levels per pixel below which a patch has no texture (default {defaults.min_contrast:g})"
+    parser.add_argument("--min-contrast", type=float, default=defaults.min_contrast, metavar="LEVELS", help=contrast)
+    score = f"correlation with its first sight below which a point counts as hidden (default {defaults.min_score:g})"
+    parser.add_argument("--min-score", type=float, default=defaults.min_score, metavar="R", help=score)
+
+
+def command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+    """Track as ``options`` (of ``add_arguments``) say; the ``done`` event, whose ``summary`` is a text for people."""
+    takes = parse_takes(
+        options.videos,
+        start_frames=options.start_frame,
+        end_frames=options.end_frame,
+        fps_overrides=options.fps_override,
+        predict_from=options.predict_from,
+    )
+    capture = track_and_save(
+        takes,
+        load_scene(options.scene),
+        options.out,
+        objects=options.objects,
+        options=TrackOptions(density=options.density, min_contrast=options.min_contrast, min_score=options.min_score),
+        withheld=options.withheld,
+        on_event=on_event,
+        cancelled=cancelled,
+    )
+    return {"event": "done", "stage": "track", "capture": str(options.out), "summary": summary(capture)}
+
+
+def parse_takes(
+    videos: Sequence[Path],
+    *,
+    start_frames: Sequence[int] = (),
+    end_frames: Sequence[int] = (),
+    fps_overrides: Sequence[float] = (),
+    predict_from: Sequence[str] = (),
+) -> list[Take]:
+    """Takes of what the command line says. Raises InputError when numbers and videos do not go together."""
+    count = len(videos)
+    starts = _spread("--start-frame", start_frames, count)
+    ends = _spread("--end-frame", end_frames, count)
+    rates = _spread("--fps-override", fps_overrides, count)
+    seconds: list[float | None] = [None] * count
+    stems = [path.stem for path in videos]
+    for text in predict_from:
+        name, equals, number = text.rpartition("=")
+        if equals and stems.count(name) != 1:
+            raise InputError(f"--predict-from {text!r}: name one of the videos: {', '.join(stems)}")
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"--predict-from {text!r}: give SECONDS or NAME=SECONDS")
+        seconds[stems.index(name) if equals else count - 1] = value
+    return [
+        Take(
+            path=path,
+            start_frame=starts[i] or 0,
+            end_frame=ends[i],
+            fps_override=rates[i],
+            predict_from=seconds[i],
+        )
+        for i, path in enumerate(videos)
+    ]
+
+
+def _spread(flag: str, values: Sequence[Any], count: int) -> list[Any]:
+    if len(values) not in (0, 1, count):
+        raise InputError(f"{flag}: {len(values)} given for {count} videos; give one for all or one a video")
+    return [None] * count if not values else list(values) * count if len(values) == 1 else list(values)
+
+
+def track_and_save(
+    takes: Sequence[Take],
+    folder: SceneFolder,
+    out: Path,
+    *,
+    objects: Sequence[str] = (),
+    options: TrackOptions | None = None,
+    withheld: Path | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Capture:
+    """Track ``takes``, write the capture folder ``out`` and return it as loaded, with all warnings.
+
+    withheld: folder for ``NAME.npz`` with ``times``, ``pixels``, ``object_index`` and ``rest_points`` of what each
+    predict trial withholds; None drops it. Raises as ``track_videos`` does, and InputError when ``out`` is there.
+    """
+    for target in (out, withheld):
+        if target is not None and target.exists():
+            raise InputError(f"{target}: is there already; choose another folder")
+    if withheld is not None and withheld.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{withheld}: lies inside the capture, where a diagnosis could see it; choose another folder")
+    tracked = track_videos(takes, folder, objects=objects, options=options, on_event=on_event, cancelled=cancelled)
+    save_capture(tracked.capture, out)
+    if withheld is not None and tracked.withheld:
+        _save_withheld(tracked.withheld, withheld)
+    loaded = load_capture(out)
+    for warning in tracked.capture.warnings:
+        on_event({"event": "notice", "stage": "track", "message": warning})
+    names = {f.name: getattr(loaded, f.name) for f in fields(loaded)}
+    return Capture(**{**names, "warnings": tracked.capture.warnings})
+
+
+def _save_withheld(trials: dict[str, Trial], folder: Path) -> None:
+    with replacing(folder) as partial:
+        partial.mkdir(parents=True)
+        for name, trial in trials.items():
+            assert trial.pixels is not None
+            np.savez(
+                partial / f"{name}.npz",
+                times=trial.times,
+                pixels=trial.pixels,
+                object_index=trial.object_index,
+                rest_points=trial.rest_points,
+            )
+
+
+def summary(capture: Capture) -> str:
+    """What was tracked, a line a trial, for people."""
+    lines = []
+    for trial in capture.trials:
+        seen = trial.seen.sum(axis=1)
+        lines.append(
+            f"{trial.name} ({trial.role}): {len(trial.times)} frames in {trial.times[-1] - trial.times[0]:.3g} s, "
+            f"{trial.rest_points.shape[0]} points, {int(np.median(seen))} in a frame"
+        )
+    lines.append(f"scatter of a coordinate: {capture.noise_sigma:.2g} px")
+    return "\n".join(lines)
