@@ -320,8 +320,8 @@ class _Run:
         if seen.sum() < min(LEAST_FRAMES, count):
             raise InputError(
                 f"{self._take.path}: object {name!r} is lost after {int(seen.sum())} frames: it moves too far "
-                "from frame to frame, is blurred or hidden, or shows too little texture; film at more frames a second with a "
-                "shorter exposure, or put a pattern on it"
+                "from frame to frame, is blurred or hidden, or shows too little texture; film at more frames a "
+                "second with a shorter exposure, or put a pattern on it"
             )
         if not seen.all():
             gone = np.flatnonzero(~seen)

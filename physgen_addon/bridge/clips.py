@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tracks of Blender's Movie Clip editor as a capture: what was tracked by hand or by Blender counts like our own.
+
+Markers are normalised to the clip's size with y up; the middle of a pixel is half a pixel in, as in our pictures.
+Frames are the clip's own, whatever ``frame_start`` puts them at in the scene: a capture counts seconds from its first
+frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.diagnose.capture import Camera, Capture, Trial
+from ...sim.diagnose.capture_checks import check_capture
+from ...sim.diagnose.track.beliefs import (
+    SceneBody,
+    belief_warnings,
+    believed_ground,
+    believed_objects,
+    chosen_objects,
+    scene_bodies,
+    video_camera,
+)
+from ...sim.diagnose.track.noise import FLOOR_PX, pose_scatter
+from ...sim.diagnose.track.pose import Located, Pose, locate
+from ...sim.diagnose.track.surface import cast
+from ...sim.diagnose.track.tracking import withhold
+from ...sim.errors import InputError
+from ...sim.scene.folder import SceneFolder
+
+GUESSED_SIGMA_PX = 0.5
+"""Of tracks too few to measure their scatter: what Blender's tracker and a steady hand reach."""
+LIFT_PX = 3.0
+"""Median distance of an object's tracks from its fitted pose above which no later track can be put on its mesh."""
+MISFIT = 0.1
+"""How far tracks may be off the fitted pose and still count for it, over the picture's width."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipTake:
+    """A clip and how it counts.
+
+    name: of the trial; "": the clip's. fps: frames a second at which it was filmed; None: the clip's, of an image
+    sequence the scene's. predict_from: s after the first frame from which on the motion is withheld; None: nothing is.
+    """
+
+    clip: bpy.types.MovieClip
+    name: str = ""
+    fps: float | None = None
+    predict_from: float | None = None
+
+
+def capture_from_clips(takes: Sequence[ClipTake], folder: SceneFolder, *, objects: Sequence[str] = ()) -> Capture:
+    """The tracks of ``takes`` on the objects of the scene ``folder``, as a capture of pixels.
+
+    Each clip's first frame with a marker shows the scene as ``folder`` has it. Tracks seen there are put onto the mesh
+    that they are in front of; those that begin later where the object is by then, as the earlier ones tell. Muted
+    (disabled) markers and frames without one are frames in which the point was not seen.
+    objects: names of those to take; empty: all that move. Raises InputError for a clip without usable tracks, of
+    another shape than the photo, or of unknown frame rate.
+    """
+    if not takes:
+        raise InputError("no clip: load a movie clip and track points on it")
+    chosen = chosen_objects(folder.scene, objects)
+    everything = scene_bodies(folder)
+    warnings = belief_warnings(folder.scene, chosen)
+    trials, sigmas, cameras = [], [], []
+    for take in takes:
+        camera = _camera(folder, take.clip)
+        cameras.append(camera)
+        read = _read(take, camera)
+        warnings += read.warnings
+        trial, sigma = _lifted(read, everything, chosen, camera, warnings)
+        sigmas.append(sigma)
+        trials.append(trial if take.predict_from is None else withhold(trial, take.predict_from)[0])
+    if any(camera != cameras[0] for camera in cameras):
+        raise InputError("the clips have different sizes: a capture has one camera; import them apart")
+    known = [sigma for sigma in sigmas if sigma is not None]
+    if not known:
+        warnings.append(f"too few tracks to measure how they scatter: {GUESSED_SIGMA_PX} px is assumed")
+    bodies = [everything[i] for i in chosen]
+    capture = Capture(
+        gravity=folder.scene.gravity,
+        ground=believed_ground(folder.scene, [body.source for body in bodies]),
+        objects=believed_objects(bodies),
+        noise_sigma=max(FLOOR_PX, float(np.median(known))) if known else GUESSED_SIGMA_PX,
+        camera=cameras[0],
+        trials=tuple(trials),
+    )
+    checked = check_capture(capture)
+    return dataclasses.replace(capture, warnings=tuple(dict.fromkeys((*warnings, *checked.warnings))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracks:
+    """What a clip says. names: of its tracks, N; pixels: (T, N, 2), NaN where not seen; times: (T,) s."""
+
+    name: str
+    names: list[str]
+    times: Array
+    pixels: Array
+    warnings: list[str]
+
+
+def _camera(folder: SceneFolder, clip: bpy.types.MovieClip) -> Camera:
+    width, height = clip.size
+    if width <= 0 or height <= 0:
+        raise InputError(f"clip {clip.name!r}: its file cannot be read; restore it or choose another ({clip.filepath})")
+    return video_camera(folder.scene, int(width), int(height), f"clip {clip.name!r}")
+
+
+def _fps(take: ClipTake) -> float:
+    fps = take.fps
+    if fps is None:
+        fps = float(take.clip.fps)
+        if fps <= 0 and bpy.context.scene is not None:
+            fps = bpy.context.scene.render.fps / bpy.context.scene.render.fps_base
+    if not (np.isfinite(fps) and 0 < fps <= 1e5):
+        raise InputError(f"clip {take.clip.name!r}: its frame rate is {fps!r}: give frames a second up to 100000")
+    return fps
+
+
+def _read(take: ClipTake, camera: Camera) -> _Tracks:
+    clip = take.clip
+    tracks = [track for item in clip.tracking.objects for track in item.tracks]
+    seen = {
+        index: {m.frame: np.add(m.co, track.offset) for m in track.markers if not m.mute}
+        for index, track in enumerate(tracks)
+    }
+    frames = sorted({frame for markers in seen.values() for frame in markers})
+    if len(frames) < 3:
+        raise InputError(
+            f"clip {clip.name!r}: its tracks have markers in {len(frames)} frames; a motion needs 3: track points in "
+            "the Movie Clip editor first"
+        )
+    count = frames[-1] - frames[0] + 1
+    pixels = np.full((count, len(tracks), 2), np.nan)
+    for index, markers in seen.items():
+        for frame, (x, y) in markers.items():
+            pixels[frame - frames[0], index] = x * camera.width, (1.0 - y) * camera.height
+    warnings: list[str] = []
+    return _Tracks(
+        name="".join(c if c.isalnum() or c in "_- " else "_" for c in take.name or clip.name).strip() or "clip",
+        names=[track.name for track in tracks],
+        times=np.arange(count) / _fps(take),
+        pixels=_undistorted(clip, pixels, camera, warnings),
+        warnings=warnings,
+    )
+
+
+def _undistorted(clip: bpy.types.MovieClip, pixels: Array, camera: Camera, warnings: list[str]) -> Array:
+    """``pixels`` (T, N, 2) as a lens without distortion would show them, by what the clip says of its lens."""
+    lens = clip.tracking.camera
+    model = lens.distortion_model
+    numbers = {
+        "POLYNOMIAL": (lens.k1, lens.k2, lens.k3),
+        "DIVISION": (lens.division_k1, lens.division_k2),
+        "NUKE": (lens.nuke_k1, lens.nuke_k2, lens.nuke_p1, lens.nuke_p2),
+        "BROWN": (lens.brown_k1, lens.brown_k2, lens.brown_k3, lens.brown_k4, lens.brown_p1, lens.brown_p2),
+    }.get(model, ())
+    if not any(numbers):
+        return pixels
+    if model == "POLYNOMIAL":
+        radial = (lens.k1, lens.k2, lens.k3)
+    elif model == "BROWN" and lens.brown_k4 == 0:
+        radial = (lens.brown_k1, lens.brown_k2, lens.brown_k3)
+        if lens.brown_p1 or lens.brown_p2:
+            warnings.append(f"clip {clip.name!r}: the tangential part of its lens distortion is not taken out")
+    else:
+        warnings.append(f"clip {clip.name!r}: lens distortion of the model {model} is not taken out")
+        return pixels
+    focal = np.array([lens.focal_length_pixels, lens.focal_length_pixels / lens.pixel_aspect])
+    # The clip's lens has y up, which radial terms do not mind.
+    middle = np.array([lens.principal_point_pixels[0], camera.height - lens.principal_point_pixels[1]])
+    bent = (pixels - middle) / focal
+    straight = bent.copy()
+    for _ in range(60):
+        square = (straight**2).sum(axis=-1, keepdims=True)
+        straight = bent / (1.0 + square * (radial[0] + square * (radial[1] + square * radial[2])))
+    return np.asarray(straight * focal + middle)
+
+
+def _lifted(
+    read: _Tracks, everything: Sequence[SceneBody], chosen: Sequence[int], camera: Camera, warnings: list[str]
+) -> tuple[Trial, float | None]:
+    """The trial, and the scatter of rigid objects' tracks about their poses or None."""
+    count = len(read.names)
+    owner = np.full(count, -1, dtype=np.int64)
+    rest = np.full((count, 3), np.nan)
+    poses: list[Pose | None] = [body.pose(camera) for body in everything]
+    seen = np.isfinite(read.pixels).all(axis=2)
+    first = np.where(seen.any(axis=0), seen.argmax(axis=0), -1)
+    residual = np.full_like(read.pixels, np.nan)
+    # What is not tracked and moves is where the scene has it in the first frame alone.
+    moving = [i for i, body in enumerate(everything) if i not in chosen and body.source.role == "dynamic"]
+    guesses = [body.pose(camera) for body in everything]
+    for frame in range(len(read.times)):
+        for i in chosen if frame else ():
+            there = np.flatnonzero((owner == i) & seen[frame])
+            fitted = _fitted(guesses[i], rest[there], read.pixels[frame, there], camera)
+            poses[i] = None
+            if fitted is not None:
+                residual[frame, there], guesses[i] = fitted.residual, fitted.pose
+                off = np.median(np.linalg.norm(fitted.residual, axis=1))
+                poses[i] = fitted.pose if off <= LIFT_PX else None
+        for i in moving if frame else ():
+            poses[i] = None
+        new = np.flatnonzero(first == frame)
+        if len(new):
+            _put(new, read.pixels[frame], everything, poses, camera, owner, rest)
+    used = np.isin(owner, chosen)
+    if not used.any():
+        raise InputError(
+            f"clip {read.name!r}: none of its {count} tracks lies on an object to be taken in its first frame; the "
+            "clip must begin where the scene stands as reconstructed, seen by the same camera"
+        )
+    left = [name for name, kept in zip(read.names, used, strict=True) if not kept]
+    if left:
+        shown = ", ".join(left[:5]) + (" …" if len(left) > 5 else "")
+        warnings.append(f"clip {read.name!r}: {len(left)} tracks lie on no object that is taken: {shown}")
+    order = {scene_index: index for index, scene_index in enumerate(chosen)}
+    trial = Trial(
+        name=read.name,
+        role="fit",
+        times=read.times,
+        points=None,
+        pixels=read.pixels[:, used],
+        object_index=np.array([order[int(i)] for i in owner[used]], dtype=np.int64),
+        rest_points=rest[used],
+    )
+    rigid = used & np.array([i >= 0 and everything[int(i)].rigid for i in owner])
+    sigma = pose_scatter(residual[:, rigid]) if rigid.any() else None
+    return trial, sigma
+
+
+def _fitted(guess: Pose, rest: Array, pixels: Array, camera: Camera) -> Located | None:
+    """Where an object is by the tracks on it, all of which its user wanted: none is an outlier but for gross errors."""
+    return locate(camera, rest, pixels, guess, tolerance=2.0, largest=MISFIT * camera.width)
+
+
+def _put(
+    new: NDArray[np.int64],
+    pixels: Array,
+    everything: Sequence[SceneBody],
+    poses: Sequence[Pose | None],
+    camera: Camera,
+    owner: NDArray[np.int64],
+    rest: Array,
+) -> None:
+    """Put the tracks ``new`` onto the nearest object that the rays through their ``pixels`` (N, 2) hit."""
+    nearest = np.full(len(new), np.inf)
+    for i, (body, pose) in enumerate(zip(everything, poses, strict=True)):
+        if pose is None:
+            continue
+        hits = cast(body.surface, pose, camera, pixels[new])
+        nearer = hits.depth < nearest
+        nearest[nearer] = hits.depth[nearer]
+        owner[new[nearer]], rest[new[nearer]] = i, hits.rest[nearer]
