@@ -6,6 +6,7 @@ The drawing shares no code with the tracker: homographies for planes, rays for t
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Camera as CaptureCamera
 from physgen.sim.diagnose.capture import load_capture
-from physgen.sim.diagnose.track.command import parse_takes, track_and_save
+from physgen.sim.diagnose.track.command import add_arguments, command, parse_takes, track_and_save
 from physgen.sim.diagnose.track.corners import contrast, image_noise
 from physgen.sim.diagnose.track.noise import jitter, pose_scatter
 from physgen.sim.diagnose.track.options import Take, TrackOptions
@@ -402,6 +403,49 @@ def test_several_takes_and_one_to_predict(cube, tossed, tmp_path):
         np.testing.assert_array_equal(rest["rest_points"], shown.rest_points)
     assert not list((tmp_path / "capture").glob("**/*withheld*"))
     assert capture.noise_sigma == tracked.noise_sigma or capture.noise_sigma > 0
+
+
+def test_the_command(cube, tossed, tmp_path):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    line = f"{tossed[0]} --scene {cube[1].root} --out {tmp_path / 'c'} --end-frame 8 --density 20 --objects body"
+    events = []
+    done = command(parser.parse_args(line.split()), events.append, lambda: False)
+    assert done["event"] == "done" and done["capture"] == str(tmp_path / "c")
+    assert "9 frames in 0.133 s" in done["summary"]
+    trial = load_capture(tmp_path / "c").trials[0]
+    assert trial.seen[0].sum() <= 20
+    with pytest.raises(InputError, match="is there already"):
+        command(parser.parse_args(line.split()), events.append, lambda: False)
+
+
+def test_two_objects_one_behind_the_other(tmp_path):
+    """A still collider in front hides the moving cube; what it hides is not seen though nobody tracks the collider."""
+    stage = Stage()
+    folder = make_scene(tmp_path / "scene", stage)
+    wall = trimesh.creation.box((0.06, 0.01, 0.3))
+    wall.apply_translation((0.12, -0.12, 0.1))
+    wall.export(folder.root / "meshes/wall.ply")
+    items = (*folder.scene.objects, SceneObject(name="wall", mesh="meshes/wall.ply", size_m=0.3, role="collider"))
+    folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=items))
+
+    def pushed(t):
+        return REST_TURN, REST_PLACE + np.array([0.8 * max(0.0, t - 0.05), 0, 0])
+
+    corners = CAMERA.project(np.asarray(wall.vertices))[:, :2]
+    shape = cv2.convexHull(np.round(corners - 0.5).astype(np.int32))
+
+    def frames():
+        for frame in film(stage, pushed, 28):
+            cv2.fillConvexPoly(frame, shape, 120)
+            yield frame
+
+    tracked = track_video(Take(path=write_video(tmp_path / "pushed.avi", frames())), folder)
+    true = truth(tracked.trial, pushed)
+    assert np.nanmax(np.linalg.norm(tracked.trial.pixels - true, axis=2)) < 1.5
+    inside = np.array([[cv2.pointPolygonTest(shape, tuple(p), True) for p in row] for row in true - 0.5])
+    assert (inside > 4).sum() > 50
+    assert not tracked.trial.seen[inside > 4].any()
 
 
 def test_nothing_to_learn_from(cube, tossed):

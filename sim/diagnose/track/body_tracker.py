@@ -44,8 +44,9 @@ PROBATION_FRAMES = 3
 PROBATION_PX = 8.0
 """Frames through which, and way in the picture along which a new point must go with the object before it counts: it may
 sit on something that has come in front of it."""
-LIFT_PX = 1.5
-"""Median distance in pixels from the fitted pose above which new points could not be placed on the mesh."""
+LIFT_PX, LIFT_SHARE = 1.5, 0.015
+"""Median distance from the fitted pose above which new points could not be placed on the mesh: pixels, or that share of
+the object's size in the picture if it is more."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +339,7 @@ class BodyTracker:
         known = np.isfinite(self.residual).all(axis=1) & self.trusted
         if known.sum() < LEAST_POINTS + 3:
             return
-        if float(np.median(np.linalg.norm(self.residual[known], axis=1))) > LIFT_PX:
+        if float(np.median(np.linalg.norm(self.residual[known], axis=1))) > max(LIFT_PX, LIFT_SHARE * self.size):
             return
         self.add_points(view, frame, None, others)
 

@@ -7,6 +7,7 @@ depth is linear in the image, which is exact and needs no search tree.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from ..capture import Camera
 from .pose import Array, Mask, Pose, project
 
-_PAIRS_AT_ONCE = 4_000_000
+_PAIRS_AT_ONCE = 1_000_000
 """Pixels times triangles that are compared in one go, to bound the memory."""
 
 
@@ -48,20 +49,25 @@ def cast(surface: Surface, pose: Pose, camera: Camera, pixels: Array) -> Hits:
     """The nearest points of ``surface`` at ``pose`` that ``pixels`` (N, 2) show."""
     local = pose.apply(surface.vertices)
     flat, depth = project(camera, local)[surface.faces], local[surface.faces, 2]
-    usable = np.flatnonzero((depth > 1e-6).all(axis=1))
+    usable = np.flatnonzero(_over_corners(np.minimum, depth) > 1e-6)
     flat, depth = flat[usable], depth[usable]
-    low, high = flat.min(axis=1, initial=np.inf), flat.max(axis=1, initial=-np.inf)
+    low, high = _over_corners(np.minimum, flat), _over_corners(np.maximum, flat)
     count = len(pixels)
     face = np.full(count, -1, dtype=np.int64)
     rest = np.full((count, 3), np.nan)
     nearest = np.full(count, np.inf)
-    chunk = max(1, _PAIRS_AT_ONCE // max(1, len(usable)))
-    for start in range(0, count if len(usable) else 0, chunk):
-        part = pixels[start : start + chunk]
-        inside = ((part[:, None] >= low) & (part[:, None] <= high)).all(axis=2)
-        which, triangle = np.nonzero(inside)
+    # Pixels in the order of x: those beside a triangle are a stretch of them.
+    by_x = np.argsort(pixels[:, 0], kind="stable")
+    left = np.searchsorted(pixels[by_x, 0], low[:, 0], side="left")
+    counts = np.searchsorted(pixels[by_x, 0], high[:, 0], side="right") - left
+    for part in _parts(counts):
+        triangle = np.repeat(part, counts[part])
+        step = np.arange(len(triangle)) - np.repeat(np.cumsum(counts[part]) - counts[part], counts[part])
+        which = by_x[left[triangle] + step]
+        beside = (pixels[which, 1] >= low[triangle, 1]) & (pixels[which, 1] <= high[triangle, 1])
+        which, triangle = which[beside], triangle[beside]
         a, b, c = (flat[triangle, i] for i in range(3))
-        p = part[which]
+        p = pixels[which]
         area = _cross(b - a, c - a)
         area = np.where(np.abs(area) < 1e-12, np.nan, area)
         weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], axis=1) / area[:, None]
@@ -71,11 +77,25 @@ def cast(surface: Surface, pose: Pose, camera: Camera, pixels: Array) -> Hits:
         z = 1.0 / shares.sum(axis=1)
         order = np.lexsort((z, which))
         first = order[np.unique(which[order], return_index=True)[1]]
-        rows = start + which[first]
+        first = first[z[first] < nearest[which[first]]]
+        rows = which[first]
         face[rows], nearest[rows] = usable[triangle[first]], z[first]
         corners = surface.vertices[surface.faces[face[rows]]]
         rest[rows] = (corners * (shares[first] * z[first][:, None])[:, :, None]).sum(axis=1)
     return Hits(face=face, rest=rest, depth=nearest)
+
+
+def _over_corners(smaller: np.ufunc, values: Array) -> Array:
+    """The least or largest of ``values`` (F, 3, …) over the corners; NumPy's own is slow along so short an axis."""
+    return np.asarray(smaller(smaller(values[:, 0], values[:, 1]), values[:, 2]))
+
+
+def _parts(counts: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Indices of triangles, in parts whose ``counts`` of pixels together stay bounded."""
+    wanted = np.flatnonzero(counts > 0)
+    bins = np.cumsum(counts[wanted]) // _PAIRS_AT_ONCE
+    for number in np.unique(bins):
+        yield wanted[bins == number]
 
 
 def _cross(a: Array, b: Array) -> Array:
