@@ -310,15 +310,34 @@ def test_an_occluder_never_carries_points_away(cube, tmp_path):
     assert np.percentile(found, 99) < 3.0
 
 
-def test_motion_blur(cube, tmp_path):
-    """Exposed for a quarter of the frame's time, over which the cube moves by up to 6 pixels."""
+@pytest.mark.parametrize(
+    ("exposure", "median", "most"), [(0.25, 0.15, 0.8), pytest.param(0.75, 0.5, 3.0, marks=pytest.mark.slow)]
+)
+def test_motion_blur(cube, tmp_path, exposure, median, most):
+    """Exposed for a share of the frame's time, over which the cube moves by up to 6 and 17 pixels."""
     stage, folder = cube
-    path = write_video(tmp_path / "blur.avi", film(stage, toss, 26, exposure=0.25))
+    path = write_video(tmp_path / "blur.avi", film(stage, toss, 26, exposure=exposure))
     tracked = track_video(Take(path=path), folder)
     found = errors(tracked.trial, toss)
     assert tracked.trial.seen.any(axis=1).all()
-    assert np.median(found) < 0.5
-    assert np.percentile(found, 95) < 2.0
+    assert np.median(found) < median
+    assert np.percentile(found, 95) < most
+
+
+def test_a_bounce(cube, tmp_path):
+    """The velocity turns round between two frames, by 40 pixels a frame."""
+    stage, folder = cube
+
+    def bounce(t):
+        t = max(0.0, t - 4.5 / FPS) % 0.25
+        spin = Rotation.from_rotvec([0, 0, 1.0 * t])
+        return spin * REST_TURN, REST_PLACE + np.array([0, 0, 4.905 * t * (0.25 - t)])
+
+    path = write_video(tmp_path / "bounce.avi", film(stage, bounce, 25))
+    tracked = track_video(Take(path=path), folder)
+    assert tracked.trial.seen.any(axis=1).all()
+    assert np.median(errors(tracked.trial, bounce)) < 0.15
+    assert np.percentile(errors(tracked.trial, bounce), 99) < 1.0
 
 
 def test_a_ball_that_deforms(tmp_path):
@@ -674,7 +693,7 @@ def test_aligning_finds_shifts_whatever_the_light(dx, dy, gain, offset):
 def test_noise_is_measured_and_is_no_texture(sigma):
     rng = np.random.default_rng(1)
     grey = np.clip(128 + rng.normal(0, sigma, (200, 200)), 0, 255).astype(np.uint8)
-    assert image_noise(grey) == pytest.approx(np.hypot(sigma, 0.29), rel=0.1)
+    assert image_noise(grey) == pytest.approx(np.hypot(sigma, 0.29), rel=0.1, abs=0.15)
     assert np.median(contrast(grey, 8)) < 2 * 0.43 * max(sigma, 0.3)
 
 

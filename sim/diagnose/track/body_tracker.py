@@ -34,6 +34,12 @@ LOOSEST_RIGID = 0.06
 """The same of a rigid body, whose mesh may be a guess."""
 REFILL_BELOW = 0.7
 """Share of the wanted points below which new ones are sought."""
+SHUTTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Shares of a frame's time for which a camera's shutter may be open."""
+SHUTTER_VOTES = 9
+"""Fast frames that are asked which of them it is; their median then stands."""
+STREAK_PX = 3.0
+"""Way from frame to frame from which on blur tells the shutter."""
 LOOKS = 3
 """A look from a better pose has better warps and brings more points in reach; after a few it is good enough."""
 LARGEST_BEND = 0.9
@@ -80,6 +86,7 @@ class BodyTracker:
         self._dropped = np.empty(0, dtype=np.bool_)
         self._agreed = np.empty((0, 2))
         self._before: Pose | None = None
+        self._shutters: list[float] = []
         self._camera, self._options = camera, options
         self._normals = np.empty((0, 3))
         self._grids = np.empty((0, 25, 3))
@@ -100,6 +107,11 @@ class BodyTracker:
     def _largest(self) -> float:
         share = LOOSEST_RIGID if self.body.rigid else SOFT_TOLERANCE
         return max(self._options.rigid_tolerance_px, share * self.size)
+
+    @property
+    def _shutter(self) -> float:
+        """Share of a frame's time for which the shutter is open, as far as it is known."""
+        return float(np.median(self._shutters)) if self._shutters else 0.0
 
     @property
     def _tolerance(self) -> float:
@@ -192,10 +204,18 @@ class BodyTracker:
         camera, rest, start = self._camera, self.rest[seen], self.places[seen]
         ahead = project(camera, predicted.apply(rest)) - project(camera, self.pose.apply(rest))
         best: Located | None = None
-        # A body that hits something does not go on as before: then from where it was.
-        for guess, initial in ((start + np.nan_to_num(ahead), predicted), (start, self.pose)):
-            ends, miss = follow(self._view.grey, view.grey, start, guess, self._half)
-            good = miss <= self._options.max_round_trip_px
+        # A body that hits something does not go on as before: then from where it was. A body that starts or stops fast
+        # is sharp in one frame and blurred in the other: then by what both show.
+        tries = ((start + np.nan_to_num(ahead), predicted, 0.0), (start, self.pose, 0.0), (start, self.pose, 0.6))
+        for guess, initial, blur in tries:
+            ends, miss = follow(
+                _blurred(self._view.grey, blur * self._half),
+                _blurred(view.grey, blur * self._half),
+                start,
+                guess,
+                self._half,
+            )
+            good = miss <= self._options.max_round_trip_px * (3 if blur else 1)
             if good.sum() < LEAST_POINTS:
                 continue
             fitted = locate(camera, rest[good], ends[good], initial, tolerance=self._tolerance, largest=self._largest)
@@ -214,7 +234,8 @@ class BodyTracker:
         if len(chosen) < LEAST_POINTS:
             return None
         chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 24)).astype(int)]
-        patches = warp(self._crops[chosen], self._maps(chosen, predicted), self._half)
+        streaks = self._shutter * np.nan_to_num(expected - project(self._camera, self.pose.apply(self.rest)))[chosen]
+        patches = warp(self._crops[chosen], self._maps(chosen, predicted), self._half, streaks)
         radius = int(0.25 * self.size) + 10 + 6 * min(self.lost, 10)
         half = self._half
         height, width = view.grey.shape
@@ -259,8 +280,7 @@ class BodyTracker:
             chosen, guesses = self._expected(view, rough, others)
             if len(chosen) < LEAST_POINTS:
                 return None
-            patches = warp(self._crops[chosen], self._maps(chosen, rough), half)
-            places, score = align(view.smooth, patches, guesses, half)
+            places, score = self._aligned(view, chosen, guesses, rough)
             good = (score >= self._options.min_score) & (np.linalg.norm(places - guesses, axis=1) <= 0.6 * half + 1)
             voting = good & self.trusted[chosen]
             fitted = locate(
@@ -287,6 +307,25 @@ class BodyTracker:
         self.places[chosen[good]], self.residual[chosen[good]] = places[good], residual[good]
         self._judge(chosen[~good], chosen[good], last)
         return best.pose
+
+    def _aligned(self, view: View, chosen: NDArray[np.int64], guesses: Array, pose: Pose) -> tuple[Array, Array]:
+        """Where the points ``chosen`` are, and how well that looks like their first sight, blurred by their motion.
+
+        For which share of a frame's time the camera's shutter is open is not known; fast motion tells.
+        """
+        camera, crops, maps = self._camera, self._crops[chosen], self._maps(chosen, pose)
+        rest = self.rest[chosen]
+        way = project(camera, pose.apply(rest)) - project(camera, self.pose.apply(rest))
+        way = np.nan_to_num(way) * (self.lost == 0)
+        fast = float(np.median(np.linalg.norm(way, axis=1))) > STREAK_PX
+        if fast and len(self._shutters) < SHUTTER_VOTES:
+            found = {}
+            for share in SHUTTERS:
+                found[share] = align(view.smooth, warp(crops, maps, self._half, share * way), guesses, self._half)
+            best = max(SHUTTERS, key=lambda share: float(np.median(found[share][1])))
+            self._shutters.append(best)
+            return found[best]
+        return align(view.smooth, warp(crops, maps, self._half, self._shutter * way), guesses, self._half)
 
     def _judge(self, missing: NDArray[np.int64], there: NDArray[np.int64], last: Array) -> None:
         """New points that went along for long enough count from now on; one that was not where it had to be never."""
@@ -342,6 +381,10 @@ class BodyTracker:
         if float(np.median(np.linalg.norm(self.residual[known], axis=1))) > max(LIFT_PX, LIFT_SHARE * self.size):
             return
         self.add_points(view, frame, None, others)
+
+
+def _blurred(grey: Grey, sigma: float) -> Grey:
+    return grey if sigma <= 0 else np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma), dtype=np.uint8)
 
 
 def _hidden(pixels: Array, depth: Array, others: Sequence[tuple[Surface, Pose]], camera: Camera) -> Mask:

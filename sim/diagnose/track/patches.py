@@ -21,6 +21,9 @@ REACH = 2.2
 """Half size of what is kept of the first sight, over that of the patch that is compared: how far views may zoom out."""
 
 
+_STREAK_STEP_PX = 1.5
+
+
 @dataclass(frozen=True, kw_only=True)
 class Patches:
     """Patches (N, n, n) as they should look in a frame, with zero mean and unit norm, and their gradients per pixel."""
@@ -79,20 +82,27 @@ def _terms(offsets: Array) -> Array:
     return np.stack([x, y, x * x, x * y, y * y], axis=-1)
 
 
-def warp(crops: Image, maps: Array, half: int) -> Patches:
+def warp(crops: Image, maps: Array, half: int, streaks: Array | None = None) -> Patches:
     """``crops`` (N, S, S) as a view shows them that the ``maps`` (N, 2, 5) lead back from.
 
     A map's columns count x, y, x², xy, y² of pixels from the point in the view; it gives pixels in the crop.
+    streaks: (N, 2) px, the way of each point in the view while the frame was exposed, centred; None: none.
     """
     wide = np.arange(-half - 1, half + 2, dtype=np.float64)
     columns, rows = np.meshgrid(wide, wide)
-    offsets = _terms(np.stack([columns.ravel(), rows.ravel()], axis=1)).T
+    offsets = np.stack([columns.ravel(), rows.ravel()], axis=1)
     side = len(wide)
     centre = crops.shape[1] // 2
     out = np.empty((len(crops), side, side), dtype=np.float64)
     for i, crop in enumerate(crops):
-        x, y = (maps[i] @ offsets + centre).astype(np.float32).reshape(2, side, side)
-        out[i] = cv2.remap(crop, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        streak = np.zeros(2) if streaks is None else streaks[i]
+        count = int(np.clip(np.ceil(np.linalg.norm(streak) / _STREAK_STEP_PX), 0, 12)) + 1
+        moments = (np.arange(count) + 0.5) / count - 0.5
+        total = np.zeros((side, side))
+        for moment in moments:
+            x, y = (maps[i] @ _terms(offsets - moment * streak).T + centre).astype(np.float32).reshape(2, side, side)
+            total += cv2.remap(crop, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        out[i] = total / count
     inner = out[:, 1:-1, 1:-1]
     values, norm = _standardised(inner)
     scale = 0.5 / norm[:, None, None]
