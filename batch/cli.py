@@ -157,6 +157,8 @@ def build_parser() -> argparse.ArgumentParser:
         command("diagnose", diagnosis.run_diagnose, "capture of a real motion → which effect the simulation lacks")
     )
 
+    diagnosis.add_track(command("track", diagnosis.run_track, "videos of a scene → capture folder"))
+
     listing = command("effects", _effects, "physical effects that a scene can have, with their parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="these only (default: all)")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs of the diagnosis: ``physgen diagnose`` (docs/diagnosis.md)."""
+"""The verbs of the diagnosis: ``physgen track`` and ``physgen diagnose`` (docs/tracking.md, docs/diagnosis.md)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import argparse
 import re
 from pathlib import Path
 
+from ..sim.diagnose.track import command as track_command
 from ..sim.events import IsCancelled
 from .terminal import Terminal
 
@@ -24,6 +25,19 @@ def duration(text: str) -> float:
 def names(text: str) -> tuple[str, ...]:
     """Names separated by commas."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def add_track(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen track``."""
+    track_command.add_arguments(parser)
+
+
+def run_track(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen track``; the exit code."""
+    done = track_command.command(options, terminal, cancelled)
+    terminal(done)
+    terminal.line(done["summary"])
+    return 0
 
 
 def add_diagnose(parser: argparse.ArgumentParser) -> None:
