@@ -1,14 +1,48 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Blender side of PhysGen. ``bridge`` is bpy without any user interface.
+"""The Blender side of PhysGen. ``bridge`` is bpy without any user interface; the rest is the interface.
 
-This version brings no panels yet: enabling the extension adds nothing to Blender's interface, and the stages run from
-the ``physgen`` command and ``batch/render.py``.
+``props`` is what Blender remembers, ``operators`` what it can do, ``panels`` what people see, ``jobs`` long work.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+
+MODULES = (
+    "props.preferences",
+    "props.diagnose",
+    "jobs",
+    "operators.capture",
+    "operators.diagnose",
+    "operators.effect",
+    "panels.diagnose",
+)
+"""All that Blender must know, in the order in which it must learn it; each has CLASSES, some a ``register`` too."""
+
+
+def _modules() -> list[ModuleType]:
+    """Imported late, because this package is also there without bpy."""
+    return [import_module(f".{name}", __package__) for name in MODULES]
 
 
 def register() -> None:
-    """Called by Blender when the extension is enabled; there is nothing to register yet."""
+    """Called by Blender when the extension is enabled."""
+    import bpy
+
+    for module in _modules():
+        for kind in module.CLASSES:
+            bpy.utils.register_class(kind)
+        if hasattr(module, "register"):
+            module.register()
 
 
 def unregister() -> None:
-    """Called by Blender when the extension is disabled."""
+    """Called by Blender when the extension is disabled; running jobs are cancelled."""
+    import bpy
+
+    for module in reversed(_modules()):
+        if hasattr(module, "unregister"):
+            module.unregister()
+        for kind in reversed(module.CLASSES):
+            bpy.utils.unregister_class(kind)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import bpy
 
@@ -79,3 +80,21 @@ def active_scene(scene: bpy.types.Scene) -> Iterator[None]:
     """Make ``scene`` the context's scene, for operators that look for it there."""
     with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
         yield
+
+
+def new_curves(item: bpy.types.Object) -> bpy.types.bpy_prop_collection:
+    """The animation curves of a new action on ``item`` (``action.fcurves`` is gone from 5.0 on)."""
+    action = bpy.data.actions.new(item.name)
+    slot = action.slots.new(item.id_type, item.name)
+    bag = action.layers.new("Layer").strips.new(type="KEYFRAME").channelbag(slot, ensure=True)
+    data = item.animation_data_create()
+    data.action, data.action_slot = action, slot
+    return bag.fcurves
+
+
+def set_modifier_input(modifier: bpy.types.NodesModifier, identifier: str, value: Any) -> None:
+    """Set an input of a geometry nodes modifier; they were custom properties until 5.1."""
+    if hasattr(modifier, "properties"):
+        getattr(modifier.properties.inputs, identifier).value = value
+    else:
+        modifier[identifier] = value

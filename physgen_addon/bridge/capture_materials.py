@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a capture looks like: one colour a layer, in the viewport's solid mode as in a render."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import compat
+from .capture_nodes import COLOUR
+
+OBSERVED, NOMINAL, FOUND = "observed", "nominal", "found"
+LAYERS = (OBSERVED, NOMINAL, FOUND)
+COLOURS = {OBSERVED: (0.9, 0.9, 0.9), NOMINAL: (1.0, 0.36, 0.04), FOUND: (0.0, 0.62, 0.55)}
+"""Linear RGB: white, orange, blue-green; told apart also by people who do not see red."""
+GROUND = (0.16, 0.17, 0.18)
+GHOST_ALPHA = 0.35
+
+
+def plain(name: str, colour: tuple[float, float, float], *, alpha: float = 1.0) -> bpy.types.Material:
+    """A material of this colour (linear), called ``PhysGen NAME``; the one of an earlier capture is used again."""
+    found = bpy.data.materials.get(f"PhysGen {name}")
+    if found is not None:
+        return found
+    material = bpy.data.materials.new(f"PhysGen {name}")
+    material.diffuse_color = (*colour, alpha)
+    tree = compat.node_tree(material)
+    shader = tree.nodes.new("ShaderNodeBsdfPrincipled")
+    shader.inputs["Base Color"].default_value = (*colour, 1.0)
+    shader.inputs["Roughness"].default_value = 0.6
+    shader.inputs["Alpha"].default_value = alpha
+    _show(tree, shader.outputs[0])
+    return material
+
+
+def glowing(name: str, colour: tuple[float, float, float]) -> bpy.types.Material:
+    """The same, half by its own light: small things keep their colour in the shade."""
+    material = plain(name, colour)
+    shader = next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+    shader.inputs["Emission Color"].default_value = (*colour, 1.0)
+    shader.inputs["Emission Strength"].default_value = 0.5
+    return material
+
+
+def body(layer: str) -> bpy.types.Material:
+    """Shows the colour attribute of the body's mesh: the layer's colour, or the discrepancy."""
+    found = bpy.data.materials.get(f"PhysGen {layer} body")
+    if found is not None:
+        return found
+    material = bpy.data.materials.new(f"PhysGen {layer} body")
+    material.diffuse_color = (*COLOURS[layer], 1.0)
+    tree = compat.node_tree(material)
+    attribute = tree.nodes.new("ShaderNodeAttribute")
+    attribute.attribute_name = COLOUR
+    shader = tree.nodes.new("ShaderNodeBsdfPrincipled")
+    shader.inputs["Roughness"].default_value = 0.7
+    tree.links.new(attribute.outputs["Color"], shader.inputs["Base Color"])
+    tree.links.new(attribute.outputs["Color"], shader.inputs["Emission Color"])
+    shader.inputs["Emission Strength"].default_value = 0.35
+    _show(tree, shader.outputs[0])
+    return material
+
+
+def _show(tree: bpy.types.NodeTree, shader: bpy.types.NodeSocket) -> None:
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(shader, output.inputs["Surface"])

@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A capture, and its diagnosis where there is one, as a Blender collection that plays.
+
+``PhysGen capture`` holds the ground, the camera and one collection a trial. A trial has for every layer (observed,
+nominal, found) an object of all its points and one body an object of the capture. Objects and collections say what
+they are in custom properties, so that renaming them in Blender breaks nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Quaternion
+from numpy.typing import NDArray
+from trimesh.remesh import subdivide_to_size
+
+from ...sim.diagnose.capture import Camera, Capture, CaptureObject, Trial
+from ...sim.errors import InputError
+from ...sim.scene.model import Camera as SceneCamera
+from . import capture_materials as materials
+from . import capture_nodes as nodes
+from . import compat
+from .camera import add_camera
+from .capture_materials import FOUND, NOMINAL, OBSERVED
+from .motion import Array, Clock, body_shifts, carriers, clock, depths, fit_poses, in_space
+from .regions import plane_axes
+
+TRIAL, LAYER, ROLE, FRAMES, RATE = (f"physgen_{n}" for n in ("trial", "layer", "role", "frames", "rate"))
+POINTS, BODY, SAMPLES = "points", "body", "samples"
+MODIFIER = "PhysGen"
+
+SMOOTH_DEG = 35.0
+EDGES_ACROSS = 20
+"""A body's edges are at most this share of its size, so that colours have somewhere to change."""
+MAX_VERTICES = 40_000
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """The arrays of a diagnosis, as ``read_diagnosis`` gives them."""
+
+    where: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    prediction: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def layer(self, trial: Trial, name: str) -> Array | None:
+        """``nominal`` or ``found`` of ``trial``, (T, K, 3), or (T + P, K, 3) with the withheld frames; None if absent."""
+        shown = self.where.get(f"{trial.name}.{name}")
+        count = trial.observed.shape[1]
+        if shown is None:
+            return None
+        if shown.shape != (len(trial.times), count, 3):
+            raise InputError(
+                f"where.npz: {trial.name}.{name} has shape {shown.shape}: of another capture; diagnose again"
+            )
+        later = self.prediction.get(f"{trial.name}.{'before' if name == NOMINAL else 'after'}")
+        if (
+            trial.predict_times is not None
+            and later is not None
+            and later.shape == (len(trial.predict_times), count, 3)
+        ):
+            shown = np.concatenate([shown, later])
+        return np.asarray(shown, dtype=np.float64)
+
+    def score(self, trial: Trial) -> Array | None:
+        """Discrepancy (T, K) in m/s²; None if absent."""
+        found = self.where.get(f"{trial.name}.point_score")
+        if found is not None and found.shape != trial.observed.shape[:2]:
+            raise InputError(
+                f"where.npz: {trial.name}.point_score has shape {found.shape}: of another capture; diagnose again"
+            )
+        return None if found is None else np.asarray(found, dtype=np.float64)
+
+    def most(self, capture: Capture) -> float:
+        """A discrepancy that few points and frames exceed, m/s²: what the strongest colour stands for. 0 if unknown."""
+        values = [v[np.isfinite(v)] for v in map(self.score, capture.trials) if v is not None]
+        return float(np.percentile(np.concatenate(values), 98)) if values and sum(map(len, values)) else 0.0
+
+
+@dataclass(frozen=True)
+class _Take:
+    """A trial by frames. layers: name → (F, K, 3); score: (F, K) or None."""
+
+    trial: Trial
+    clock: Clock
+    layers: Mapping[str, Array]
+    score: Array | None
+
+
+def build(scene: bpy.types.Scene, capture: Capture, diagnosed: Diagnosed) -> bpy.types.Collection:
+    """Add ``capture`` to ``scene``; the collection. Nothing is left behind when it raises InputError."""
+    takes = [_take(capture, trial, diagnosed) for trial in capture.trials]
+    root = bpy.data.collections.new("PhysGen capture")
+    shapes: list[bpy.types.Mesh] = []
+    try:
+        scene.collection.children.link(root)
+        size = _extent(capture)
+        _add_ground(root, capture, takes)
+        if capture.camera is not None:
+            _add_camera(scene, root, capture.camera)
+        shapes += [_refined(item) for item in capture.objects]
+        for take in takes:
+            _add_take(root, capture, take, shapes, size)
+    except Exception:
+        remove(root)
+        raise
+    finally:
+        bpy.data.batch_remove(shapes)
+    return root
+
+
+def remove(root: bpy.types.Collection) -> None:
+    """Delete the collection of ``build`` with all that is in it and that nothing else uses."""
+    objects = list(root.all_objects)
+    data = {item.data for item in objects if item.data is not None}
+    data |= {item.animation_data.action for item in objects if item.animation_data and item.animation_data.action}
+    bpy.data.batch_remove([*objects, *root.children_recursive, root])
+    bpy.data.batch_remove([item for item in data if item.users == 0])
+
+
+def trial_collections(root: bpy.types.Collection) -> dict[str, bpy.types.Collection]:
+    """The collections of the trials by the trials' names."""
+    return {child[TRIAL]: child for child in root.children if TRIAL in child}
+
+
+def _take(capture: Capture, trial: Trial, diagnosed: Diagnosed) -> _Take:
+    layers = {name: diagnosed.layer(trial, name) for name in (NOMINAL, FOUND)}
+    longest = max((len(v) for v in layers.values() if v is not None), default=len(trial.times))
+    times = trial.times
+    if trial.predict_times is not None and longest > len(times):
+        times = np.concatenate([times, trial.predict_times])
+    ticks = clock(times)
+    if trial.points is not None:
+        observed = trial.points
+    else:
+        assert capture.camera is not None and trial.pixels is not None
+        observed = in_space(trial.pixels, capture.camera, _depth(capture, trial, layers))
+    shown = {OBSERVED: observed, **{name: v for name, v in layers.items() if v is not None}}
+    score = diagnosed.score(trial)
+    return _Take(
+        trial=trial,
+        clock=ticks,
+        layers={name: ticks.pick(_padded(values, len(times))) for name, values in shown.items()},
+        score=None if score is None else ticks.pick(_padded(score, len(times))),
+    )
+
+
+def _padded(values: Array, count: int) -> Array:
+    """``values`` (T, …) up to ``count`` samples, NaN where there are none."""
+    rest = np.full((max(count - len(values), 0), *values.shape[1:]), np.nan)
+    return np.concatenate([np.asarray(values, dtype=np.float64), rest])
+
+
+def _depth(capture: Capture, trial: Trial, layers: Mapping[str, Array | None]) -> Array:
+    """Depth (T, K) m at which pixels are shown: the found motion's, else that of the ground's point."""
+    assert capture.camera is not None
+    shape = trial.observed.shape[:2]
+    for name in (FOUND, NOMINAL):
+        found = layers[name]
+        if found is not None:
+            depth = depths(found[: shape[0]], capture.camera)
+            return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+    middle = float(depths(np.asarray(capture.ground.point), capture.camera))
+    return np.full(shape, middle if middle > 0 else 1.0)
+
+
+def _extent(capture: Capture) -> float:
+    """Largest extent of any object, m."""
+    return float(max(np.ptp(item.vertices, axis=0).max() for item in capture.objects))
+
+
+def _add_ground(root: bpy.types.Collection, capture: Capture, takes: list[_Take]) -> None:
+    points = np.concatenate([v[np.isfinite(v).all(axis=2)] for take in takes for v in take.layers.values()])
+    normal, origin = capture.ground.unit_normal, np.asarray(capture.ground.point, dtype=float)
+    first, second = plane_axes(normal)
+    low, high = np.percentile(points, [2, 98], axis=0)
+    centre = (low + high) / 2
+    centre = centre - ((centre - origin) @ normal) * normal
+    half = 0.75 * float(np.linalg.norm(high - low)) + 2 * _extent(capture)
+    mesh = bpy.data.meshes.new("ground")
+    corners = [centre + half * (a * first + b * second) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    mesh.from_pydata([tuple(c) for c in corners], [], [(0, 1, 2, 3)])
+    mesh.materials.append(materials.plain("capture ground", materials.GROUND))
+    item = bpy.data.objects.new("ground", mesh)
+    item.color = (*materials.GROUND, 1.0)
+    item.hide_select = True
+    root.objects.link(item)
+
+
+def _add_camera(scene: bpy.types.Scene, root: bpy.types.Collection, camera: Camera) -> None:
+    seen = SceneCamera(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        world_from_camera=_orthonormal(camera.matrix),
+    )
+    item = add_camera(scene, seen, (camera.width, camera.height))
+    item.name = "capture camera"
+    item.data.display_size = 0.2
+    scene.collection.objects.unlink(item)
+    root.objects.link(item)
+
+
+def _orthonormal(matrix: Array) -> Any:
+    """A capture's rotation may be rounded more than a scene's; the nearest exact one."""
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    exact = matrix.copy()
+    exact[:3, :3] = u @ vt
+    return tuple(tuple(float(x) for x in row) for row in exact)
+
+
+def _refined(item: CaptureObject) -> bpy.types.Mesh:
+    """The object's mesh at rest, fine enough to carry colours; the attributes of its carriers come with each trial."""
+    vertices, faces = item.vertices, item.faces
+    longest = float(np.ptp(vertices, axis=0).max()) / EDGES_ACROSS
+    if len(vertices) < MAX_VERTICES / 8:
+        vertices, faces = subdivide_to_size(vertices, faces, max_edge=max(longest, 1e-9), max_iter=12)
+    mesh = bpy.data.meshes.new(item.name)
+    mesh.from_pydata(np.asarray(vertices).tolist(), [], np.asarray(faces).tolist())
+    import bmesh
+
+    welded = bmesh.new()
+    welded.from_mesh(mesh)
+    bmesh.ops.remove_doubles(welded, verts=welded.verts, dist=1e-6 * max(longest, 1e-9) * EDGES_ACROSS)
+    welded.to_mesh(mesh)
+    welded.free()
+    mesh.shade_smooth()
+    mesh.set_sharp_from_angle(angle=math.radians(SMOOTH_DEG))
+    attribute = mesh.color_attributes.new(nodes.COLOUR, "FLOAT_COLOR", "POINT")
+    mesh.color_attributes.active_color = attribute
+    return mesh
+
+
+def _add_take(
+    root: bpy.types.Collection, capture: Capture, take: _Take, shapes: list[bpy.types.Mesh], size: float
+) -> None:
+    trial = take.trial
+    collection = bpy.data.collections.new(trial.name)
+    root.children.link(collection)
+    collection[TRIAL], collection[FRAMES], collection[RATE] = trial.name, take.clock.frames, take.clock.rate
+    samples = _add_samples(collection, take)
+    shift = {name: np.zeros_like(values) for name, values in take.layers.items()}
+    known = {name: np.zeros(values.shape[:2], dtype=bool) for name, values in take.layers.items()}
+    for index, (item, shape) in enumerate(zip(capture.objects, shapes, strict=True)):
+        mine = np.flatnonzero(trial.object_index == index)
+        if not len(mine):
+            continue
+        mesh = shape.copy()
+        mesh.name = f"{item.name} {trial.name}"
+        _set_carriers(mesh, mine, trial.rest_points)
+        for name, values in take.layers.items():
+            poses = fit_poses(trial.rest_points[mine], values[:, mine])
+            known[name][:, mine] = poses.known[:, None]
+            if not item.belief.rigid:
+                shift[name][:, mine] = body_shifts(trial.rest_points[mine], values[:, mine], poses)
+            body = bpy.data.objects.new(f"{item.name} {name} {trial.name}", mesh)
+            body[ROLE], body[LAYER] = BODY, name
+            body.color = (*materials.COLOURS[name], 1.0)
+            collection.objects.link(body)
+            _animate(body, poses.rotations, poses.shifts)
+            modifier = body.modifiers.new(MODIFIER, "NODES")
+            modifier.node_group = nodes.body_group()
+            inputs = {
+                "Samples": samples,
+                "Frames": take.clock.frames,
+                "Points": len(trial.object_index),
+                "Shift": f"shift_{name}",
+                "Known": f"known_{name}",
+                "Deform": not item.belief.rigid,
+                "Plain": (*materials.COLOURS[name], 1.0),
+                "Material": materials.body(name),
+            }
+            for key, value in inputs.items():
+                nodes.set_input(modifier, key, value)
+    for name, values in take.layers.items():
+        _set_attribute(samples.data, f"shift_{name}", "FLOAT_VECTOR", "vector", shift[name])
+        _set_attribute(samples.data, f"known_{name}", "BOOLEAN", "value", known[name])
+        _add_points(collection, trial, name, values, size)
+
+
+def _add_samples(collection: bpy.types.Collection, take: _Take) -> bpy.types.Object:
+    """One vertex a frame and point, frame by frame, with what is known there; never shown itself."""
+    frames, count = next(iter(take.layers.values())).shape[:2]
+    mesh = bpy.data.meshes.new(f"samples {take.trial.name}")
+    mesh.vertices.add(frames * count)
+    if take.score is not None:
+        _set_attribute(mesh, nodes.SCORE, "FLOAT", "value", np.nan_to_num(take.score))
+    item = bpy.data.objects.new(f"samples {take.trial.name}", mesh)
+    item[ROLE] = SAMPLES
+    item.hide_viewport = item.hide_render = True
+    collection.objects.link(item)
+    return item
+
+
+def _set_attribute(mesh: bpy.types.Mesh, name: str, kind: str, slot: str, values: NDArray[Any]) -> None:
+    attribute = mesh.attributes.new(name, kind, "POINT")
+    flat = values.ravel() if values.dtype == bool else values.astype(np.int32 if kind == "INT" else np.float32).ravel()
+    attribute.data.foreach_set(slot, np.ascontiguousarray(flat))
+
+
+def _set_carriers(mesh: bpy.types.Mesh, mine: NDArray[np.int64], rest_points: Array) -> None:
+    vertices = np.empty(3 * len(mesh.vertices), dtype=np.float32)
+    mesh.vertices.foreach_get("co", vertices)
+    index, weights = carriers(vertices.reshape(-1, 3).astype(np.float64), rest_points[mine])
+    for slot in range(nodes.CARRIERS):
+        names = nodes.carrier_names(slot)
+        given = slot < index.shape[1]
+        chosen = mine[index[:, slot]] if given else np.full(len(index), mine[0])
+        _set_attribute(mesh, names[0], "INT", "value", chosen)
+        _set_attribute(mesh, names[1], "FLOAT", "value", weights[:, slot] if given else np.zeros(len(index)))
+
+
+def _add_points(collection: bpy.types.Collection, trial: Trial, layer: str, values: Array, size: float) -> None:
+    """All points of a layer that were seen; edges join a point at neighbouring frames, from which trails grow."""
+    seen = np.isfinite(values).all(axis=2)
+    number = np.full(seen.shape, -1)
+    number[seen] = np.arange(int(seen.sum()))
+    joined = seen[:-1] & seen[1:]
+    edges = np.stack([number[:-1][joined], number[1:][joined]], axis=1)
+    mesh = bpy.data.meshes.new(f"{layer} points {trial.name}")
+    mesh.from_pydata(values[seen].tolist(), edges.tolist(), [])
+    frame = np.broadcast_to(np.arange(len(values))[:, None], seen.shape)[seen]
+    _set_attribute(mesh, nodes.SAMPLE, "INT", "value", frame)
+    item = bpy.data.objects.new(f"{layer} points {trial.name}", mesh)
+    item[ROLE], item[LAYER] = POINTS, layer
+    item.color = (*materials.COLOURS[layer], 1.0)
+    collection.objects.link(item)
+    modifier = item.modifiers.new(MODIFIER, "NODES")
+    modifier.node_group = nodes.points_group()
+    material = materials.glowing(f"{layer} points", materials.COLOURS[layer])
+    nodes.set_input(modifier, "Radius", 0.02 * size)
+    nodes.set_input(modifier, "Material", material)
+    nodes.set_input(modifier, "Trail material", material)
+
+
+def _animate(item: bpy.types.Object, rotations: Array, shifts: Array) -> None:
+    """Keyframes of a pose a frame from frame 1 on, straight between them."""
+    item.rotation_mode = "QUATERNION"
+    turns = []
+    for matrix in rotations:
+        turn = Matrix(matrix.tolist()).to_quaternion()
+        if turns and turn.dot(turns[-1]) < 0:
+            turn = Quaternion((-turn.w, -turn.x, -turn.y, -turn.z))
+        turns.append(turn)
+    frames = np.arange(1, len(shifts) + 1, dtype=np.float32)
+    curves = compat.new_curves(item)
+    for path, values in (("location", shifts), ("rotation_quaternion", np.asarray([tuple(q) for q in turns]))):
+        for axis in range(values.shape[1]):
+            curve = curves.new(path, index=axis)
+            curve.keyframe_points.add(len(frames))
+            curve.keyframe_points.foreach_set(
+                "co", np.stack([frames, values[:, axis]], axis=1).astype(np.float32).ravel()
+            )
+            for key in curve.keyframe_points:
+                key.interpolation = "LINEAR"
+            curve.update()

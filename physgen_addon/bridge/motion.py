@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Takes as Blender plays them: one sample a frame, a rigid pose a frame, what is left over, and who carries a vertex.
+
+Plain numpy. Frame ``1 + f`` of Blender's time line shows sample f.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.diagnose.capture import Camera
+from ...sim.errors import InputError
+from ...sim.skinning.binding import bind
+
+Array = NDArray[np.float64]
+
+CARRIERS = 8
+"""Tracked points that a vertex listens to, at most."""
+MAX_FRAMES = 20_000
+FLAT = 1e-3
+"""Points whose second spread is below this share of the first lie on a line: they do not fix a rotation."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Which sample a frame shows. rate: frames a second; samples: (F,) index, -1 where there is none near."""
+
+    rate: float
+    samples: NDArray[np.int64]
+
+    @property
+    def frames(self) -> int:
+        """How many frames the take lasts."""
+        return len(self.samples)
+
+    def pick(self, values: Array) -> Array:
+        """(T, …) by sample → (F, …) by frame, NaN where there is none."""
+        found = np.asarray(values, dtype=np.float64)[np.maximum(self.samples, 0)]
+        found[self.samples < 0] = np.nan
+        return found
+
+
+def clock(times: Array) -> Clock:
+    """Frames at the take's own rate, the inverse of the usual time between its samples ``times`` (T,) in s.
+
+    A dropped frame stays a gap, so that the take plays at the right speed. Raises InputError for a take whose longest
+    gap would make it absurdly long.
+    """
+    rate = 1.0 / float(np.median(np.diff(times)))
+    count = round(float(times[-1] - times[0]) * rate) + 1
+    if count > MAX_FRAMES:
+        raise InputError(f"times: last {times[-1] - times[0]:g} s at {rate:g} frames a second; shorten the take")
+    wanted = times[0] + np.arange(count) / rate
+    right = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    nearest = np.where(wanted - times[right - 1] <= times[right] - wanted, right - 1, right)
+    nearest[np.abs(times[nearest] - wanted) > 0.75 / rate] = -1
+    return Clock(rate=rate, samples=nearest)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Of a body, by frame. rotations: (F, 3, 3); shifts: (F, 3) m; known: (F,) whether any point told."""
+
+    rotations: Array
+    shifts: Array
+    known: NDArray[np.bool_]
+
+
+def fit_poses(rest: Array, points: Array) -> Poses:
+    """The rigid motions that carry ``rest`` (K, 3) nearest to ``points`` (F, K, 3), NaN where not seen.
+
+    Least squares [Kabsch 1976]. Where the points seen are one, two or on a line they leave a rotation open; then the
+    one nearest to the frame before is taken. A frame without points repeats the one before.
+    """
+    rotations = np.tile(np.eye(3), (len(points), 1, 1))
+    seen = np.isfinite(points).all(axis=2)
+    known = seen.any(axis=1)
+    shifts = np.zeros((len(points), 3))
+    turn, last = (
+        np.eye(3),
+        points[int(np.argmax(known))][seen[int(np.argmax(known))]].mean(axis=0) if known.any() else 0,
+    )
+    shift = last - rest.mean(axis=0)
+    for frame in range(len(points)):
+        use = seen[frame]
+        if use.any():
+            here, there = rest[use].mean(axis=0), points[frame, use].mean(axis=0)
+            turn = _rotation(rest[use] - here, points[frame, use] - there, turn)
+            shift = there - turn @ here
+        rotations[frame], shifts[frame] = turn, shift
+    return Poses(rotations=rotations, shifts=shifts, known=known)
+
+
+def _rotation(rest: Array, points: Array, before: Array) -> Array:
+    """The rotation of centred ``rest`` (K, 3) onto centred ``points``; ``before`` settles what they leave open."""
+    spread = np.linalg.svd(rest, compute_uv=False)
+    moment = points.T @ rest
+    if len(rest) < 3 or spread[1] < FLAT * max(spread[0], 1e-12):
+        moment = moment + 1e-3 * max(float(spread[0]) ** 2, 1e-12) * before
+    u, _, vt = np.linalg.svd(moment)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def body_shifts(rest: Array, points: Array, poses: Poses) -> Array:
+    """What the rigid ``poses`` leave over, (F, K, 3) m in the body's frame; gaps in time are bridged, else 0."""
+    local = np.einsum("fij,fki->fkj", poses.rotations, points - poses.shifts[:, None]) - rest
+    frames = np.arange(len(points))
+    for k in range(len(rest)):
+        seen = np.isfinite(local[:, k]).all(axis=1)
+        for axis in range(3):
+            local[:, k, axis] = np.interp(frames, frames[seen], local[seen, k, axis]) if seen.any() else 0.0
+    return local
+
+
+def carriers(vertices: Array, points: Array) -> tuple[NDArray[np.int64], Array]:
+    """Which ``points`` (K, 3) a vertex listens to and how much: indices and weights, both (V, n), rows sum to 1."""
+    if len(points) > 4:
+        found = bind(vertices, points, neighbours=min(CARRIERS, len(points) - 1))
+        return found.particles, found.weights
+    distance = np.linalg.norm(vertices[:, None] - points[None], axis=2)
+    weights = 1.0 / np.maximum(distance, 1e-6) ** 2
+    index = np.tile(np.arange(len(points)), (len(vertices), 1))
+    return index, weights / weights.sum(axis=1, keepdims=True)
+
+
+def in_space(pixels: Array, camera: Camera, depth: Array) -> Array:
+    """Seen ``pixels`` (F, K, 2) at ``depth`` (F, K) metres before the camera, as points (F, K, 3) of the world."""
+    matrix = camera.matrix
+    x = (pixels[..., 0] - camera.cx) / camera.fx * depth
+    y = (pixels[..., 1] - camera.cy) / camera.fy * depth
+    return np.stack([x, y, depth], axis=-1) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def depths(points: Array, camera: Camera) -> Array:
+    """How far ``points`` (..., 3) are before the camera, metres."""
+    return (points - camera.matrix[:3, 3]) @ camera.matrix[:3, 2]

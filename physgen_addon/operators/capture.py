@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Load a capture, with its diagnosis where there is one; clear it; open the report."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+
+import bpy
+
+from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
+from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
+from ...sim.errors import InputError, PhysGenError
+from ..bridge import capture_scene, capture_view
+from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
+from ..paths import folder_beside, require_folder
+from ..props import report as report_props
+from ..props.diagnose import apply_view
+
+
+def capture_folder(path: str) -> Path:
+    """The folder of a capture; its ``capture.json`` is fine too."""
+    folder = require_folder(path, "Capture")
+    return folder.parent if folder.name == CAPTURE_FILE else folder
+
+
+def report_folder(state: bpy.types.PropertyGroup) -> Path:
+    """Where the diagnosis of the scene's capture is or will be."""
+    if state.report.strip():
+        return require_folder(state.report, "Diagnosis")
+    return folder_beside(capture_folder(state.capture), "diagnosis")
+
+
+def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
+    """(Re)build the capture of ``scene``, with the diagnosis in the folder ``diagnosis``; what was shown stays shown.
+
+    Raises InputError; what was there before then stays as it was.
+    """
+    state = scene.physgen_diagnose
+    capture = load_capture(capture_folder(state.capture))
+    report, arrays = None, capture_scene.Diagnosed()
+    if diagnosis is not None:
+        report, where, prediction = read_diagnosis(diagnosis)
+        arrays = capture_scene.Diagnosed(where=where, prediction=prediction)
+    old, trial, had_motion = state.root, state.trial, state.has_motion
+    root = capture_scene.build(scene, capture, arrays)
+    if old is not None:
+        capture_scene.remove(old)
+        root.name = "PhysGen capture"
+    state.root = root
+    _fill_trials(state, capture)
+    state.has_scores = any(arrays.score(t) is not None for t in capture.trials)
+    state.has_motion = any(arrays.layer(t, NOMINAL) is not None for t in capture.trials)
+    if state.has_scores:
+        state.most = max(arrays.most(capture), 1e-6)
+    if report is not None:
+        report_props.fill(state, report)
+    else:
+        report_props.clear(state)
+    if old is None or had_motion != state.has_motion:
+        _choose_layers(state)
+        state.radius = 0.022 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
+    names = [t.name for t in capture.trials]
+    state.trial = trial if trial in names else names[0]
+    apply_view(state)
+    capture_view.play_range(scene, root, state.trial)
+    return capture
+
+
+def _fill_trials(state: bpy.types.PropertyGroup, capture: Capture) -> None:
+    state.trials.clear()
+    for trial in capture.trials:
+        line = state.trials.add()
+        line.name = trial.name
+        what = "shown to the end" if trial.role == "fit" else "its end is withheld and predicted"
+        line.label = f"{len(trial.times)} frames, {trial.observed.shape[1]} points, {what}"
+    state.capture_warnings.clear()
+    for text in capture.warnings:
+        state.capture_warnings.add().text = text
+
+
+def _choose_layers(state: bpy.types.PropertyGroup) -> None:
+    """Before a diagnosis the recording; after it, the recording as coloured mesh and the models as points."""
+    chosen = {
+        OBSERVED: {"points": True, "trail": True, "body": True},
+        NOMINAL: {"points": state.has_motion, "trail": state.has_motion, "body": False},
+        FOUND: {"points": False, "trail": False, "body": False},
+    }
+    for name in LAYERS:
+        for key, value in chosen[name].items():
+            setattr(getattr(state, name), key, value)
+
+
+class PHYSGEN_OT_load_capture(bpy.types.Operator):
+    """Load the capture: its ground, camera, objects and tracked points, and its diagnosis if there is one beside it"""
+
+    bl_idname = "physgen.load_capture"
+    bl_label = "Load Capture"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load and show."""
+        scene = context.scene
+        state = scene.physgen_diagnose
+        try:
+            folder = report_folder(state) if state.report.strip() or _found_beside(state) else None
+            if folder is not None and not (folder / REPORT_FILE).is_file():
+                folder = None
+            capture = show_capture(scene, folder)
+        except PhysGenError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if folder is not None:
+            state.report = str(folder)
+        look_at_capture(context)
+        count = len(capture.trials)
+        self.report({"INFO"}, f"{count} {'trial' if count == 1 else 'trials'} of {capture.root.name} loaded")
+        return {"FINISHED"}
+
+
+def _found_beside(state: bpy.types.PropertyGroup) -> bool:
+    folder = capture_folder(state.capture)
+    return (folder.with_name(f"{folder.name}_diagnosis") / REPORT_FILE).is_file()
+
+
+class PHYSGEN_OT_load_diagnosis(bpy.types.Operator):
+    """Read the diagnosis again and show it with the capture"""
+
+    bl_idname = "physgen.load_diagnosis"
+    bl_label = "Load Diagnosis"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load and show."""
+        try:
+            show_capture(context.scene, report_folder(context.scene.physgen_diagnose))
+        except PhysGenError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_clear_capture(bpy.types.Operator):
+    """Take the capture out of the scene; its files stay where they are"""
+
+    bl_idname = "physgen.clear_capture"
+    bl_label = "Clear Capture"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is one."""
+        return context.scene.physgen_diagnose.root is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove what was built and what was concluded."""
+        state = context.scene.physgen_diagnose
+        capture_scene.remove(state.root)
+        state.trials.clear()
+        state.capture_warnings.clear()
+        state.has_motion = state.has_scores = False
+        report_props.clear(state)
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_open_report(bpy.types.Operator):
+    """Open the diagnosis' page in the browser"""
+
+    bl_idname = "physgen.open_report"
+    bl_label = "Open Report"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Open report.html."""
+        try:
+            page = report_folder(context.scene.physgen_diagnose) / PAGE_FILE
+            if not page.is_file():
+                raise InputError(f"{page}: there is no such page; run the diagnosis again")
+        except PhysGenError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        webbrowser.open(page.as_uri())
+        return {"FINISHED"}
+
+
+def look_at_capture(context: bpy.types.Context) -> None:
+    """Turn the window's viewports towards the capture and let solid ones show colour attributes."""
+    root = context.scene.physgen_diagnose.root
+    ground = next((item for item in root.objects if item.name.startswith("ground")), None)
+    if context.window is None or ground is None:
+        return
+    corners = [ground.matrix_world @ v.co for v in ground.data.vertices]
+    middle = sum(corners[1:], corners[0].copy()) / len(corners)
+    reach = (corners[0] - corners[2]).length
+    for area in context.window.screen.areas:
+        if area.type == "VIEW_3D":
+            space = area.spaces.active
+            space.shading.color_type = "VERTEX"
+            if space.region_3d is not None:
+                space.region_3d.view_location = middle
+                space.region_3d.view_distance = reach * 0.8
+            space.clip_start = min(space.clip_start, reach / 1000)
+
+
+CLASSES = (PHYSGEN_OT_load_capture, PHYSGEN_OT_load_diagnosis, PHYSGEN_OT_clear_capture, PHYSGEN_OT_open_report)

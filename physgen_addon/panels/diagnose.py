@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Diagnose: where simulation and reality part, why, and what adding the cause changes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import bpy
+
+from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
+from ..jobs import draw_job, running
+from ..operators.capture import (
+    PHYSGEN_OT_clear_capture,
+    PHYSGEN_OT_load_capture,
+    PHYSGEN_OT_load_diagnosis,
+    PHYSGEN_OT_open_report,
+)
+from ..operators.diagnose import PHYSGEN_OT_diagnose
+from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_show_overlay
+from ..props.report import readable
+from . import text
+
+TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "With Effect"}
+ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_05"}
+SURE = 0.005
+"""Effects less probable than this are summed up in the list's last words rather than shown as 0 %."""
+
+
+class _Sidebar:
+    bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", "PhysGen"
+
+
+class PHYSGEN_UL_effects(bpy.types.UIList):
+    """The ranking: an effect and how probable it is."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Name on the left, a bar with the probability on the right."""
+        split = layout.split(factor=0.52)
+        split.label(text=readable(item.name))
+        split.progress(factor=item.probability, text=f"{100 * item.probability:.0f} %")
+
+
+class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
+    """A recording of the real motion, and what it says of the simulation"""
+
+    bl_idname = "PHYSGEN_PT_diagnose"
+    bl_label = "Diagnose"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Capture, trial, Diagnose."""
+        layout, state = self.layout, context.scene.physgen_diagnose
+        column = layout.column(align=True)
+        column.label(text="Recording of the real motion")
+        column.prop(state, "capture", text="")
+        row = column.row(align=True)
+        row.operator(PHYSGEN_OT_load_capture.bl_idname, text="Reload" if state.root else "Load Capture", icon="IMPORT")
+        if state.root is not None:
+            row.operator(PHYSGEN_OT_clear_capture.bl_idname, text="", icon="TRASH")
+        if state.root is None:
+            text.sentences(layout, context, "Choose a capture folder: capture.json, meshes and tracked takes.")
+            return
+        layout.prop(state, "trial")
+        label = next((t.label for t in state.trials if t.name == state.trial), "")
+        text.sentences(layout, context, label)
+        for warning in state.capture_warnings:
+            text.sentences(layout, context, warning.text, icon="ERROR")
+        column = layout.column(align=True)
+        column.label(text="Results")
+        row = column.row(align=True)
+        row.prop(state, "report", text="", placeholder="Beside the capture")
+        row.operator(PHYSGEN_OT_load_diagnosis.bl_idname, text="", icon="FILE_REFRESH")
+        if running() is not None:
+            draw_job(layout)
+        else:
+            row = layout.row()
+            row.scale_y = 1.4
+            row.operator(PHYSGEN_OT_diagnose.bl_idname, icon="VIEWZOOM")
+
+
+class _Part(_Sidebar):
+    bl_parent_id = "PHYSGEN_PT_diagnose"
+
+
+class PHYSGEN_PT_diagnose_show(_Part, bpy.types.Panel):
+    """What is shown of the capture"""
+
+    bl_label = "Show"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A capture is loaded."""
+        return context.scene.physgen_diagnose.root is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """One line a layer; then colours and sizes."""
+        layout, state = self.layout, context.scene.physgen_diagnose
+        grid = layout.column(align=True)
+        for name in LAYERS:
+            split = grid.split(factor=0.38, align=True)
+            split.active = name == OBSERVED or state.has_motion
+            split.label(text=TITLES[name], icon=ICONS[name])
+            row = split.row(align=True)
+            layer = getattr(state, name)
+            for key in ("points", "trail", "body"):
+                row.prop(layer, key, toggle=True)
+        if not state.has_motion:
+            text.sentences(layout, context, "Diagnose to see what the models do.")
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        colours = column.column()
+        colours.active = state.has_scores
+        colours.prop(state, "colours")
+        scale = colours.row()
+        scale.active = state.colours
+        scale.prop(state, "most", text="Darkest At (m/s²)")
+        column.prop(state, "radius")
+        column.prop(state, "trail_s")
+
+
+class PHYSGEN_PT_diagnose_finding(_Part, bpy.types.Panel):
+    """What was concluded"""
+
+    bl_label = "Finding"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a diagnosis."""
+        return context.scene.physgen_diagnose.has_report
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Verdict in a sentence, ranking, the gap, warnings, what to record next."""
+        layout, state = self.layout, context.scene.physgen_diagnose
+        text.sentences(layout.box(), context, state.summary)
+        if state.alternatives:
+            names = ", ".join(readable(name).lower() for name in state.alternatives.split(", "))
+            text.sentences(layout, context, f"The data cannot tell it from {names}.", icon="QUESTION")
+        layout.template_list("PHYSGEN_UL_effects", "", state, "effects", state, "effect_index", rows=5)
+        if 0 <= state.effect_index < len(state.effects):
+            _draw_effect(layout, state.effects[state.effect_index])
+        _draw_gap(layout, context, state)
+        for warning in state.warnings:
+            text.sentences(layout, context, warning.text, icon="ERROR")
+        if state.next_experiment:
+            text.sentences(layout, context, f"Record next: {state.next_experiment}", icon="CAMERA_DATA")
+        layout.operator(PHYSGEN_OT_open_report.bl_idname, icon="URL")
+
+
+def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
+    if not len(effect.parameters) and not effect.has_closed:
+        return
+    column = layout.box().column(align=True)
+    for item in effect.parameters:
+        split = column.split(factor=0.45)
+        split.label(text=readable(item.name))
+        words = text.number(item.value, item.unit)
+        if math.isfinite(item.low) and math.isfinite(item.high):
+            words += f"  ({item.low:.3g} to {item.high:.3g})"
+        split.label(text=words)
+    if effect.has_closed:
+        split = column.split(factor=0.45)
+        split.label(text="Closes")
+        split.label(text=f"{100 * effect.closed:.0f} % of the gap")
+
+
+def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    column = layout.column(align=True)
+    column.label(text="Distance to motion that no fit saw")
+    rows = (
+        ("As believed", state.before_m),
+        ("Re-tuned, nothing added", state.refitted_m),
+        ("With the effect", state.after_m),
+        ("Noise floor", state.floor_m),
+    )
+    box = column.box().column(align=True)
+    most = max(value for _, value in rows)
+    for title, value in rows:
+        split = box.split(factor=0.52)
+        split.label(text=title)
+        share = min(value / most, 1.0) if most > 0 and value > 0 else 0.0
+        split.progress(factor=share, text=text.length(value))
+    if not state.resolvable:
+        text.sentences(box, context, "Too near the noise floor to say how much of it is closed.")
+    elif state.closed > -1:
+        box.label(text=f"{100 * state.closed:.0f} % of the gap is closed")
+    if state.numerics_m > 0:
+        box.label(text=f"{text.length(state.numerics_m)} of it is the simulator's own error")
+
+
+class PHYSGEN_PT_diagnose_add(_Part, bpy.types.Panel):
+    """Add what was found to a scene and bake it"""
+
+    bl_label = "Add to a Scene"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a diagnosis, or bakes to compare."""
+        state = context.scene.physgen_diagnose
+        return state.has_report or state.before_root is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Scene folder, how to bake, the button, the overlay."""
+        layout, state = self.layout, context.scene.physgen_diagnose
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.prop(state, "scene_folder")
+        column.prop(state, "before", placeholder="Baked first")
+        column.prop(state, "frames")
+        column.prop(state, "fps")
+        column.prop(state, "quality")
+        draw_job(layout)
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator(PHYSGEN_OT_add_effect.bl_idname, icon="ADD")
+        if state.verdict in ("none", "unknown"):
+            text.sentences(layout, context, "The diagnosis names no effect that could be added.")
+        if state.after:
+            column = layout.column(align=True)
+            column.prop(state, "after", text="")
+            column.operator(PHYSGEN_OT_show_overlay.bl_idname, icon="OVERLAY")
+        if state.before_root is not None:
+            layout.row(align=True).prop(state, "overlay", expand=True)
+
+
+CLASSES = (
+    PHYSGEN_UL_effects,
+    PHYSGEN_PT_diagnose,
+    PHYSGEN_PT_diagnose_show,
+    PHYSGEN_PT_diagnose_finding,
+    PHYSGEN_PT_diagnose_add,
+)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sentences and numbers in a panel: Blender's labels neither wrap nor round."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+
+import bpy
+
+
+def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE") -> None:
+    """``text`` on as many lines as the sidebar's width asks for."""
+    scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
+    width = context.region.width if context.region is not None else 300
+    room = max(int((width - (60 if icon == "NONE" else 85) * scale) / (6.2 * scale)), 16)
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for index, line in enumerate(textwrap.wrap(text, room)):
+        column.label(text=line, icon=icon if index == 0 else ("NONE" if icon == "NONE" else "BLANK1"))
+
+
+def length(metres: float) -> str:
+    """Such as ``1.2 mm`` or ``34 cm``; a dash for what is not known (below zero)."""
+    if not math.isfinite(metres) or metres < 0:
+        return "–"
+    for unit, size in (("m", 1.0), ("cm", 1e-2)):
+        if metres >= size:
+            return f"{metres / size:.3g} {unit}"
+    return f"{metres / 1e-3:.2g} mm" if metres >= 1e-4 else f"{metres / 1e-6:.2g} µm"
+
+
+def number(value: float, unit: str) -> str:
+    """Three digits and the unit, a dash for what is no number."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.3g}" if unit in ("", "1") else f"{value:.3g} {unit}"
