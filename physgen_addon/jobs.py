@@ -226,6 +226,7 @@ def draw_job(layout: bpy.types.UILayout) -> None:
         return
     column = layout.column(align=True)
     row = column.row(align=True)
+    row.scale_y = 1.4
     row.progress(factor=job.fraction or 0.0, text=progress_text(job))
     row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
     if job.message:

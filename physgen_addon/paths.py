@@ -8,6 +8,7 @@ from pathlib import Path
 
 import bpy
 
+from ..sim.cache.manifest import load_manifest
 from ..sim.errors import InputError
 
 
@@ -25,9 +26,19 @@ def folder_beside(path: Path, suffix: str) -> Path:
     return path.with_name(f"{path.name}_{suffix}")
 
 
-def unused(path: Path) -> Path:
-    """``path``, or with a number behind it where something has that name already."""
+def bake_folder(path: Path) -> Path:
+    """``path``, or with a number behind it where a complete bake or something else has that name already.
+
+    A bake that was stopped keeps its name, so that it goes on.
+    """
     candidate, number = path, 2
-    while candidate.exists():
+    while candidate.exists() and not _unfinished(candidate):
         candidate, number = path.with_name(f"{path.name}_{number}"), number + 1
     return candidate
+
+
+def _unfinished(folder: Path) -> bool:
+    try:
+        return load_manifest(folder).state != "complete"
+    except InputError:
+        return False

@@ -12,6 +12,8 @@ OBSERVED, NOMINAL, FOUND = "observed", "nominal", "found"
 LAYERS = (OBSERVED, NOMINAL, FOUND)
 COLOURS = {OBSERVED: (0.9, 0.9, 0.9), NOMINAL: (1.0, 0.36, 0.04), FOUND: (0.0, 0.62, 0.55)}
 """Linear RGB: white, orange, blue-green; told apart also by people who do not see red."""
+BODIES = {**COLOURS, OBSERVED: (0.25, 0.27, 0.3)}
+"""Of the meshes: white points would not show on a white one."""
 GROUND = (0.16, 0.17, 0.18)
 GHOST_ALPHA = 0.35
 
@@ -47,7 +49,7 @@ def body(layer: str) -> bpy.types.Material:
     if found is not None:
         return found
     material = bpy.data.materials.new(f"PhysGen {layer} body")
-    material.diffuse_color = (*COLOURS[layer], 1.0)
+    material.diffuse_color = (*BODIES[layer], 1.0)
     tree = compat.node_tree(material)
     attribute = tree.nodes.new("ShaderNodeAttribute")
     attribute.attribute_name = COLOUR

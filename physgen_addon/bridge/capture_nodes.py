@@ -116,7 +116,7 @@ def points_group() -> bpy.types.NodeTree:
     early = tree.compare("LESS_THAN", sample, tree.math("SUBTRACT", now, given["Trail"]))
     other = tree.both("OR", early, tree.compare("GREATER_THAN", sample, now))
     lines = tree.out("GeometryNodeDeleteGeometry", given["Geometry"], other, domain="POINT")
-    profile = tree.out("GeometryNodeCurvePrimitiveCircle", 5, tree.math("MULTIPLY", given["Radius"], 0.28))
+    profile = tree.out("GeometryNodeCurvePrimitiveCircle", 5, tree.math("MULTIPLY", given["Radius"], 0.32))
     tubes = tree.out("GeometryNodeCurveToMesh", tree.out("GeometryNodeMeshToCurve", lines), profile)
     tubes = tree.out("GeometryNodeSetMaterial", tubes, None, given["Trail material"])
     join = tree.node("GeometryNodeJoinGeometry")

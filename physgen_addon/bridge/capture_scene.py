@@ -48,7 +48,7 @@ class Diagnosed:
     prediction: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def layer(self, trial: Trial, name: str) -> Array | None:
-        """``nominal`` or ``found`` of ``trial``, (T, K, 3), or (T + P, K, 3) with the withheld frames; None if absent."""
+        """``nominal`` or ``found`` of ``trial``, (T, K, 3), with withheld frames (T + P, K, 3); None if absent."""
         shown = self.where.get(f"{trial.name}.{name}")
         count = trial.observed.shape[1]
         if shown is None:
@@ -82,8 +82,8 @@ class Diagnosed:
 
 
 @dataclass(frozen=True)
-class _Take:
-    """A trial by frames. layers: name → (F, K, 3); score: (F, K) or None."""
+class Take:
+    """A trial by frames. layers: name → (F, K, 3) m; score: (F, K) m/s² or None."""
 
     trial: Trial
     clock: Clock
@@ -91,25 +91,23 @@ class _Take:
     score: Array | None
 
 
-def build(scene: bpy.types.Scene, capture: Capture, diagnosed: Diagnosed) -> bpy.types.Collection:
-    """Add ``capture`` to ``scene``; the collection. Nothing is left behind when it raises InputError."""
-    takes = [_take(capture, trial, diagnosed) for trial in capture.trials]
+def prepare(capture: Capture, diagnosed: Diagnosed) -> list[Take]:
+    """What ``build`` shows. Raises InputError for a diagnosis of another capture, or a take too long to play."""
+    return [_take(capture, trial, diagnosed) for trial in capture.trials]
+
+
+def build(scene: bpy.types.Scene, capture: Capture, takes: list[Take]) -> bpy.types.Collection:
+    """Add ``capture`` to ``scene``; the collection."""
     root = bpy.data.collections.new("PhysGen capture")
-    shapes: list[bpy.types.Mesh] = []
-    try:
-        scene.collection.children.link(root)
-        size = _extent(capture)
-        _add_ground(root, capture, takes)
-        if capture.camera is not None:
-            _add_camera(scene, root, capture.camera)
-        shapes += [_refined(item) for item in capture.objects]
-        for take in takes:
-            _add_take(root, capture, take, shapes, size)
-    except Exception:
-        remove(root)
-        raise
-    finally:
-        bpy.data.batch_remove(shapes)
+    scene.collection.children.link(root)
+    size = _extent(capture)
+    _add_ground(root, capture, takes)
+    if capture.camera is not None:
+        _add_camera(scene, root, capture.camera)
+    shapes = [_refined(item) for item in capture.objects]
+    for take in takes:
+        _add_take(root, capture, take, shapes, size)
+    bpy.data.batch_remove(shapes)
     return root
 
 
@@ -127,7 +125,7 @@ def trial_collections(root: bpy.types.Collection) -> dict[str, bpy.types.Collect
     return {child[TRIAL]: child for child in root.children if TRIAL in child}
 
 
-def _take(capture: Capture, trial: Trial, diagnosed: Diagnosed) -> _Take:
+def _take(capture: Capture, trial: Trial, diagnosed: Diagnosed) -> Take:
     layers = {name: diagnosed.layer(trial, name) for name in (NOMINAL, FOUND)}
     longest = max((len(v) for v in layers.values() if v is not None), default=len(trial.times))
     times = trial.times
@@ -141,7 +139,7 @@ def _take(capture: Capture, trial: Trial, diagnosed: Diagnosed) -> _Take:
         observed = in_space(trial.pixels, capture.camera, _depth(capture, trial, layers))
     shown = {OBSERVED: observed, **{name: v for name, v in layers.items() if v is not None}}
     score = diagnosed.score(trial)
-    return _Take(
+    return Take(
         trial=trial,
         clock=ticks,
         layers={name: ticks.pick(_padded(values, len(times))) for name, values in shown.items()},
@@ -173,7 +171,7 @@ def _extent(capture: Capture) -> float:
     return float(max(np.ptp(item.vertices, axis=0).max() for item in capture.objects))
 
 
-def _add_ground(root: bpy.types.Collection, capture: Capture, takes: list[_Take]) -> None:
+def _add_ground(root: bpy.types.Collection, capture: Capture, takes: list[Take]) -> None:
     points = np.concatenate([v[np.isfinite(v).all(axis=2)] for take in takes for v in take.layers.values()])
     normal, origin = capture.ground.unit_normal, np.asarray(capture.ground.point, dtype=float)
     first, second = plane_axes(normal)
@@ -239,7 +237,7 @@ def _refined(item: CaptureObject) -> bpy.types.Mesh:
 
 
 def _add_take(
-    root: bpy.types.Collection, capture: Capture, take: _Take, shapes: list[bpy.types.Mesh], size: float
+    root: bpy.types.Collection, capture: Capture, take: Take, shapes: list[bpy.types.Mesh], size: float
 ) -> None:
     trial = take.trial
     collection = bpy.data.collections.new(trial.name)
@@ -262,7 +260,7 @@ def _add_take(
                 shift[name][:, mine] = body_shifts(trial.rest_points[mine], values[:, mine], poses)
             body = bpy.data.objects.new(f"{item.name} {name} {trial.name}", mesh)
             body[ROLE], body[LAYER] = BODY, name
-            body.color = (*materials.COLOURS[name], 1.0)
+            body.color = (*materials.BODIES[name], 1.0)
             collection.objects.link(body)
             _animate(body, poses.rotations, poses.shifts)
             modifier = body.modifiers.new(MODIFIER, "NODES")
@@ -274,7 +272,7 @@ def _add_take(
                 "Shift": f"shift_{name}",
                 "Known": f"known_{name}",
                 "Deform": not item.belief.rigid,
-                "Plain": (*materials.COLOURS[name], 1.0),
+                "Plain": (*materials.BODIES[name], 1.0),
                 "Material": materials.body(name),
             }
             for key, value in inputs.items():
@@ -285,7 +283,7 @@ def _add_take(
         _add_points(collection, trial, name, values, size)
 
 
-def _add_samples(collection: bpy.types.Collection, take: _Take) -> bpy.types.Object:
+def _add_samples(collection: bpy.types.Collection, take: Take) -> bpy.types.Object:
     """One vertex a frame and point, frame by frame, with what is known there; never shown itself."""
     frames, count = next(iter(take.layers.values())).shape[:2]
     mesh = bpy.data.meshes.new(f"samples {take.trial.name}")

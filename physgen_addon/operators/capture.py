@@ -42,12 +42,11 @@ def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
     if diagnosis is not None:
         report, where, prediction = read_diagnosis(diagnosis)
         arrays = capture_scene.Diagnosed(where=where, prediction=prediction)
-    old, trial, had_motion = state.root, state.trial, state.has_motion
-    root = capture_scene.build(scene, capture, arrays)
-    if old is not None:
-        capture_scene.remove(old)
-        root.name = "PhysGen capture"
-    state.root = root
+    takes = capture_scene.prepare(capture, arrays)
+    fresh, trial, had_motion = state.root is None, state.trial if state.trials else "", state.has_motion
+    if state.root is not None:
+        capture_scene.remove(state.root)
+    root = state.root = capture_scene.build(scene, capture, takes)
     _fill_trials(state, capture)
     state.has_scores = any(arrays.score(t) is not None for t in capture.trials)
     state.has_motion = any(arrays.layer(t, NOMINAL) is not None for t in capture.trials)
@@ -57,9 +56,9 @@ def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
         report_props.fill(state, report)
     else:
         report_props.clear(state)
-    if old is None or had_motion != state.has_motion:
+    if fresh or had_motion != state.has_motion:
         _choose_layers(state)
-        state.radius = 0.022 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
+        state.radius = 0.03 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
     names = [t.name for t in capture.trials]
     state.trial = trial if trial in names else names[0]
     apply_view(state)
@@ -72,8 +71,9 @@ def _fill_trials(state: bpy.types.PropertyGroup, capture: Capture) -> None:
     for trial in capture.trials:
         line = state.trials.add()
         line.name = trial.name
-        what = "shown to the end" if trial.role == "fit" else "its end is withheld and predicted"
-        line.label = f"{len(trial.times)} frames, {trial.observed.shape[1]} points, {what}"
+        rate = (len(trial.times) - 1) / (trial.times[-1] - trial.times[0])
+        what = "" if trial.role == "fit" else "; its end is withheld"
+        line.label = f"{len(trial.times)} frames at {rate:.4g} Hz, {trial.observed.shape[1]} points{what}"
     state.capture_warnings.clear()
     for text in capture.warnings:
         state.capture_warnings.add().text = text
@@ -182,23 +182,61 @@ class PHYSGEN_OT_open_report(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
+    """The 3D viewports of the window; none in background mode."""
+    areas = context.window.screen.areas if context.window is not None else ()
+    return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
+
+
 def look_at_capture(context: bpy.types.Context) -> None:
-    """Turn the window's viewports towards the capture and let solid ones show colour attributes."""
-    root = context.scene.physgen_diagnose.root
-    ground = next((item for item in root.objects if item.name.startswith("ground")), None)
-    if context.window is None or ground is None:
-        return
-    corners = [ground.matrix_world @ v.co for v in ground.data.vertices]
-    middle = sum(corners[1:], corners[0].copy()) / len(corners)
-    reach = (corners[0] - corners[2]).length
-    for area in context.window.screen.areas:
-        if area.type == "VIEW_3D":
-            space = area.spaces.active
-            space.shading.color_type = "VERTEX"
+    """Turn the window's viewports towards the trial that is shown, and let solid ones show colour attributes."""
+    state = context.scene.physgen_diagnose
+    corners = capture_view.bounds(state.root, state.trial)
+    reach = (corners[1] - corners[0]).length
+    for space in viewports(context):
+        space.shading.color_type = "VERTEX"
+        space.shading.show_object_outline = False  # it would paint thin trails black
+        space.clip_start = min(space.clip_start, reach / 1000)
+        if space.region_3d is not None and reach > 0:
+            space.lock_object = None
+            space.region_3d.view_location = (corners[0] + corners[1]) / 2
+            space.region_3d.view_distance = reach
+
+
+class PHYSGEN_OT_follow(bpy.types.Operator):
+    """Let the viewport go with the object, close to it; press again to let go"""
+
+    bl_idname = "physgen.follow_object"
+    bl_label = "Follow the Object"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a viewport, and something in it."""
+        return context.scene.physgen_diagnose.root is not None and bool(viewports(context))
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Lock the viewports to the body that is shown, or free them."""
+        state = context.scene.physgen_diagnose
+        spaces = viewports(context)
+        if any(space.lock_object is not None for space in spaces):
+            look_at_capture(context)
+            return {"FINISHED"}
+        body = capture_view.shown_body(state.root, state.trial)
+        if body is None:
+            self.report({"WARNING"}, "no object is in sight: show the mesh of a layer")
+            return {"CANCELLED"}
+        for space in spaces:
+            space.lock_object = body
             if space.region_3d is not None:
-                space.region_3d.view_location = middle
-                space.region_3d.view_distance = reach * 0.8
-            space.clip_start = min(space.clip_start, reach / 1000)
+                space.region_3d.view_distance = 5 * max(body.dimensions)
+        return {"FINISHED"}
 
 
-CLASSES = (PHYSGEN_OT_load_capture, PHYSGEN_OT_load_diagnosis, PHYSGEN_OT_clear_capture, PHYSGEN_OT_open_report)
+CLASSES = (
+    PHYSGEN_OT_load_capture,
+    PHYSGEN_OT_load_diagnosis,
+    PHYSGEN_OT_clear_capture,
+    PHYSGEN_OT_open_report,
+    PHYSGEN_OT_follow,
+)

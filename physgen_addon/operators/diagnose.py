@@ -36,16 +36,17 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             command = cli_command(find_python(preferred), "diagnose", str(capture), "--out", str(out))
-            return {"out": str(out), **run_stage(command, on_event, cancelled)}
+            return {"out": str(out), **run_stage(command, on_event, cancelled), "capture": str(capture)}
 
         return work
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
-        """Show what was found."""
-        out = Path(str(final["out"]))
+        """Show what was found, also where undo has meanwhile taken the capture out of the scene."""
+        state, out = scene.physgen_diagnose, Path(str(final["out"]))
+        state.capture = str(final["capture"])
         show_capture(scene, out)
-        scene.physgen_diagnose.report = str(out)
-        return scene.physgen_diagnose.summary
+        state.report = str(out)
+        return str(state.summary)
 
 
 CLASSES = (PHYSGEN_OT_diagnose,)

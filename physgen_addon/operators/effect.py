@@ -17,7 +17,7 @@ from ...sim.scene.json_fields import read_json
 from ..bridge import capture_view, overlay
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
-from ..paths import folder_beside, require_folder, unused
+from ..paths import bake_folder, folder_beside, require_folder
 from ..props.preferences import python
 from .capture import report_folder
 
@@ -46,14 +46,14 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
         found = found_effects(read_json(report_folder(state) / REPORT_FILE))
         with_effects(load_scene(scene_root).scene, found)
         bake_before = not state.before.strip()
-        before = (
-            unused(folder_beside(scene_root, "bake_before")) if bake_before else require_folder(state.before, "Bake")
-        )
+        # One from an earlier run is not made again as long as the scene is still the same.
+        beside = folder_beside(scene_root, "bake_before")
+        before = beside if bake_before else require_folder(state.before, "Bake Before")
         request = AddRequest(
             scene=scene_root,
             found=found,
             before=before,
-            after=unused(folder_beside(scene_root, "bake_after")),
+            after=bake_folder(folder_beside(scene_root, "bake_after")),
             bake_before=bake_before,
         )
         settings = ("--frames", str(state.frames), "--fps", repr(state.fps), "--quality", state.quality)
@@ -68,6 +68,8 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show both bakes."""
         state = scene.physgen_diagnose
+        # Undo may have emptied the field meanwhile.
+        state.scene_folder = str(final["scene"])
         state.before, state.after = str(final["before"]), str(final["after"])
         show_overlay(scene)
         return "the effect is in the scene; before and after lie over each other"

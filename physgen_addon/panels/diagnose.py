@@ -12,6 +12,7 @@ from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..jobs import draw_job, running
 from ..operators.capture import (
     PHYSGEN_OT_clear_capture,
+    PHYSGEN_OT_follow,
     PHYSGEN_OT_load_capture,
     PHYSGEN_OT_load_diagnosis,
     PHYSGEN_OT_open_report,
@@ -21,8 +22,8 @@ from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_show_overlay
 from ..props.report import readable
 from . import text
 
-TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "With Effect"}
-ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_05"}
+TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "Found"}
+ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_04"}
 SURE = 0.005
 """Effects less probable than this are summed up in the list's last words rather than shown as 0 %."""
 
@@ -57,7 +58,7 @@ class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
     bl_label = "Diagnose"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Capture, trial, Diagnose."""
+        """Capture, trial, Diagnose, the verdict in a sentence."""
         layout, state = self.layout, context.scene.physgen_diagnose
         column = layout.column(align=True)
         column.label(text="Recording of the real motion")
@@ -85,6 +86,8 @@ class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
             row = layout.row()
             row.scale_y = 1.4
             row.operator(PHYSGEN_OT_diagnose.bl_idname, icon="VIEWZOOM")
+        if state.has_report:
+            _draw_verdict(layout, context, state)
 
 
 class _Part(_Sidebar):
@@ -115,22 +118,23 @@ class PHYSGEN_PT_diagnose_show(_Part, bpy.types.Panel):
                 row.prop(layer, key, toggle=True)
         if not state.has_motion:
             text.sentences(layout, context, "Diagnose to see what the models do.")
-        column = layout.column()
-        column.use_property_split, column.use_property_decorate = True, False
-        colours = column.column()
+        colours = layout.column()
         colours.active = state.has_scores
         colours.prop(state, "colours")
-        scale = colours.row()
-        scale.active = state.colours
-        scale.prop(state, "most", text="Darkest At (m/s²)")
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        scale = column.row()
+        scale.active = state.colours and state.has_scores
+        scale.prop(state, "most", text="Dark Red (m/s²)")
         column.prop(state, "radius")
         column.prop(state, "trail_s")
+        layout.operator(PHYSGEN_OT_follow.bl_idname, icon="CON_FOLLOWTRACK")
 
 
-class PHYSGEN_PT_diagnose_finding(_Part, bpy.types.Panel):
-    """What was concluded"""
+class PHYSGEN_PT_diagnose_causes(_Part, bpy.types.Panel):
+    """Every cause that was tried, and how much of the gap is closed"""
 
-    bl_label = "Finding"
+    bl_label = "Causes"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -138,12 +142,8 @@ class PHYSGEN_PT_diagnose_finding(_Part, bpy.types.Panel):
         return context.scene.physgen_diagnose.has_report
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Verdict in a sentence, ranking, the gap, warnings, what to record next."""
+        """Ranking, the gap, warnings, what to record next."""
         layout, state = self.layout, context.scene.physgen_diagnose
-        text.sentences(layout.box(), context, state.summary)
-        if state.alternatives:
-            names = ", ".join(readable(name).lower() for name in state.alternatives.split(", "))
-            text.sentences(layout, context, f"The data cannot tell it from {names}.", icon="QUESTION")
         layout.template_list("PHYSGEN_UL_effects", "", state, "effects", state, "effect_index", rows=5)
         if 0 <= state.effect_index < len(state.effects):
             _draw_effect(layout, state.effects[state.effect_index])
@@ -152,7 +152,15 @@ class PHYSGEN_PT_diagnose_finding(_Part, bpy.types.Panel):
             text.sentences(layout, context, warning.text, icon="ERROR")
         if state.next_experiment:
             text.sentences(layout, context, f"Record next: {state.next_experiment}", icon="CAMERA_DATA")
-        layout.operator(PHYSGEN_OT_open_report.bl_idname, icon="URL")
+
+
+def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    box = layout.box()
+    text.sentences(box, context, state.summary)
+    if state.alternatives:
+        names = ", ".join(readable(name).lower() for name in state.alternatives.split(", "))
+        text.sentences(box, context, f"The data cannot tell it from {names}.", icon="QUESTION")
+    box.operator(PHYSGEN_OT_open_report.bl_idname, icon="URL")
 
 
 def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
@@ -162,10 +170,12 @@ def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
     for item in effect.parameters:
         split = column.split(factor=0.45)
         split.label(text=readable(item.name))
-        words = text.number(item.value, item.unit)
+        split.label(text=text.number(item.value, item.unit))
         if math.isfinite(item.low) and math.isfinite(item.high):
-            words += f"  ({item.low:.3g} to {item.high:.3g})"
-        split.label(text=words)
+            split = column.split(factor=0.45)
+            split.active = False
+            split.label(text="95 % between")
+            split.label(text=f"{item.low:.3g} and {item.high:.3g}")
     if effect.has_closed:
         split = column.split(factor=0.45)
         split.label(text="Closes")
@@ -177,7 +187,7 @@ def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any
     column.label(text="Distance to motion that no fit saw")
     rows = (
         ("As believed", state.before_m),
-        ("Re-tuned, nothing added", state.refitted_m),
+        ("Re-tuned only", state.refitted_m),
         ("With the effect", state.after_m),
         ("Noise floor", state.floor_m),
     )
@@ -235,6 +245,6 @@ CLASSES = (
     PHYSGEN_UL_effects,
     PHYSGEN_PT_diagnose,
     PHYSGEN_PT_diagnose_show,
-    PHYSGEN_PT_diagnose_finding,
+    PHYSGEN_PT_diagnose_causes,
     PHYSGEN_PT_diagnose_add,
 )

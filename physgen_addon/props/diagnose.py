@@ -36,6 +36,7 @@ def _on_trial(self: "PHYSGEN_PG_diagnose", context: bpy.types.Context) -> None:
     if self.root is not None:
         apply_view(self)
         capture_view.play_range(self.id_data, self.root, self.trial)
+        capture_view.follow(self.root, self.trial)
 
 
 def _on_view(self: Any, context: bpy.types.Context) -> None:
@@ -126,7 +127,7 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
     has_motion: BoolProperty()
     has_scores: BoolProperty()
     colours: BoolProperty(
-        name="Discrepancy as Colours",
+        name="Discrepancy as colours",
         description="Colour the meshes by the force per mass that the nominal model lacks there and then",
         default=True,
         update=_on_view,

@@ -111,7 +111,7 @@ def add_and_bake(request: AddRequest, run_bake: RunBake, on_event: OnEvent, canc
     """Bake the scene without the found effects if asked to, add them, and bake it with them.
 
     A bake that fails leaves ``scene.json`` as it was before; one that is cancelled in the second bake leaves the
-    effects in, so that the same call goes on from there. Returns ``{"event": "done", "before", "after"}``.
+    effects in, so that the same call goes on from there. Returns ``{"event": "done", "scene", "before", "after"}``.
     """
     original = load_scene(request.scene).scene
     changed = with_effects(original, request.found)
@@ -130,7 +130,8 @@ def add_and_bake(request: AddRequest, run_bake: RunBake, on_event: OnEvent, canc
     except PhysGenError:
         save_scene(request.scene, original)
         raise
-    return {"event": "done", "before": str(request.before), "after": str(request.after)}
+    folders = {"scene": request.scene, "before": request.before, "after": request.after}
+    return {"event": "done", **{name: str(path) for name, path in folders.items()}}
 
 
 def _named(on_event: OnEvent, which: str) -> OnEvent:
