@@ -139,6 +139,7 @@ def body_group() -> bpy.types.NodeTree:
             "Samples": ("Object", None),
             "Frames": ("Int", 1),
             "Points": ("Int", 1),
+            "First": ("Int", 0),
             "Shift": ("String", ""),
             "Known": ("String", ""),
             "Deform": ("Bool", False),
@@ -154,14 +155,13 @@ def body_group() -> bpy.types.NodeTree:
     last = tree.math("SUBTRACT", given["Frames"], 1.0)
     frame = tree.math("MAXIMUM", tree.math("MINIMUM", tree.math("ROUND", now), last), 0.0)
     row = tree.math("MULTIPLY", frame, given["Points"])
-    score = shift = first = None
+    score = shift = None
     for index in range(CARRIERS):
         carrier, weight_name = carrier_names(index)
         weight = tree.attribute(weight_name, "FLOAT")
         place = tree.out(
             "FunctionNodeFloatToInt", tree.math("ADD", row, tree.attribute(carrier, "INT")), rounding_mode="ROUND"
         )
-        first = first or place
         here = _sample(tree, samples, tree.attribute(SCORE, "FLOAT"), place, "FLOAT")
         part = tree.math("MULTIPLY", here, weight)
         score = part if score is None else tree.math("ADD", score, part)
@@ -170,8 +170,6 @@ def body_group() -> bpy.types.NodeTree:
         tree.group.links.new(weight, scaled.inputs["Scale"])
         step = scaled.outputs[0]
         shift = step if shift is None else tree.out("ShaderNodeVectorMath", shift, step, operation="ADD")
-    known = _sample(tree, samples, tree.attribute(given["Known"], "BOOLEAN"), first, "BOOLEAN")
-    unknown = tree.out("FunctionNodeBooleanMath", known, operation="NOT")
     body = tree.out("GeometryNodeSetPosition", given["Geometry"], given["Deform"], None, shift)
     share = tree.math("DIVIDE", score, tree.math("MAXIMUM", given["Most"], 1e-9))
     ramp = tree.node("ShaderNodeValToRGB", share)
@@ -181,7 +179,10 @@ def body_group() -> bpy.types.NodeTree:
         "GeometryNodeStoreNamedAttribute", body, None, COLOUR, colour, data_type="FLOAT_COLOR", domain="POINT"
     )
     body = tree.out("GeometryNodeSetMaterial", body, None, given["Material"])
-    return tree.finish(tree.out("GeometryNodeDeleteGeometry", body, unknown, domain="POINT"))
+    # One value for the whole body, so that a switch can do it: deleting vertices would cost a copy in every frame.
+    first = tree.out("FunctionNodeFloatToInt", tree.math("ADD", row, given["First"]), rounding_mode="ROUND")
+    known = _sample(tree, samples, tree.attribute(given["Known"], "BOOLEAN"), first, "BOOLEAN")
+    return tree.finish(tree.out("GeometryNodeSwitch", known, None, body, input_type="GEOMETRY"))
 
 
 def _sample(tree: _Tree, samples: Socket, value: Socket, index: Socket, kind: str) -> Socket:

@@ -35,7 +35,7 @@ POINTS, BODY, SAMPLES = "points", "body", "samples"
 MODIFIER = "PhysGen"
 
 SMOOTH_DEG = 35.0
-EDGES_ACROSS = 20
+EDGES_ACROSS = 12
 """A body's edges are at most this share of its size, so that colours have somewhere to change."""
 MAX_VERTICES = 40_000
 
@@ -269,6 +269,7 @@ def _add_take(
                 "Samples": samples,
                 "Frames": take.clock.frames,
                 "Points": len(trial.object_index),
+                "First": int(mine[0]),
                 "Shift": f"shift_{name}",
                 "Known": f"known_{name}",
                 "Deform": not item.belief.rigid,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 from ...sim.scene.folder import SceneFolder, load_scene
 from ...sim.scene.meshes import load_object_mesh
@@ -49,6 +50,12 @@ def remove(root: bpy.types.Collection) -> None:
     bpy.data.batch_remove([mesh for mesh in meshes if mesh.users == 0])
 
 
+def bounds(root: bpy.types.Collection) -> tuple[Vector, Vector]:
+    """Lowest and highest corner of the objects at rest, m."""
+    corners = np.array([tuple(corner) for item in root.objects for corner in item.bound_box])
+    return Vector(corners.min(axis=0).tolist()), Vector(corners.max(axis=0).tolist())
+
+
 def frame_range(scene_root: Path, bake: Path) -> tuple[int, int, float]:
     """First and last frame and frames a second of ``bake``."""
     opened = caches.open_bake(bake, load_scene(scene_root).scene)
@@ -65,7 +72,6 @@ def show(before: bpy.types.Collection | None, after: bpy.types.Collection | None
         for item in collection.objects:
             item.data.materials[0] = _material(which, ghost=ghost)
             item.color = (*COLOURS[which], materials.GHOST_ALPHA if ghost else 1.0)
-            item.show_wire = ghost
 
 
 def _material(which: str, *, ghost: bool) -> bpy.types.Material:

@@ -16,12 +16,16 @@ from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..paths import folder_beside, require_folder
 from ..props import report as report_props
 from ..props.diagnose import apply_view
+from ..views import look_through_camera, turn_to, viewports
 
 
 def capture_folder(path: str) -> Path:
-    """The folder of a capture; its ``capture.json`` is fine too."""
+    """The folder of a capture; its ``capture.json`` is fine too. InputError where there is none."""
     folder = require_folder(path, "Capture")
-    return folder.parent if folder.name == CAPTURE_FILE else folder
+    folder = folder.parent if folder.name == CAPTURE_FILE else folder
+    if not (folder / CAPTURE_FILE).is_file():
+        raise InputError(f"{folder}: there is no {CAPTURE_FILE} in it; choose the folder of a capture")
+    return folder
 
 
 def report_folder(state: bpy.types.PropertyGroup) -> Path:
@@ -57,7 +61,7 @@ def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
     else:
         report_props.clear(state)
     if fresh or had_motion != state.has_motion:
-        _choose_layers(state)
+        _choose_layers(state, flat=capture.camera is not None and not state.has_motion)
         state.radius = 0.03 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
     names = [t.name for t in capture.trials]
     state.trial = trial if trial in names else names[0]
@@ -79,10 +83,13 @@ def _fill_trials(state: bpy.types.PropertyGroup, capture: Capture) -> None:
         state.capture_warnings.add().text = text
 
 
-def _choose_layers(state: bpy.types.PropertyGroup) -> None:
-    """Before a diagnosis the recording; after it, the recording as coloured mesh and the models as points."""
+def _choose_layers(state: bpy.types.PropertyGroup, *, flat: bool) -> None:
+    """Before a diagnosis the recording; after it, the recording as coloured mesh and the nominal model as points.
+
+    flat: the points are pixels of unknown depth, to which a mesh cannot be fitted.
+    """
     chosen = {
-        OBSERVED: {"points": True, "trail": True, "body": True},
+        OBSERVED: {"points": True, "trail": True, "body": not flat},
         NOMINAL: {"points": state.has_motion, "trail": state.has_motion, "body": False},
         FOUND: {"points": False, "trail": False, "body": False},
     }
@@ -112,7 +119,9 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
             return {"CANCELLED"}
         if folder is not None:
             state.report = str(folder)
-        look_at_capture(context)
+        turn_to(context, *capture_view.bounds(state.root, state.trial))
+        if capture.camera is not None:
+            look_through_camera(context)
         count = len(capture.trials)
         self.report({"INFO"}, f"{count} {'trial' if count == 1 else 'trials'} of {capture.root.name} loaded")
         return {"FINISHED"}
@@ -182,27 +191,6 @@ class PHYSGEN_OT_open_report(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
-    """The 3D viewports of the window; none in background mode."""
-    areas = context.window.screen.areas if context.window is not None else ()
-    return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
-
-
-def look_at_capture(context: bpy.types.Context) -> None:
-    """Turn the window's viewports towards the trial that is shown, and let solid ones show colour attributes."""
-    state = context.scene.physgen_diagnose
-    corners = capture_view.bounds(state.root, state.trial)
-    reach = (corners[1] - corners[0]).length
-    for space in viewports(context):
-        space.shading.color_type = "VERTEX"
-        space.shading.show_object_outline = False  # it would paint thin trails black
-        space.clip_start = min(space.clip_start, reach / 1000)
-        if space.region_3d is not None and reach > 0:
-            space.lock_object = None
-            space.region_3d.view_location = (corners[0] + corners[1]) / 2
-            space.region_3d.view_distance = reach
-
-
 class PHYSGEN_OT_follow(bpy.types.Operator):
     """Let the viewport go with the object, close to it; press again to let go"""
 
@@ -220,7 +208,7 @@ class PHYSGEN_OT_follow(bpy.types.Operator):
         state = context.scene.physgen_diagnose
         spaces = viewports(context)
         if any(space.lock_object is not None for space in spaces):
-            look_at_capture(context)
+            turn_to(context, *capture_view.bounds(state.root, state.trial))
             return {"FINISHED"}
         body = capture_view.shown_body(state.root, state.trial)
         if body is None:

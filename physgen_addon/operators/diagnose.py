@@ -8,8 +8,6 @@ from pathlib import Path
 import bpy
 
 from ...sim.app.process import run_stage
-from ...sim.diagnose.capture import CAPTURE_FILE
-from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
@@ -29,8 +27,6 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
         """The diagnosis as a child process."""
         state = context.scene.physgen_diagnose
         capture = capture_folder(state.capture)
-        if not (capture / CAPTURE_FILE).is_file():
-            raise InputError(f"{capture}: there is no {CAPTURE_FILE}; choose the folder of a capture")
         out = report_folder(state)
         preferred = python(context)
 

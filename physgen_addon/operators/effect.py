@@ -19,6 +19,7 @@ from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
 from ..paths import bake_folder, folder_beside, require_folder
 from ..props.preferences import python
+from ..views import turn_to
 from .capture import report_folder
 
 
@@ -116,8 +117,29 @@ def show_overlay(scene: bpy.types.Scene) -> None:
     if state.root is not None:
         state.root.hide_viewport = state.root.hide_render = True
     overlay.show(*built, choice=state.overlay)
+    low, high = overlay.bounds(built[1])
+    turn_to(bpy.context, 2 * low - high, 2 * high - low)
     scene.frame_start, scene.frame_end = first, last
     capture_view.set_rate(scene, rate)
 
 
-CLASSES = (PHYSGEN_OT_add_effect, PHYSGEN_OT_show_overlay)
+class PHYSGEN_OT_clear_overlay(bpy.types.Operator):
+    """Take both bakes out of the scene and show the capture again; their files stay where they are"""
+
+    bl_idname = "physgen.clear_overlay"
+    bl_label = "Clear Overlay"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove the two collections."""
+        state = context.scene.physgen_diagnose
+        for collection in (state.before_root, state.after_root):
+            if collection is not None:
+                overlay.remove(collection)
+        if state.root is not None:
+            state.root.hide_viewport = state.root.hide_render = False
+            capture_view.play_range(context.scene, state.root, state.trial)
+        return {"FINISHED"}
+
+
+CLASSES = (PHYSGEN_OT_add_effect, PHYSGEN_OT_show_overlay, PHYSGEN_OT_clear_overlay)

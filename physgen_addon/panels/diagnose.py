@@ -18,7 +18,7 @@ from ..operators.capture import (
     PHYSGEN_OT_open_report,
 )
 from ..operators.diagnose import PHYSGEN_OT_diagnose
-from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_show_overlay
+from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_clear_overlay, PHYSGEN_OT_show_overlay
 from ..props.report import readable
 from . import text
 
@@ -70,7 +70,9 @@ class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
         if state.root is None:
             text.sentences(layout, context, "Choose a capture folder: capture.json, meshes and tracked takes.")
             return
-        layout.prop(state, "trial")
+        row = layout.row(align=True)
+        row.prop(state, "trial")
+        row.prop(state.root, "hide_viewport", text="")
         label = next((t.label for t in state.trials if t.name == state.trial), "")
         text.sentences(layout, context, label)
         for warning in state.capture_warnings:
@@ -238,7 +240,9 @@ class PHYSGEN_PT_diagnose_add(_Part, bpy.types.Panel):
             column.prop(state, "after", text="")
             column.operator(PHYSGEN_OT_show_overlay.bl_idname, icon="OVERLAY")
         if state.before_root is not None:
-            layout.row(align=True).prop(state, "overlay", expand=True)
+            row = layout.row(align=True)
+            row.prop(state, "overlay", expand=True)
+            row.operator(PHYSGEN_OT_clear_overlay.bl_idname, text="", icon="TRASH")
 
 
 CLASSES = (

@@ -425,7 +425,7 @@ def test_bad_input_is_named_and_changes_nothing(throw, tmp_path):
     _, folder = throw
     state = load(folder)
     objects = set(bpy.data.objects.keys())
-    for path, message in ((tmp_path / "nowhere", "there is no such file"), ("", "Capture is empty")):
+    for path, message in ((tmp_path / "nowhere", "choose the folder of a capture"), ("", "Capture is empty")):
         state.capture = str(path)
         with pytest.raises(RuntimeError, match=message):
             bpy.ops.physgen.load_capture()
@@ -546,6 +546,9 @@ def test_the_found_effect_goes_into_the_scene_and_both_bakes_are_shown(throw, tm
     assert Path(state.after) == tmp_path / "scene_bake_after_2"
     assert [e.name for e in load_scene(root).scene.effects] == ["air_drag"]
     assert len([c for c in bpy.data.collections if "physgen_bake" in c]) == 2
+    assert state.root.hide_viewport
+    bpy.ops.physgen.clear_overlay()
+    assert not state.root.hide_viewport and state.before_root is None and scene.frame_end == FRAMES
 
 
 @pytest.mark.parametrize("verdict", ["none", "unknown"])
