@@ -55,6 +55,11 @@ class Job:
         self._stop.set()
         self.message = "cancelling"
 
+    def abandon(self) -> None:
+        """Cancel, and wait just long enough that the child process has been told; nobody will ask for the result."""
+        self.cancel()
+        self._thread.join(5 * STEP_S)
+
     def step(self) -> bool:
         """Take in the news; whether the work has ended. Never waits."""
         ended = not self._thread.is_alive()
@@ -177,7 +182,7 @@ class JobOperator:
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator itself: another file is loaded, or it quits."""
-        self._job.cancel()
+        self._job.abandon()
         self._release(context)
 
     def _release(self, context: bpy.types.Context) -> None:
@@ -258,5 +263,5 @@ CLASSES = (PHYSGEN_OT_cancel_job,)
 def unregister() -> None:
     """Stop whatever runs, because the extension is disabled."""
     for job in _running:
-        job.cancel()
+        job.abandon()
     _running.clear()

@@ -146,7 +146,8 @@ class PHYSGEN_PT_diagnose_causes(_Part, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Ranking, the gap, warnings, what to record next."""
         layout, state = self.layout, context.scene.physgen_diagnose
-        layout.template_list("PHYSGEN_UL_effects", "", state, "effects", state, "effect_index", rows=5)
+        rows = min(max(len(state.effects), 2), 5)
+        layout.template_list("PHYSGEN_UL_effects", "", state, "effects", state, "effect_index", rows=rows)
         if 0 <= state.effect_index < len(state.effects):
             _draw_effect(layout, state.effects[state.effect_index])
         _draw_gap(layout, context, state)
@@ -181,7 +182,7 @@ def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
     if effect.has_closed:
         split = column.split(factor=0.45)
         split.label(text="Closes")
-        split.label(text=f"{100 * effect.closed:.0f} % of the gap")
+        split.label(text=f"{100 * effect.closed:.3g} % of the gap")
 
 
 def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
@@ -203,7 +204,7 @@ def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any
     if not state.resolvable:
         text.sentences(box, context, "Too near the noise floor to say how much of it is closed.")
     elif state.closed > -1:
-        box.label(text=f"{100 * state.closed:.0f} % of the gap is closed")
+        box.label(text=f"{100 * state.closed:.3g} % of the gap is closed")
     if state.numerics_m > 0:
         box.label(text=f"{text.length(state.numerics_m)} of it is the simulator's own error")
 

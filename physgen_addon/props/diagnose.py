@@ -20,6 +20,7 @@ from bpy.props import (
 from ..bridge import capture_view, overlay
 from ..bridge.capture_materials import LAYERS
 
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 NOT_KNOWN = -1.0
 """Stands for a number that the report does not have; Blender's properties have no null."""
 
@@ -109,12 +110,16 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
     """All that the Diagnose panel knows, kept with the scene."""
 
     capture: StringProperty(
-        name="Capture", description="Folder of a recording (capture.json with its meshes and takes)", subtype="DIR_PATH"
+        name="Capture",
+        description="Folder of a recording (capture.json with its meshes and takes)",
+        subtype="DIR_PATH",
+        options=RELATIVE,
     )
     report: StringProperty(
         name="Diagnosis",
         description="Folder of the diagnosis. Empty: beside the capture, with _diagnosis behind its name",
         subtype="DIR_PATH",
+        options=RELATIVE,
     )
     root: PointerProperty(type=bpy.types.Collection)
     trials: CollectionProperty(type=PHYSGEN_PG_trial)
@@ -179,15 +184,22 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
     warnings: CollectionProperty(type=PHYSGEN_PG_text)
 
     scene_folder: StringProperty(
-        name="Scene", description="PhysGen scene folder that the found effect is added to", subtype="DIR_PATH"
+        name="Scene",
+        description="PhysGen scene folder that the found effect is added to",
+        subtype="DIR_PATH",
+        options=RELATIVE,
     )
     before: StringProperty(
         name="Bake Before",
         description="Bake of that scene without the effect. Empty: it is baked first",
         subtype="DIR_PATH",
+        options=RELATIVE,
     )
     after: StringProperty(
-        name="Bake After", description="Bake with the effect. A new folder each time", subtype="DIR_PATH"
+        name="Bake After",
+        description="Bake with the effect. A new folder each time",
+        subtype="DIR_PATH",
+        options=RELATIVE,
     )
     frames: IntProperty(name="Frames", description="How many frames to bake", default=48, min=1, soft_max=500)
     fps: FloatProperty(name="Frame Rate", description="Frames a second of the bake", default=24, min=1, soft_max=120)
