@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: MIT
+"""A rigid body above a ground plane, moved by MuJoCo: another contact law and another integrator than sim/mpm's.
+
+Contact: a spring-damper of 1600 rad/s whose force is clamped at zero, with the elliptic Coulomb cone of Todorov,
+"Convex and analytically-invertible dynamics with contacts and constraints", ICRA 2014; motion by Runge-Kutta of fourth
+order.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from ...errors import InputError
+
+Array = NDArray[np.float64]
+Push = Callable[[float, Array, Array, Array, Array], Array]
+"""(time s, position m, velocity m/s, spin rad/s, rotation (3, 3)) → force per mass in m/s² on the centre."""
+
+GroundMotion = Callable[[float], tuple[Array, Array]]
+"""time s → displacement m and velocity m/s of the ground."""
+
+STEP_S = 1e-4
+CONTACT_RATE = 1600.0
+"""Undamped angular frequency of the contact, rad/s: it lasts 2 ms."""
+
+STRIKE_M_S = 0.08
+"""Speed towards or off the ground from which a contact is an impact and not a rest."""
+
+GRAVITY = 9.81
+_GRIP = 100.0
+"""impratio: a contact that sticks does not creep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """shape: ``sphere``, ``cube`` or ``box``. half: half extents in m (a sphere's radius, three times). In kg/m³."""
+
+    shape: str
+    half: tuple[float, float, float]
+    density: float
+
+    @property
+    def volume(self) -> float:
+        """m³."""
+        product = math.prod(self.half)
+        return 4 / 3 * math.pi * product if self.shape == "sphere" else 8 * product
+
+    @property
+    def mass(self) -> float:
+        """kg."""
+        return self.density * self.volume
+
+    @property
+    def cross_section(self) -> float:
+        """m², averaged over directions: of a convex body a quarter of its surface (Cauchy)."""
+        a, b, c = self.half
+        return math.pi * a * a if self.shape == "sphere" else 2 * (a * b + b * c + c * a)
+
+    @property
+    def size(self) -> float:
+        """Mean half extent in m."""
+        return float(np.mean(self.half))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidWorld:
+    """Everything that decides how a body moves.
+
+    pellet: (extra mass over the body's, place in the body in m). rolling: m, arm of the rolling resistance.
+    adhesion: (pull per mass in m/s², reach in m): the ground pulls what leaves it, up to that distance.
+    bump: (x, y, radius, height) in m of a spherical cap on the ground that nobody mentioned.
+    push: see ``Push``. ground_motion: see ``GroundMotion``.
+    """
+
+    body: Body
+    friction: float
+    restitution: float
+    gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY)
+    pellet: tuple[float, tuple[float, float, float]] | None = None
+    rolling: float = 0.0
+    adhesion: tuple[float, float] | None = None
+    bump: tuple[float, float, float, float] | None = None
+    push: Push | None = None
+    ground_motion: GroundMotion | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """position m, quaternion (w, x, y, z), velocity m/s, spin rad/s; world axes, at the body's geometric centre."""
+
+    position: Array
+    quaternion: Array
+    velocity: Array
+    spin: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """At T times: position (T, 3), rotation (T, 3, 3), and, from half-way since
+    the frame before to half-way to the next,
+
+    touched (T,) whether it touched the ground, struck (T,) whether at more than ``STRIKE_M_S``, slid (T,) whether the
+    touching part slid, pulled (T,) whether adhesion held it; push (T, 3) force per mass in m/s².
+    """
+
+    position: Array
+    rotation: Array
+    touched: NDArray[np.bool_]
+    struck: NDArray[np.bool_]
+    slid: NDArray[np.bool_]
+    pulled: NDArray[np.bool_]
+    push: Array
+
+    def points(self, rest: Array) -> Array:
+        """Where the body's points ``rest`` (K, 3) are: (T, K, 3)."""
+        return np.einsum("tij,kj->tki", self.rotation, rest) + self.position[:, None]
+
+
+def load_mujoco() -> Any:
+    """The module. Raises InputError, with the way out, where it is not installed."""
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError as error:
+        raise InputError(
+            f"blind-check needs MuJoCo, which cannot be loaded ({error}): run `pip install 'physgen[blind]'`"
+        ) from None
+
+
+def bounce_of_damping(zeta: float) -> float:
+    """Restitution of a spring-damper of damping ratio ``zeta`` whose force may not pull.
+
+    The force -2 zeta w v - w² x ends at the time t1 with tan(wd t1) = 2 zeta wd w / (w² - 2 zeta² w²) on the branch
+    below pi; the speed there over the speed at the beginning (Schwager and Pöschel, Granular Matter 9, 2007).
+    """
+    root = math.sqrt(1 - zeta * zeta)
+    end = math.pi - math.atan2(2 * zeta * root, 1 - 2 * zeta * zeta)
+    # In units of 1/w: v(t) = exp(-zeta t) (cos(wd t) - zeta/wd sin(wd t)), downwards positive.
+    return -math.exp(-zeta * end / root) * (math.cos(end) - zeta / root * math.sin(end))
+
+
+@lru_cache(maxsize=256)
+def damping_of_bounce(restitution: float) -> float:
+    """The damping ratio with that restitution; 0.02 to 0.98 are kept apart from the ends."""
+    wanted = min(max(restitution, 0.02), 0.98)
+    return float(brentq(lambda z: bounce_of_damping(z) - wanted, 1e-4, 0.999))
+
+
+def _model(mujoco: Any, world: RigidWorld) -> Any:
+    body = world.body
+    size = repr(body.half[0]) if body.shape == "sphere" else " ".join(map(repr, body.half))
+    kind = "sphere" if body.shape == "sphere" else "box"
+    rate = CONTACT_RATE
+    law = (
+        f'solref="{-rate * rate!r} {-2 * damping_of_bounce(world.restitution) * rate!r}" '
+        f'solimp="0.9999 0.9999 0.001" friction="{world.friction!r} 0 {max(world.rolling, 1e-9)!r}" '
+        f'condim="{6 if world.rolling > 0 else 3}"'
+    )
+    joints = "".join(f'<joint type="slide" axis="{a}"/>' for a in ("1 0 0", "0 1 0", "0 0 1"))
+    bump = ""
+    if world.bump is not None:
+        x, y, radius, height = world.bump
+        ball = (radius * radius + height * height) / (2 * height)
+        bump = f'<geom type="sphere" size="{ball!r}" pos="{x!r} {y!r} {height - ball!r}" {law}/>'
+    ground = f'<geom type="plane" size="0 0 1" {law}/>'
+    if world.ground_motion is not None:
+        # A plane may not move in MuJoCo; a wide slab, heavy enough that nothing disturbs its prescribed motion, may.
+        ground = f'<body name="ground">{joints}<geom type="box" size="20 20 1" pos="0 0 -1" mass="1e9" {law}/></body>'
+    inertial = ""
+    density = f'density="{body.density!r}"'
+    if world.pellet is not None:
+        inertial, density = _loaded_inertia(body, *world.pellet), 'mass="0"'
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="{STEP_S}" integrator="RK4" cone="elliptic" impratio="{_GRIP}" '
+        f'gravity="{" ".join(map(repr, world.gravity))}"/><worldbody>{ground}{bump}'
+        f'<body name="body"><freejoint/>{inertial}<geom type="{kind}" size="{size}" {density} {law}/></body>'
+        "</worldbody></mujoco>"
+    )
+
+
+def _loaded_inertia(body: Body, fraction: float, at: tuple[float, float, float]) -> str:
+    """The ``inertial`` element of ``body`` with a pellet of ``fraction`` of its mass at ``at``."""
+    half, mass = np.array(body.half), body.mass
+    share = 0.4 if body.shape == "sphere" else None
+    if share is not None:
+        tensor = np.eye(3) * share * mass * half[0] ** 2
+    else:
+        tensor = (
+            np.diag([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2]) * mass / 3
+        )
+    place = np.array(at)
+    centre = place * fraction / (1 + fraction)
+    for part, where in ((mass, -centre), (mass * fraction, place - centre)):
+        tensor = tensor + part * (where @ where * np.eye(3) - np.outer(where, where))
+    six = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
+    return (
+        f'<inertial mass="{mass * (1 + fraction)!r}" pos="{" ".join(repr(float(c)) for c in centre)}" '
+        f'fullinertia="{" ".join(repr(float(x)) for x in six)}"/>'
+    )
+
+
+def move(world: RigidWorld, state: State, times: Array) -> Motion:
+    """The motion from ``state`` at ``times[0]``. times: (T,) s, rising, the body's own clock.
+
+    Raises InputError without MuJoCo.
+    """
+    mujoco = load_mujoco()
+    model = _model(mujoco, world)
+    data = mujoco.MjData(model)
+    recorder = _Recorder(world, model, data, mujoco, len(times))
+    recorder.place(state, float(times[0]))
+    for frame in range(len(times)):
+        if frame:
+            recorder.advance(frame, float(times[frame] - times[frame - 1]))
+        recorder.keep(frame)
+    return recorder.motion()
+
+
+class _Recorder:
+    """Steps a model from frame to frame and notes what happened between them."""
+
+    def __init__(self, world: RigidWorld, model: Any, data: Any, mujoco: Any, frames: int) -> None:
+        self._world, self._model, self._data, self._mujoco = world, model, data, mujoco
+        self._body = model.body("body").id
+        self._mass = float(model.body_mass[self._body])
+        self._first = 3 if world.ground_motion is not None else 0  # degrees of freedom of the ground come first
+        smooth = world.push is not None and world.adhesion is None and world.ground_motion is None
+        free = world.push is None and world.adhesion is None and world.ground_motion is None
+        # Smooth forces may be held for half a millisecond; what depends on contact must be asked at each step.
+        self._stride = 5 if smooth else (10 if free else 1)
+        self._position, self._rotation = np.zeros((frames, 3)), np.zeros((frames, 3, 3))
+        self._flags = np.zeros((4, frames), dtype=bool)
+        self._push = np.zeros((frames, 3))
+
+    def place(self, state: State, time: float) -> None:
+        turn = Rotation.from_quat(np.roll(state.quaternion, -1))
+        q, v = self._data.qpos[self._first :], self._data.qvel[self._first :]
+        q[:3], q[3:7] = state.position, state.quaternion / np.linalg.norm(state.quaternion)
+        v[:3], v[3:6] = state.velocity, turn.inv().apply(state.spin)  # MuJoCo keeps the spin in the body's axes
+        self._data.time = time
+        self._mujoco.mj_forward(self._model, self._data)
+
+    def advance(self, frame: int, duration: float) -> None:
+        steps = max(1, round(duration / STEP_S))
+        self._model.opt.timestep = duration / steps
+        done = 0
+        while done < steps:
+            now = min(self._stride, steps - done)
+            self._force()
+            self._mujoco.mj_step(self._model, self._data, nstep=now)
+            done += now
+            self._note(frame if 2 * done > steps else frame - 1)
+
+    def _force(self) -> None:
+        world, data, first = self._world, self._data, self._first
+        if world.ground_motion is not None:
+            data.qpos[:3], data.qvel[:3] = world.ground_motion(data.time)
+        if world.push is None and world.adhesion is None:
+            return
+        q, v = data.qpos[first:], data.qvel[first:]
+        force = np.zeros(3)
+        if world.push is not None:
+            turn = data.xmat[self._body].reshape(3, 3)
+            force = force + world.push(data.time, q[:3].copy(), v[:3].copy(), turn @ v[3:6], turn)
+        if world.adhesion is not None:
+            force = force + np.array([0.0, 0.0, self._pull(q, v)])
+        data.xfrc_applied[self._body, :3] = force * self._mass
+
+    def _pull(self, q: Array, v: Array) -> float:
+        assert self._world.adhesion is not None
+        strength, reach = self._world.adhesion
+        body = self._world.body
+        turn = self._data.xmat[self._body].reshape(3, 3)
+        low = body.half[0] if body.shape == "sphere" else float(np.abs(turn[2]) @ np.array(body.half))
+        return -strength if v[2] > 0 and q[2] - low < reach else 0.0
+
+    def _note(self, frame: int) -> None:
+        data, first = self._data, self._first
+        v = data.qvel[first:]
+        if data.ncon > 0:
+            turn = data.xmat[self._body].reshape(3, 3)
+            arm = np.mean([data.contact[i].pos for i in range(data.ncon)], axis=0) - data.qpos[first:][:3]
+            slip = v[:3] + np.cross(turn @ v[3:6], arm)
+            self._flags[0, frame] = True
+            self._flags[1, frame] |= bool(abs(slip[2]) > STRIKE_M_S)
+            self._flags[2, frame] |= bool(np.hypot(slip[0], slip[1]) > 0.02)
+        if self._world.adhesion is not None:
+            # A body at rest trembles by micrometres: that is no leaving.
+            self._flags[3, frame] |= self._pull(data.qpos[first:], v) < 0 and bool(v[2] > 0.01)
+
+    def keep(self, frame: int) -> None:
+        data = self._data
+        self._position[frame] = data.qpos[self._first :][:3]
+        quaternion = data.qpos[self._first :][3:7]
+        self._rotation[frame] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+        if self._world.push is not None:
+            v, turn = data.qvel[self._first :], self._rotation[frame]
+            self._push[frame] = self._world.push(data.time, self._position[frame], v[:3].copy(), turn @ v[3:6], turn)
+
+    def motion(self) -> Motion:
+        return Motion(
+            position=self._position,
+            rotation=self._rotation,
+            touched=self._flags[0],
+            struck=self._flags[1],
+            slid=self._flags[2],
+            pulled=self._flags[3],
+            push=self._push,
+        )
