@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
 
 from ...errors import SimulationError
 from ...events import IsCancelled, never
@@ -228,7 +229,7 @@ def _assembled(
     nominal: Sequence[_Seen],
     rng: np.random.Generator,
 ) -> BlindCase:
-    seen = _observe(stage, hidden)
+    seen = _observe(stage, hidden) if hidden else nominal
     order = np.argsort(ratios)[::-1]
     hidden = [hidden[i] for i in order]
     effects = tuple(h.cause.effect for h in hidden if h.cause.effect != UNKNOWN)
@@ -351,10 +352,15 @@ def _active(cause: Cause, motion: Motion, times: Array) -> NDArray[np.bool_]:
         return np.asarray(size > 0.1 * max(float(size.max()), 1e-12))
     if cause.active == "rolling":
         moved = np.linalg.norm(np.gradient(motion.position[:, :2], times, axis=0), axis=1) > 0.02
-        return motion.touched & moved
-    return {"touched": motion.touched, "struck": motion.struck, "slid": motion.slid, "pulled": motion.pulled}[
-        cause.active
-    ]
+        return _closed(motion.touched & moved)
+    if cause.active == "slid":
+        return _closed(motion.slid)
+    return {"touched": motion.touched, "struck": motion.struck, "pulled": motion.pulled}[cause.active]
+
+
+def _closed(flags: NDArray[np.bool_], gap: int = 2) -> NDArray[np.bool_]:
+    """``flags`` without gaps of up to ``gap`` frames: what slides on its edges leaves the ground for moments."""
+    return binary_closing(np.pad(flags, gap), np.ones(gap + 1, dtype=bool))[gap:-gap]
 
 
 def _oracle(stage: _Stage, hidden: Sequence[_Hidden], seen: Sequence[_Seen], rng: np.random.Generator) -> float:

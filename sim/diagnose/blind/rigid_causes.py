@@ -235,7 +235,7 @@ def restitution(world: RigidWorld, rng: np.random.Generator) -> Cause:
     sign = 1.0 if world.restitution < 0.35 else -1.0 if world.restitution > 0.6 else float(rng.choice([-1, 1]))
 
     def bounce(s: float) -> float:
-        return min(max(world.restitution + sign * s, 0.05), 0.93)
+        return min(max(world.restitution + sign * s, 0.16), 0.93)
 
     return Cause(
         effect="restitution",

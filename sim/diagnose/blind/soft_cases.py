@@ -24,7 +24,7 @@ from .soft_causes import UNKNOWN as UNKNOWN_CAUSES
 from .soft_solid import Array, Solid, ball, block, surface_mesh
 from .soft_world import SoftMotion, SoftWorld, move_soft
 
-LEAST_OVER_NOISE = 6.0
+LEAST_OVER_NOISE, MOST_OVER_NOISE = 6.0, 60.0
 MEDIUM_FROM_PA = 1e5
 """Young's modulus from which a body is called ``medium`` instead of ``soft``."""
 
@@ -73,7 +73,7 @@ def soft_case(effects: Sequence[str], rng: np.random.Generator, cancelled: IsCan
         try:
             strength = 0.0
             if cause is not None:
-                wanted = math.exp(rng.uniform(math.log(10), math.log(45))) * noise
+                wanted = math.exp(rng.uniform(math.log(10), math.log(40))) * noise
                 strength = _strength(shape.coarse, world, cause, starts[:2], times, wanted, cancelled)
             nominal = _run(shape.fine, world, starts, times, cancelled)
             motion = nominal
@@ -82,7 +82,7 @@ def soft_case(effects: Sequence[str], rng: np.random.Generator, cancelled: IsCan
         except SimulationError:
             continue
         ratio = _difference(motion, nominal) / noise
-        if cause is None or LEAST_OVER_NOISE <= ratio <= 100:
+        if cause is None or LEAST_OVER_NOISE <= ratio <= MOST_OVER_NOISE:
             return _assembled(shape, world, cause, strength, starts, times, noise, motion, nominal, ratio, rng)
     raise SimulationError(f"no draw of {_ATTEMPTS} made {', '.join(names)} visible; choose another seed")
 

@@ -141,8 +141,8 @@ def fading(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCaus
     return SoftCause(
         effect="unknown",
         mechanism="fading",
-        low=0.3,
-        high=3.0,
+        low=0.2,
+        high=1.3,
         change=lambda s, w: dataclasses.replace(w, fading=s),
         parameters=lambda s: {"rate": s},
     )
