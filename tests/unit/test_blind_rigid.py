@@ -71,9 +71,9 @@ def test_a_rolling_ball_keeps_rolling_unless_something_resists():
     plain = move(_world(), start, TIMES).position[:, 0]
     held = move(_world(rolling=0.02 * 0.04), start, TIMES).position[:, 0]
     assert np.abs(plain - TIMES).max() < 1e-3
-    # Braking by b g / R, b the arm: a force at the contact slows centre and spin alike, 5/7 of it the centre.
+    # The torque -b N brakes the rolling ball by b g R / (R² + k²), k² = 2 R² / 5.
     lost = TIMES[-1] - held[-1]
-    assert 0.6 < lost / (0.5 * 0.02 * 9.81 * TIMES[-1] ** 2) < 1.1
+    assert lost == pytest.approx(0.5 * 0.02 * 9.81 * 5 / 7 * TIMES[-1] ** 2, rel=0.05)
 
 
 def test_a_pellet_keeps_the_loaded_centre_on_the_parabola():

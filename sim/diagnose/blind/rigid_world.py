@@ -162,8 +162,7 @@ def _model(mujoco: Any, world: RigidWorld) -> Any:
     rate = CONTACT_RATE
     law = (
         f'solref="{-rate * rate!r} {-2 * damping_of_bounce(world.restitution) * rate!r}" '
-        f'solimp="0.9999 0.9999 0.001" friction="{world.friction!r} 0 {max(world.rolling, 1e-9)!r}" '
-        f'condim="{6 if world.rolling > 0 else 3}"'
+        f'solimp="0.9999 0.9999 0.001" friction="{world.friction!r} 0 0" condim="3"'
     )
     joints = "".join(f'<joint type="slide" axis="{a}"/>' for a in ("1 0 0", "0 1 0", "0 0 1"))
     bump = ""
@@ -234,7 +233,9 @@ class _Recorder:
         self._mass = float(model.body_mass[self._body])
         self._first = 3 if world.ground_motion is not None else 0  # degrees of freedom of the ground come first
         smooth = world.push is not None and world.adhesion is None and world.ground_motion is None
-        free = world.push is None and world.adhesion is None and world.ground_motion is None
+        smooth = smooth and world.rolling == 0
+        free = world.push is None and world.adhesion is None and world.ground_motion is None and world.rolling == 0
+        self._load = np.zeros(6)
         # Smooth forces may be held for half a millisecond; what depends on contact must be asked at each step.
         self._stride = 5 if smooth else (10 if free else 1)
         self._position, self._rotation = np.zeros((frames, 3)), np.zeros((frames, 3, 3))
@@ -250,7 +251,7 @@ class _Recorder:
         self._mujoco.mj_forward(self._model, self._data)
 
     def advance(self, frame: int, duration: float) -> None:
-        steps = max(1, round(duration / STEP_S))
+        steps = max(1, math.ceil(duration / STEP_S - 1e-9))
         self._model.opt.timestep = duration / steps
         done = 0
         while done < steps:
@@ -265,6 +266,8 @@ class _Recorder:
         world, data, first = self._world, self._data, self._first
         if world.ground_motion is not None:
             data.qpos[:3], data.qvel[:3] = world.ground_motion(data.time)
+        if world.rolling > 0:
+            data.xfrc_applied[self._body, 3:] = self._resistance()
         if world.push is None and world.adhesion is None:
             return
         q, v = data.qpos[first:], data.qvel[first:]
@@ -275,6 +278,16 @@ class _Recorder:
         if world.adhesion is not None:
             force = force + np.array([0.0, 0.0, self._pull(q, v)])
         data.xfrc_applied[self._body, :3] = force * self._mass
+
+    def _resistance(self) -> Array:
+        """Torque against the level part of the spin: the arm times what presses on the ground."""
+        data = self._data
+        spin = data.xmat[self._body].reshape(3, 3) @ data.qvel[self._first :][3:6]
+        size, press = math.hypot(spin[0], spin[1]), 0.0
+        for i in range(data.ncon):
+            self._mujoco.mj_contactForce(self._model, data, i, self._load)
+            press += float(self._load[0])
+        return np.array([spin[0], spin[1], 0.0]) * (-self._world.rolling * press / max(size, 1e-3))
 
     def _pull(self, q: Array, v: Array) -> float:
         assert self._world.adhesion is not None
