@@ -76,6 +76,14 @@ def test_a_rolling_ball_keeps_rolling_unless_something_resists():
     assert lost == pytest.approx(0.5 * 0.02 * 9.81 * 5 / 7 * TIMES[-1] ** 2, rel=0.05)
 
 
+def test_adhesion_takes_its_work_from_the_bounce():
+    times, pull, reach = np.linspace(0, 0.5, 501), 30.0, 0.005
+    free, held = (move(_world(adhesion=a), _state(0.54), times).position[:, 2] - 0.04 for a in (None, (pull, reach)))
+    low = int(np.argmin(free[:400]))
+    # Work per mass: pull times half the reach, and as much as gravity does over the height that is lost.
+    assert free[low:].max() - held[low:].max() == pytest.approx(pull * reach / 2 / 9.81, rel=0.25)
+
+
 def test_a_pellet_keeps_the_loaded_centre_on_the_parabola():
     fraction, at = 0.5, (0.03, 0.0, 0.0)
     motion = move(_world(pellet=(fraction, at)), _state(5.0, spin=(0, 0, 10)), TIMES)

@@ -77,7 +77,7 @@ class RigidWorld:
     """Everything that decides how a body moves.
 
     pellet: (extra mass over the body's, place in the body in m). rolling: m, arm of the rolling resistance.
-    adhesion: (pull per mass in m/s², reach in m): the ground pulls what leaves it, up to that distance.
+    adhesion: (pull per mass in m/s², reach in m): the ground pulls what leaves it, ever less up to that distance.
     bump: (x, y, radius, height) in m of a spherical cap on the ground that nobody mentioned.
     push: see ``Push``. ground_motion: see ``GroundMotion``.
     """
@@ -295,7 +295,8 @@ class _Recorder:
         body = self._world.body
         turn = self._data.xmat[self._body].reshape(3, 3)
         low = body.half[0] if body.shape == "sphere" else float(np.abs(turn[2]) @ np.array(body.half))
-        return -strength if v[2] > 0 and q[2] - low < reach else 0.0
+        gap = max(float(q[2]) - low, 0.0)
+        return -strength * max(1 - gap / reach, 0.0) if v[2] > 0 else 0.0
 
     def _note(self, frame: int) -> None:
         data, first = self._data, self._first
