@@ -24,11 +24,11 @@ from .soft_causes import UNKNOWN as UNKNOWN_CAUSES
 from .soft_solid import Array, Solid, ball, block, surface_mesh
 from .soft_world import SoftMotion, SoftWorld, move_soft
 
-LEAST_OVER_NOISE, MOST_OVER_NOISE = 6.0, 60.0
+LEAST_OVER_NOISE, MOST_OVER_NOISE = 6.0, 80.0
 MEDIUM_FROM_PA = 1e5
 """Young's modulus from which a body is called ``medium`` instead of ``soft``."""
 
-_ATTEMPTS = 6
+_ATTEMPTS = 8
 
 
 @dataclass(frozen=True, kw_only=True)

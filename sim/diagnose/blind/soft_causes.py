@@ -66,8 +66,8 @@ def plastic_yield(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> S
     return SoftCause(
         effect="plastic_yield",
         mechanism="plastic_yield",
-        low=0.07,
-        high=0.5,
+        low=0.1,
+        high=1.0,
         change=lambda s, w: dataclasses.replace(w, yield_stress=s * young),
         parameters=lambda s: {"yield_s": s * young},
         weaker=True,
