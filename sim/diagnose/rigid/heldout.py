@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""What a candidate is worth on a take that its parameters were fitted without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .prediction import first_flights, placed, run_on
+from .shooting import Fit, Problem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Heldout:
+    """log_score: (fit takes,) nats. rms_m: predicted from the first frames. floor_rms_m, numerics_rms_m: as ``Fits``."""
+
+    log_score: Array
+    rms_m: float
+    floor_rms_m: float
+    numerics_rms_m: float
+
+
+def without_each(fit: Fit) -> Array:
+    """Numbers (takes, P) as fitted without each take, from the information that it brought."""
+    size = fit.model.size
+    whole = np.eye(size) + fit.schur.sum(axis=0)
+    found = []
+    for schur, pull in zip(fit.schur, fit.pull, strict=True):
+        # At the fit all slopes together vanish, so without this take its own is what is left over.
+        step = np.linalg.solve(whole - schur + 1e-9 * np.eye(size), -pull)
+        found.append(fit.z + np.clip(step, -2.0, 2.0))
+    return np.array(found)
+
+
+def heldout(problem: Problem, fit: Fit) -> Heldout:
+    """Of ``fit``, take by take."""
+    numbers = without_each(fit)
+    scores = []
+    for i, take in enumerate(problem.takes):
+        if take.sight.trial.role == "fit":
+            step = numbers[i] - fit.z
+            cost = fit.evaluation.linear[i].cost - 2 * float(fit.pull[i] @ step) + float(step @ fit.schur[i] @ step)
+            scores.append(-0.5 * cost)
+    starts = first_flights(problem, fit, numbers)
+    squares, coarse, floors = [], [], []
+    for i, take in enumerate(problem.takes):
+        if take.sight.trial.role != "fit" or len(take.sight.times) < 5:
+            continue
+        times = take.sight.times
+        record = run_on(problem, fit, numbers[i], take, starts[i], times - times[0])[: len(times)]
+        points = placed(take, record)
+        if take.sight.camera is None:
+            off = take.sight.seen - points
+        else:
+            off = _followed(problem, fit, i) - points
+        squares.append(np.sum(off**2, axis=-1).ravel())
+        if take.sight.camera is None:
+            floors.append(3 * take.sight.sigma**2)
+    rms = float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("nan")
+    floor = float(np.sqrt(np.mean(floors))) if floors else rms
+    return Heldout(log_score=np.array(scores), rms_m=rms, floor_rms_m=floor, numerics_rms_m=0.0 if not coarse else 0.0)
+
+
+def _followed(problem: Problem, fit: Fit, index: int) -> Array:
+    """Points (T, K, 3) of a take as ``fit`` follows them, contact by contact; NaN where it was not followed."""
+    take = problem.takes[index]
+    found = np.full((len(take.sight.times), len(take.sight.places), 3), np.nan)
+    for segment in fit.evaluation.segments:
+        if segment.take == index:
+            found[segment.frames] = placed(take, segment.record)
+    return found

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: MIT
+"""Multiple shooting: a take as a chain of short flights and contacts, each exact in itself.
+
+A take has states at nodes: at its start, after every impact, and every now and then in a long contact. From a node the
+kernel runs to the next; what was observed on the way is compared with the noise, and where it arrives is compared with
+the next node's state, with the grain of a contact (how well one simulator of impacts knows another, or reality).
+Bock and Plitt, A multiple shooting algorithm, IFAC 1984; Gauss and Newton's steps, with the states eliminated take by
+take (Schur).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .candidates import BELIEFS, Freedom, Scene, Setting
+from .observation import Sight
+from .turning import between, from_vector, inverse, moved, product, to_vector
+from .worlds import Launcher
+
+Array = NDArray[np.float64]
+
+SHIFT_STEP, TURN_STEP, SPEED_STEP = 3e-4, 3e-3, 4e-3
+"""Of the difference quotients: m, rad, m/s; spins change by the speed over the body's size. Near contact smaller
+steps measure chatter."""
+
+FREEDOM_OF_GRAIN = 4.0
+"""Degrees of freedom of the grain's Student distribution: few contacts go quite differently."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Take:
+    """A body in a take, cut at its nodes. nodes: (N,) frames, rising. states: (N, 13). end: frame after the last used.
+
+    prior: (12,) standard deviation of what the first state was guessed at. Per segment: cover, (D, 12) covariances of
+    the defects at its end as (12, 12); weights, (F,) of its frames.
+    """
+
+    sight: Sight
+    nodes: list[int]
+    states: Array
+    end: int
+    guess: Array
+    prior: Array
+    covers: list[Array] = field(default_factory=list)
+    weights: list[Array] = field(default_factory=list)
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """Frames from and to of every segment."""
+        return list(zip(self.nodes, [*self.nodes[1:], self.end], strict=True))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """Effects added to the nominal model, with its own parameters."""
+
+    freedoms: tuple[Freedom, ...]
+
+    @property
+    def size(self) -> int:
+        """Numbers in all."""
+        return BELIEFS.size + sum(f.size for f in self.freedoms)
+
+    @property
+    def steps(self) -> Array:
+        """(P,) of the difference quotients."""
+        parts = [np.full(BELIEFS.size, BELIEFS.step), *(np.full(f.size, f.step) for f in self.freedoms)]
+        return np.concatenate(parts)
+
+    def setting(self, scene: Scene, z: Array) -> Setting:
+        """Surroundings with the numbers ``z`` (P,)."""
+        setting = BELIEFS.change(scene, scene.base, z[: BELIEFS.size])
+        at = BELIEFS.size
+        for freedom in self.freedoms:
+            setting = freedom.change(scene, setting, z[at : at + freedom.size])
+            at += freedom.size
+        return setting
+
+
+@dataclass(kw_only=True, eq=False)
+class Segment:
+    """What became of one segment. frames: (F,). record: (F, 17), undisturbed; arrival: (17,), at the next node.
+
+    turn: (F, 6, 12 + B), come: (12, 12 + B): how poses and arrival change with the start and the beliefs.
+    """
+
+    take: int
+    index: int
+    frames: NDArray[np.int64]
+    record: Array
+    arrival: Array
+    chi2: Array
+    defect: Array | None
+    turn: Array | None = None
+    come: Array | None = None
+
+
+@dataclass(kw_only=True, eq=False)
+class Linear:
+    """Normal equations of one take: hessian of states and numbers together (12 N + P), slope of minus the objective."""
+
+    hessian: Array
+    slope: Array
+    cost: float
+
+
+@dataclass(kw_only=True, eq=False)
+class Evaluation:
+    """Of one model at given states and numbers."""
+
+    segments: list[Segment]
+    linear: list[Linear]
+    cost: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """All takes of one body."""
+
+    scene: Scene
+    launcher: Launcher
+    takes: list[Take]
+
+    def state_steps(self) -> Array:
+        """(12,) of the difference quotients."""
+        spin = SPEED_STEP / self.scene.body.bound
+        return np.repeat([SHIFT_STEP, TURN_STEP, SPEED_STEP, spin], 3)
+
+    def evaluate(
+        self, model: Model, z: Array, states: list[Array], *, slopes: bool = True, held: Evaluation | None = None
+    ) -> Evaluation:
+        """Residuals, and with ``slopes`` the normal equations, of ``model`` with numbers ``z`` (P,) at ``states``.
+
+        z may be (takes, P), other numbers for each take. held: an evaluation near by, whose slopes with states and beliefs are taken as they are (the chord method).
+        """
+        scene, size = self.scene, model.size
+        many = [self._variants(model, row, slopes, held is not None) for row in np.atleast_2d(z)]
+        changes = many[0][0]
+        around = [m[1] for m in many] if len(many) > 1 else [many[0][1]] * len(states)
+        variants, settings = len(changes), many[0][1]
+        tables = [scene.numbers(m[1]) for m in many]
+        rows = tables if len(many) > 1 else tables * len(states)
+        owner = np.concatenate([np.zeros(variants - len(settings) + 1), np.arange(1, len(settings))]).astype(int)
+        spans = [(i, j, a, b) for i, take in enumerate(self.takes) for j, (a, b) in enumerate(take.spans)]
+        starts, times = [], []
+        for i, j, a, b in spans:
+            take = self.takes[i]
+            last = b if b < take.end else b - 1
+            clock = take.sight.times[a : last + 1] - take.sight.times[a]
+            starts.append(moved(np.repeat(states[i][j][None], variants, axis=0), changes))
+            times += [clock * around[i][o].rate for o in owner]
+        numbers = np.concatenate([rows[i][owner] for i, _, _, _ in spans])
+        out = self.launcher.run(np.concatenate(starts), numbers, times)
+        out = out.reshape(len(spans), variants, *out.shape[1:])
+        steps = np.concatenate([self.state_steps(), model.steps])
+        if held is not None:
+            steps = model.steps[BELIEFS.size :]
+        segments: list[Segment] = []
+        linear = [
+            Linear(hessian=np.zeros((12 * len(s) + size,) * 2), slope=np.zeros(12 * len(s) + size), cost=0.0)
+            for s in states
+        ]
+        for number, ((i, j, a, b), world) in enumerate(zip(spans, out, strict=True)):
+            take = self.takes[i]
+            old = held.segments[number] if held is not None else None
+            turn = come = None
+            part = linear[i]
+            frames = np.arange(a, b)
+            count = len(frames)
+            pose = self.seen_poses(world[:, :count], [around[i][o] for o in owner])
+            chi2, slope, info = take.sight.information(pose[0, :, :3], pose[0, :, 3:7], frames)
+            weight = take.weights[j] if j < len(take.weights) else np.ones(count)
+            chi2 = chi2 * weight
+            part.cost += float(chi2.sum())
+            defect = None
+            own = slice(12 * j, 12 * j + 12)
+            where = np.r_[own, 12 * len(states[i]) : 12 * len(states[i]) + size]
+            if slopes:
+                turn = _pose_slopes(pose, steps)
+                if old is not None:
+                    turn = np.concatenate([old.turn, turn], axis=-1)
+                info, slope = info * weight[:, None, None], slope * weight[:, None]
+                part.hessian[np.ix_(where, where)] += np.einsum("fav,fab,fbw->vw", turn, info, turn, optimize=True)
+                part.slope[where] += np.einsum("fav,fa->v", turn, slope)
+            if b < take.end:
+                arrival = world[:, count]
+                defect = between(arrival[0, :13], states[i][j + 1])
+                scale = np.linalg.inv(take.covers[j]) if j < len(take.covers) else np.eye(12)
+                square = float(defect @ scale @ defect)
+                nu = FREEDOM_OF_GRAIN
+                part.cost += (nu + 12) * np.log1p(square / nu)
+                if slopes:
+                    scale = scale * (nu + 12) / (nu + square)
+                    up, down = between(arrival[:1, :13], arrival[1::2, :13]), between(arrival[:1, :13], arrival[2::2, :13])
+                    come = ((up - down) / (2 * steps[:, None])).T
+                    if old is not None:
+                        come = np.concatenate([old.come, come], axis=1)
+                    both = np.concatenate([come, -np.eye(12)], axis=1)
+                    spot = np.r_[where, 12 * (j + 1) : 12 * (j + 2)]
+                    part.hessian[np.ix_(spot, spot)] += both.T @ scale @ both
+                    part.slope[spot] += both.T @ scale @ defect
+            if j == 0:
+                off = between(states[i][0], take.guess) / take.prior
+                part.cost += float(off @ off)
+                part.hessian[own, own] += np.diag(take.prior**-2.0)
+                part.slope[own] += off / take.prior
+            segments.append(
+                Segment(
+                    take=i,
+                    index=j,
+                    frames=frames,
+                    record=world[0, :count],
+                    arrival=world[0, count] if b < take.end else world[0, count - 1],
+                    chi2=chi2,
+                    defect=defect,
+                    turn=None if turn is None else turn[..., : 12 + BELIEFS.size],
+                    come=None if come is None else come[:, : 12 + BELIEFS.size],
+                )
+            )
+        total = (float(z @ z) if z.ndim == 1 else 0.0) + sum(part.cost for part in linear)
+        return Evaluation(segments=segments, linear=linear, cost=total)
+
+    def _variants(self, model: Model, z: Array, slopes: bool, held: bool) -> tuple[Array, list[Setting]]:
+        """Changes (V, 12) of the start and the settings of a segment's worlds: undisturbed, then up and down each."""
+        settings = [model.setting(self.scene, z)]
+        if not slopes:
+            return np.zeros((1, 12)), settings
+        steps = self.state_steps()
+        first = BELIEFS.size if held else 0
+        changes = np.zeros((1 + 2 * ((0 if held else 12) + model.size - first), 12))
+        if not held:
+            for c in range(12):
+                changes[1 + 2 * c, c], changes[2 + 2 * c, c] = steps[c], -steps[c]
+        for p, step in list(enumerate(model.steps))[first:]:
+            for sign in (1, -1):
+                shifted = z.copy()
+                shifted[p] += sign * step
+                settings.append(model.setting(self.scene, shifted))
+        return changes, settings
+
+    def seen_poses(self, world: Array, settings: list[Setting]) -> Array:
+        """Poses (V, F, 7) where the believed camera would have them."""
+        pose = world[..., :7]
+        if not any(s.camera is not None for s in settings):
+            return pose
+        pose = pose.copy()
+        for v, s in enumerate(settings):
+            if s.camera is not None:
+                turn, shift = s.camera
+                pose[v, :, :3] = pose[v, :, :3] @ turn.T + shift
+                pose[v, :, 3:7] = product(_quaternion(turn), pose[v, :, 3:7])
+        return pose
+
+
+def _quaternion(turn: Array) -> Array:
+    """Of a small rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    return from_vector(Rotation.from_matrix(turn).as_rotvec())
+
+
+def _pose_slopes(pose: Array, steps: Array) -> Array:
+    """How poses (V, F, 7) change with what their worlds differ by: (F, 6, (V - 1) / 2)."""
+    up, down = pose[1::2], pose[2::2]
+    shift = (up[..., :3] - down[..., :3]) / (2 * steps[:, None, None])
+    turn = to_vector(product(up[..., 3:7], inverse(down[..., 3:7]))) / (2 * steps[:, None, None])
+    return np.moveaxis(np.concatenate([shift, turn], axis=-1), 0, -1)
+
+
+@dataclass(kw_only=True, eq=False)
+class Fit:
+    """A model fitted. schur: (takes, P, P) information of each take on the numbers; pull: (takes, P) its slope there.
+
+    evidence: log probability of the data, nats. residual cost without the priors: ``cost``.
+    """
+
+    model: Model
+    z: Array
+    states: list[Array]
+    evaluation: Evaluation
+    schur: Array
+    pull: Array
+    evidence: float
+
+    @property
+    def cost(self) -> float:
+        """The objective: chi² and its like, with the priors."""
+        return self.evaluation.cost
+
+
+def reduce_take(linear: Linear, size: int, damping: float) -> tuple[Array, Array, Array, Array]:
+    """(information on the numbers, slope there, states' answer to them (12 N, P), states' own step (12 N,))."""
+    n = len(linear.slope) - size
+    a = linear.hessian[:n, :n].copy()
+    a[np.diag_indices(n)] *= 1 + damping
+    a[np.diag_indices(n)] += 1e-9 * np.trace(a) / n * np.finfo(float).eps + 1e-12
+    b, c = linear.hessian[:n, n:], linear.hessian[n:, n:]
+    solved = np.linalg.solve(a, np.concatenate([b, linear.slope[:n, None]], axis=1))
+    answer, own = solved[:, :-1], solved[:, -1]
+    return c - b.T @ answer, linear.slope[n:] - b.T @ own, answer, own
+
+
+def solve(
+    problem: Problem,
+    model: Model,
+    z: Array,
+    states: list[Array],
+    *,
+    rounds: int = 8,
+    tolerance: float = 0.2,
+    held: Evaluation | None = None,
+) -> Fit:
+    """Gauss and Newton's steps (Levenberg and Marquardt's damping) from ``z`` (P,) and ``states``."""
+    size = model.size
+    best = problem.evaluate(model, z, states, held=held)
+    damping = 1e-3
+    for _ in range(rounds):
+        parts = [reduce_take(part, size, damping) for part in best.linear]
+        matrix = np.eye(size) * (1 + damping) + sum(p[0] for p in parts)
+        step = np.linalg.solve(matrix, sum(p[1] for p in parts) - z)
+        step = np.clip(step, -1.5, 1.5)
+        tried = [
+            moved(s, (own - answer @ step).reshape(-1, 12)) for s, (_, _, answer, own) in zip(states, parts, strict=True)
+        ]
+        new = problem.evaluate(model, z + step, tried, held=held)
+        if np.isfinite(new.cost) and new.cost < best.cost:
+            gain = best.cost - new.cost
+            z, states, best, damping = z + step, tried, new, max(damping / 5, 1e-6)
+            if gain < tolerance:
+                break
+        else:
+            damping *= 10 if damping < 1 else 100
+            if damping > 1e4:
+                break
+    parts = [reduce_take(part, size, 0.0) for part in best.linear]
+    schur, pull = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
+    matrix = np.eye(size) + schur.sum(axis=0)
+    evidence = -0.5 * best.cost - 0.5 * float(np.linalg.slogdet(0.5 * (matrix + matrix.T))[1])
+    return Fit(model=model, z=z, states=states, evaluation=best, schur=schur, pull=pull, evidence=evidence)
