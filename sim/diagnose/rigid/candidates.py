@@ -26,7 +26,7 @@ AIR = 1.2
 RUB = 5.0 / np.pi
 """Sliding is taken up five times in a contact's half period: the surfaces do not shear."""
 
-FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.006, 0.01, 0.2
+FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.006, 0.006, 0.1
 """How far a believed coefficient may be off (of itself; absolute; of itself) before that is an effect."""
 
 UNKNOWN_RESTITUTION, UNKNOWN_RESTITUTION_SPREAD = 0.35, 0.2
@@ -112,7 +112,7 @@ Change = Callable[[Scene, Setting, Array], Setting]
 class Freedom:
     """An effect's free numbers. change: setting and numbers (P,) to setting. values: numbers to the effect's own
     parameters. starts: numbers to begin with; neutral comes first where several do. positive: the first number is
-    an amount, of which less than none means nothing."""
+    an amount, of which less than none means nothing. grid: numbers to look at first, of an effect of contact."""
 
     name: str
     size: int
@@ -121,6 +121,7 @@ class Freedom:
     starts: tuple[tuple[float, ...], ...]
     positive: bool = False
     step: float = 0.05
+    grid: tuple[tuple[float, ...], ...] = ((0.0,),)
 
 
 def drag_reference(body: RigidBody) -> float:
@@ -304,6 +305,7 @@ FREEDOMS: Mapping[str, Freedom] = {
             change=_friction,
             values=lambda scene, s, z: {"friction": s.friction},
             starts=((0.0,),),
+            grid=tuple((0.25 * k,) for k in range(-12, 13)),
         ),
         Freedom(
             name="restitution",
@@ -311,6 +313,7 @@ FREEDOMS: Mapping[str, Freedom] = {
             change=_restitution,
             values=lambda scene, s, z: {"restitution": s.restitution},
             starts=((0.0,),),
+            grid=tuple((0.1 * k,) for k in range(-20, 21)),
         ),
         Freedom(
             name="rolling_resistance",
@@ -319,14 +322,16 @@ FREEDOMS: Mapping[str, Freedom] = {
             values=lambda scene, s, z: {"lever_arm": max(s.rolling, 0.0)},
             starts=((0.3,),),
             positive=True,
+            grid=tuple((z,) for z in (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)),
         ),
         Freedom(
             name="adhesion",
             size=2,
             change=_adhesion,
             values=lambda scene, s, z: {"pull_per_mass": s.pull, "reach": s.reach},
-            starts=((-1.0, 0.0), (0.5, 0.0)),
+            starts=((0.0, 0.0),),
             step=0.1,
+            grid=tuple((a, b) for a in (-3.0, -1.5, -0.7, 0.0, 0.7, 1.5) for b in (-1.5, -0.7, 0.0, 0.7, 1.5)),
         ),
         Freedom(
             name="mass_offset",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Sequence
@@ -22,8 +23,8 @@ from .heldout import heldout
 from .misfit import misfit
 from .observation import frame_pose, sights
 from .prediction import believed_fit, predict_points, simulate_points
-from .shooting import Fit, Model, Problem, solve
-from .tracking import track, weigh
+from .shooting import FREEDOM_OF_GRAIN, Fit, Model, Problem, solve
+from .tracking import camera_guess, track, weigh
 from .where import discrepancies
 from .worlds import Launcher
 
@@ -31,8 +32,20 @@ Array = NDArray[np.float64]
 
 ROUNDS = 10
 
+CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion")
+"""Effects that act in contact alone."""
+
+LOOSE = 300.0
+"""Factor on the grain while only flights count."""
+
 PROMISING = 12.0
 """Nats below the best within which a single effect is refined, and combined with others."""
+
+FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
+"""Nats over the nominal model, and misfit, above which an effect is fitted with nodes of its own."""
+
+MOVED_MISFIT = 3.0
+"""Misfit of the nominal model above which a moved camera is followed on its own."""
 
 PAIR_MISFIT = 1.6
 """Misfit of the best single effect above which pairs are tried."""
@@ -40,10 +53,11 @@ PAIR_MISFIT = 1.6
 
 @dataclass(kw_only=True, eq=False)
 class BodyFits:
-    """All fits of one body: by effects."""
+    """All fits of one body: by effects; flown: with states that flights alone fix, by effects."""
 
     problem: Problem
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
 
 
 class Cancelled(Exception):
@@ -74,13 +88,13 @@ class RigidFits:
     def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
         """By trial; see ``Fits``."""
         key = None if fit is None else fit.effects
-        return discrepancies(self.capture, [(b.problem, b.fits[()], None if key is None else b.fits[key]) for b in self.bodies])
+        return discrepancies(self.capture, [(b.fits[()], None if key is None else b.fits[key]) for b in self.bodies])
 
     def _joined(self, how, fit: CandidateFit, trials: list[Trial]) -> dict[str, Array]:  # type: ignore[no-untyped-def]
         joined: dict[str, Array] = {}
         for body in self.bodies:
-            found = believed_fit(body.problem, body.fits[()]) if fit is self.nominal else body.fits[fit.effects]
-            for name, (columns, points) in how(body.problem, found).items():
+            found = believed_fit(body.fits[()]) if fit is self.nominal else body.fits[fit.effects]
+            for name, (columns, points) in how(found).items():
                 trial = next(t for t in trials if t.name == name)
                 if name not in joined:
                     joined[name] = np.zeros((len(points), trial.rest_points.shape[0], 3))
@@ -122,12 +136,16 @@ def fit_rigid(
     for body in bodies:
         _fit_nominal(body)
         tick("nominal")
-        _fit(body, (FREEDOMS["friction"], FREEDOMS["restitution"]))
-        tick("refitted")
         for freedom in wanted:
             if time.monotonic() - started < budget_s:
                 _fit(body, (freedom,))
+                if freedom.name == "camera_pose":
+                    _moved_camera(body)
             tick(freedom.name)
+        _refit_beliefs(body)
+        tick("refitted")
+        if time.monotonic() - started < budget_s:
+            _follow_best(body)
         _refine(body, started + budget_s)
         _pairs(body, wanted, started + budget_s)
     return _assemble(capture, bodies)
@@ -179,20 +197,106 @@ def _fit(body: BodyFits, freedoms: tuple[Freedom, ...], base: Fit | None = None)
     begin = nominal if base is None else base
     model = Model(freedoms=freedoms)
     new = freedoms[len(begin.model.freedoms) :]
+    slopes = nominal.evaluation if begin.problem is problem else begin.evaluation
+    problem = begin.problem
     starts: list[Array] = [begin.z]
     for freedom in new:
         starts = [np.concatenate([z, s]) for z in starts for s in freedom.starts]
-    fits = [(z, begin.states) for z in starts]
-    if len(starts) > 1:
-        first = [solve(problem, model, z, begin.states, rounds=2, held=nominal.evaluation) for z in starts]
+    if new[0].name not in CONTACTS:
+        # In flight everything is nearly linear: contacts join in once the forces are about right.
+        loose = _loosened(problem)
+        flown = [solve(loose, model, z, begin.states, rounds=3, held=slopes) for z in starts]
+        flown = sorted(flown, key=lambda f: -f.evidence)[:3]
+        fits = [(f.z, f.states) for f in flown]
+    else:
+        fits = [_scanned(body, begin, model, new[-1])]
+    if len(fits) > 1:
+        first = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
         first.sort(key=lambda f: -f.evidence)
         fits = [(f.z, f.states) for f in first[:2]]
-    done = [solve(problem, model, z, s, rounds=ROUNDS, held=nominal.evaluation) for z, s in fits]
+    done = [solve(problem, model, z, s, rounds=ROUNDS, held=slopes) for z, s in fits]
     best = max(done, key=lambda f: f.evidence)
     key = tuple(f.name for f in freedoms)
     if key not in body.fits or body.fits[key].evidence < best.evidence:
         body.fits[key] = best
     return best
+
+
+def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: Freedom) -> tuple[Array, list[Array]]:
+    """Where to begin with an effect of contact: flights fix the states, whatever it is; then its best numbers on a grid.
+
+    Begun from the nominal fit, states that were bent to wrong contacts would hold on to them.
+    """
+    problem = begin.problem
+    key = tuple(f.name for f in begin.model.freedoms)
+    if key not in body.flown:
+        body.flown[key] = solve(_loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
+    flown = body.flown[key]
+    spreads = _arrival_spreads(problem, flown)
+    base = begin.z.copy()
+    base[: BELIEFS.size] = 0.0
+    tried = [np.concatenate([base, s]) for s in freedom.grid]
+    costs = []
+    for z in tried:
+        look = problem.evaluate(model, z, flown.states, slopes=False)
+        squares = np.array(
+            [
+                s.defect @ np.linalg.solve(c, s.defect)
+                for s, c in zip(look.segments, spreads, strict=True)
+                if s.defect is not None and c is not None
+            ]
+        )
+        own = float(z[len(base) :] @ z[len(base) :])
+        costs.append(own + float(np.sum((FREEDOM_OF_GRAIN + 12) * np.log1p(squares / FREEDOM_OF_GRAIN))))
+    return tried[int(np.argmin(costs))], flown.states
+
+
+def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
+    """Covariances (12, 12) of the defects where flights alone fix the states: of both states and of the grain."""
+    found: list[Array | None] = []
+    for segment in flown.evaluation.segments:
+        if segment.defect is None or segment.come is None:
+            found.append(None)
+            continue
+        hessian = flown.evaluation.linear[segment.take].hessian
+        first, second = 12 * segment.index, 12 * segment.index + 12
+        here = np.linalg.pinv(hessian[first:second, first:second] + 1e-6 * np.eye(12))
+        there = np.linalg.pinv(hessian[second : second + 12, second : second + 12] + 1e-6 * np.eye(12))
+        come = segment.come[:, :12]
+        found.append(problem.takes[segment.take].covers[segment.index] + come @ here @ come.T + there)
+    return found
+
+
+def _moved_camera(body: BodyFits) -> None:
+    """Fit ``camera_pose`` with nodes of its own: seen from elsewhere, the body meets the ground at other times."""
+    problem, nominal = body.problem, body.fits[()]
+    if misfit(nominal).ratio < MOVED_MISFIT:
+        return
+    freedom = FREEDOMS["camera_pose"]
+    model = Model(freedoms=(freedom,))
+    z = np.concatenate([np.zeros(BELIEFS.size), camera_guess(problem)])
+    for _ in range(2):
+        z = _followed(body, model, z).z
+
+
+def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
+    """``model`` fitted with nodes where it meets the ground itself, from the numbers ``z``; kept where it is better."""
+    problem = body.problem
+    takes = track(problem.scene, problem.launcher, [t.sight for t in problem.takes], model=model, z=z)
+    other = dataclasses.replace(problem, takes=takes)
+    weigh(other, model, z)
+    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=4)
+    begin = flown.z if model.freedoms[-1].name not in CONTACTS else z
+    fit = solve(other, model, begin, flown.states, rounds=ROUNDS)
+    key = tuple(f.name for f in model.freedoms)
+    if key not in body.fits or body.fits[key].evidence < fit.evidence:
+        body.fits[key] = fit
+    return fit
+
+
+def _loosened(problem: Problem) -> Problem:
+    takes = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.takes]
+    return dataclasses.replace(problem, takes=takes)
 
 
 def _refine(body: BodyFits, until: float) -> None:
@@ -204,9 +308,28 @@ def _refine(body: BodyFits, until: float) -> None:
         if time.monotonic() > until:
             return
         key = tuple(f.name for f in fit.model.freedoms)
-        new = solve(body.problem, fit.model, fit.z, fit.states, rounds=4)
+        new = solve(fit.problem, fit.model, fit.z, fit.states, rounds=4)
         if new.evidence > fit.evidence:
             body.fits[key] = new
+
+
+def _refit_beliefs(body: BodyFits) -> None:
+    """The nominal model with its own coefficients free: both contact effects, without a new one."""
+    asked = ("friction",) in body.fits
+    first = body.fits["friction",] if asked else _fit(body, (FREEDOMS["friction"],))
+    _fit(body, (FREEDOMS["friction"], FREEDOMS["restitution"]), first)
+    if not asked:
+        del body.fits["friction",]
+
+
+def _follow_best(body: BodyFits) -> None:
+    """The best effects once more with nodes of their own, where the nominal model's may stand in the way."""
+    nominal = body.fits[()]
+    singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:2]
+    for fit in singles:
+        gained = fit.evidence - nominal.evidence
+        if fit.problem is body.problem and gained > FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
+            _followed(body, fit.model, fit.z)
 
 
 def _pairs(body: BodyFits, wanted: list[Freedom], until: float) -> None:
@@ -215,7 +338,7 @@ def _pairs(body: BodyFits, wanted: list[Freedom], until: float) -> None:
     if not singles:
         return
     singles.sort(key=lambda item: -item[1].evidence)
-    if misfit(body.problem, singles[0][1]).ratio < PAIR_MISFIT:
+    if misfit(singles[0][1]).ratio < PAIR_MISFIT:
         return
     for name, fit in singles[:2]:
         for freedom in wanted:
@@ -231,10 +354,10 @@ def _pairs(body: BodyFits, wanted: list[Freedom], until: float) -> None:
 def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     keys = [k for k in bodies[0].fits if all(k in b.fits for b in bodies)]
     made = {}
-    held = {k: [heldout(b.problem, b.fits[k]) for b in bodies] for k in keys}
+    held = {k: [heldout(b.fits[k]) for b in bodies] for k in keys}
     for k in keys:
         made[k] = _candidate(capture, bodies, k, held[k])
-    believed = [heldout(b.problem, believed_fit(b.problem, b.fits[()])) for b in bodies]
+    believed = [heldout(believed_fit(b.fits[()])) for b in bodies]
     floor = min(c.heldout_rms_m for c in made.values())
     refit = made[("friction", "restitution")]
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
@@ -252,7 +375,8 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
 
 def _candidate(capture: Capture, bodies: list[BodyFits], key: tuple[str, ...], held) -> CandidateFit:  # type: ignore[no-untyped-def]
     first = max(bodies, key=lambda b: float(np.trace(b.fits[key].schur.sum(axis=0))))
-    fit, scene = first.fits[key], first.problem.scene
+    fit = first.fits[key]
+    scene = fit.problem.scene
     cover = np.linalg.inv(np.eye(fit.model.size) + fit.schur.sum(axis=0))
     spread = 0.5 * (cover + cover.T)
     rng = np.random.default_rng(0)
@@ -273,7 +397,7 @@ def _candidate(capture: Capture, bodies: list[BodyFits], key: tuple[str, ...], h
         if freedom.positive and _amount(fit, name) < 0:
             # Less than none of it: what is left of it is the nominal model with a number too many.
             evidence = min(evidence, sum(b.fits[()].evidence for b in bodies) - 3.0)
-    ratios = [misfit(b.problem, b.fits[key]) for b in bodies]
+    ratios = [misfit(b.fits[key]) for b in bodies]
     square = sum(m.flight + m.contact for m in ratios) / max(1, sum(m.flight_count + m.contact_count for m in ratios))
     return CandidateFit(
         effects=key,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .prediction import first_flights, placed, run_on
-from .shooting import Fit, Problem
+from .prediction import first_states, placed, run_on, shown_frames
+from .shooting import Fit
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,9 @@ def without_each(fit: Fit) -> Array:
     return np.array(found)
 
 
-def heldout(problem: Problem, fit: Fit) -> Heldout:
+def heldout(fit: Fit) -> Heldout:
     """Of ``fit``, take by take."""
+    problem = fit.problem
     numbers = without_each(fit)
     scores = []
     for i, take in enumerate(problem.takes):
@@ -45,18 +46,17 @@ def heldout(problem: Problem, fit: Fit) -> Heldout:
             step = numbers[i] - fit.z
             cost = fit.evaluation.linear[i].cost - 2 * float(fit.pull[i] @ step) + float(step @ fit.schur[i] @ step)
             scores.append(-0.5 * cost)
-    starts = first_flights(problem, fit, numbers)
+    starts = first_states(fit, numbers)
     squares, coarse, floors = [], [], []
     for i, take in enumerate(problem.takes):
         if take.sight.trial.role != "fit" or len(take.sight.times) < 5:
             continue
         times = take.sight.times
-        record = run_on(problem, fit, numbers[i], take, starts[i], times - times[0])[: len(times)]
+        begin, state = starts[i]
+        record = run_on(fit, numbers[i], state, times[begin:] - times[begin])
         points = placed(take, record)
-        if take.sight.camera is None:
-            off = take.sight.seen - points
-        else:
-            off = _followed(problem, fit, i) - points
+        off = (take.sight.seen if take.sight.camera is None else _followed(fit, i))[begin:] - points
+        off = off[max(0, shown_frames(fit, take) - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
         if take.sight.camera is None:
             floors.append(3 * take.sight.sigma**2)
@@ -65,9 +65,9 @@ def heldout(problem: Problem, fit: Fit) -> Heldout:
     return Heldout(log_score=np.array(scores), rms_m=rms, floor_rms_m=floor, numerics_rms_m=0.0 if not coarse else 0.0)
 
 
-def _followed(problem: Problem, fit: Fit, index: int) -> Array:
+def _followed(fit: Fit, index: int) -> Array:
     """Points (T, K, 3) of a take as ``fit`` follows them, contact by contact; NaN where it was not followed."""
-    take = problem.takes[index]
+    take = fit.problem.takes[index]
     found = np.full((len(take.sight.times), len(take.sight.places), 3), np.nan)
     for segment in fit.evaluation.segments:
         if segment.take == index:

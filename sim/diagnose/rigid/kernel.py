@@ -25,8 +25,8 @@ ITERATIONS = 512
 
 MOST_CONTACTS = 6
 SWEEPS = 8
-CALM_STEP, CALM_SPEED = 1e-3, 0.02
-"""Step in s, and speed in m/s towards or off the plane below which a body that touches takes it."""
+CALM_STEP, CALM_SPEED, CALM_FORCE = 1e-3, 0.02, 40.0
+"""Step in s, and what a body that touches may have to take it: speed in m/s towards or off the plane, m/s² of force."""
 
 GRAVITY, DRAG, WIND, LIFT = 0, 3, 4, 7
 TETHER, LENGTH, ANCHOR, STRING = 8, 9, 10, 13
@@ -178,7 +178,8 @@ def advance(
                             if depth >= 0 and depth < 4 * CALM_STEP * ti.max(-un, 0.0):
                                 calm = False
                             if depth < 0 and found < MOST_CONTACTS:
-                                if ti.abs(un) > CALM_SPEED:
+                                # Where a bounce turns round, its speed is small too, but not its spring's force.
+                                if ti.abs(un) > CALM_SPEED or p[w, SPRING] * depth < -CALM_FORCE:
                                     calm = False
                                 # What the contact's velocity is to be after the step, along the plane and across it.
                                 keep = ti.exp(-p[w, RUB] * h)

@@ -34,8 +34,9 @@ class Misfit:
         return float(np.sqrt((self.flight + self.contact) / count)) if count else 1.0
 
 
-def misfit(problem: Problem, fit: Fit) -> Misfit:
+def misfit(fit: Fit) -> Misfit:
     """Of ``fit``."""
+    problem = fit.problem
     flight = contact = 0.0
     flights = contacts = 0
     setting = fit.model.setting(problem.scene, fit.z)

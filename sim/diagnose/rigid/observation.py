@@ -15,6 +15,16 @@ from .turning import skew, to_matrix
 Array = NDArray[np.float64]
 
 
+SCALE_ERROR = 0.006
+"""Of the way that a single point went: how far a film's scale is off from place to place."""
+
+TOGETHER = 4.0
+"""Frames, or shares of a take, whose errors are one where they are not independent."""
+
+STIFF = 0.3
+"""Root mean square change of distances over the noise, below which points are computed from a pose."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sight:
     """One body in one take. T frames, K points of it.
@@ -75,10 +85,36 @@ def sights(capture: Capture, trial: Trial, index: int, center: Array) -> Sight:
         times=trial.times,
         seen=trial.observed[:, columns],
         places=trial.rest_points[columns] - center,
-        sigma=capture.noise_sigma,
+        sigma=effective_sigma(capture, trial, columns),
         camera=capture.camera if trial.pixels is not None else None,
         columns=columns,
     )
+
+
+def effective_sigma(capture: Capture, trial: Trial, columns: NDArray[np.int64]) -> float:
+    """Standard deviation that the coordinates would have if they erred independently, knowing as much as they do.
+
+    Points that keep their distances far better than their noise come from a measured pose, and err together, from frame
+    to frame too. A single point in the distance is read off a picture, whose scale errs slowly along the way.
+    """
+    sigma = capture.noise_sigma
+    if trial.points is None:
+        return sigma
+    points = trial.points[:, columns]
+    if len(columns) == 1:
+        seen = points[np.isfinite(points).all(axis=(1, 2)), 0]
+        reach = float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
+        return float(np.hypot(sigma, SCALE_ERROR * reach * np.sqrt(max(1.0, len(seen) / TOGETHER))))
+    if len(columns) < 4:
+        return sigma
+    rest = trial.rest_points[columns]
+    off = []
+    for frame in points[np.isfinite(points).all(axis=(1, 2))][:40]:
+        apart = np.linalg.norm(frame[1:] - frame[:1], axis=1) - np.linalg.norm(rest[1:] - rest[:1], axis=1)
+        off.append(apart)
+    if len(off) >= 3 and float(np.sqrt(np.mean(np.square(off)))) < STIFF * sigma:
+        return float(sigma * np.sqrt(len(columns) / 2 * TOGETHER))
+    return sigma
 
 
 def project(camera: Camera, points: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .candidates import BELIEFS
-from .shooting import Fit, Model, Problem, Take
+from .shooting import Fit, Model, Take
 from .tracking import settle
 from .turning import to_matrix
 
@@ -17,20 +17,21 @@ Array = NDArray[np.float64]
 Points = dict[str, tuple[NDArray[np.int64], Array]]
 
 SHOWN = 0.16
-"""Seconds from which a complete take is predicted, or as long as it flies."""
+"""Seconds from which a complete take is predicted where no predict trial says how much there is to see."""
 
 
-def believed_fit(problem: Problem, nominal: Fit) -> Fit:
+def believed_fit(nominal: Fit) -> Fit:
     """The nominal model exactly as believed, its states fitted."""
     model, z = Model(freedoms=()), np.zeros(BELIEFS.size)
-    states = settle(problem, model, z, nominal.states, 3)
+    states = settle(nominal.problem, model, z, nominal.states, 3)
     return dataclasses.replace(nominal, model=model, z=z, states=states)
 
 
-def run_on(problem: Problem, fit: Fit, z: Array, take: Take, state: Array, times: Array) -> Array:
+def run_on(fit: Fit, z: Array, state: Array, times: Array) -> Array:
     """Record (M, 17) at ``times``, s since ``state`` in the recording's clock."""
-    setting = fit.model.setting(problem.scene, z)
-    return problem.launcher.run(state[None], problem.scene.numbers([setting]), [times * setting.rate])[0]
+    scene = fit.problem.scene
+    setting = fit.model.setting(scene, z)
+    return fit.problem.launcher.run(state[None], scene.numbers([setting]), [times * setting.rate])[0, : len(times)]
 
 
 def placed(take: Take, record: Array) -> Array:
@@ -38,44 +39,53 @@ def placed(take: Take, record: Array) -> Array:
     return np.asarray(record[:, None, :3] + np.einsum("mij,kj->mki", to_matrix(record[:, 3:7]), take.sight.places))
 
 
-def predict_points(problem: Problem, fit: Fit) -> Points:
+def predict_points(fit: Fit) -> Points:
     """By predict trial: columns and points (P, K, 3) at its ``predict_times``."""
     found: Points = {}
-    for take, states in zip(problem.takes, fit.states, strict=True):
+    for take, states in zip(fit.problem.takes, fit.states, strict=True):
         wanted = take.sight.trial.predict_times
         if wanted is None:
             continue
         begin = take.sight.times[take.nodes[-1]]
-        record = run_on(problem, fit, fit.z, take, states[-1], wanted - begin)
-        found[take.sight.trial.name] = take.sight.columns, placed(take, record[: len(wanted)])
+        record = run_on(fit, fit.z, states[-1], wanted - begin)
+        found[take.sight.trial.name] = take.sight.columns, placed(take, record)
     return found
 
 
-def first_flights(problem: Problem, fit: Fit, z: Array) -> list[Array]:
-    """First states (13,) of all takes from nothing but their first frames. z: (P,) or (takes, P)."""
-    short = []
-    for take, states in zip(problem.takes, fit.states, strict=True):
-        times = take.sight.times - take.sight.times[0]
-        last = take.nodes[1] if len(take.nodes) > 1 else take.end
-        touched = [s for s in fit.evaluation.segments if problem.takes[s.take] is take and s.index == 0]
-        free = np.flatnonzero(touched[0].record[:, 15] > 0) if touched else np.zeros(0)
-        end = int(free[0]) if len(free) and free[0] >= 4 else last
-        limit = 2 * SHOWN if take.sight.camera is not None else SHOWN
-        if take.sight.poses_alone:
-            end = min(end, int(np.searchsorted(times, limit)) + 1)
-        end = max(end, min(4, take.end))
+def shown_frames(fit: Fit, take: Take) -> int:
+    """As many first frames of ``take`` as the predict trials show, or ``SHOWN`` seconds."""
+    spans = [
+        t.sight.times[-1] - t.sight.times[0] for t in fit.problem.takes if t.sight.trial.predict_times is not None
+    ]
+    times = take.sight.times - take.sight.times[0]
+    count = int(np.searchsorted(times, float(np.median(spans)) if spans else SHOWN, side="right"))
+    return int(np.clip(count, min(4, take.end), take.end))
+
+
+def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
+    """(frame, state (13,) there) of all takes, known from no more than their first frames. z: (P,) or (takes, P)."""
+    short, states = [], []
+    for take, whole in zip(fit.problem.takes, fit.states, strict=True):
+        end = shown_frames(fit, take)
+        nodes = [n for n in take.nodes if n < end - 2] or [0]
+        cut = end - nodes[-1]
+        weights = [*take.weights[: len(nodes) - 1], take.weights[len(nodes) - 1][:cut]]
         short.append(
-            dataclasses.replace(take, nodes=[0], states=states[:1], end=end, covers=[], weights=[np.ones(end)])
+            dataclasses.replace(
+                take, nodes=nodes, end=end, states=whole[: len(nodes)], covers=take.covers[: len(nodes) - 1], weights=weights
+            )
         )
-    small = dataclasses.replace(problem, takes=short)
-    return [s[0] for s in settle(small, fit.model, z, [s[:1] for s in fit.states], 3)]
+        states.append(whole[: len(nodes)])
+    found = settle(dataclasses.replace(fit.problem, takes=short), fit.model, z, states, 3)
+    return [(t.nodes[-1], s[-1]) for t, s in zip(short, found, strict=True)]
 
 
-def simulate_points(problem: Problem, fit: Fit) -> Points:
+def simulate_points(fit: Fit) -> Points:
     """By trial: columns and points (T, K, 3) at its frames, run from its first frames without another look."""
     found: Points = {}
-    for take, state in zip(problem.takes, first_flights(problem, fit, fit.z), strict=True):
+    for i, (take, (begin, state)) in enumerate(zip(fit.problem.takes, first_states(fit, fit.z), strict=True)):
         times = take.sight.times
-        record = run_on(problem, fit, fit.z, take, state, times - times[0])
-        found[take.sight.trial.name] = take.sight.columns, placed(take, record[: len(times)])
+        record = run_on(fit, fit.z, state, times[begin:] - times[begin])
+        earlier = [s.record[s.frames < begin] for s in fit.evaluation.segments if s.take == i]
+        found[take.sight.trial.name] = take.sight.columns, placed(take, np.concatenate([*earlier, record]))
     return found

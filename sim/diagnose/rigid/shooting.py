@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cholesky_banded, solveh_banded
+from scipy.special import gammaln
 
 from .candidates import BELIEFS, Freedom, Scene, Setting
 from .observation import Sight
@@ -25,6 +27,12 @@ Array = NDArray[np.float64]
 SHIFT_STEP, TURN_STEP, SPEED_STEP = 3e-4, 3e-3, 4e-3
 """Of the difference quotients: m, rad, m/s; spins change by the speed over the body's size. Near contact smaller
 steps measure chatter."""
+
+LONGEST_STEP = 2.0
+"""Of a number of an effect, in standard deviations of its prior."""
+
+PLAUSIBLE = 3.0
+"""Standard deviations within which the nominal model's own numbers may move; beyond that it is an effect."""
 
 FREEDOM_OF_GRAIN = 4.0
 """Degrees of freedom of the grain's Student distribution: few contacts go quite differently."""
@@ -277,6 +285,7 @@ class Fit:
     evidence: log probability of the data, nats. residual cost without the priors: ``cost``.
     """
 
+    problem: Problem
     model: Model
     z: Array
     states: list[Array]
@@ -294,11 +303,14 @@ class Fit:
 def reduce_take(linear: Linear, size: int, damping: float) -> tuple[Array, Array, Array, Array]:
     """(information on the numbers, slope there, states' answer to them (12 N, P), states' own step (12 N,))."""
     n = len(linear.slope) - size
-    a = linear.hessian[:n, :n].copy()
-    a[np.diag_indices(n)] *= 1 + damping
-    a[np.diag_indices(n)] += 1e-9 * np.trace(a) / n * np.finfo(float).eps + 1e-12
     b, c = linear.hessian[:n, n:], linear.hessian[n:, n:]
-    solved = np.linalg.solve(a, np.concatenate([b, linear.slope[:n, None]], axis=1))
+    # A state meets the next one only: 23 diagonals on either side. Solving them alone also keeps clear of the threads
+    # of a full solver, which on a busy machine wait for each other.
+    band = np.zeros((24, n))
+    for k in range(min(24, n)):
+        band[k, : n - k] = np.diagonal(linear.hessian[:n, :n], -k)
+    band[0] = band[0] * (1 + damping) + 1e-9
+    solved = solveh_banded(band, np.concatenate([b, linear.slope[:n, None]], axis=1), lower=True, check_finite=False)
     answer, own = solved[:, :-1], solved[:, -1]
     return c - b.T @ answer, linear.slope[n:] - b.T @ own, answer, own
 
@@ -319,9 +331,11 @@ def solve(
     damping = 1e-3
     for _ in range(rounds):
         parts = [reduce_take(part, size, damping) for part in best.linear]
-        matrix = np.eye(size) * (1 + damping) + sum(p[0] for p in parts)
+        matrix = np.eye(size) + sum(p[0] for p in parts)
+        matrix[np.diag_indices(size)] *= 1 + damping
         step = np.linalg.solve(matrix, sum(p[1] for p in parts) - z)
-        step = np.clip(step, -1.5, 1.5)
+        step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        step[: BELIEFS.size] = np.clip(z[: BELIEFS.size] + step[: BELIEFS.size], -PLAUSIBLE, PLAUSIBLE) - z[: BELIEFS.size]
         tried = [
             moved(s, (own - answer @ step).reshape(-1, 12)) for s, (_, _, answer, own) in zip(states, parts, strict=True)
         ]
@@ -339,4 +353,27 @@ def solve(
     schur, pull = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
     matrix = np.eye(size) + schur.sum(axis=0)
     evidence = -0.5 * best.cost - 0.5 * float(np.linalg.slogdet(0.5 * (matrix + matrix.T))[1])
-    return Fit(model=model, z=z, states=states, evaluation=best, schur=schur, pull=pull, evidence=evidence)
+    evidence += _volumes(problem, best, size)
+    return Fit(problem=problem, model=model, z=z, states=states, evaluation=best, schur=schur, pull=pull, evidence=evidence)
+
+
+def _volumes(problem: Problem, evaluation: Evaluation, size: int) -> float:
+    """ln of what Laplace's integral over the states is worth against the priors' and the defects' own volumes.
+
+    It hardly differs between candidates at the same nodes, and makes those at other nodes comparable.
+    """
+    total = 0.0
+    nu = FREEDOM_OF_GRAIN
+    # Student's distribution against the normal one, of 12 numbers.
+    student = gammaln((nu + 12) / 2) - gammaln(nu / 2) - 6 * np.log(nu / 2)
+    for take, part in zip(problem.takes, evaluation.linear, strict=True):
+        n = len(part.slope) - size
+        hessian = part.hessian[:n, :n]
+        band = np.zeros((24, n))
+        for k in range(min(24, n)):
+            band[k, : n - k] = np.diagonal(hessian, -k)
+        total -= float(np.sum(np.log(np.abs(cholesky_banded(band + 0.0, lower=True, check_finite=False)[0]))))
+        total -= float(np.sum(np.log(take.prior)))
+        for cover in take.covers[: len(take.nodes) - 1]:
+            total += float(student) - 0.5 * float(np.sum(np.log(np.diag(cover))))
+    return total

@@ -31,6 +31,9 @@ LONGEST_IMPACT = 0.05
 
 MOST_NODES = 24
 
+GUESS_HEIGHT = 0.01
+"""m, what a height from one frame's pixels errs by."""
+
 NOMINAL = Model(freedoms=())
 
 
@@ -217,3 +220,40 @@ def weigh(problem: Problem, model: Model, z: Array) -> None:
         _, _, info = take.sight.information(segment.record[:, :3], segment.record[:, 3:7], segment.frames)
         count = len(segment.frames)
         take.weights.append(frame_weights(grain, scene.body, segment.record, times[:count], weight, info))
+
+
+def camera_guess(problem: Problem) -> Array:
+    """First numbers (6,) of a moved camera: poses from pixels alone, where the body turns round or lies, touch ground.
+
+    The body's height over the ground then should be none; how it is not says how the camera is turned and shifted.
+    """
+    scene = problem.scene
+    camera, body, ground = scene.capture.camera, scene.body, scene.capture.ground
+    assert camera is not None
+    place, normal, foot = camera.matrix[:3, 3], ground.unit_normal, np.asarray(ground.point)
+    rows, values = [], []
+    for take in problem.takes:
+        if take.sight.trial.predict_times is not None:
+            continue
+        heights, poses, guess = [], [], None
+        for frame in range(len(take.sight.times)):
+            found = frame_pose(take.sight, frame, guess)
+            if found is None:
+                continue
+            guess = found
+            low = (found[0] - foot + body.corners @ found[1].T) @ normal - body.radius
+            heights.append(float(low.min()))
+            poses.append(found[0])
+        if len(heights) < 8:
+            continue
+        # The lowest tenth of a take, in the middle of what its noise leaves, is contact.
+        count = max(4, len(heights) // 5)
+        for k in np.argsort(heights)[count // 4 : count]:
+            lever = poses[k] - place
+            rows.append(np.concatenate([0.03 * np.cross(lever, normal), 0.02 * normal]))
+            values.append(-heights[k])
+    if not rows:
+        return np.zeros(6)
+    matrix, right = np.array(rows) / GUESS_HEIGHT, np.array(values) / GUESS_HEIGHT
+    share = 12.0 / max(12.0, len(rows))  # poses of one take err together
+    return np.linalg.solve(np.eye(6) + share * matrix.T @ matrix, share * matrix.T @ right)

@@ -10,7 +10,7 @@ from ..analysis import DIRECTIONS, Discrepancy, Interval
 from ..capture import Capture
 from .candidates import BELIEFS, Setting
 from .observation import project
-from .prediction import believed_fit, placed
+from .prediction import placed
 from .shooting import Fit, Model, Problem, Take
 from .turning import to_matrix
 
@@ -23,7 +23,7 @@ REST_SPEED = 0.02
 """m/s, of the fastest point of a body that rests."""
 
 
-def discrepancies(capture: Capture, bodies: list[tuple[Problem, Fit, Fit | None]]) -> dict[str, Discrepancy]:
+def discrepancies(capture: Capture, bodies: list[tuple[Fit, Fit | None]]) -> dict[str, Discrepancy]:
     """By trial. Every body with its nominal fit and the fit that is to explain it, None for the raw measurement."""
     found: dict[str, Discrepancy] = {}
     for trial in capture.trials:
@@ -33,16 +33,16 @@ def discrepancies(capture: Capture, bodies: list[tuple[Problem, Fit, Fit | None]
         force = np.zeros((len(trial.times), 3))
         phases: list[str] = ["rest"] * len(trial.times)
         velocity = np.zeros((len(trial.times), 3))
-        for problem, nominal, fit in bodies:
-            for i, take in enumerate(problem.takes):
+        for nominal, fit in bodies:
+            for i, take in enumerate(nominal.problem.takes):
                 if take.sight.trial is not trial:
                     continue
-                lack, body_phases, speed = _lack(problem, nominal, fit, i)
+                lack, body_phases, speed = _lack(nominal, fit, i)
                 points[:, take.sight.columns] = np.linalg.norm(lack, axis=1)[:, None]
                 strongest = np.linalg.norm(lack, axis=1) > np.linalg.norm(force, axis=1)
                 force = np.where(strongest[:, None], lack, force)
                 phases, velocity = body_phases, speed
-                modelled = _nominal_points(problem, nominal, i)
+                modelled = _nominal_points(nominal, i)
                 if capture.camera is not None and trial.pixels is not None:
                     modelled = project(capture.camera, modelled)
                 residual[:, take.sight.columns] = take.sight.seen - modelled
@@ -56,7 +56,8 @@ def discrepancies(capture: Capture, bodies: list[tuple[Problem, Fit, Fit | None]
     return found
 
 
-def _nominal_points(problem: Problem, nominal: Fit, index: int) -> Array:
+def _nominal_points(nominal: Fit, index: int) -> Array:
+    problem = nominal.problem
     take = problem.takes[index]
     state = nominal.states[index][0]
     times = take.sight.times
@@ -65,8 +66,9 @@ def _nominal_points(problem: Problem, nominal: Fit, index: int) -> Array:
     return placed(take, record[: len(times)])
 
 
-def _fine(problem: Problem, fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
+def _fine(fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
     """(times (M,) of the recording, records (M, 17), nearest frames (M,)) of a take between its frames."""
+    problem = fit.problem
     take, setting = problem.takes[index], fit.model.setting(problem.scene, fit.z)
     times = take.sight.times
     rows, clocks = [], []
@@ -86,12 +88,12 @@ def _fine(problem: Problem, fit: Fit, index: int) -> tuple[Array, Array, NDArray
     return clock, np.concatenate(rows), np.searchsorted(middle, clock)
 
 
-def _lack(problem: Problem, nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], Array]:
+def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], Array]:
     """(force per mass lacking (T, 3), phase of every frame, velocity (T, 3))."""
-    take, scene = problem.takes[index], problem.scene
-    frames = len(take.sight.times)
     used = nominal if fit is None else fit
-    clock, record, nearest = _fine(problem, used, index)
+    take, scene = used.problem.takes[index], used.problem.scene
+    frames = len(take.sight.times)
+    clock, record, nearest = _fine(used, index)
     step = np.diff(clock, append=clock[-1] + 1e-3)
     normal = scene.capture.ground.unit_normal
     gains = np.maximum(np.diff(record[:, 13:17], axis=0, append=record[-1:, 13:17]), 0.0)
@@ -114,9 +116,9 @@ def _lack(problem: Problem, nominal: Fit, fit: Fit | None, index: int) -> tuple[
         else:
             phases.append("impact" if blow[f] > 0.05 else "contact")
     lack = np.zeros((frames, 3))
-    raw = measured(problem, nominal, index)
+    
     if fit is None:
-        return raw, phases, velocity
+        return measured(nominal, index), phases, velocity
     base = Model(freedoms=()).setting(scene, fit.z[: BELIEFS.size])
     setting = fit.model.setting(scene, fit.z)
     lack += _by_frame(_force_difference(scene, base, setting, record), nearest, frames, np.mean)
@@ -132,7 +134,7 @@ def _lack(problem: Problem, nominal: Fit, fit: Fit | None, index: int) -> tuple[
         way = velocity / (np.linalg.norm(velocity, axis=1, keepdims=True) + 1e-9)
         lack -= (setting.rolling / scene.body.bound * rate)[:, None] * way
     if setting.pull > 0:
-        gap = _gap(problem, record)
+        gap = _gap(used.problem, record)
         lack -= (_by_frame((gap < setting.reach)[:, None] * 1.0, nearest, frames, np.mean) * setting.pull) * normal
     if setting.fraction > 0:
         arm = np.einsum("fij,j->fi", to_matrix(record[:, 3:7]), setting.center)
@@ -166,11 +168,12 @@ def _gap(problem: Problem, record: Array) -> Array:
     return np.asarray(((corners - np.asarray(ground.point)) @ ground.unit_normal).min(axis=1) - body.radius)
 
 
-def measured(problem: Problem, fit: Fit, index: int) -> Array:
+def measured(fit: Fit, index: int) -> Array:
     """Force per mass (T, 3) that ``fit`` lacks, measured: curvature of what it leaves in flight, jumps in contact.
 
     What noise alone would give is taken off.
     """
+    problem = fit.problem
     take = problem.takes[index]
     times = take.sight.times
     lack = np.zeros((len(times), 3))
