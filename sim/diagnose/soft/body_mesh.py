@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""A body of tetrahedra inside a closed surface: a lattice of cells, stretched along the rays from its middle.
+
+A box becomes the lattice itself, a ball the lattice blown up to a ball, any star-shaped surface what lies between.
+Where the surface is such a lattice's own, its resolution is taken, so that nodes and vertices are the same points.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ...errors import InputError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Cells3 = tuple[int, int, int]
+
+CELLS_ACROSS = 7.0
+"""Cells along the mean extent, where the surface does not say."""
+
+MOST_CELLS = 1600
+"""Boxes of six tetrahedra; a finer surface is met by a coarser lattice."""
+
+SLIVER = 0.05
+"""Volume of the smallest cell over the median's, below which the diagonals are turned."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyMesh:
+    """nodes: (N, 3) m, rest frame. cells: (C, 4) nodes of each tetrahedron, positively oriented. lattice: boxes a side.
+
+    shapes: (C, 3, 3) inverse of the edge matrix: F = (x1 - x0, x2 - x0, x3 - x0) shapes. volumes: (C,) m³.
+    """
+
+    nodes: Array
+    cells: Indices
+    shapes: Array
+    volumes: Array
+    lattice: Cells3
+
+    @property
+    def centres(self) -> Array:
+        """(C, 3) middles of the cells."""
+        return np.asarray(self.nodes[self.cells].mean(axis=1))
+
+    def node_volumes(self) -> Array:
+        """(N,) a quarter of each cell to each of its nodes."""
+        found = np.zeros(len(self.nodes))
+        np.add.at(found, self.cells, np.repeat(self.volumes[:, None] / 4, 4, axis=1))
+        return found
+
+    def locate(self, points: Array) -> tuple[Indices, Array]:
+        """Nodes (K, 4) and weights (K, 4) of ``points`` (K, 3); a point outside is extended from the nearest cell."""
+        _, near = cKDTree(self.centres).query(points, k=min(40, len(self.cells)))
+        near = np.asarray(near).reshape(len(points), -1)
+        away = points[:, None] - self.nodes[self.cells[near, 0]]
+        inner = np.einsum("kcij,kcj->kci", self.shapes[near], away)
+        weights = np.concatenate([1 - inner.sum(axis=2, keepdims=True), inner], axis=2)
+        best = weights.min(axis=2).argmax(axis=1)
+        rows = np.arange(len(points))
+        return self.cells[near[rows, best]], weights[rows, best]
+
+
+def body_mesh(vertices: Array, faces: Indices, *, lattice: Cells3 | None = None) -> BodyMesh:
+    """Fill the closed surface ``vertices`` (V, 3), ``faces`` (F, 3); ``lattice`` sets the boxes along each axis.
+
+    A surface that is not closed, or not star-shaped seen from the middle of its bounds, is replaced by its convex hull.
+    Raises InputError when it has no inside.
+    """
+    surface = trimesh.Trimesh(vertices, faces, process=False)
+    whole = trimesh.Trimesh(vertices, faces, process=True)
+    if not whole.is_watertight or whole.volume <= 0 or not _star_shaped(surface):
+        surface = trimesh.Trimesh(vertices, faces, process=True).convex_hull
+    if surface.volume <= 1e-15:
+        raise InputError("the mesh has no inside: give a closed surface")
+    if lattice is None:
+        lattice = _own_lattice(surface) or _default_lattice(np.ptp(surface.vertices, axis=0))
+    return _tetrahedra(_nodes(surface, lattice), lattice)
+
+
+def coarser(mesh: BodyMesh, surface_vertices: Array, faces: Indices, *, factor: float) -> BodyMesh:
+    """The same body with cells larger by ``factor``."""
+    nx, ny, nz = (max(2, round(n / factor)) for n in mesh.lattice)
+    return body_mesh(surface_vertices, faces, lattice=(nx, ny, nz))
+
+
+def _middle(surface: trimesh.Trimesh) -> tuple[Array, Array]:
+    low, high = np.asarray(surface.vertices.min(axis=0)), np.asarray(surface.vertices.max(axis=0))
+    return (low + high) / 2, (high - low) / 2
+
+
+def _star_shaped(surface: trimesh.Trimesh) -> bool:
+    centre, _ = _middle(surface)
+    corners = surface.vertices[surface.faces] - centre
+    return bool((np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0).all())
+
+
+def _reach(surface: trimesh.Trimesh, centre: Array, directions: Array) -> Array:
+    """(D,) distance from ``centre`` to the surface along unit ``directions`` (D, 3)."""
+    corners = surface.vertices[surface.faces] - centre
+    turned = np.linalg.inv(np.transpose(corners, (0, 2, 1)))
+    reach = np.zeros(len(directions))
+    for start in range(0, len(directions), 256):
+        inside = np.einsum("fij,dj->dfi", turned, directions[start : start + 256])
+        hit = inside.min(axis=2) / (np.abs(inside).sum(axis=2) + 1e-300)
+        best = np.where(inside.sum(axis=2) > 0, hit, -np.inf).argmax(axis=1)
+        reach[start : start + 256] = 1 / inside.sum(axis=2)[np.arange(len(best)), best]
+    return reach
+
+
+def _nodes(surface: trimesh.Trimesh, lattice: Cells3) -> Array:
+    centre, half = _middle(surface)
+    axes = [np.linspace(-1, 1, n + 1) for n in lattice]
+    unit = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    level = np.abs(unit).max(axis=1)
+    rays = unit * half / np.where(level > 0, level, 1.0)[:, None]
+    length = np.linalg.norm(rays, axis=1)
+    ok = level > 1e-9
+    out = np.tile(centre, (len(unit), 1))
+    directions = rays[ok] / length[ok, None]
+    radial = (level[ok] * _reach(surface, centre, directions))[:, None] * directions
+    # Towards the middle the plain lattice takes over: stretched all the way in, cells at its edges would be slivers.
+    share = level[ok, None]
+    out[ok] += share * radial + (1 - share) * unit[ok] * half
+    return np.asarray(out)
+
+
+def _own_lattice(surface: trimesh.Trimesh) -> Cells3 | None:
+    """The lattice whose surface has the surface's own vertices; None if there is none that is coarse enough."""
+    quads, extent = len(surface.faces) / 4, float(np.ptp(surface.vertices, axis=0).max())
+    tree = cKDTree(surface.vertices)
+    for nx, ny, nz in itertools.product(range(2, 25), repeat=3):
+        if nx * ny + ny * nz + nz * nx != quads or nx * ny * nz > MOST_CELLS:
+            continue
+        outer = _nodes(surface, (nx, ny, nz))[_on_surface((nx, ny, nz))]
+        if len(outer) == len(surface.vertices) and float(tree.query(outer)[0].max()) < 1e-3 * extent:
+            return nx, ny, nz
+    return None
+
+
+def _on_surface(lattice: Cells3) -> NDArray[np.bool_]:
+    places = np.stack(np.meshgrid(*(np.arange(n + 1) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(((places == 0) | (places == np.asarray(lattice))).any(axis=1))
+
+
+def _default_lattice(extents: Array) -> Cells3:
+    size = float(np.cbrt(extents.prod())) / CELLS_ACROSS
+    nx, ny, nz = (int(np.clip(round(e / size), 3, 24)) for e in extents)
+    return nx, ny, nz
+
+
+def _tetrahedra(nodes: Array, lattice: Cells3) -> BodyMesh:
+    """Six tetrahedra to a box around its diagonal (Kuhn's subdivision).
+
+    All diagonals point the same way, except in bodies where that leaves slivers: there they point away from the middle,
+    so that no cell has all its nodes on two faces of a box that the surface has made one.
+    """
+    mesh = _around_diagonals(nodes, lattice, np.ones((int(np.prod(lattice)), 3), dtype=np.int64))
+    if mesh.volumes.min() > SLIVER * float(np.median(mesh.volumes)):
+        return mesh
+    boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
+    return _around_diagonals(nodes, lattice, np.where(2 * boxes + 1 >= np.asarray(lattice), 1, -1))
+
+
+def _around_diagonals(nodes: Array, lattice: Cells3, towards: Indices) -> BodyMesh:
+    """``towards`` (boxes, 3), each 1 or -1: where the diagonal of a box goes."""
+    _, ny, nz = lattice
+    strides = np.array([(ny + 1) * (nz + 1), nz + 1, 1])
+    boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
+    first = (boxes + (towards < 0)) @ strides
+    steps = towards * strides
+    cells = np.concatenate([
+        np.stack([first, first + steps[:, i], first + steps[:, i] + steps[:, j], first + steps.sum(axis=1)], axis=1)
+        for i, j, _ in itertools.permutations(range(3))
+    ])
+    edges = np.transpose(nodes[cells[:, 1:]] - nodes[cells[:, :1]], (0, 2, 1))
+    turned = np.linalg.det(edges) < 0
+    cells[turned] = cells[turned][:, [0, 2, 1, 3]]
+    edges = np.transpose(nodes[cells[:, 1:]] - nodes[cells[:, :1]], (0, 2, 1))
+    return BodyMesh(
+        nodes=nodes,
+        cells=cells,
+        shapes=np.linalg.inv(edges),
+        volumes=np.linalg.det(edges) / 6,
+        lattice=lattice,
+    )

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""Candidate effects on a soft body as vectors of free numbers, with where to start and what is plausible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .laws import Laws, with_effect
+
+Array = NDArray[np.float64]
+Values = dict[str, float]
+
+IN_FLIGHT = ("air_drag", "wind", "magnus", "buoyancy", "gravity_tilt", "tether", "time_scale", "mass_offset")
+"""Effects that show before anything is touched."""
+
+IN_CONTACT = (
+    "stiffness",
+    "internal_damping",
+    "plastic_yield",
+    "anisotropy",
+    "stiffness_gradient",
+    "friction",
+    "adhesion",
+)
+"""Effects that show from the first contact on."""
+
+NAMES = IN_FLIGHT + IN_CONTACT
+
+PELLET = 0.3
+"""Share of the mass in a pellet: a motion only tells share times offset."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One effect with p free numbers.
+
+    values: free numbers (p,) → the effect's parameters. mean, spread: (p,) of the Gaussian prior. step: (p,) for
+    differences. starts: (S, p). low, high: (p,) bounds. choices: how many such candidates share one name (axes).
+    """
+
+    name: str
+    values: Callable[[Array], Values]
+    mean: Array
+    spread: Array
+    step: Array
+    starts: Array
+    low: Array
+    high: Array
+    choices: int = 1
+
+    def laws(self, base: Laws, free: Array) -> Laws:
+        """``base`` with the effect."""
+        return with_effect(base, self.name, self.values(np.clip(free, self.low, self.high)))
+
+    def log_prior(self, free: Array) -> float:
+        """Log density of ``free``, in nats."""
+        z = (free - self.mean) / self.spread
+        return float(-0.5 * z @ z - np.log(self.spread).sum() - 0.5 * len(free) * math.log(2 * math.pi)) - math.log(
+            self.choices
+        )
+
+
+def _make(
+    name: str,
+    values: Callable[[Array], Values],
+    mean: list[float],
+    spread: list[float],
+    step: list[float],
+    starts: list[list[float]],
+    low: list[float],
+    high: list[float],
+    choices: int = 1,
+) -> Candidate:
+    as_array = [np.asarray(a, dtype=np.float64) for a in (mean, spread, step, starts, low, high)]
+    m, s, d, at, lo, hi = as_array
+    return Candidate(
+        name=name, values=values, mean=m, spread=s, step=d, starts=at, low=lo, high=hi, choices=choices
+    )
+
+
+def _one(name: str, parameter: str, guess: float, spread: float, starts: list[float], *, most: float) -> Candidate:
+    """A single positive number, free as its logarithm."""
+    return _make(
+        name,
+        lambda free: {parameter: math.exp(free[0])},
+        [math.log(guess)],
+        [spread],
+        [0.03],
+        [[math.log(x)] for x in starts],
+        [math.log(guess) - 8],
+        [math.log(most)],
+    )
+
+
+def candidates(base: Laws, size: float, middle: Array) -> dict[str, tuple[Candidate, ...]]:
+    """By name; several where a choice cannot be gone through smoothly. size: the body's in m; middle: (3,) of motion."""
+    e, mu = base.modulus, base.friction
+    pairs: Mapping[str, tuple[Candidate, ...]] = {
+        "stiffness": (_one("stiffness", "factor", 1.0, 0.8, [0.35, 0.6, 1.6, 2.6], most=12.0),),
+        "internal_damping": (
+            _one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4, 9e-4], most=3e-3),
+        ),
+        "plastic_yield": (
+            _one("plastic_yield", "yield_stress", 0.15 * e, 0.8, [0.05 * e, 0.1 * e, 0.2 * e, 0.4 * e], most=3 * e),
+        ),
+        "anisotropy": tuple(_fibres(e, axis) for axis in np.eye(3)),
+        "stiffness_gradient": (_gradient(),),
+        "friction": (_one("friction", "friction", max(mu, 0.02), 0.8, [0.4 * mu + 0.01, 1.8 * mu + 0.02], most=5.0),),
+        "adhesion": (
+            _make(
+                "adhesion",
+                lambda f: {"pull_per_mass": math.exp(f[0]), "reach": math.exp(f[1])},
+                [math.log(40.0), math.log(5e-3)],
+                [1.0, 0.7],
+                [0.05, 0.05],
+                [[math.log(40.0), math.log(5e-3)], [math.log(150.0), math.log(5e-3)]],
+                [-3.0, math.log(5e-4)],
+                [7.0, math.log(0.05)],
+            ),
+        ),
+        "air_drag": (_one("air_drag", "drag_per_mass", 0.1, 1.2, [0.1], most=20.0),),
+        "wind": (
+            _make(
+                "wind",
+                lambda f: {"drag_per_mass": math.exp(f[0]), "wind_x": f[1], "wind_y": f[2], "wind_z": f[3]},
+                [math.log(0.1), 0.0, 0.0, 0.0],
+                [1.0, 3.0, 3.0, 1.0],
+                [0.05, 0.1, 0.1, 0.1],
+                [[math.log(0.1), a * 2.0, b * 2.0, 0.0] for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))],
+                [-6.0, -30.0, -30.0, -30.0],
+                [3.0, 30.0, 30.0, 30.0],
+            ),
+        ),
+        "magnus": (
+            _make(
+                "magnus", lambda f: {"lift_per_mass": f[0]}, [0.0], [0.05], [1e-3], [[0.0]], [-2.0], [2.0]
+            ),
+        ),
+        "buoyancy": (
+            _make("buoyancy", lambda f: {"fraction": f[0]}, [0.0], [0.25], [1e-3], [[0.0]], [-2.0], [0.97]),
+        ),
+        "gravity_tilt": (
+            _make(
+                "gravity_tilt",
+                lambda f: {"angle": math.hypot(f[0], f[1]), "azimuth": math.atan2(f[1], f[0])},
+                [0.0, 0.0],
+                [0.1, 0.1],
+                [1e-3, 1e-3],
+                [[0.0, 0.0]],
+                [-0.7, -0.7],
+                [0.7, 0.7],
+            ),
+        ),
+        "tether": tuple(_tether(middle, string) for string in (1.0, 0.0)),
+        "time_scale": (
+            _make("time_scale", lambda f: {"rate": math.exp(f[0])}, [0.0], [0.1], [1e-3], [[0.0]], [-1.0], [1.0]),
+        ),
+        "mass_offset": (
+            _make(
+                "mass_offset",
+                lambda f: {"fraction": PELLET, "offset_x": f[0], "offset_y": f[1], "offset_z": f[2]},
+                [0.0] * 3,
+                [0.3 * size] * 3,
+                [1e-3 * size] * 3,
+                [[0.0, 0.0, 0.0]],
+                [-0.8 * size] * 3,
+                [0.8 * size] * 3,
+            ),
+        ),
+    }
+    return dict(pairs)
+
+
+def _fibres(modulus: float, axis: Array) -> Candidate:
+    x, y, z = (float(a) for a in axis)
+    return _make(
+        "anisotropy",
+        lambda f: {"fibre_modulus": math.exp(f[0]), "axis_x": x, "axis_y": y, "axis_z": z},
+        [math.log(modulus)],
+        [0.9],
+        [0.05],
+        [[math.log(0.5 * modulus)], [math.log(1.5 * modulus)]],
+        [math.log(1e-3 * modulus)],
+        [math.log(20 * modulus)],
+        choices=3,
+    )
+
+
+def _gradient() -> Candidate:
+    def values(f: Array) -> Values:
+        q = float(np.linalg.norm(f))
+        d = f / q if q > 1e-9 else np.array([0.0, 0.0, 1.0])
+        names = ("direction_x", "direction_y", "direction_z")
+        return {"slope": min(q, 0.95), **dict(zip(names, (float(a) for a in d), strict=True))}
+
+    starts = [list(sign * 0.45 * axis) for axis in np.eye(3) for sign in (1, -1)]
+    return _make("stiffness_gradient", values, [0.0] * 3, [0.4] * 3, [0.04] * 3, starts, [-0.95] * 3, [0.95] * 3)
+
+
+def _tether(middle: Array, string: float) -> Candidate:
+    def values(f: Array) -> Values:
+        return {
+            "stiffness_per_mass": math.exp(f[0]),
+            "rest_length": float(f[1]),
+            "anchor_x": float(f[2]),
+            "anchor_y": float(f[3]),
+            "anchor_z": float(f[4]),
+            "string": string,
+        }
+
+    starts = [
+        [math.log(10.0), 0.2, *(middle + np.array([dx, dy, 0.6]))]
+        for dx, dy in ((0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
+    ]
+    return _make(
+        "tether",
+        values,
+        [math.log(15.0), 0.3, *(middle + np.array([0.0, 0.0, 0.5]))],
+        [1.0, 0.3, 0.6, 0.6, 0.6],
+        [0.03, 0.01, 0.01, 0.01, 0.01],
+        starts,
+        [-4.0, 0.0, -20.0, -20.0, -20.0],
+        [8.0, 10.0, 20.0, 20.0, 20.0],
+        choices=2,
+    )

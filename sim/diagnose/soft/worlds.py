@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: MIT
+"""Many worlds of one soft body at once: laws and rigid starts in, tracked points out. The only door to the kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mpm.options import SolverOptions
+from ...mpm.runtime import ensure_started
+from . import element_kernels as kernels
+from .body_mesh import BodyMesh
+from .flight import Inertia, State
+from .laws import Laws
+
+Array = NDArray[np.float64]
+
+CONTACT = 2.75
+"""Stiffness of the ground's spring at a node over Young's modulus and the width of a cell: some mm of give at none of
+the speeds at which soft things are dropped, and no step shorter than the matter's own."""
+
+SAFETY = 0.5
+"""Share of the longest stable step that is taken; matter stiffens when it is pressed."""
+
+SPARED = 2.0
+"""Square of the highest frequency of a single cell over that of the median cell; see ``_spared``."""
+
+DROPPED = 0.1
+"""Share below which a sliver has no stiffness at all: so thin, its strain is that of rounding."""
+
+MOST_BYTES = 256 * 2**20
+"""What one launch may hold; more worlds go in several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One world: from the rigid ``start`` (still undeformed) under ``laws`` to ``times`` (T,), rising, after start.time.
+
+    Times are true ones: ``laws.rate`` is not applied here.
+    """
+
+    start: State
+    laws: Laws
+    times: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeHistory:
+    """Places and inner accelerations of all nodes at a job's times, (T, N, 3)."""
+
+    places: Array
+    accelerations: Array
+
+
+class SoftWorlds:
+    """The body ``mesh`` of ``density``, with tracked ``rest_points`` (K, 3), ready to be simulated many at a time."""
+
+    def __init__(self, mesh: BodyMesh, density: float, rest_points: Array, *, threads: int = 0) -> None:
+        self.mesh = mesh
+        self.density = density
+        self.masses = density * mesh.node_volumes()
+        self.inertia = Inertia.of(mesh.nodes, self.masses)
+        self.holders, self.weights = mesh.locate(rest_points)
+        self._cell = float(np.cbrt(6 * np.median(mesh.volumes)))
+        self._options = SolverOptions(threads=threads)
+        self._shares = _spared(mesh, self.masses)
+        self._rate = _fastest(mesh, self.masses, self._shares)
+        half = np.ptp(mesh.nodes, axis=0) / 2
+        self._middle = (mesh.nodes.max(axis=0) + mesh.nodes.min(axis=0)) / 2
+        self._half = half
+
+    def node_masses(self, laws: Laws) -> Array:
+        """(N,) kg, with the pellet of ``mass_offset``."""
+        if laws.fraction <= 0:
+            return self.masses
+        place = self.inertia.centre + np.asarray(laws.offset)
+        return pellet(self.mesh.nodes, self.masses, laws.fraction, place)
+
+    def inertia_of(self, laws: Laws) -> Inertia:
+        """Mass, centre and inertia under ``laws``."""
+        return self.inertia if laws.fraction <= 0 else Inertia.of(self.mesh.nodes, self.node_masses(laws))
+
+    def step(self, laws: Laws) -> float:
+        """Time step in s: below what elastic waves, fibres and viscosity allow."""
+        mu, lam = laws.lame
+        stiffness = (lam + 2 * mu) * (1 + float(np.abs(self._grade(laws)[0] * self._half).sum())) + laws.fibre
+        omega = math.sqrt(stiffness) * self._rate
+        ratio = 0.5 * laws.damping * omega
+        lighter = float(np.sqrt((self.node_masses(laws) / self.masses).min())) if laws.fraction > 0 else 1.0
+        pressed = math.sqrt(2 * self.contact_stiffness(laws) / (self.density * self._cell**3))
+        return SAFETY * 2 / math.hypot(omega, pressed) * (math.sqrt(1 + ratio * ratio) - ratio) * lighter
+
+    def contact_stiffness(self, laws: Laws) -> float:
+        """Of the ground's spring at a node, N/m."""
+        return CONTACT * laws.contact * laws.factor * laws.modulus * self._cell
+
+    def _grade(self, laws: Laws) -> tuple[Array, float]:
+        """The stiffness as 1 + at + grade · X: -1 at one end of the body along the slope's direction, 1 at the other."""
+        slope = np.asarray(laws.slope)
+        q = float(np.linalg.norm(slope))
+        if q == 0:
+            return np.zeros(3), 0.0
+        along = self.mesh.nodes @ (slope / q)
+        low, high = float(along.min()), float(along.max())
+        grade = slope * 2 / (high - low)
+        return grade, -q * (low + high) / (high - low)
+
+    def run(self, jobs: Sequence[Job], *, keep: bool = False) -> tuple[list[Array], list[NodeHistory]]:
+        """Tracked points (T, K, 3) of each job; with ``keep`` the nodes' histories too."""
+        points: list[Array | None] = [None] * len(jobs)
+        histories: list[NodeHistory | None] = [None] * len(jobs)
+        groups: dict[tuple[bool, bool], list[int]] = {}
+        for i, job in enumerate(jobs):
+            groups.setdefault((job.laws.damping > 0, job.laws.yield_stress > 0), []).append(i)
+        for (damped, yields), members in groups.items():
+            # The longest first: a thread that is done takes the next.
+            members.sort(key=lambda i: -(jobs[i].times[-1] - jobs[i].start.time) / self.step(jobs[i].laws))
+            for i, found, history in self._launch(jobs, members, damped, yields, keep):
+                points[i], histories[i] = found, history
+        return [p for p in points if p is not None], [h for h in histories if h is not None]
+
+    def _launch(
+        self, jobs: Sequence[Job], members: list[int], damped: bool, yields: bool, keep: bool
+    ) -> list[tuple[int, Array, NodeHistory | None]]:
+        ensure_started(self._options)
+        nodes, frames = len(self.mesh.nodes), max(len(jobs[i].times) for i in members)
+        row = 8 * (9 * nodes + 3 * frames * len(self.holders) + (9 * len(self.mesh.cells) if yields else 0))
+        row += 48 * frames * nodes if keep else 0
+        most = max(1, MOST_BYTES // row)
+        out: list[tuple[int, Array, NodeHistory | None]] = []
+        for start in range(0, len(members), most):
+            chosen = members[start : start + most]
+            out += self._launch_some([jobs[i] for i in chosen], chosen, frames, damped, yields, keep)
+        return out
+
+    def _launch_some(
+        self, jobs: list[Job], names: list[int], frames: int, damped: bool, yields: bool, keep: bool
+    ) -> list[tuple[int, Array, NodeHistory | None]]:
+        mesh, count, nodes = self.mesh, len(jobs), len(self.mesh.nodes)
+        times = np.zeros((count, frames))
+        x, v = np.zeros((count, nodes, 3)), np.zeros((count, nodes, 3))
+        for i, job in enumerate(jobs):
+            times[i, : len(job.times)] = job.times
+            inertia = self.inertia_of(job.laws)
+            x[i] = job.start.points(inertia, mesh.nodes)
+            v[i] = job.start.velocities(inertia, mesh.nodes)
+        plastic = np.tile(np.eye(3), (count if yields else 1, len(mesh.cells) if yields else 1, 1, 1))
+        tracked = np.zeros((count, frames, len(self.holders), 3))
+        kept = (count, frames, nodes, 3) if keep else (1, 1, 1, 3)
+        kept_x, kept_f = np.zeros(kept), np.zeros(kept)
+        kernels.advance_worlds(
+            np.stack([self._row(job) for job in jobs]),
+            np.ascontiguousarray(mesh.cells, dtype=np.int32),
+            np.ascontiguousarray(mesh.shapes),
+            np.ascontiguousarray(mesh.volumes),
+            np.ascontiguousarray(mesh.centres),
+            self._shares,
+            np.stack([self.node_masses(job.laws) for job in jobs]),
+            times,
+            np.array([[len(job.times)] for job in jobs], dtype=np.int32),
+            np.ascontiguousarray(self.holders, dtype=np.int32),
+            np.ascontiguousarray(self.weights),
+            x,
+            v,
+            np.zeros_like(x),
+            plastic,
+            tracked,
+            kept_x,
+            kept_f,
+            damped,
+            yields,
+            keep,
+        )
+        return [
+            (
+                name,
+                tracked[i, : len(job.times)],
+                NodeHistory(places=kept_x[i, : len(job.times)], accelerations=kept_f[i, : len(job.times)])
+                if keep
+                else None,
+            )
+            for i, (name, job) in enumerate(zip(names, jobs, strict=True))
+        ]
+
+    def _row(self, job: Job) -> Array:
+        laws, row = job.laws, np.zeros(kernels.WORLD_ROW)
+        row[kernels.MU], row[kernels.LAMBDA] = laws.lame
+        row[kernels.GRADE : kernels.GRADE + 3], row[kernels.GRADE_AT] = self._grade(laws)
+        axis = np.asarray(laws.axis)
+        row[kernels.FIBRE] = laws.fibre
+        row[kernels.FIBRE_AXIS : kernels.FIBRE_AXIS + 3] = axis / np.linalg.norm(axis)
+        row[kernels.DAMPING], row[kernels.YIELD] = laws.damping, laws.yield_stress
+        row[kernels.FRICTION], row[kernels.CONTACT_STIFFNESS] = laws.friction, self.contact_stiffness(laws)
+        row[kernels.GRAVITY : kernels.GRAVITY + 3] = laws.gravity
+        row[kernels.DRAG], row[kernels.LIFT] = laws.drag, laws.lift
+        row[kernels.WIND : kernels.WIND + 3] = laws.wind
+        row[kernels.TETHER_STIFFNESS], row[kernels.TETHER_LENGTH] = laws.tether_stiffness, laws.tether_length
+        row[kernels.TETHER_ANCHOR : kernels.TETHER_ANCHOR + 3] = laws.tether_anchor
+        row[kernels.TETHER_STRING] = float(laws.tether_string)
+        row[kernels.ADHESION], row[kernels.REACH] = laws.adhesion, laws.reach
+        row[kernels.STEP], row[kernels.START] = self.step(laws), job.start.time
+        return row
+
+
+def pellet(nodes: Array, masses: Array, fraction: float, place: Array) -> Array:
+    """Masses (N,) with the share ``fraction`` of them gathered about ``place``, as sim/effects/mass_offset does it."""
+    spread = float(np.cbrt(np.prod(np.ptp(nodes, axis=0)) / len(nodes)))
+    r = (nodes - place) / spread
+    base = np.log(masses) - 0.5 * np.einsum("ni,ni->n", r, r)
+    b = np.zeros(3)
+    weights = np.exp(base - base.max())
+    for _ in range(60):
+        exponent = base + r @ b
+        weights = np.exp(exponent - exponent.max())
+        weights /= weights.sum()
+        centre = weights @ r
+        if float(np.abs(centre).max()) < 1e-10:
+            break
+        cover = (r - centre).T @ (weights[:, None] * (r - centre))
+        change = -np.linalg.lstsq(cover + 1e-9 * np.eye(3), centre, rcond=None)[0]
+        b += change * min(1.0, 2.0 / max(float(np.linalg.norm(change)), 1e-12))
+    return np.asarray((1 - fraction) * masses + fraction * masses.sum() * weights)
+
+
+def _gradients(mesh: BodyMesh) -> Array:
+    """(C, 4, 3) of the four shape functions."""
+    return np.concatenate([-mesh.shapes.sum(axis=1, keepdims=True), mesh.shapes], axis=1)
+
+
+def _spared(mesh: BodyMesh, masses: Array) -> Array:
+    """(C,) share of the stiffness that a cell has: below 1 only in slivers, whose volume does not matter but whose
+    frequency would set everyone's step."""
+    squares = (_gradients(mesh) ** 2).sum(axis=2)
+    rate = mesh.volumes * (squares / masses[mesh.cells]).sum(axis=1)
+    share = np.minimum(1.0, SPARED * float(np.median(rate)) / rate)
+    return np.where(share < DROPPED, 0.0, share)
+
+
+def _fastest(mesh: BodyMesh, masses: Array, shares: Array) -> float:
+    """Highest angular frequency of the body in rad/s over the root of its longitudinal modulus in Pa, at rest.
+
+    Power iteration on M^-1 K with K that of lambda = mu / 2 ... bounded by the modulus lambda + 2 mu in every strain:
+    psi <= (lambda + 2 mu) / 2 |grad u|².
+    """
+    gradients, volumes = _gradients(mesh), mesh.volumes * shares
+    u = np.random.default_rng(0).normal(size=len(mesh.nodes))
+    value = 0.0
+    for _ in range(60):
+        slope = np.einsum("cni,cn->ci", gradients, u[mesh.cells])
+        force = np.zeros_like(u)
+        np.add.at(force, mesh.cells, volumes[:, None] * np.einsum("cni,ci->cn", gradients, slope))
+        force /= masses
+        value = float(np.linalg.norm(force) / np.linalg.norm(u))
+        u = force / np.linalg.norm(force)
+    return math.sqrt(1.05 * value)
