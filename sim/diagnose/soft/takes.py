@@ -99,7 +99,7 @@ class Flights:
     """Flight fits of all takes under any laws, each done once. sigma: noise of a coordinate in m."""
 
     def __init__(self, takes: list[Take], worlds: SoftWorlds, sigma: float) -> None:
-        self.takes, self._worlds, self._sigma = takes, worlds, sigma
+        self.takes, self._worlds, self.sigma = takes, worlds, sigma
         self._fits: dict[tuple[object, ...], FlightFit] = {}
         self._flights: dict[int, Flight] = {}
         self._starts: dict[tuple[object, ...], State | None] = {}
@@ -109,7 +109,7 @@ class Flights:
         """The flying frames of take ``index``."""
         if index not in self._flights:
             take, n = self.takes[index], self.takes[index].flying
-            self._flights[index] = Flight.of(take.times[:n], take.rest, take.points[:n], self._sigma)
+            self._flights[index] = Flight.of(take.times[:n], take.rest, take.points[:n], self.sigma)
         return self._flights[index]
 
     def fit(self, index: int, laws: Laws) -> FlightFit:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ...mpm.options import SolverOptions
 from ...mpm.runtime import ensure_started
-from . import element_kernels as kernels
 from .body_mesh import BodyMesh
 from .flight import Inertia, State
 from .laws import Laws
@@ -22,6 +21,9 @@ Array = NDArray[np.float64]
 CONTACT = 2.75
 """Stiffness of the ground's spring at a node over Young's modulus and the width of a cell: some mm of give at none of
 the speeds at which soft things are dropped, and no step shorter than the matter's own."""
+
+CRUSHED = 0.05
+"""As in the kernels, which nobody needs to load for it."""
 
 SAFETY = 0.5
 """Share of the longest stable step that is taken; matter stiffens when it is pressed."""
@@ -98,6 +100,51 @@ class SoftWorlds:
         """Of the ground's spring at a node, N/m."""
         return CONTACT * laws.contact * laws.factor * laws.modulus * self._cell
 
+    def inner_accelerations(self, places: Array, laws: Laws) -> Array:
+        """(T, N, 3) m/s² that elastic matter under ``laws`` (no fibres, no viscosity, no yield) has at ``places``."""
+        mesh, out = self.mesh, np.zeros_like(places)
+        mu, lam = laws.lame
+        grade, at = self._grade(laws)
+        scale = self._shares * np.maximum(0.01, 1 + at + mesh.centres @ grade) * mesh.volumes
+        for frame, x in enumerate(places):
+            corners = x[mesh.cells]
+            F = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2) @ mesh.shapes
+            columns = np.moveaxis(F, 2, 0)
+            cofactors = np.stack([np.cross(columns[i - 2], columns[i - 1]) for i in range(3)], axis=2)
+            volume = np.maximum(np.einsum("ci,ci->c", columns[0], cofactors[:, :, 0]), CRUSHED)[:, None, None]
+            back = cofactors / volume
+            stress = mu * (F - back) + lam * np.log(volume) * back
+            pull = -(scale[:, None, None] * stress) @ np.swapaxes(mesh.shapes, 1, 2)
+            np.add.at(out[frame], mesh.cells[:, 1:], np.swapaxes(pull, 1, 2))
+            np.add.at(out[frame], mesh.cells[:, 0], -pull.sum(axis=2))
+        return out / self.node_masses(laws)[:, None]
+
+    def contact_difference(self, places: Array, following: Array, times: Array, laws: Laws, base: Laws) -> Array:
+        """(T, N, 3) m/s² of friction at ``places`` (T, N, 3) that ``laws`` have and ``base`` lacks.
+
+        ``following`` (T + 1, N, 3) goes on one frame more, at ``times`` (T + 1,): which way a node slides.
+        """
+        out = np.zeros_like(places)
+        change = laws.friction - base.friction
+        if abs(change) < 0.1 * base.friction:
+            return out
+        depth = np.maximum(0.0, -places[:, :, 2])
+        slide = np.gradient(following, times, axis=0)[:-1] * np.array([1.0, 1.0, 0.0])
+        way = slide / np.maximum(np.linalg.norm(slide, axis=2, keepdims=True), 1e-3)
+        out -= (change * self.contact_stiffness(laws) * depth / self.masses)[:, :, None] * way
+        return out
+
+    def smoothed(self, accelerations: Array) -> Array:
+        """(T, N, 3) averaged over each node's cells: a node alone carries the lattice's own jitter."""
+        total = np.zeros_like(accelerations)
+        weight = np.zeros(len(self.masses))
+        share = self.masses[self.mesh.cells]
+        np.add.at(weight, self.mesh.cells, np.repeat(share.sum(axis=1, keepdims=True), 4, axis=1))
+        for frame, a in enumerate(accelerations):
+            mean = (share[:, :, None] * a[self.mesh.cells]).sum(axis=1)
+            np.add.at(total[frame], self.mesh.cells, np.repeat(mean[:, None], 4, axis=1))
+        return total / weight[:, None]
+
     def _grade(self, laws: Laws) -> tuple[Array, float]:
         """The stiffness as 1 + at + grade · X: -1 at one end of the body along the slope's direction, 1 at the other."""
         slope = np.asarray(laws.slope)
@@ -126,7 +173,6 @@ class SoftWorlds:
     def _launch(
         self, jobs: Sequence[Job], members: list[int], damped: bool, yields: bool, keep: bool
     ) -> list[tuple[int, Array, NodeHistory | None]]:
-        ensure_started(self._options)
         nodes, frames = len(self.mesh.nodes), max(len(jobs[i].times) for i in members)
         row = 8 * (9 * nodes + 3 * frames * len(self.holders) + (9 * len(self.mesh.cells) if yields else 0))
         row += 48 * frames * nodes if keep else 0
@@ -140,6 +186,9 @@ class SoftWorlds:
     def _launch_some(
         self, jobs: list[Job], names: list[int], frames: int, damped: bool, yields: bool, keep: bool
     ) -> list[tuple[int, Array, NodeHistory | None]]:
+        ensure_started(self._options)
+        from . import element_kernels as kernels
+
         mesh, count, nodes = self.mesh, len(jobs), len(self.mesh.nodes)
         times = np.zeros((count, frames))
         x, v = np.zeros((count, nodes, 3)), np.zeros((count, nodes, 3))
@@ -187,6 +236,8 @@ class SoftWorlds:
         ]
 
     def _row(self, job: Job) -> Array:
+        from . import element_kernels as kernels
+
         laws, row = job.laws, np.zeros(kernels.WORLD_ROW)
         row[kernels.MU], row[kernels.LAMBDA] = laws.lame
         row[kernels.GRADE : kernels.GRADE + 3], row[kernels.GRADE_AT] = self._grade(laws)
