@@ -22,7 +22,10 @@ QUIET = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Airborne:
-    """free: (p,) best numbers. chi2: (takes,) at them. gradients (takes, p) and curvatures (takes, p, p) of -chi2 / 2."""
+    """free: (p,) best numbers. chi2: (takes,) at them.
+
+    gradients (takes, p) and curvatures (takes, p, p): slope of -chi2 / 2 there, and its second derivative's negative.
+    """
 
     free: Array
     chi2: Array
@@ -59,7 +62,9 @@ def _descend(flights: Flights, takes: list[int], base: Laws, candidate: Candidat
         curvature = here.curvatures.sum(axis=0) + weight
         gradient = here.gradients.sum(axis=0) - weight @ (here.free - candidate.mean)
         step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
-        free = np.clip(here.free + np.clip(step, -1.5 * candidate.spread, 1.5 * candidate.spread), candidate.low, candidate.high)
+        free = np.clip(
+            here.free + np.clip(step, -1.5 * candidate.spread, 1.5 * candidate.spread), candidate.low, candidate.high
+        )
         there = _look(flights, takes, base, candidate, free)
         if _cost(there, candidate) > _cost(here, candidate) or not np.isfinite(there.chi2).all():
             damping = max(10 * damping, 0.3)

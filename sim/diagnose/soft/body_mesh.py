@@ -175,10 +175,12 @@ def _around_diagonals(nodes: Array, lattice: Cells3, towards: Indices) -> BodyMe
     boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
     first = (boxes + (towards < 0)) @ strides
     steps = towards * strides
-    cells = np.concatenate([
-        np.stack([first, first + steps[:, i], first + steps[:, i] + steps[:, j], first + steps.sum(axis=1)], axis=1)
-        for i, j, _ in itertools.permutations(range(3))
-    ])
+    cells = np.concatenate(
+        [
+            np.stack([first, first + steps[:, i], first + steps[:, i] + steps[:, j], first + steps.sum(axis=1)], axis=1)
+            for i, j, _ in itertools.permutations(range(3))
+        ]
+    )
     edges = np.transpose(nodes[cells[:, 1:]] - nodes[cells[:, :1]], (0, 2, 1))
     turned = np.linalg.det(edges) < 0
     cells[turned] = cells[turned][:, [0, 2, 1, 3]]

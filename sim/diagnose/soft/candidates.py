@@ -78,9 +78,7 @@ def _make(
 ) -> Candidate:
     as_array = [np.asarray(a, dtype=np.float64) for a in (mean, spread, step, starts, low, high)]
     m, s, d, at, lo, hi = as_array
-    return Candidate(
-        name=name, values=values, mean=m, spread=s, step=d, starts=at, low=lo, high=hi, choices=choices
-    )
+    return Candidate(name=name, values=values, mean=m, spread=s, step=d, starts=at, low=lo, high=hi, choices=choices)
 
 
 def _one(name: str, parameter: str, guess: float, spread: float, starts: list[float], *, most: float) -> Candidate:
@@ -98,13 +96,14 @@ def _one(name: str, parameter: str, guess: float, spread: float, starts: list[fl
 
 
 def candidates(base: Laws, size: float, middle: Array) -> dict[str, tuple[Candidate, ...]]:
-    """By name; several where a choice cannot be gone through smoothly. size: the body's in m; middle: (3,) of motion."""
+    """By name; several where a choice cannot be gone through smoothly.
+
+    size: half the body's width in m; middle: (3,) of the motion.
+    """
     e, mu = base.modulus, base.friction
     pairs: Mapping[str, tuple[Candidate, ...]] = {
         "stiffness": (_one("stiffness", "factor", 1.0, 0.8, [0.35, 0.6, 1.6, 2.6], most=12.0),),
-        "internal_damping": (
-            _one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4, 9e-4], most=3e-3),
-        ),
+        "internal_damping": (_one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4], most=2e-3),),
         "plastic_yield": (
             _one("plastic_yield", "yield_stress", 0.15 * e, 0.8, [0.05 * e, 0.1 * e, 0.2 * e, 0.4 * e], most=3 * e),
         ),
@@ -136,14 +135,8 @@ def candidates(base: Laws, size: float, middle: Array) -> dict[str, tuple[Candid
                 [3.0, 30.0, 30.0, 30.0],
             ),
         ),
-        "magnus": (
-            _make(
-                "magnus", lambda f: {"lift_per_mass": f[0]}, [0.0], [0.05], [1e-3], [[0.0]], [-2.0], [2.0]
-            ),
-        ),
-        "buoyancy": (
-            _make("buoyancy", lambda f: {"fraction": f[0]}, [0.0], [0.25], [1e-3], [[0.0]], [-2.0], [0.97]),
-        ),
+        "magnus": (_make("magnus", lambda f: {"lift_per_mass": f[0]}, [0.0], [0.05], [1e-3], [[0.0]], [-2.0], [2.0]),),
+        "buoyancy": (_make("buoyancy", lambda f: {"fraction": f[0]}, [0.0], [0.25], [1e-3], [[0.0]], [-2.0], [0.97]),),
         "gravity_tilt": (
             _make(
                 "gravity_tilt",

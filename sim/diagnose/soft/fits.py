@@ -37,10 +37,15 @@ COARSER = 1.5
 SEEN_IN_FLIGHT = 9.0
 """Gain in chi2 of the flights from which an effect that acts in flight is followed into the contact as well."""
 
-ROUNDS, FEW_ROUNDS = 4, 1
-FULL_SEARCHES = 4
+ROUNDS, FINE_ROUNDS = 4, 2
+FULL_SEARCHES = 3
+"""Candidates that are followed on the fine lattice."""
+
 UNEXPLAINED = 1.3
 """Misfit of the best single effect above which two at once are tried."""
+
+FREEDOM = 4.0
+"""Nats that a number of an effect fitted before costs: about what Laplace's method takes from one in these fits."""
 
 DRAWS = 400
 
@@ -100,15 +105,15 @@ class SoftFits:
         self._fit_takes = [i for i, t in enumerate(self._takes) if t.role == "fit"]
         self._check()
         coarse_mesh = coarser(mesh, item.vertices, item.faces, factor=COARSER)
-        self._coarse = Flights(
-            self._takes, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma
-        )
+        self._coarse = Flights(self._takes, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma)
         self._motions: dict[Laws, dict[str, Array]] = {}
         self._found: dict[int, _Found] = {}
         self._laws: dict[int, Laws] = {}
-        windows = [w for i in self._fit_takes if (w := self._window(i)) is not None]
+        found = (self._window(i) for i in self._fit_takes)
+        windows = [w for w in found if w is not None]
         grain = self._measure_grain(windows)
         self._problem = ContactProblem(self._flights, windows, self._base, grain=grain, size=self._size)
+        self._rough = ContactProblem(self._coarse, windows, self._base, grain=grain.times(1.5), size=self._size)
         self._run(tuple(names))
 
     # The search
@@ -118,9 +123,11 @@ class SoftFits:
         middle = np.mean([np.nanmean(t.points[: t.flying], axis=(0, 1)) for t in self._takes], axis=0)
         known = candidates(base, self._size, middle)
         neutral = Search(problem, None)
-        believed = neutral.try_all([neutral.mean])[0]
+        rough = Search(self._rough, None)
+        end = rough.descend(rough.try_all([rough.mean])[0], ROUNDS, self._stop)
+        believed, refitted = neutral.try_all([neutral.mean, end.free])
+        refitted = neutral.descend(min(believed, refitted, key=lambda f: f.cost), 2, self._stop)
         self._report(10, "nominal model")
-        refitted = neutral.descend(believed, ROUNDS, self._stop)
         self._flight_chi2 = np.array([self._flights.fit(i, base).chi2 for i in self._fit_takes])
         self._flight_count = sum(self._flights.fit(i, base).count for i in self._fit_takes)
         airborne: list[tuple[Candidate, Airborne]] = []
@@ -128,7 +135,7 @@ class SoftFits:
             self._stop()
             airborne.append((candidate, fit_airborne(self._flights, self._fit_takes, base, candidate)))
         self._report(25, "flights")
-        found = self._contact_effects(problem, [c for n in names if n not in IN_FLIGHT for c in known[n]])
+        found = self._contact_effects(problem, self._rough, [c for n in names if n not in IN_FLIGHT for c in known[n]])
         for candidate, air in airborne:
             gain = float(self._flight_chi2.sum() - air.chi2.sum())
             search = Search(problem, candidate, air)
@@ -149,24 +156,29 @@ class SoftFits:
         plain = _Found(search=neutral, fit=refitted, airborne=None)
         self._summarize(plain, believed, found)
 
-    def _contact_effects(self, problem: ContactProblem, tried: list[Candidate]) -> list[_Found]:
-        """Search every candidate of ``tried``: all starts at once, then the promising ones to the end."""
-        best: list[tuple[float, Search, ContactFit]] = []
-        for candidate in tried:
-            self._stop()
+    def _contact_effects(self, problem: ContactProblem, rough: ContactProblem, tried: list[Candidate]) -> list[_Found]:
+        """Search all of ``tried`` on the rough lattice, from all their starts; then the best on the fine one."""
+        found: list[tuple[float, Candidate, ContactFit]] = []
+        for rank, candidate in enumerate(tried):
+            search = Search(rough, candidate)
+            ends = sorted(
+                search.try_all([np.concatenate([s, np.zeros(2)]) for s in candidate.starts]), key=lambda f: f.cost
+            )
+            end = ends[0] if self._late(0.5) else search.descend(ends[0], ROUNDS, self._stop)
+            found.append((end.cost, candidate, end))
+            self._report(30 + 20 * (rank + 1) // len(tried), candidate.name)
+        found.sort(key=lambda entry: entry[0])
+        out = []
+        for rank, (_, candidate, end) in enumerate(found):
             search = Search(problem, candidate)
-            points = [np.concatenate([s, np.zeros(2)]) for s in candidate.starts]
-            fit = min(search.try_all(points), key=lambda f: f.cost)
-            best.append((fit.cost, search, fit))
-        best.sort(key=lambda entry: entry[0])
-        found = []
-        for rank, (_, search, fit) in enumerate(best):
-            rounds = ROUNDS if rank < FULL_SEARCHES else FEW_ROUNDS
-            if not self._late(0.5 if rank < FULL_SEARCHES else 0.7):
-                fit = search.descend(fit, rounds, self._stop)
-            self._report(30 + 40 * (rank + 1) // len(best), search.candidate.name if search.candidate else "")
-            found.append(_Found(search=search, fit=fit, airborne=None))
-        return found
+            fit = search.try_all([end.free])[0]
+            if rank < FULL_SEARCHES and not self._late(0.7):
+                fit = search.descend(fit, FINE_ROUNDS, self._stop)
+            else:
+                fit = dataclasses.replace(fit, jacobians=end.jacobians)
+            self._report(50 + 30 * (rank + 1) // len(found), candidate.name)
+            out.append(_Found(search=search, fit=fit, airborne=None))
+        return out
 
     def _pairs(
         self, found: list[_Found], known: dict[str, tuple[Candidate, ...]], names: Sequence[str]
@@ -181,12 +193,11 @@ class SoftFits:
         assert best.search.candidate is not None and best.airborne is not None
         values = best.search.candidate.values(best.airborne.free)
         base = best.search.candidate.laws(self._base, best.airborne.free)
-        problem = ContactProblem(
-            self._flights, self._problem.windows, base, grain=self._problem.grain, size=self._size
-        )
+        problem = ContactProblem(self._flights, self._problem.windows, base, grain=self._problem.grain, size=self._size)
+        rough = ContactProblem(self._coarse, self._problem.windows, base, grain=self._rough.grain, size=self._size)
         tried = [c for n in names if n not in IN_FLIGHT for c in known[n]]
         before = ((best.search.candidate.name, values, best.airborne),)
-        return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, tried)]
+        return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, rough, tried)]
 
     # What the fits say
 
@@ -231,9 +242,8 @@ class SoftFits:
             beliefs["friction"] = Estimate(
                 value=f, unit="1", low=f * math.exp(-1.96 * spread), high=f * math.exp(1.96 * spread)
             )
-        window = self._window_rms(residuals)
         if rms is None:
-            rms = self._whole_nominal * window / max(self._windows_nominal, 1e-12)
+            rms = self._whole_nominal * self._window_rms(residuals) / max(self._windows_nominal, 1e-12)
         result = CandidateFit(
             effects=found.effects,
             parameters=parameters,
@@ -264,9 +274,8 @@ class SoftFits:
         value = found.search.log_evidence(found.fit)
         if found.airborne is None:
             value -= 0.5 * float(self._flight_part(found).sum())
-        for name, _, air in found.before:
-            value -= 0.5 * 4.0 * len(air.free)  # What freedom of this kind costs elsewhere in these fits.
-            del name
+        for _, _, air in found.before:
+            value -= FREEDOM * len(air.free)
         return value
 
     def _contact_misfit(self, found: _Found) -> float:
@@ -314,7 +323,9 @@ class SoftFits:
     def _whole_takes(self, laws: list[Laws]) -> list[list[Array]]:
         n = len(self._fit_takes)
         pairs = list(itertools.product(laws, self._fit_takes))
-        found = self._flights.motion([i for _, i in pairs], [a for a, _ in pairs], [self._takes[i].times for _, i in pairs])
+        found = self._flights.motion(
+            [i for _, i in pairs], [a for a, _ in pairs], [self._takes[i].times for _, i in pairs]
+        )
         return [found[k * n : (k + 1) * n] for k in range(len(laws))]
 
     # Numbers
@@ -357,7 +368,7 @@ class SoftFits:
 
     def _check(self) -> None:
         if not self._fit_takes:
-            raise InputError("no trial has role \"fit\": mark the complete takes as such")
+            raise InputError('no trial has role "fit": mark the complete takes as such')
         for take in self._takes:
             if (take.seen[: take.flying].sum(axis=1) >= 3).sum() < 3:
                 raise InputError(
@@ -385,9 +396,7 @@ def _estimates(name: str, draws: list[dict[str, float]], values: dict[str, float
         found = np.array([d[parameter.name] for d in draws])
         value = float(np.clip(values[parameter.name], parameter.low, parameter.high))
         low, high = (float(q) for q in np.quantile(found, [0.025, 0.975]))
-        out[parameter.name] = Estimate(
-            value=value, unit=parameter.unit, low=min(low, value), high=max(high, value)
-        )
+        out[parameter.name] = Estimate(value=value, unit=parameter.unit, low=min(low, value), high=max(high, value))
     return out
 
 

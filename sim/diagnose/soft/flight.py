@@ -204,10 +204,12 @@ def first_guess(times: Array, rest: Array, points: Array, inertia: Inertia, grav
         return State(time=times[0], place=places[0], velocity=np.zeros(3), turn=turns[0], spin=np.zeros(3))
     fall = np.array(places) - 0.5 * t[:, None] ** 2 * gravity
     line = np.polyfit(t, fall, 1)
-    steps = np.array([
-        Rotation.from_matrix(b @ a.T).as_rotvec() / (tb - ta)
-        for a, b, ta, tb in zip(turns[:-1], turns[1:], t[:-1], t[1:], strict=True)
-    ])
+    steps = np.array(
+        [
+            Rotation.from_matrix(b @ a.T).as_rotvec() / (tb - ta)
+            for a, b, ta, tb in zip(turns[:-1], turns[1:], t[:-1], t[1:], strict=True)
+        ]
+    )
     spin = np.median(steps, axis=0)
     return State(time=times[0], place=line[1], velocity=line[0], turn=turns[0], spin=spin)
 
@@ -216,7 +218,7 @@ def first_guess(times: Array, rest: Array, points: Array, inertia: Inertia, grav
 class Flight:
     """Flying frames of a take, each reduced to what a rigid motion can tell: twelve numbers and a rest.
 
-    times: (T,) recorded. bases: (T, 4, 4), triangular factor of the seen points' (rest, 1). seen: (T, 4, 3) the observed
+    times: (T,) recorded. bases: (T, 4, 4), triangular factor of the seen points' (rest, 1). seen: (T, 4, 3) observed
     coordinates along the orthonormal columns that go with it. rest_chi2: what no affine motion explains, over sigma².
     count: how many coordinates were seen.
     """

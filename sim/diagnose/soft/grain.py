@@ -78,7 +78,7 @@ def whiten(
 
 
 def modes_of(points: Array, late: Array, seen: NDArray[np.bool_], size: float) -> Array:
-    """(n, 6): by how much the coordinates ``seen`` move for 1 m/s of drift, and of turning at ``size``, ``late`` (T,)."""
+    """(n, 6): how coordinates ``seen`` (T, K) have moved at ``late`` (T,) s for 1 m/s of drift and of turning."""
     away = (points - points.mean(axis=1, keepdims=True)) / size
     columns = []
     for axis in np.eye(3):

@@ -23,7 +23,7 @@ from .takes import Flights
 
 Array = NDArray[np.float64]
 
-FRICTION_SPREAD, CONTACT_SPREAD = 0.1, 0.2
+FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.12
 COMMON_STEP = np.array([0.06, 0.1])
 LOST = 1e12
 """Objective of a simulation that came to nothing."""
@@ -117,7 +117,7 @@ class Search:
         return common_laws(own, base, free[self.own :], friction=bool(self.moves[self.own]))
 
     def prior(self, free: Array) -> tuple[float, Array, Array]:
-        """Minus twice the log prior but for constants, with the flights' word; its negative half gradient, curvature."""
+        """Minus twice the log prior and flights' likelihood, less constants; its negative half gradient, curvature."""
         d = free - self.mean
         weight = np.diag(self.spread**-2.0)
         cost, pull = float(d @ weight @ d), -weight @ d
@@ -165,9 +165,11 @@ class Search:
 
     def descend(self, fit: ContactFit, rounds: int, stop: Callable[[], bool]) -> ContactFit:
         """Improve ``fit`` by up to ``rounds`` steps; the end has jacobians of its last or last but one place."""
+        if fit.cost >= LOST or stop():
+            return fit
         fit = self.with_jacobians(fit)
         for _ in range(rounds):
-            if stop() or fit.cost >= LOST:
+            if stop():
                 break
             gradient, curvature = self.normal_equations(fit)
             step = np.where(self.moves, np.linalg.solve(curvature, gradient), 0.0)
@@ -184,14 +186,14 @@ class Search:
             fit = self.with_jacobians(fit)
         return fit
 
-    def normal_equations(self, fit: ContactFit, *, without: int | None = None, level: float = 1.0) -> tuple[Array, Array]:
+    def normal_equations(
+        self, fit: ContactFit, *, without: int | None = None, level: float = 1.0
+    ) -> tuple[Array, Array]:
         """Gradient and curvature of the log posterior at ``fit``; ``without`` leaves a take out."""
         assert fit.jacobians is not None
         _, gradient, curvature = self.prior(fit.free)
         problem = self.problem
-        for k, (w, m, r, j) in enumerate(
-            zip(problem.windows, fit.motions, fit.residuals, fit.jacobians, strict=True)
-        ):
+        for k, (w, m, r, j) in enumerate(zip(problem.windows, fit.motions, fit.residuals, fit.jacobians, strict=True)):
             if k != without:
                 c = problem.covariance(w, m, level)
                 gradient = gradient + c.inner(j, r)

@@ -172,9 +172,7 @@ class Flights:
         """Tracked points (T, K, 3) at recorded ``times`` if nothing were in the way."""
         inertia = self._worlds.inertia_of(laws)
         first = self.fit(index, laws).state
-        place, _, turn, _ = (
-            a[0] for a in fly([first], [inertia], [laws], self.true_times(index, laws, times)[None])
-        )
+        place, _, turn, _ = (a[0] for a in fly([first], [inertia], [laws], self.true_times(index, laws, times)[None]))
         rest = self.takes[index].rest - inertia.centre
         return np.asarray(np.einsum("tij,kj->tki", turn, rest) + place[:, None])
 
@@ -188,7 +186,7 @@ class Flights:
         return Job(start=start, laws=laws, times=true) if len(true) else None
 
     def motion(self, indices: list[int], laws: list[Laws], times: list[Array]) -> list[Array]:
-        """Tracked points (T, K, 3) of takes ``indices`` at recorded ``times``: in flight, then from the first contact."""
+        """Tracked points (T, K, 3) of takes ``indices`` at recorded ``times``: flight, and what comes after it."""
         jobs = [self.job(i, a, t) for i, a, t in zip(indices, laws, times, strict=True)]
         found, _ = self._worlds.run([j for j in jobs if j is not None])
         after = iter(found)

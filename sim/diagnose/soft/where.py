@@ -88,8 +88,8 @@ def _outside(take: Take, whole: Array, low: Array, laws: Laws, base: Laws) -> Ar
     if laws.rate != 1:
         force += (laws.rate**2 - 1) * np.asarray(base.gravity)
     if laws.fraction:
-        away = laws.fraction * np.linalg.norm(laws.offset)
-        force[:, 2] += away * (_spin(take, whole) ** 2).sum(axis=1)
+        arm = laws.fraction * float(np.linalg.norm(laws.offset))
+        force[:, 2] += arm * (_spin(take, whole) ** 2).sum(axis=1)
     return force
 
 
@@ -116,7 +116,7 @@ def _discrepancy(take: Take, forces: Array, motion: Array, nominal: Array, low: 
 
 
 def _directions(forces: Array, velocity: Array) -> dict[str, float]:
-    """How forces (T, K, 3) point: along the ground's normal (which is gravity's direction too), the velocity, neither."""
+    """How forces (T, K, 3) point: along the ground's normal (gravity's direction too), the velocity, neither."""
     total = float((forces**2).sum())
     if total <= 0:
         return {"normal": 0.0, "along_velocity": 0.0, "along_gravity": 0.0, "other": 1.0}

@@ -22,11 +22,17 @@ CONTACT = 2.75
 """Stiffness of the ground's spring at a node over Young's modulus and the width of a cell: some mm of give at none of
 the speeds at which soft things are dropped, and no step shorter than the matter's own."""
 
-CRUSHED = 0.05
+CRUSHED = 0.15
 """As in the kernels, which nobody needs to load for it."""
 
-SAFETY = 0.5
+SAFETY = 0.6
 """Share of the longest stable step that is taken; matter stiffens when it is pressed."""
+
+RETRIES = 1
+"""With a shorter step, of worlds that came to nothing."""
+
+FARTHEST = 1e3
+"""m"""
 
 SPARED = 2.0
 """Square of the highest frequency of a single cell over that of the median cell; see ``_spared``."""
@@ -40,7 +46,7 @@ MOST_BYTES = 256 * 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One world: from the rigid ``start`` (still undeformed) under ``laws`` to ``times`` (T,), rising, after start.time.
+    """One world: from the rigid ``start``, undeformed, under ``laws`` to rising ``times`` (T,) after start.time.
 
     Times are true ones: ``laws.rate`` is not applied here.
     """
@@ -146,7 +152,7 @@ class SoftWorlds:
         return total / weight[:, None]
 
     def _grade(self, laws: Laws) -> tuple[Array, float]:
-        """The stiffness as 1 + at + grade · X: -1 at one end of the body along the slope's direction, 1 at the other."""
+        """grade (3,) and at: the stiffness is 1 + at + grade · X, from 1 - q at one end along the slope to 1 + q."""
         slope = np.asarray(laws.slope)
         q = float(np.linalg.norm(slope))
         if q == 0:
@@ -166,12 +172,19 @@ class SoftWorlds:
         for (damped, yields), members in groups.items():
             # The longest first: a thread that is done takes the next.
             members.sort(key=lambda i: -(jobs[i].times[-1] - jobs[i].start.time) / self.step(jobs[i].laws))
-            for i, found, history in self._launch(jobs, members, damped, yields, keep):
-                points[i], histories[i] = found, history
+            shorter = 1.0
+            for _ in range(RETRIES + 1):
+                for i, found, history in self._launch(jobs, members, damped, yields, keep, shorter):
+                    points[i], histories[i] = found, history
+                # Matter that is crushed is stiffer than the step allows for.
+                members = [i for i in members if not _sane(points[i])]
+                shorter *= 0.4
+                if not members:
+                    break
         return [p for p in points if p is not None], [h for h in histories if h is not None]
 
     def _launch(
-        self, jobs: Sequence[Job], members: list[int], damped: bool, yields: bool, keep: bool
+        self, jobs: Sequence[Job], members: list[int], damped: bool, yields: bool, keep: bool, shorter: float
     ) -> list[tuple[int, Array, NodeHistory | None]]:
         nodes, frames = len(self.mesh.nodes), max(len(jobs[i].times) for i in members)
         row = 8 * (9 * nodes + 3 * frames * len(self.holders) + (9 * len(self.mesh.cells) if yields else 0))
@@ -180,11 +193,18 @@ class SoftWorlds:
         out: list[tuple[int, Array, NodeHistory | None]] = []
         for start in range(0, len(members), most):
             chosen = members[start : start + most]
-            out += self._launch_some([jobs[i] for i in chosen], chosen, frames, damped, yields, keep)
+            out += self._launch_some([jobs[i] for i in chosen], chosen, frames, damped, yields, keep, shorter)
         return out
 
     def _launch_some(
-        self, jobs: list[Job], names: list[int], frames: int, damped: bool, yields: bool, keep: bool
+        self,
+        jobs: list[Job],
+        names: list[int],
+        frames: int,
+        damped: bool,
+        yields: bool,
+        keep: bool,
+        shorter: float,
     ) -> list[tuple[int, Array, NodeHistory | None]]:
         ensure_started(self._options)
         from . import element_kernels as kernels
@@ -202,7 +222,7 @@ class SoftWorlds:
         kept = (count, frames, nodes, 3) if keep else (1, 1, 1, 3)
         kept_x, kept_f = np.zeros(kept), np.zeros(kept)
         kernels.advance_worlds(
-            np.stack([self._row(job) for job in jobs]),
+            np.stack([self._row(job, shorter) for job in jobs]),
             np.ascontiguousarray(mesh.cells, dtype=np.int32),
             np.ascontiguousarray(mesh.shapes),
             np.ascontiguousarray(mesh.volumes),
@@ -235,7 +255,7 @@ class SoftWorlds:
             for i, (name, job) in enumerate(zip(names, jobs, strict=True))
         ]
 
-    def _row(self, job: Job) -> Array:
+    def _row(self, job: Job, shorter: float) -> Array:
         from . import element_kernels as kernels
 
         laws, row = job.laws, np.zeros(kernels.WORLD_ROW)
@@ -253,8 +273,13 @@ class SoftWorlds:
         row[kernels.TETHER_ANCHOR : kernels.TETHER_ANCHOR + 3] = laws.tether_anchor
         row[kernels.TETHER_STRING] = float(laws.tether_string)
         row[kernels.ADHESION], row[kernels.REACH] = laws.adhesion, laws.reach
-        row[kernels.STEP], row[kernels.START] = self.step(laws), job.start.time
+        row[kernels.STEP], row[kernels.START] = shorter * self.step(laws), job.start.time
         return row
+
+
+def _sane(points: Array | None) -> bool:
+    """Whether a simulation came to something: finite, and not farther than anything is thrown."""
+    return points is not None and bool(np.isfinite(points).all()) and float(np.abs(points).max()) < FARTHEST
 
 
 def pellet(nodes: Array, masses: Array, fraction: float, place: Array) -> Array:

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""The finite elements of sim/diagnose/soft against theory: patch, vibration, energy, viscosity, yield."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physgen.sim.diagnose.soft.body_mesh import body_mesh
+from physgen.sim.diagnose.soft.flight import State
+from physgen.sim.diagnose.soft.laws import Laws
+from physgen.sim.diagnose.soft.worlds import Job, SoftWorlds, pellet
+
+LAWS = Laws(modulus=1e5, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
+FREE = dataclasses.replace(LAWS, gravity=(0.0, 0.0, 0.0))
+
+
+def box(extents=(0.06, 0.06, 0.06), lattice=(3, 3, 3)):
+    mesh = trimesh.creation.box(extents)
+    return body_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), lattice=lattice)
+
+
+def worlds(mesh, points=None):
+    return SoftWorlds(mesh, 400.0, mesh.nodes if points is None else points, threads=1)
+
+
+def at(place=(0, 0, 1), velocity=(0, 0, 0), spin=(0, 0, 0), turn=None):
+    place, velocity, spin = (np.asarray(a, dtype=float) for a in (place, velocity, spin))
+    return State(time=0.0, place=place, velocity=velocity, turn=np.eye(3) if turn is None else turn, spin=spin)
+
+
+@pytest.mark.parametrize("shape", [trimesh.creation.box((0.05, 0.07, 0.1)), trimesh.creation.icosphere(3, 0.04)])
+def test_the_lattice_fills_the_surface(shape):
+    mesh = body_mesh(np.asarray(shape.vertices), np.asarray(shape.faces))
+    assert mesh.volumes.min() > 0
+    assert mesh.volumes.sum() == pytest.approx(shape.volume, rel=0.06)
+    assert np.allclose(mesh.volumes @ mesh.centres / mesh.volumes.sum(), 0, atol=1e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(-0.029, 0.029), min_size=3, max_size=3))
+def test_points_are_found_in_their_cells(place):
+    mesh = box()
+    nodes, weights = mesh.locate(np.array([place]))
+    assert weights.min() > -1e-9
+    assert np.allclose((weights[0][:, None] * mesh.nodes[nodes[0]]).sum(axis=0), place, atol=1e-12)
+
+
+def test_a_homogeneous_stretch_leaves_no_force_inside():
+    mesh = box()
+    stretched = mesh.nodes @ np.diag([1.1, 0.97, 1.02])
+    found = worlds(mesh).inner_accelerations(stretched[None], FREE)[0]
+    inside = (np.abs(mesh.nodes) < 0.029).all(axis=1)
+    assert inside.sum() == 8
+    assert np.abs(found[inside]).max() < 1e-9 * np.abs(found[~inside]).max()
+
+
+def test_flight_is_rigid_and_exact():
+    mesh = box()
+    start = at(velocity=(1.0, 0.5, 2.0))
+    (points,), _ = worlds(mesh).run([Job(start=start, laws=LAWS, times=np.array([0.05, 0.1]))])
+    centre = points.mean(axis=1)
+    assert np.allclose(centre[1] - [0, 0, 1], [0.1, 0.05, 0.2 - 0.5 * 9.81 * 0.01], atol=2e-4)
+    assert np.allclose(points[1] - centre[1], mesh.nodes, atol=1e-9)
+
+
+@pytest.mark.parametrize("stiffer", [1.0, 4.0])
+def test_a_wave_runs_up_a_bar_at_the_bar_speed(stiffer):
+    """Stopped at its foot, the top of a bar goes on falling until the wave has come up to turn it round."""
+    long, fall = 0.2, 0.3
+    mesh = box((long, 0.02, 0.02), (24, 2, 2))
+    upright = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    times = np.arange(1, 250) * 1e-4
+    start = at(place=(0, 0, long / 2), velocity=(0, 0, -fall), turn=upright)
+    laws = dataclasses.replace(FREE, factor=stiffer)
+    (points,), _ = worlds(mesh, np.array([[-long / 2, 0, 0]])).run([Job(start=start, laws=laws, times=times)])
+    speed = np.gradient(points[:, 0, 2], times)
+    turned = times[np.argmax(speed > 0)]
+    assert turned == pytest.approx(long / math.sqrt(stiffer * 1e5 / 400), rel=0.1)
+    assert speed[times < 0.7 * turned] == pytest.approx(-fall, rel=0.1)
+
+
+def bounce(laws, velocity=-2.0):
+    mesh = box((0.06, 0.06, 0.06), (4, 4, 4))
+    times = np.arange(1, 60) * 1e-3
+    start = at(place=(0, 0, 0.0301), velocity=(0, 0, velocity))
+    (points,), (history,) = worlds(mesh).run([Job(start=start, laws=laws, times=times)], keep=True)
+    return mesh, times, points, history
+
+
+def test_an_elastic_bounce_keeps_its_energy():
+    mesh, times, points, _ = bounce(FREE)
+    masses = 400.0 * mesh.node_volumes()
+    velocity = np.gradient(points, times, axis=0)
+    kinetic = 0.5 * (masses[None, :, None] * velocity**2).sum(axis=(1, 2))
+    whole = 0.5 * masses.sum() * 4.0
+    # Ringing goes back and forth between motion and strain; what is moving never exceeds what came in, and the
+    # translation alone is most of it.
+    assert kinetic[30:].max() <= 1.03 * whole
+    assert kinetic[30:].max() >= 0.7 * whole
+
+
+def test_viscosity_takes_ringing_away_and_yield_keeps_a_shape():
+    _, _, elastic, _ = bounce(FREE)
+    _, _, damped, _ = bounce(dataclasses.replace(FREE, damping=1e-3))
+    _, _, yielding, _ = bounce(dataclasses.replace(FREE, yield_stress=5e3))
+
+    def height(points):
+        return np.ptp(points[:, :, 2], axis=1)
+
+    assert np.ptp(height(damped)[-15:]) < 0.3 * np.ptp(height(elastic)[-15:])
+    assert height(damped)[-1] == pytest.approx(0.06, rel=0.04)
+    assert height(yielding)[-15:].mean() < 0.97 * height(elastic)[-15:].mean()
+
+
+def test_the_last_inner_accelerations_are_those_of_the_places():
+    mesh, _, _, history = bounce(FREE)
+    found = worlds(mesh).inner_accelerations(history.places[10:12], FREE)
+    scale = np.abs(found).max()
+    assert scale > 10
+    assert np.abs(found - history.accelerations[10:12]).max() < 1e-6 * scale
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.05, 0.5), st.lists(st.floats(-0.012, 0.012), min_size=3, max_size=3))
+def test_a_pellet_keeps_the_mass_and_moves_its_centre(fraction, offset):
+    mesh = box()
+    masses = 400.0 * mesh.node_volumes()
+    centre = masses @ mesh.nodes / masses.sum()
+    loaded = pellet(mesh.nodes, masses, fraction, centre + np.array(offset))
+    assert loaded.sum() == pytest.approx(masses.sum())
+    assert np.allclose(loaded @ mesh.nodes / masses.sum(), centre + fraction * np.array(offset), atol=1e-6)

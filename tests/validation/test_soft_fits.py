@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""sim/diagnose/soft on small captures made here: causes in flight and in matter are found, and nothing where nothing is."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.soft.airborne import fit_airborne
+from physgen.sim.diagnose.soft.body_mesh import body_mesh
+from physgen.sim.diagnose.soft.candidates import candidates
+from physgen.sim.diagnose.soft.fits import Cancelled, fit_soft
+from physgen.sim.diagnose.soft.flight import State
+from physgen.sim.diagnose.soft.laws import Laws
+from physgen.sim.diagnose.soft.takes import Flights, GroundFrame, take_of
+from physgen.sim.diagnose.soft.worlds import Job, SoftWorlds
+from physgen.sim.errors import InputError
+from scipy.spatial.transform import Rotation
+
+SIGMA = 5e-4
+NOMINAL = Laws(modulus=8e4, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
+
+
+def cube_surface(side=0.06, cells=4):
+    """A cube's surface whose vertices are those of a lattice."""
+    lattice = np.stack(np.meshgrid(*[np.linspace(-side / 2, side / 2, cells + 1)] * 3, indexing="ij"), -1).reshape(
+        -1, 3
+    )
+    index = np.arange((cells + 1) ** 3).reshape((cells + 1,) * 3)
+    faces = []
+    for axis, end in itertools.product(range(3), (0, cells)):
+        plane = np.take(index, end, axis=axis)
+        a, b, c, d = (x.ravel() for x in (plane[:-1, :-1], plane[1:, :-1], plane[1:, 1:], plane[:-1, 1:]))
+        quads = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+        outward = (end > 0) == (axis != 1)
+        faces.append(quads if outward else quads[:, ::-1])
+    used, again = np.unique(np.concatenate(faces), return_inverse=True)
+    return lattice[used], again.reshape(-1, 3)
+
+
+def capture(laws, *, takes=3, after=0.15, seed=0):
+    rng = np.random.default_rng(seed)
+    vertices, faces = cube_surface()
+    mesh = body_mesh(vertices, faces)
+    rest = rng.uniform(-0.03, 0.03, size=(14, 3))
+    worlds = SoftWorlds(mesh, 400.0, rest, threads=1)
+    times = np.arange(0, 0.25 + after, 1 / 200)
+    starts = [
+        State(
+            time=-1e-6,
+            place=np.array([0.0, 0.0, 0.42]),
+            velocity=np.array([0.4 * i, -0.2, -0.3]),
+            turn=Rotation.from_euler("xyz", [0.3 * i, 0.2 * i, 0.5]).as_matrix(),
+            spin=rng.normal(size=3) * 3,
+        )
+        for i in range(takes)
+    ]
+    points, _ = worlds.run([Job(start=s, laws=laws, times=times) for s in starts])
+    trials = []
+    for i, truth in enumerate(points):
+        seen = truth + SIGMA * rng.normal(size=truth.shape)
+        shown = 40 if i == takes - 1 else len(times)
+        trials.append(
+            Trial(
+                name=f"take{i}",
+                role="fit" if shown == len(times) else "predict",
+                times=times[:shown],
+                points=seen[:shown],
+                pixels=None,
+                object_index=np.zeros(14, dtype=np.int64),
+                rest_points=rest,
+                predict_times=None if shown == len(times) else times[shown:],
+            )
+        )
+    belief = ObjectBelief(
+        name="body", mesh="body.obj", density_kg_m3=400.0, stiffness="soft", youngs_modulus_pa=8e4, poisson_ratio=0.3
+    )
+    made = Capture(
+        gravity=(0.0, 0.0, -9.81),
+        ground=Ground(friction=0.4),
+        objects=(CaptureObject(belief=belief, vertices=vertices, faces=faces),),
+        noise_sigma=SIGMA,
+        camera=None,
+        trials=tuple(trials),
+    )
+    return made, points[-1][shown:]
+
+
+def fits(made, names, budget=120.0):
+    return fit_soft(made, names, on_event=lambda event: None, cancelled=lambda: False, budget_s=budget)
+
+
+def test_the_surface_gives_its_lattice_away():
+    assert body_mesh(*cube_surface(cells=5)).lattice == (5, 5, 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "laws", "parameter", "truth"),
+    [
+        ("buoyancy", dataclasses.replace(NOMINAL, gravity=(0.0, 0.0, -8.0)), "fraction", 1 - 8.0 / 9.81),
+        ("air_drag", dataclasses.replace(NOMINAL, drag=0.3), "drag_per_mass", 0.3),
+        ("time_scale", NOMINAL, "rate", 1.0),
+    ],
+)
+def test_flights_alone_find_what_acts_in_flight(name, laws, parameter, truth):
+    made, _ = capture(laws, takes=3, after=0.0)
+    mesh = body_mesh(made.objects[0].vertices, made.objects[0].faces)
+    frame = GroundFrame(made)
+    takes = [take_of(t, frame, mesh.nodes) for t in made.trials]
+    flights = Flights(takes, SoftWorlds(mesh, 400.0, made.trials[0].rest_points, threads=1), SIGMA)
+    (candidate,) = candidates(NOMINAL, 0.03, np.array([0, 0, 0.4]))[name]
+    found = fit_airborne(flights, [0, 1, 2], NOMINAL, candidate)
+    spread = float(found.curvatures.sum(axis=0)[0, 0]) ** -0.5
+    assert candidate.values(found.free)[parameter] == pytest.approx(truth, abs=max(4 * spread, 2e-3))
+    count = sum(flights.fit(i, NOMINAL).count for i in range(3))
+    assert found.chi2.sum() == pytest.approx(count, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_softer_body_is_found_predicted_and_placed():
+    made, withheld = capture(dataclasses.replace(NOMINAL, factor=0.55))
+    found = fits(made, ["stiffness", "internal_damping", "friction", "buoyancy"])
+    best = found.candidates[0]
+    assert best.effects == ("stiffness",)
+    assert best.parameters["stiffness"]["factor"].value == pytest.approx(0.55, rel=0.06)
+    assert best.log_evidence > found.refitted.log_evidence + 20
+    assert best.misfit < 1.2 < found.nominal.misfit
+    after = found.predict(best)["take2"] - withheld
+    before = found.predict(found.nominal)["take2"] - withheld
+    assert np.sqrt((after**2).mean()) < 0.3 * np.sqrt((before**2).mean())
+    for name, where in found.discrepancy(best).items():
+        trial = next(t for t in made.trials if t.name == name)
+        flying = trial.times < 0.18
+        assert where.frame_score[flying].max() < 1e-6
+        if trial.role == "fit":
+            assert where.frame_score[~flying].max() > 10
+        assert sum(where.directions.values()) == pytest.approx(1)
+
+
+@pytest.mark.slow
+def test_nothing_is_found_where_nothing_is():
+    made, _ = capture(NOMINAL, seed=1)
+    found = fits(made, ["stiffness", "internal_damping", "friction", "buoyancy"])
+    assert found.nominal.misfit < 1.1
+    assert max(c.log_evidence for c in found.candidates) < found.refitted.log_evidence + 3
+
+
+def test_what_it_cannot_do_is_said():
+    made, _ = capture(NOMINAL, after=0.0)
+    rigid = dataclasses.replace(made.objects[0].belief, stiffness="hard", youngs_modulus_pa=None)
+    with pytest.raises(InputError, match="rigid"):
+        fits(dataclasses.replace(made, objects=(dataclasses.replace(made.objects[0], belief=rigid),)), None)
+    with pytest.raises(InputError, match="one"):
+        fits(dataclasses.replace(made, objects=made.objects * 2), None)
+    with pytest.raises(Cancelled):
+        fit_soft(made, None, on_event=lambda event: None, cancelled=lambda: True, budget_s=60)
