@@ -158,6 +158,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     diagnosis.add_track(command("track", diagnosis.run_track, "videos of a scene → capture folder"))
+    diagnosis.add_blind_check(
+        command("blind-check", diagnosis.run_blind_check, "the diagnosis examines itself on motion of withheld cause")
+    )
 
     listing = command("effects", _effects, "physical effects that a scene can have, with their parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="these only (default: all)")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs of the diagnosis: ``physgen track`` and ``physgen diagnose`` (docs/tracking.md, docs/diagnosis.md)."""
+"""The verbs ``track``, ``diagnose`` and ``blind-check`` (docs/tracking.md, docs/diagnosis.md)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import argparse
 import re
 from pathlib import Path
 
+from ..sim.diagnose.blind import command as blind_command
 from ..sim.diagnose.track import command as track_command
 from ..sim.events import IsCancelled
 from .terminal import Terminal
@@ -75,4 +76,17 @@ def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     if found.next_experiment:
         lines.append(f"next: {found.next_experiment}")
     terminal.line("\n".join([*lines, f"report: {options.out / 'report.html'}"]))
+    return 0
+
+
+def add_blind_check(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen blind-check``."""
+    blind_command.add_arguments(parser)
+
+
+def run_blind_check(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen blind-check``; the exit code."""
+    done, table = blind_command.command(options, terminal, cancelled)
+    terminal(done)
+    terminal.line(table)
     return 0

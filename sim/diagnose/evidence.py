@@ -67,7 +67,7 @@ class Weighed:
 
 def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     """Verdict and probabilities. A candidate of two effects counts for the first of its effects."""
-    candidates = [fits.refitted, *fits.candidates]
+    candidates = [fits.nominal, *fits.candidates]
     weights = _weights(candidates, weighing)
     adequate = [_adequacy(c.misfit, weighing) for c in candidates]
     probabilities: dict[str, float] = {}

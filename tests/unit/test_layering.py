@@ -12,11 +12,7 @@ import pytest
 from physgen.sim.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
-<<<<<<< HEAD
 MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians", "sim/diagnose/rigid", "sim/diagnose/soft")
-=======
-MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians", "sim/diagnose/soft/element_kernels.py")
->>>>>>> 71deb52 (Soft diagnosis: fits of candidate effects to captures of deforming bodies, with tests)
 FORBIDDEN = {"sim": ("physgen_addon", "batch"), "physgen_addon/bridge": ("batch",)}
 
 
