@@ -86,7 +86,6 @@ class Fits(Protocol):
     nominal: the model as believed. refitted: the same with its own parameters fitted. candidates: one or two effects.
     floor_rms_m: distance in m that noise alone leaves on data that no fit saw.
     numerics_rms_m: how far the nominal model's prediction moves when its resolution or time step is changed.
-    last_residual_rms_m: distance there in m when the nominal model's last seen residual is carried forward.
     """
 
     nominal: CandidateFit
@@ -94,7 +93,6 @@ class Fits(Protocol):
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
     numerics_rms_m: float
-    last_residual_rms_m: float
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""

@@ -92,7 +92,7 @@ def diagnose(
         verdict=verdict,
         effects=ranked,
         gap=gap,
-        controls=controls_of(fits, weighed, found),
+        controls=controls_of(capture, fits, weighed, found, nominal_points),
         next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable),
         where=where_of(capture, discrepancies),
         trials=_arrays(capture, discrepancies, nominal_points, found_points, *predictions),
@@ -109,7 +109,7 @@ def _fit(
     # Taichi is imported only when something is fitted.
     rigid = [item.belief.rigid for item in capture.objects]
     if all(rigid):
-        from .rigid import fit_rigid
+        from .rigid.fits import fit_rigid
 
         fits: Fits = fit_rigid(
             capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s
@@ -121,7 +121,7 @@ def _fit(
             f"object {soft!r} deforms and is not alone: a capture holds either rigid objects or one that deforms; "
             "make a capture of it alone"
         )
-    from .soft import fit_soft
+    from .soft.fits import fit_soft
 
     fits = fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
     return fits, SOFT_WEIGHING

@@ -19,6 +19,9 @@ RESOLVABLE = 1.5
 
 RESAMPLES = 400
 
+SHOWN_S = 0.15
+"""Seconds of a take that count as its first frames where no predict trial says how many there are."""
+
 
 def measured_gap(capture: Capture, fits: Fits, found: CandidateFit) -> Gap:
     """Distances on held-out takes, each predicted from its first frames; the interval is not known yet."""
@@ -70,11 +73,33 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
-def controls_of(fits: Fits, weighed: Weighed, found: CandidateFit) -> dict[str, float]:
+def carried_residual(capture: Capture, nominal: Mapping[str, Array]) -> float:
+    """Root mean square distance in m of complete takes from the nominal model (T, K, 3) with its residual at the end
+    of the first frames carried forward: no physics at all."""
+    shown = [len(t.times) * np.diff(t.times).mean() for t in capture.predict_trials]
+    lead = float(np.median(shown)) if shown else SHOWN_S
+    squares = []
+    for trial in capture.fit_trials:
+        residual = observed_residual(capture, trial, nominal[trial.name])
+        first = int(np.searchsorted(trial.times - trial.times[0], lead))
+        if not 0 < first < len(residual):
+            continue
+        tail = residual[max(0, first - 3) : first]
+        known = np.isfinite(tail)
+        last = np.where(known, tail, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        off = np.square(residual[first:] - last).sum(axis=-1)
+        squares.append(off[np.isfinite(off)] * metres_per_unit(capture, trial, nominal[trial.name]) ** 2)
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else math.nan
+
+
+def controls_of(
+    capture: Capture, fits: Fits, weighed: Weighed, found: CandidateFit, nominal: Mapping[str, Array]
+) -> dict[str, float]:
     """What the same procedure scores with something wrong.
 
     wrong_effect_rms_m: the effect of as many parameters as the verdict, or next to that, which the evidence likes
         least. last_residual_rms_m: the nominal model with its last seen residual carried forward.
+    nominal: (T, K, 3) m by take, started from its first frames.
     """
     freedom = sum(len(p) for p in found.parameters.values())
     wrong = [
@@ -91,4 +116,4 @@ def controls_of(fits: Fits, weighed: Weighed, found: CandidateFit) -> dict[str, 
         return abs(sum(len(p) for p in fit.parameters.values()) - freedom), fit.log_evidence
 
     chosen = min(wrong, key=unlike).heldout_rms_m if wrong else math.nan
-    return {"wrong_effect_rms_m": chosen, "last_residual_rms_m": fits.last_residual_rms_m}
+    return {"wrong_effect_rms_m": chosen, "last_residual_rms_m": carried_residual(capture, nominal)}

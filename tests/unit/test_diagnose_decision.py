@@ -29,7 +29,6 @@ class Found:
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float = 0.001
     numerics_rms_m: float = 0.0
-    last_residual_rms_m: float = 0.02
 
 
 def fit(*effects, evidence=0.0, misfit=1.0, rms=0.01):
