@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""sim/diagnose/soft on small captures made here: causes in flight and in matter are found, and nothing where nothing is."""
+"""sim/diagnose/soft on small captures made here: causes in flight and in matter are found, none where there is none."""
 
 import dataclasses
 import itertools

@@ -31,6 +31,9 @@ IN_CONTACT = (
 
 NAMES = IN_FLIGHT + IN_CONTACT
 
+STIFFNESSES = [float(x) for x in np.exp(np.arange(-7, 8) * 0.2) if x != 1.0]
+"""Factors to start from: a body that rings for ten periods is a cycle out of step with a modulus 20 % off."""
+
 PELLET = 0.3
 """Share of the mass in a pellet: a motion only tells share times offset."""
 
@@ -102,7 +105,7 @@ def candidates(base: Laws, size: float, middle: Array) -> dict[str, tuple[Candid
     """
     e, mu = base.modulus, base.friction
     pairs: Mapping[str, tuple[Candidate, ...]] = {
-        "stiffness": (_one("stiffness", "factor", 1.0, 0.8, [0.35, 0.6, 1.6, 2.6], most=12.0),),
+        "stiffness": (_one("stiffness", "factor", 1.0, 0.8, STIFFNESSES, most=12.0),),
         "internal_damping": (_one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4], most=2e-3),),
         "plastic_yield": (
             _one("plastic_yield", "yield_stress", 0.15 * e, 0.8, [0.05 * e, 0.1 * e, 0.2 * e, 0.4 * e], most=3 * e),

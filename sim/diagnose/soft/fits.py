@@ -38,6 +38,12 @@ SEEN_IN_FLIGHT = 9.0
 """Gain in chi2 of the flights from which an effect that acts in flight is followed into the contact as well."""
 
 ROUNDS, FINE_ROUNDS = 4, 2
+DESCENTS = 2
+"""Starts of a candidate that are followed on the rough lattice."""
+
+NEARBY = (-0.12, 0.0, 0.12)
+"""Logarithms about the rough lattice's end that are tried on the fine one, which is a little softer."""
+
 FULL_SEARCHES = 3
 """Candidates that are followed on the fine lattice."""
 
@@ -158,21 +164,31 @@ class SoftFits:
 
     def _contact_effects(self, problem: ContactProblem, rough: ContactProblem, tried: list[Candidate]) -> list[_Found]:
         """Search all of ``tried`` on the rough lattice, from all their starts; then the best on the fine one."""
-        found: list[tuple[float, Candidate, ContactFit]] = []
-        for rank, candidate in enumerate(tried):
+        begun: list[tuple[Candidate, Search, list[ContactFit]]] = []
+        for candidate in tried:
+            self._stop()
             search = Search(rough, candidate)
-            ends = sorted(
-                search.try_all([np.concatenate([s, np.zeros(2)]) for s in candidate.starts]), key=lambda f: f.cost
-            )
-            end = ends[0] if self._late(0.5) else search.descend(ends[0], ROUNDS, self._stop)
+            starts = [np.concatenate([s, np.zeros(2)]) for s in candidate.starts]
+            begun.append((candidate, search, sorted(search.try_all(starts), key=lambda f: f.cost)))
+        # Should time run out, the promising ones have had theirs.
+        begun.sort(key=lambda entry: entry[2][0].cost)
+        found: list[tuple[float, Candidate, ContactFit]] = []
+        for rank, (candidate, search, ends) in enumerate(begun):
+            followed = ends[: DESCENTS if rank < FULL_SEARCHES else 1]
+            if not self._late(0.45):
+                followed = [search.descend(e, ROUNDS, self._stop) for e in followed]
+            end = min(followed, key=lambda f: f.cost)
             found.append((end.cost, candidate, end))
             self._report(30 + 20 * (rank + 1) // len(tried), candidate.name)
         found.sort(key=lambda entry: entry[0])
         out = []
         for rank, (_, candidate, end) in enumerate(found):
             search = Search(problem, candidate)
-            fit = search.try_all([end.free])[0]
-            if rank < FULL_SEARCHES and not self._late(0.7):
+            near = rank < FULL_SEARCHES and len(candidate.mean) == 1
+            first = np.eye(len(end.free))[0]
+            about = [end.free + d * first for d in (NEARBY if near else (0.0,))]
+            fit = min(search.try_all(about), key=lambda f: f.cost)
+            if rank < FULL_SEARCHES and not self._late(0.6 if rank else 0.85):
                 fit = search.descend(fit, FINE_ROUNDS, self._stop)
             else:
                 fit = dataclasses.replace(fit, jacobians=end.jacobians)

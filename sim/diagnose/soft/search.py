@@ -24,6 +24,9 @@ from .takes import Flights
 Array = NDArray[np.float64]
 
 FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.12
+FRICTION_REACH, CONTACT_REACH = 0.3, 0.5
+"""Farthest that they may go, as logarithms: beyond it is another cause, which must not hide in them."""
+
 COMMON_STEP = np.array([0.06, 0.1])
 LOST = 1e12
 """Objective of a simulation that came to nothing."""
@@ -277,8 +280,9 @@ class Search:
         return -0.5 * (float(c.inner(r, r)) + c.log_det + len(r) * math.log(2 * math.pi))
 
     def _inside(self, free: Array) -> Array:
-        if self.candidate is None:
-            return free
         out = free.copy()
-        out[: self.own] = np.clip(free[: self.own], self.candidate.low, self.candidate.high)
+        if self.candidate is not None:
+            out[: self.own] = np.clip(free[: self.own], self.candidate.low, self.candidate.high)
+        reach = np.array([FRICTION_REACH, CONTACT_REACH])
+        out[self.own :] = np.clip(free[self.own :], -reach, reach)
         return out
