@@ -161,14 +161,16 @@ def _confirm(
             )
         except InputError as error:
             return results, [f"the engine could not run {trial.name} again: {error}"]
-    against = [c.trial for c in results if not c.confirmed]
-    if not against:
-        return results, []
-    return results, [f"the engine does not confirm the verdict on {', '.join(against)}"]
+    against = [c.trial for c in results if c.word == "contradicted"]
+    if against:
+        return results, [f"the particle engine contradicts the verdict on {', '.join(against)}"]
+    if all(c.word == "undecided" for c in results):
+        return results, ["the particle engine cannot tell verdict and nominal model apart at its resolution"]
+    return results, []
 
 
 def _confirmation_json(items: list[Confirmation]) -> Mapping[str, Any]:
-    return {"takes": [dataclasses.asdict(c) | {"confirmed": c.confirmed} for c in items]} if items else {}
+    return {"takes": [dataclasses.asdict(c) | {"word": c.word} for c in items]} if items else {}
 
 
 def _ranking(fits: Fits, weighed: Weighed, gap: Gap) -> tuple[RankedEffect, ...]:

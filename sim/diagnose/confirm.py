@@ -64,9 +64,12 @@ class Confirmation:
     against_model_rms_m: float
 
     @property
-    def confirmed(self) -> bool:
-        """Whether the verdict brings the engine nearer to the recording by more than its numerics."""
-        return self.before_rms_m - self.after_rms_m > 0.25 * self.numerics_rms_m
+    def word(self) -> str:
+        """ "confirmed" or "contradicted" where verdict and nominal model differ by more than the engine's numerics,
+        else "undecided"."""
+        if abs(self.before_rms_m - self.after_rms_m) <= self.numerics_rms_m:
+            return "undecided"
+        return "confirmed" if self.after_rms_m < self.before_rms_m else "contradicted"
 
 
 def confirm(

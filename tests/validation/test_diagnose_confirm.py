@@ -89,7 +89,7 @@ def test_the_engine_confirms_drag_in_flight(belief):
     # A fifth of a second at 3.6 m/s under drag of 0.3/m: k v² t² / 2 = 8 cm at the end, 3.5 cm in the mean.
     assert result.before_rms_m > 0.02
     # Symplectic Euler with steps of 0.2 ms is off by about step / time, on a way of 2 m.
-    assert result.after_rms_m < 2e-3 and result.numerics_rms_m < 2e-3 and result.confirmed
+    assert result.after_rms_m < 2e-3 and result.numerics_rms_m < 2e-3 and result.word == "confirmed"
     assert result.against_model_rms_m < 2e-3
 
 
@@ -97,7 +97,7 @@ def test_a_wrong_verdict_is_not_confirmed():
     trial = flight(0.0)
     found = fit("air_drag", drag_per_mass=DRAG)
     result = confirm(ball(trial), trial, fit(), found, trial.points, flight(DRAG).points, lambda: False)
-    assert not result.confirmed and result.before_rms_m < 2e-3 < result.after_rms_m
+    assert result.word == "contradicted" and result.before_rms_m < 2e-3 < result.after_rms_m
 
 
 def test_a_fast_clock_is_given_to_the_engine():
@@ -106,7 +106,7 @@ def test_a_fast_clock_is_given_to_the_engine():
     found = fit("time_scale", rate=1.1)
     nominal = flight(0.0, rate=120.0 * 1.1).points
     result = confirm(ball(recorded), recorded, fit(), found, nominal, recorded.points, lambda: False)
-    assert result.confirmed and result.after_rms_m < 2e-3
+    assert result.word == "confirmed" and result.after_rms_m < 2e-3
 
 
 def test_only_vectors_are_turned():
