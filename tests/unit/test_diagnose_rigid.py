@@ -94,7 +94,11 @@ def test_drag_slows_as_in_closed_form():
 @given(st.floats(0.15, 0.95), st.floats(0.5, 4.0))
 def test_a_ball_leaves_with_its_restitution(restitution, speed):
     found = run(
-        scene_of(sphere()), state((0, 0, RADIUS + 0.01), (0, 0, -speed)), [0.1], gravity=np.zeros(3), restitution=restitution
+        scene_of(sphere()),
+        state((0, 0, RADIUS + 0.01), (0, 0, -speed)),
+        [0.1],
+        gravity=np.zeros(3),
+        restitution=restitution,
     )
     # The fitted bodies' dashpots are 2 % weak, and a bounce of 20 steps is resolved to about a percent.
     assert found[0, 9] / speed == pytest.approx(restitution, abs=0.035)

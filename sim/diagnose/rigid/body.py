@@ -59,7 +59,9 @@ def rigid_body(item: CaptureObject) -> RigidBody:
     try:
         hull = ConvexHull(vertices)
     except (QhullError, ValueError) as error:
-        raise InputError(f"object {item.name!r}: its mesh is flat ({type(error).__name__}): give a closed body") from None
+        raise InputError(
+            f"object {item.name!r}: its mesh is flat ({type(error).__name__}): give a closed body"
+        ) from None
     middle = 0.5 * (vertices[hull.vertices].min(axis=0) + vertices[hull.vertices].max(axis=0))
     reach = float(np.linalg.norm(vertices - middle, axis=1).max())
     if hull.volume > ROUND * 4 / 3 * np.pi * reach**3 or _spherical(vertices[hull.vertices], middle, reach):

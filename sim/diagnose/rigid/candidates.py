@@ -261,7 +261,7 @@ def _camera_values(scene: Scene, s: Setting, z: Array) -> Values:
 
 
 def _tether_starts() -> tuple[tuple[float, ...], ...]:
-    corners = [(x, y, h) for x in (-0.6, 0.6) for y in (-0.6, 0.6) for h in (-0.2, 0.8)]
+    corners = [(x, y, h) for x, y, h in ((-0.6, -0.6, 0.3), (-0.6, 0.6, 0.3), (0.6, -0.6, 0.3), (0.6, 0.6, 0.3))]
     return tuple((-0.5, -0.5, *c) for c in corners)
 
 

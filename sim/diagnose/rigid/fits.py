@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,10 +19,10 @@ from ..analysis import CandidateFit, Discrepancy, Estimate
 from ..capture import Capture, Trial
 from .body import rigid_body
 from .candidates import BELIEFS, FREEDOMS, Freedom, Scene
-from .heldout import heldout
+from .heldout import Heldout, heldout
 from .misfit import misfit
 from .observation import frame_pose, sights
-from .prediction import believed_fit, predict_points, simulate_points
+from .prediction import Points, believed_fit, numerics, predict_points, simulate_points
 from .shooting import FREEDOM_OF_GRAIN, Fit, Model, Problem, solve
 from .tracking import camera_guess, track, weigh
 from .where import discrepancies
@@ -44,6 +44,9 @@ PROMISING = 12.0
 FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
 """Nats over the nominal model, and misfit, above which an effect is fitted with nodes of its own."""
 
+MOVED_GUESS = 0.3
+"""Standard deviations of the prior that poses alone must say a camera has moved, for that."""
+
 MOVED_MISFIT = 3.0
 """Misfit of the nominal model above which a moved camera is followed on its own."""
 
@@ -60,7 +63,7 @@ class BodyFits:
     flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
 
 
-class Cancelled(Exception):
+class CancelledError(Exception):
     """The caller no longer wants the fits."""
 
 
@@ -79,7 +82,7 @@ class RigidFits:
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""
-        return self._joined(predict_points, fit, [t for t in self.capture.predict_trials])
+        return self._joined(predict_points, fit, list(self.capture.predict_trials))
 
     def simulate(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (T, K, 3) in m at the frames of every trial, by its name, started from its first frames."""
@@ -90,7 +93,7 @@ class RigidFits:
         key = None if fit is None else fit.effects
         return discrepancies(self.capture, [(b.fits[()], None if key is None else b.fits[key]) for b in self.bodies])
 
-    def _joined(self, how, fit: CandidateFit, trials: list[Trial]) -> dict[str, Array]:  # type: ignore[no-untyped-def]
+    def _joined(self, how: Callable[[Fit], Points], fit: CandidateFit, trials: list[Trial]) -> dict[str, Array]:
         joined: dict[str, Array] = {}
         for body in self.bodies:
             found = believed_fit(body.fits[()]) if fit is self.nominal else body.fits[fit.effects]
@@ -113,7 +116,7 @@ def fit_rigid(
     """Every effect of ``names`` (None: all that mean something for a rigid body) fitted to ``capture``.
 
     budget_s: seconds after which no further candidate is begun. Raises InputError where no body is rigid or a name is
-    unknown, and whatever ``cancelled`` makes of it: ``Cancelled``.
+    unknown, and whatever ``cancelled`` makes of it: ``CancelledError``.
     """
     started = time.monotonic()
     wanted = _wanted(capture, names)
@@ -131,7 +134,7 @@ def fit_rigid(
         done += 1
         progress.report(done, what)
         if cancelled():
-            raise Cancelled
+            raise CancelledError
 
     for body in bodies:
         _fit_nominal(body)
@@ -223,7 +226,7 @@ def _fit(body: BodyFits, freedoms: tuple[Freedom, ...], base: Fit | None = None)
 
 
 def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: Freedom) -> tuple[Array, list[Array]]:
-    """Where to begin with an effect of contact: flights fix the states, whatever it is; then its best numbers on a grid.
+    """Where to begin with an effect of contact: flights fix the states whatever it is, a grid its best numbers.
 
     Begun from the nominal fit, states that were bent to wrong contacts would hold on to them.
     """
@@ -274,9 +277,9 @@ def _moved_camera(body: BodyFits) -> None:
         return
     freedom = FREEDOMS["camera_pose"]
     model = Model(freedoms=(freedom,))
-    z = np.concatenate([np.zeros(BELIEFS.size), camera_guess(problem)])
-    for _ in range(2):
-        z = _followed(body, model, z).z
+    guess = camera_guess(problem)
+    if float(np.abs(guess).max()) > MOVED_GUESS:
+        _followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
 
 
 def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
@@ -285,9 +288,10 @@ def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
     takes = track(problem.scene, problem.launcher, [t.sight for t in problem.takes], model=model, z=z)
     other = dataclasses.replace(problem, takes=takes)
     weigh(other, model, z)
-    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=4)
+    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=3)
     begin = flown.z if model.freedoms[-1].name not in CONTACTS else z
-    fit = solve(other, model, begin, flown.states, rounds=ROUNDS)
+    fit = solve(other, model, begin, flown.states, rounds=2)
+    fit = solve(other, model, fit.z, fit.states, rounds=ROUNDS, held=fit.evaluation)
     key = tuple(f.name for f in model.freedoms)
     if key not in body.fits or body.fits[key].evidence < fit.evidence:
         body.fits[key] = fit
@@ -357,6 +361,7 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     held = {k: [heldout(b.fits[k]) for b in bodies] for k in keys}
     for k in keys:
         made[k] = _candidate(capture, bodies, k, held[k])
+    _level_twins(made)
     believed = [heldout(believed_fit(b.fits[()])) for b in bodies]
     floor = min(c.heldout_rms_m for c in made.values())
     refit = made[("friction", "restitution")]
@@ -368,12 +373,25 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         refitted=refit,
         candidates=tuple(singles),
         floor_rms_m=min(floor, believed[0].floor_rms_m),
-        numerics_rms_m=believed[0].numerics_rms_m,
+        numerics_rms_m=float(np.sqrt(np.mean([numerics(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
         believed_rms_m=float(np.sqrt(np.mean([b.rms_m**2 for b in believed]))),
     )
 
 
-def _candidate(capture: Capture, bodies: list[BodyFits], key: tuple[str, ...], held) -> CandidateFit:  # type: ignore[no-untyped-def]
+def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
+    """A slow clock and a lighter body are one and the same motion: what their evidence differs by is the search's."""
+    clock, weight = made.get(("time_scale",)), made.get(("buoyancy",))
+    if clock is None or weight is None:
+        return
+    rate = clock.parameters["time_scale"]["rate"].value
+    fraction = weight.parameters["buoyancy"]["fraction"].value
+    if abs(rate**2 - (1 - fraction)) < 0.1 * abs(fraction) + 1e-4:
+        best = max(clock.log_evidence, weight.log_evidence)
+        made["time_scale",] = dataclasses.replace(clock, log_evidence=best)
+        made["buoyancy",] = dataclasses.replace(weight, log_evidence=best)
+
+
+def _candidate(capture: Capture, bodies: list[BodyFits], key: tuple[str, ...], held: list[Heldout]) -> CandidateFit:
     first = max(bodies, key=lambda b: float(np.trace(b.fits[key].schur.sum(axis=0))))
     fit = first.fits[key]
     scene = fit.problem.scene

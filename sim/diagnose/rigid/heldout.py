@@ -16,12 +16,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Heldout:
-    """log_score: (fit takes,) nats. rms_m: predicted from the first frames. floor_rms_m, numerics_rms_m: as ``Fits``."""
+    """log_score: (fit takes,) nats. rms_m: predicted from the first frames. floor_rms_m: what noise alone leaves."""
 
     log_score: Array
     rms_m: float
     floor_rms_m: float
-    numerics_rms_m: float
 
 
 def without_each(fit: Fit) -> Array:
@@ -47,7 +46,8 @@ def heldout(fit: Fit) -> Heldout:
             cost = fit.evaluation.linear[i].cost - 2 * float(fit.pull[i] @ step) + float(step @ fit.schur[i] @ step)
             scores.append(-0.5 * cost)
     starts = first_states(fit, numbers)
-    squares, coarse, floors = [], [], []
+    squares: list[Array] = []
+    floors: list[float] = []
     for i, take in enumerate(problem.takes):
         if take.sight.trial.role != "fit" or len(take.sight.times) < 5:
             continue
@@ -62,7 +62,7 @@ def heldout(fit: Fit) -> Heldout:
             floors.append(3 * take.sight.sigma**2)
     rms = float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("nan")
     floor = float(np.sqrt(np.mean(floors))) if floors else rms
-    return Heldout(log_score=np.array(scores), rms_m=rms, floor_rms_m=floor, numerics_rms_m=0.0 if not coarse else 0.0)
+    return Heldout(log_score=np.array(scores), rms_m=rms, floor_rms_m=floor)
 
 
 def _followed(fit: Fit, index: int) -> Array:

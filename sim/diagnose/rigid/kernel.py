@@ -99,8 +99,8 @@ def advance(
     """Take every world from its start to each of its times.
 
     points: corners about the reference point; bound: their largest distance to it plus the radius; longest: step in s
-    in flight. starts (W, 13), p (W, NUMBERS), counts (W,), times (W, M) s since the start, rising; out (W, M, 17). Start
-    and out are of the reference point, from which the world's centre of mass lies CENTER away, body axes.
+    in flight. starts (W, 13), p (W, NUMBERS), counts (W,), times (W, M) s since the start, rising; out (W, M, 17). Both
+    are of the reference point, from which the world's centre of mass lies CENTER away, body axes.
     """
     for ww in range(worlds * ITERATIONS):
         if ww % ITERATIONS == 0:
@@ -212,7 +212,9 @@ def advance(
                                     u = v + spin.cross(lever)
                                     pn = old.dot(n)
                                     # The 2 % give redundant contacts (four under a face) one answer.
-                                    new_n = ti.max(0.0, pn + eases[i] * ((want - u).dot(n) - 0.02 * pn / eases[i] / 1.02))
+                                    new_n = ti.max(
+                                        0.0, pn + eases[i] * ((want - u).dot(n) - 0.02 * pn / eases[i] / 1.02)
+                                    )
                                     push = (new_n - pn) * n
                                     v += push
                                     spin += inverse @ lever.cross(push)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .shooting import Fit, Problem
+from .candidates import Setting
+from .shooting import Fit, Problem, Segment, Take
 
 Array = NDArray[np.float64]
 
@@ -53,7 +54,9 @@ def misfit(fit: Fit) -> Misfit:
     return Misfit(flight=flight, flight_count=flights, contact=contact, contact_count=contacts)
 
 
-def _remainder(problem: Problem, take, segment, free, setting) -> tuple[float, int]:  # type: ignore[no-untyped-def]
+def _remainder(
+    problem: Problem, take: Take, segment: Segment, free: NDArray[np.int64], setting: Setting
+) -> tuple[float, int]:
     """chi² that a smooth change of the poses takes away, and its degrees of freedom."""
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]

@@ -54,9 +54,7 @@ class Sight:
         """
         lever = np.einsum("fij,kj->fki", to_matrix(q), self.places)
         points = x[:, None] + lever
-        slope = np.concatenate(
-            [np.broadcast_to(np.eye(3), (*points.shape[:2], 3, 3)), -skew(lever)], axis=-1
-        )
+        slope = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape[:2], 3, 3)), -skew(lever)], axis=-1)
         seen = self.seen[frames]
         if self.camera is None:
             gap = seen - points

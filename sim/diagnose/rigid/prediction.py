@@ -12,6 +12,7 @@ from .candidates import BELIEFS
 from .shooting import Fit, Model, Take
 from .tracking import settle
 from .turning import to_matrix
+from .worlds import SLOTS
 
 Array = NDArray[np.float64]
 Points = dict[str, tuple[NDArray[np.int64], Array]]
@@ -54,9 +55,7 @@ def predict_points(fit: Fit) -> Points:
 
 def shown_frames(fit: Fit, take: Take) -> int:
     """As many first frames of ``take`` as the predict trials show, or ``SHOWN`` seconds."""
-    spans = [
-        t.sight.times[-1] - t.sight.times[0] for t in fit.problem.takes if t.sight.trial.predict_times is not None
-    ]
+    spans = [t.sight.times[-1] - t.sight.times[0] for t in fit.problem.takes if t.sight.trial.predict_times is not None]
     times = take.sight.times - take.sight.times[0]
     count = int(np.searchsorted(times, float(np.median(spans)) if spans else SHOWN, side="right"))
     return int(np.clip(count, min(4, take.end), take.end))
@@ -68,11 +67,17 @@ def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
     for take, whole in zip(fit.problem.takes, fit.states, strict=True):
         end = shown_frames(fit, take)
         nodes = [n for n in take.nodes if n < end - 2] or [0]
+        end = min([end, *take.nodes[len(nodes) : len(nodes) + 1]])
         cut = end - nodes[-1]
         weights = [*take.weights[: len(nodes) - 1], take.weights[len(nodes) - 1][:cut]]
         short.append(
             dataclasses.replace(
-                take, nodes=nodes, end=end, states=whole[: len(nodes)], covers=take.covers[: len(nodes) - 1], weights=weights
+                take,
+                nodes=nodes,
+                end=end,
+                states=whole[: len(nodes)],
+                covers=take.covers[: len(nodes) - 1],
+                weights=weights,
             )
         )
         states.append(whole[: len(nodes)])
@@ -89,3 +94,19 @@ def simulate_points(fit: Fit) -> Points:
         earlier = [s.record[s.frames < begin] for s in fit.evaluation.segments if s.take == i]
         found[take.sight.trial.name] = take.sight.columns, placed(take, np.concatenate([*earlier, record]))
     return found
+
+
+def numerics(fit: Fit) -> float:
+    """Root mean square distance in m by which ``fit``'s takes move when every step is half as long."""
+    problem = fit.problem
+    fine = dataclasses.replace(problem.launcher, longest=0.5 * problem.launcher.longest)
+    setting = fit.model.setting(problem.scene, fit.z)
+    row = problem.scene.numbers([setting])
+    half = row.copy()
+    half[:, SLOTS["step"]] *= 0.5
+    off = []
+    for take, states in zip(problem.takes, fit.states, strict=True):
+        clock = [(take.sight.times - take.sight.times[0]) * setting.rate]
+        coarse = placed(take, problem.launcher.run(states[:1], row, clock)[0])
+        off.append(np.sum((placed(take, fine.run(states[:1], half, clock)[0]) - coarse) ** 2, axis=-1).ravel())
+    return float(np.sqrt(np.mean(np.concatenate(off))))

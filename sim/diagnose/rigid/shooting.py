@@ -142,7 +142,8 @@ class Problem:
     ) -> Evaluation:
         """Residuals, and with ``slopes`` the normal equations, of ``model`` with numbers ``z`` (P,) at ``states``.
 
-        z may be (takes, P), other numbers for each take. held: an evaluation near by, whose slopes with states and beliefs are taken as they are (the chord method).
+        z may be (takes, P), other numbers for each take. held: an evaluation near by, whose slopes with states and
+        beliefs are taken as they are (the chord method).
         """
         scene, size = self.scene, model.size
         many = [self._variants(model, row, slopes, held is not None) for row in np.atleast_2d(z)]
@@ -202,7 +203,10 @@ class Problem:
                 part.cost += (nu + 12) * np.log1p(square / nu)
                 if slopes:
                     scale = scale * (nu + 12) / (nu + square)
-                    up, down = between(arrival[:1, :13], arrival[1::2, :13]), between(arrival[:1, :13], arrival[2::2, :13])
+                    up, down = (
+                        between(arrival[:1, :13], arrival[1::2, :13]),
+                        between(arrival[:1, :13], arrival[2::2, :13]),
+                    )
                     come = ((up - down) / (2 * steps[:, None])).T
                     if old is not None:
                         come = np.concatenate([old.come, come], axis=1)
@@ -335,9 +339,12 @@ def solve(
         matrix[np.diag_indices(size)] *= 1 + damping
         step = np.linalg.solve(matrix, sum(p[1] for p in parts) - z)
         step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-        step[: BELIEFS.size] = np.clip(z[: BELIEFS.size] + step[: BELIEFS.size], -PLAUSIBLE, PLAUSIBLE) - z[: BELIEFS.size]
+        step[: BELIEFS.size] = (
+            np.clip(z[: BELIEFS.size] + step[: BELIEFS.size], -PLAUSIBLE, PLAUSIBLE) - z[: BELIEFS.size]
+        )
         tried = [
-            moved(s, (own - answer @ step).reshape(-1, 12)) for s, (_, _, answer, own) in zip(states, parts, strict=True)
+            moved(s, (own - answer @ step).reshape(-1, 12))
+            for s, (_, _, answer, own) in zip(states, parts, strict=True)
         ]
         new = problem.evaluate(model, z + step, tried, held=held)
         if np.isfinite(new.cost) and new.cost < best.cost:
@@ -354,7 +361,9 @@ def solve(
     matrix = np.eye(size) + schur.sum(axis=0)
     evidence = -0.5 * best.cost - 0.5 * float(np.linalg.slogdet(0.5 * (matrix + matrix.T))[1])
     evidence += _volumes(problem, best, size)
-    return Fit(problem=problem, model=model, z=z, states=states, evaluation=best, schur=schur, pull=pull, evidence=evidence)
+    return Fit(
+        problem=problem, model=model, z=z, states=states, evaluation=best, schur=schur, pull=pull, evidence=evidence
+    )
 
 
 def _volumes(problem: Problem, evaluation: Evaluation, size: int) -> float:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def first_state(scene: Scene, sight: Sight) -> tuple[Array, Array]:
         state[:3] = x[0]
     turns = [Rotation.from_matrix(p[2]) for p in poses]
     if alone and len(poses) >= 2:
-        spins = [(b * a.inv()).as_rotvec() / (t[i + 1] - t[i]) for i, (a, b) in enumerate(zip(turns, turns[1:], strict=False))]
+        spins = [(b * a.inv()).as_rotvec() / (t[i + 1] - t[i]) for i, (a, b) in enumerate(pairwise(turns))]
         spin = np.median(spins, axis=0)
         # Turned back to the start, all frames say where it was turned then.
         back = [Rotation.from_rotvec(-spin * (ti)) * r for ti, r in zip(t, turns, strict=True)]
@@ -111,15 +112,15 @@ def settle(problem: Problem, model: Model, z: Array, states: list[Array], rounds
     return states
 
 
-def track(scene: Scene, launcher: Launcher, seen: list[Sight], *, model: Model = NOMINAL, z: Array | None = None) -> list[Take]:
+def track(
+    scene: Scene, launcher: Launcher, seen: list[Sight], *, model: Model = NOMINAL, z: Array | None = None
+) -> list[Take]:
     """Takes with nodes and first states: nominal model, one stretch after the other."""
     numbers = np.zeros(model.size) if z is None else z
     takes = []
     for sight in seen:
         state, prior = first_state(scene, sight)
-        takes.append(
-            Take(sight=sight, nodes=[0], states=state[None], end=used_frames(sight), guess=state, prior=prior)
-        )
+        takes.append(Take(sight=sight, nodes=[0], states=state[None], end=used_frames(sight), guess=state, prior=prior))
     here = [dataclasses.replace(t, states=t.states.copy(), nodes=[0]) for t in takes]
     active = list(range(len(takes)))
     for _ in range(MOST_NODES):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ from ..capture import Capture
 from .candidates import BELIEFS, Setting
 from .observation import project
 from .prediction import placed
-from .shooting import Fit, Model, Problem, Take
+from .shooting import Fit, Model, Problem, Segment, Take
 from .turning import to_matrix
 
 Array = NDArray[np.float64]
@@ -72,11 +74,13 @@ def _fine(fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
     take, setting = problem.takes[index], fit.model.setting(problem.scene, fit.z)
     times = take.sight.times
     rows, clocks = [], []
-    spans = take.spans[:-1] + [(take.nodes[-1], len(times))]
+    spans = [*take.spans[:-1], (take.nodes[-1], len(times))]
     for a, b in spans:
         last = b if b < len(times) else b - 1
         edges = times[a : last + 1]
-        fine = np.unique(np.concatenate([np.linspace(s, e, PARTS, endpoint=False) for s, e in zip(edges, edges[1:], strict=False)] + [edges[-1:]]))
+        fine = np.unique(
+            np.concatenate([np.linspace(s, e, PARTS, endpoint=False) for s, e in pairwise(edges)] + [edges[-1:]])
+        )
         clocks.append(fine)
     starts = fit.states[index]
     table = np.repeat(problem.scene.numbers([setting]), len(spans), axis=0)
@@ -94,12 +98,11 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     take, scene = used.problem.takes[index], used.problem.scene
     frames = len(take.sight.times)
     clock, record, nearest = _fine(used, index)
-    step = np.diff(clock, append=clock[-1] + 1e-3)
     normal = scene.capture.ground.unit_normal
     gains = np.maximum(np.diff(record[:, 13:17], axis=0, append=record[-1:, 13:17]), 0.0)
     gains[np.diff(clock, append=clock[-1]) <= 0] = 0.0
-    velocity = _by_frame(record[:, 7:10], nearest, frames, np.mean)
-    spin = _by_frame(record[:, 10:13], nearest, frames, np.mean)
+    velocity = _by_frame(record[:, 7:10], nearest, frames)
+    spin = _by_frame(record[:, 10:13], nearest, frames)
     pushed = _summed(gains[:, 0], nearest, frames)
     touched = _summed(gains[:, 2], nearest, frames)
     slid = _summed(gains[:, 3], nearest, frames)
@@ -116,12 +119,12 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
         else:
             phases.append("impact" if blow[f] > 0.05 else "contact")
     lack = np.zeros((frames, 3))
-    
+
     if fit is None:
         return measured(nominal, index), phases, velocity
     base = Model(freedoms=()).setting(scene, fit.z[: BELIEFS.size])
     setting = fit.model.setting(scene, fit.z)
-    lack += _by_frame(_force_difference(scene, base, setting, record), nearest, frames, np.mean)
+    lack += _by_frame(_force_difference(base, setting, record), nearest, frames)
     rate = pushed / spacing
     if setting.friction != base.friction:
         way = velocity - (velocity @ normal)[:, None] * normal
@@ -135,11 +138,11 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
         lack -= (setting.rolling / scene.body.bound * rate)[:, None] * way
     if setting.pull > 0:
         gap = _gap(used.problem, record)
-        lack -= (_by_frame((gap < setting.reach)[:, None] * 1.0, nearest, frames, np.mean) * setting.pull) * normal
+        lack -= (_by_frame((gap < setting.reach)[:, None] * 1.0, nearest, frames) * setting.pull) * normal
     if setting.fraction > 0:
         arm = np.einsum("fij,j->fi", to_matrix(record[:, 3:7]), setting.center)
         w = record[:, 10:13]
-        lack += _by_frame(np.cross(w, np.cross(w, arm)), nearest, frames, np.mean)
+        lack += _by_frame(np.cross(w, np.cross(w, arm)), nearest, frames)
     if setting.rate != 1.0:
         lack += (setting.rate**2 - 1) * np.asarray(scene.capture.gravity)
     if setting.camera is not None:
@@ -147,7 +150,7 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     return lack, phases, velocity
 
 
-def _force_difference(scene, base: Setting, setting: Setting, record: Array) -> Array:  # type: ignore[no-untyped-def]
+def _force_difference(base: Setting, setting: Setting, record: Array) -> Array:
     """Force per mass (M, 3) of ``setting`` beyond ``base`` at the states of ``record``."""
     x, v, w = record[:, :3], record[:, 7:10], record[:, 10:13]
     u = v - setting.wind
@@ -196,7 +199,7 @@ def measured(fit: Fit, index: int) -> Array:
     return lack
 
 
-def _curvature(problem: Problem, take: Take, segment, free: NDArray[np.int64], setting: Setting) -> Array:  # type: ignore[no-untyped-def]
+def _curvature(problem: Problem, take: Take, segment: Segment, free: NDArray[np.int64], setting: Setting) -> Array:
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
     _, slope, info = take.sight.information(pose[:, :3], pose[:, 3:7], frames)
@@ -225,7 +228,7 @@ def _summed(values: Array, nearest: NDArray[np.int64], frames: int) -> Array:
     return np.bincount(nearest, weights=values, minlength=frames)[:frames]
 
 
-def _by_frame(values: Array, nearest: NDArray[np.int64], frames: int, how) -> Array:  # type: ignore[no-untyped-def]
+def _by_frame(values: NDArray[np.floating], nearest: NDArray[np.int64], frames: int) -> Array:
     count = np.maximum(np.bincount(nearest, minlength=frames)[:frames], 1)
     return np.stack([_summed(v, nearest, frames) / count for v in values.T], axis=1)
 

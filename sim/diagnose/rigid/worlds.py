@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +29,7 @@ SOFTER = 0.98
 LONGEST = 0.005
 """Step in flight, s."""
 
-SLOTS = {
+SLOTS: Mapping[str, Any] = {
     "gravity": slice(0, 3),
     "drag": 3,
     "wind": slice(4, 7),
