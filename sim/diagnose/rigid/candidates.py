@@ -331,7 +331,9 @@ FREEDOMS: Mapping[str, Freedom] = {
             values=lambda scene, s, z: {"pull_per_mass": s.pull, "reach": s.reach},
             starts=((0.0, 0.0),),
             step=0.1,
-            grid=tuple((a, b) for a in (-3.0, -1.5, -0.7, 0.0, 0.7, 1.5) for b in (-1.5, -0.7, 0.0, 0.7, 1.5)),
+            grid=tuple(
+                (a, b) for a in (-2.0, -1.0, -0.4, 0.0, 0.4, 0.8, 1.3) for b in (-1.2, -0.6, -0.2, 0.2, 0.6, 1.2)
+            ),
         ),
         Freedom(
             name="mass_offset",

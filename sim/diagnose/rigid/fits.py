@@ -35,6 +35,9 @@ ROUNDS = 10
 CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion")
 """Effects that act in contact alone."""
 
+FLIES = 6
+"""Frames without contact after a node, from which its state is known."""
+
 LOOSE = 300.0
 """Factor on the grain while only flights count."""
 
@@ -49,6 +52,10 @@ MOVED_GUESS = 0.3
 
 MOVED_MISFIT = 3.0
 """Misfit of the nominal model above which a moved camera is followed on its own."""
+
+PAIR_SHARE = 0.85
+"""Of the nominal model's misfit that the best single effect must get below: where it explains next to nothing, a second
+one explains nothing either, and the cause is another."""
 
 PAIR_MISFIT = 1.6
 """Misfit of the best single effect above which pairs are tried."""
@@ -212,7 +219,8 @@ def _fit(body: BodyFits, freedoms: tuple[Freedom, ...], base: Fit | None = None)
         flown = sorted(flown, key=lambda f: -f.evidence)[:3]
         fits = [(f.z, f.states) for f in flown]
     else:
-        fits = [_scanned(body, begin, model, new[-1])]
+        z, free = _scanned(body, begin, model, new[-1])
+        fits = [(z, free), (z, begin.states)]
     if len(fits) > 1:
         first = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
         first.sort(key=lambda f: -f.evidence)
@@ -251,7 +259,12 @@ def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: Freedom) -> tupl
         )
         own = float(z[len(base) :] @ z[len(base) :])
         costs.append(own + float(np.sum((FREEDOM_OF_GRAIN + 12) * np.log1p(squares / FREEDOM_OF_GRAIN))))
-    return tried[int(np.argmin(costs))], flown.states
+    # A state that no flight follows is known by its contacts alone: it stays.
+    states = [s.copy() for s in begin.states]
+    for segment in flown.evaluation.segments:
+        if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
+            states[segment.take][segment.index] = flown.states[segment.take][segment.index]
+    return tried[int(np.argmin(costs))], states
 
 
 def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
@@ -342,7 +355,8 @@ def _pairs(body: BodyFits, wanted: list[Freedom], until: float) -> None:
     if not singles:
         return
     singles.sort(key=lambda item: -item[1].evidence)
-    if misfit(singles[0][1]).ratio < PAIR_MISFIT:
+    left = misfit(singles[0][1]).ratio
+    if left < PAIR_MISFIT or left > PAIR_SHARE * misfit(body.fits[()]).ratio:
         return
     for name, fit in singles[:2]:
         for freedom in wanted:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from .candidates import Scene
 from .grain import covariance, frame_weights, grain_of
 from .observation import Sight, frame_pose
-from .shooting import Model, Problem, Take, reduce_take
+from .shooting import Model, Problem, Segment, Take, reduce_take
 from .turning import moved
 from .worlds import Launcher
 
@@ -32,17 +32,21 @@ LONGEST_IMPACT = 0.05
 
 MOST_NODES = 24
 
+LOST = 40.0
+"""Standard deviations of the noise, root mean square, beyond which the body is not where the model goes."""
+
 GUESS_HEIGHT = 0.01
 """m, what a height from one frame's pixels errs by."""
 
 NOMINAL = Model(freedoms=())
 
 
-def first_state(scene: Scene, sight: Sight) -> tuple[Array, Array]:
-    """(state (13,), standard deviations (12,) of what it may be off), from the first frames."""
-    frames = np.flatnonzero(sight.times - sight.times[0] <= SEEN_FIRST)
+def first_state(scene: Scene, sight: Sight, first: int = 0) -> tuple[Array, Array]:
+    """(state (13,), standard deviations (12,) of what it may be off), from the frames next to frame ``first``."""
+    late = sight.times - sight.times[first]
+    frames = np.flatnonzero((late >= 0) & (late <= SEEN_FIRST))
     if len(frames) < 4:
-        frames = np.arange(min(4, len(sight.times)))
+        frames = np.arange(first, min(first + 4, len(sight.times)))
     poses: list[tuple[float, Array, Array]] = []
     guess = None
     for frame in frames:
@@ -57,7 +61,7 @@ def first_state(scene: Scene, sight: Sight) -> tuple[Array, Array]:
     if not poses:
         state[:3] = scene.middle
         return state, prior
-    t = np.array([p[0] for p in poses]) - sight.times[0]
+    t = np.array([p[0] for p in poses]) - sight.times[first]
     x = np.array([p[1] for p in poses])
     if len(poses) >= 2:
         fall = x - 0.5 * np.asarray(scene.capture.gravity) * t[:, None] ** 2
@@ -148,6 +152,16 @@ def track(
             else:
                 take.states = here[i].states.copy()
             index = _next_node(take.sight.times[node : take.end], segment.record)
+            lost = _lost(take.sight, segment)
+            if lost is not None and (index is None or lost < index):
+                # The model went somewhere else altogether: begin anew where the body is.
+                guess, prior = first_state(scene, take.sight, node + lost)
+                take.nodes.append(node + lost)
+                here[i] = Take(
+                    sight=take.sight, nodes=[node + lost], states=guess[None], end=take.end, guess=guess, prior=prior
+                )
+                going.append(i)
+                continue
             if index is None:
                 continue
             guess = segment.record[index, :13].copy()
@@ -181,6 +195,17 @@ def _window(take: Take, record: Array) -> int:
         return node + min(first, int(np.searchsorted(times, flight)) + 1)
     short = max(int(np.searchsorted(times, (2 if take.sight.camera is not None else 1) * CONTACT_WINDOW)) + 1, 5)
     return min(take.end, node + short)
+
+
+def _lost(sight: Sight, segment: Segment) -> int | None:
+    """Frame of ``segment`` from which its residuals are beyond anything that a missing force explains; None if none."""
+    seen = np.maximum(np.isfinite(sight.seen[segment.frames]).all(axis=2).sum(axis=1) * sight.seen.shape[2], 1)
+    bad = segment.chi2 / seen > LOST**2
+    run = bad[:-2] & bad[1:-1] & bad[2:]
+    if not run.any():
+        return None
+    index = max(int(np.argmax(run)), 3)
+    return index if index < len(bad) - 3 else None
 
 
 def _next_node(times: Array, record: Array) -> int | None:
