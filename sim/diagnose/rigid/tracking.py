@@ -14,7 +14,7 @@ from .candidates import Scene
 from .grain import covariance, frame_weights, grain_of
 from .observation import Sight, frame_pose
 from .shooting import Model, Problem, Segment, Take, reduce_take
-from .turning import moved
+from .turning import moved, to_matrix
 from .worlds import Launcher
 
 Array = NDArray[np.float64]
@@ -125,6 +125,7 @@ def track(
     for sight in seen:
         state, prior = first_state(scene, sight)
         takes.append(Take(sight=sight, nodes=[0], states=state[None], end=used_frames(sight), guess=state, prior=prior))
+    _set_down(scene, launcher, takes, model, numbers)
     here = [dataclasses.replace(t, states=t.states.copy(), nodes=[0]) for t in takes]
     active = list(range(len(takes)))
     for _ in range(MOST_NODES):
@@ -179,6 +180,29 @@ def track(
     for take in takes:
         take.nodes = take.nodes[: len(take.states)]
     return takes
+
+
+def _set_down(scene: Scene, launcher: Launcher, takes: list[Take], model: Model, z: Array) -> None:
+    """Begin on the ground where that explains the first frames better: pixels leave a start's height open."""
+    near = [t for t in takes if t.sight.camera is not None]
+    if not near:
+        return
+    normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
+    options = []
+    for take in near:
+        down = take.states.copy()
+        corners = down[0, :3] + scene.body.corners @ to_matrix(down[0, 3:7]).T
+        down[0, :3] -= ((corners - foot) @ normal - scene.body.radius).min() * normal
+        down[0, 7:10] -= (down[0, 7:10] @ normal) * normal
+        end = min(take.end, int(np.searchsorted(take.sight.times - take.sight.times[0], PIXEL_WINDOW)) + 1)
+        options += [dataclasses.replace(take, end=end), dataclasses.replace(take, end=end, states=down)]
+    problem = Problem(scene=scene, launcher=launcher, takes=options)
+    settled = settle(problem, model, z, [t.states for t in options], 6)
+    costs = [part.cost for part in problem.evaluate(model, z, settled, slopes=False).linear]
+    for k, take in enumerate(near):
+        best = 2 * k + int(costs[2 * k + 1] < costs[2 * k])
+        take.states = settled[best]
+        take.guess = settled[best][0].copy()
 
 
 def _window(take: Take, record: Array) -> int:
