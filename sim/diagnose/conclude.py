@@ -128,11 +128,15 @@ def _fit(
 
 
 def _found(fits: Fits, weighed: Weighed) -> CandidateFit:
-    """The fit that predicts ``after``: the verdict's; for ``none`` and ``unknown`` the model with its own re-fitted."""
+    """The fit that predicts ``after``: the verdict's.
+
+    For ``none`` that is the nominal model, for ``unknown`` the nominal model with its own numbers re-fitted where that
+    predicts better.
+    """
     name = weighed.verdict.effect
-    if name in (NONE, UNKNOWN):
-        return fits.refitted
-    return weighed.best[name]
+    if name == NONE or (name == UNKNOWN and not fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m):
+        return fits.nominal
+    return fits.refitted if name == UNKNOWN else weighed.best[name]
 
 
 def _confirm(

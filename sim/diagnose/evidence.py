@@ -32,6 +32,8 @@ class Weighing:
     enough: misfit at which the chance that the right candidate leaves that much is one half.
     sharpness: slope of that curve in ln m.
     prior_none: prior probability that nothing is missing; the effects share the rest.
+    second_gain, second_misfit: a candidate of two effects counts only where it gains more nats than this over each of
+        them alone, and each alone leaves more than so many times its misfit.
     alternative: an effect is named beside the verdict from this share of the verdict's probability on.
     """
 
@@ -39,6 +41,8 @@ class Weighing:
     enough: float = 2.0
     sharpness: float = 8.0
     prior_none: float = 0.3
+    second_gain: float = 15.0
+    second_misfit: float = 1.15
     alternative: float = 0.1
 
 
@@ -67,7 +71,7 @@ class Weighed:
 
 def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     """Verdict and probabilities. A candidate of two effects counts for the first of its effects."""
-    candidates = [fits.nominal, *fits.candidates]
+    candidates = [fits.nominal, *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
     weights = _weights(candidates, weighing)
     adequate = [_adequacy(c.misfit, weighing) for c in candidates]
     probabilities: dict[str, float] = {}
@@ -83,6 +87,16 @@ def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     probabilities = {name: p / total for name, p in probabilities.items()}
     found = {name: fit for name, (_, fit) in best.items()}
     return Weighed(verdict=_verdict(probabilities, found, weighing), probabilities=probabilities, best=found)
+
+
+def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: Weighing) -> bool:
+    """Whether a second effect explains what the first alone leaves; always true of a single one."""
+    if len(fit.effects) < 2:
+        return True
+    singles = [c for c in candidates if len(c.effects) == 1 and c.effects[0] in fit.effects]
+    gained = min((fit.log_evidence - c.log_evidence for c in singles), default=math.inf)
+    better = min((c.misfit for c in singles), default=math.inf) > weighing.second_misfit * fit.misfit
+    return bool(gained > weighing.second_gain and better)
 
 
 def _weights(candidates: Sequence[CandidateFit], weighing: Weighing) -> list[float]:

@@ -70,6 +70,14 @@ def test_two_causes_count_for_the_first():
     assert result.verdict.effect == "friction" and result.verdict.effects == ("friction", "air_drag")
 
 
+def test_a_second_cause_has_to_earn_its_place():
+    singles = fit("friction", evidence=900, misfit=1.2), fit("air_drag", evidence=20, misfit=4.0)
+    little = weighed(*singles, fit("friction", "air_drag", evidence=908, misfit=1.0), nominal_misfit=5.0)
+    assert little.verdict.effects == ("friction",)
+    hardly = weighed(*singles, fit("friction", "air_drag", evidence=990, misfit=1.19), nominal_misfit=5.0)
+    assert hardly.verdict.effects == ("friction",)
+
+
 @given(
     st.lists(
         st.tuples(
