@@ -37,8 +37,8 @@ class Weighing:
     alternative: an effect is named beside the verdict from this share of the verdict's probability on.
     """
 
-    temperature: float = 4.0
-    enough: float = 2.0
+    temperature: float = 8.0
+    enough: float = 3.0
     sharpness: float = 8.0
     prior_none: float = 0.3
     second_gain: float = 15.0
