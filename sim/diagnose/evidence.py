@@ -4,11 +4,13 @@
 Two questions are kept apart. Which of the known candidates explains the takes best is answered by their evidence, in
 which every extra parameter is paid for. Whether the best one explains them at all is answered by what it leaves over:
 
-    p(c) = w_c a(m_c),   w_c = prior_c exp(L_c / T) / sum,   p(unknown) = 1 - sum p(c)
+    p(c) = w_c a(m_c),   w_c = prior_c exp((L_c - L_none - d) / T) / sum,   p(unknown) = 1 - sum p(c)
 
-with the log evidence L_c in nats, a temperature T > 1 because takes of one recording share what the model gets wrong,
-the misfit m_c of the fit and a(m), how probable the right candidate would leave a misfit of m (a logistic curve in
-ln m). The constants were set on captures of known cause made by other simulators (docs/diagnosis.md).
+with the log evidence L_c in nats over that of the nominal model, an entry fee d that only effects pay (what search and
+grain leave to chance), a temperature T > 1 because takes of one recording share what the model gets wrong, the misfit
+m_c of the fit and a(m), how probable the right candidate would leave a misfit of m (a logistic curve in ln m). An
+effect that does not predict takes better that it was not fitted to has no gain, whatever its evidence. The constants
+were set on captures of known cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ from .diagnosis import NONE, UNKNOWN, Verdict
 class Weighing:
     """Constants of the decision.
 
-    temperature: T above, at least 1.
+    temperature: T above, at least 1. fee: d above, nats.
+    predicts: share of the nominal model's held-out error below which an effect has to come.
     enough: misfit at which the chance that the right candidate leaves that much is one half.
     sharpness: slope of that curve in ln m.
     prior_none: prior probability that nothing is missing; the effects share the rest.
@@ -37,7 +40,9 @@ class Weighing:
     alternative: an effect is named beside the verdict from this share of the verdict's probability on.
     """
 
-    temperature: float = 8.0
+    temperature: float = 4.0
+    fee: float = 8.0
+    predicts: float = 0.97
     enough: float = 3.0
     sharpness: float = 8.0
     prior_none: float = 0.3
@@ -56,7 +61,9 @@ TWINS: Mapping[str, tuple[str, ...]] = {
 }
 """Effects that are the same motion for a rigid body, or contain it: whoever is named, so is the other."""
 
-TWIN_SHARE = 0.01
+MOST_ALTERNATIVES = 4
+
+TWIN_SHARE = 0.003
 """A twin is named from this share of the verdict's probability on."""
 
 
@@ -100,18 +107,28 @@ def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: W
 
 
 def _weights(candidates: Sequence[CandidateFit], weighing: Weighing) -> list[float]:
+    nominal = candidates[0]
     logs = []
     for fit in candidates:
         # A second cause is as improbable beside the first as the first is by itself.
         each = (1 - weighing.prior_none) / VOCABULARY
         prior = each ** len(fit.effects) if fit.effects else weighing.prior_none
-        usable = fit.log_evidence if math.isfinite(fit.log_evidence) else -math.inf
-        logs.append(math.log(prior) + usable / weighing.temperature)
+        logs.append(math.log(prior) + _gain(fit, nominal, weighing) / weighing.temperature)
     highest = max(logs)
-    if not math.isfinite(highest):
-        return [1.0 / len(candidates)] * len(candidates)
     raw = np.exp(np.array(logs) - highest)
     return [float(w) for w in raw / raw.sum()]
+
+
+def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: Weighing) -> float:
+    """Nats over the nominal model that count for ``fit``."""
+    if fit is nominal:
+        return 0.0
+    gain = fit.log_evidence - nominal.log_evidence
+    if math.isnan(gain) or not math.isfinite(fit.log_evidence):
+        return -math.inf
+    if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m:
+        gain = min(gain, 0.0)
+    return gain - weighing.fee
 
 
 def _adequacy(misfit: float, weighing: Weighing) -> float:
@@ -124,13 +141,13 @@ def _adequacy(misfit: float, weighing: Weighing) -> float:
 def _verdict(probabilities: Mapping[str, float], best: Mapping[str, CandidateFit], weighing: Weighing) -> Verdict:
     name = max(probabilities, key=lambda n: probabilities[n])
     top = probabilities[name]
-    ranked = sorted(probabilities, key=lambda n: -probabilities[n])
+    share = weighing.alternative if name not in (NONE, UNKNOWN) else 2 * weighing.alternative
     others = [
         n
-        for n in ranked
+        for n in sorted(probabilities, key=lambda n: -probabilities[n])
         if n not in (name, UNKNOWN, NONE)
-        and probabilities[n] >= top * (TWIN_SHARE if n in TWINS.get(name, ()) else weighing.alternative)
-    ]
+        and probabilities[n] >= top * (TWIN_SHARE if n in TWINS.get(name, ()) else share)
+    ][:MOST_ALTERNATIVES]
     if name in (NONE, UNKNOWN):
         return Verdict(effect=name, probability=top, alternatives=tuple(others))
     return Verdict(effect=name, probability=top, alternatives=tuple(others), effects=best[name].effects)

@@ -31,14 +31,14 @@ class Found:
     numerics_rms_m: float = 0.0
 
 
-def fit(*effects, evidence=0.0, misfit=1.0, rms=0.01):
+def fit(*effects, evidence=0.0, misfit=1.0, rms=None):
     parameters = {name: {"x": Estimate(value=1.0, unit="1", low=0.5, high=1.5)} for name in effects}
     return CandidateFit(
         effects=effects,
         parameters=parameters,
         log_evidence=evidence,
         heldout_log_score=np.zeros(3),
-        heldout_rms_m=rms,
+        heldout_rms_m=(0.005 if effects else 0.01) if rms is None else rms,
         misfit=misfit,
     )
 
@@ -68,6 +68,11 @@ def test_what_cannot_be_told_apart_is_named():
 def test_two_causes_count_for_the_first():
     result = weighed(fit("friction", evidence=100, misfit=4.0), fit("friction", "air_drag", evidence=900))
     assert result.verdict.effect == "friction" and result.verdict.effects == ("friction", "air_drag")
+
+
+def test_what_predicts_no_better_is_no_cause():
+    result = weighed(fit("restitution", evidence=56.0, rms=0.012), nominal_misfit=1.2)
+    assert result.verdict.effect == NONE
 
 
 def test_a_second_cause_has_to_earn_its_place():
