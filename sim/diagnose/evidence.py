@@ -101,6 +101,8 @@ def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: W
     if len(fit.effects) < 2:
         return True
     singles = [c for c in candidates if len(c.effects) == 1 and c.effects[0] in fit.effects]
+    if len(singles) < len(fit.effects):
+        return False
     gained = min((fit.log_evidence - c.log_evidence for c in singles), default=math.inf)
     better = min((c.misfit for c in singles), default=math.inf) > weighing.second_misfit * fit.misfit
     return bool(gained > weighing.second_gain and better)

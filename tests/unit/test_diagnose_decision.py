@@ -66,7 +66,8 @@ def test_what_cannot_be_told_apart_is_named():
 
 
 def test_two_causes_count_for_the_first():
-    result = weighed(fit("friction", evidence=100, misfit=4.0), fit("friction", "air_drag", evidence=900))
+    alone = fit("friction", evidence=100, misfit=4.0), fit("air_drag", evidence=50, misfit=4.5)
+    result = weighed(*alone, fit("friction", "air_drag", evidence=900))
     assert result.verdict.effect == "friction" and result.verdict.effects == ("friction", "air_drag")
 
 
