@@ -55,6 +55,20 @@ class BodyMesh:
         np.add.at(found, self.cells, np.repeat(self.volumes[:, None] / 4, 4, axis=1))
         return found
 
+    def faces(self) -> Indices:
+        """(F, 3) nodes of the faces that belong to one cell only: the surface."""
+        every = np.sort(np.concatenate([self.cells[:, c] for c in itertools.combinations(range(4), 3)]), axis=1)
+        found, count = np.unique(every, axis=0, return_counts=True)
+        return np.asarray(found[count == 1])
+
+    def node_areas(self) -> Array:
+        """(N,) m², a third of each face of the surface to each of its nodes."""
+        faces, found = self.faces(), np.zeros(len(self.nodes))
+        edges = self.nodes[faces[:, 1:]] - self.nodes[faces[:, :1]]
+        areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+        np.add.at(found, faces, np.repeat(areas[:, None] / 3, 3, axis=1))
+        return found
+
     def locate(self, points: Array) -> tuple[Indices, Array]:
         """Nodes (K, 4) and weights (K, 4) of ``points`` (K, 3); a point outside is extended from the nearest cell."""
         _, near = cKDTree(self.centres).query(points, k=min(40, len(self.cells)))
@@ -81,7 +95,7 @@ def body_mesh(vertices: Array, faces: Indices, *, lattice: Cells3 | None = None)
         raise InputError("the mesh has no inside: give a closed surface")
     if lattice is None:
         lattice = _own_lattice(surface) or _default_lattice(np.ptp(surface.vertices, axis=0))
-    return _tetrahedra(_nodes(surface, lattice), lattice)
+    return _tetrahedra(_nodes(surface, lattice), lattice, surface)
 
 
 def coarser(mesh: BodyMesh, surface_vertices: Array, faces: Indices, *, factor: float) -> BodyMesh:
@@ -155,17 +169,28 @@ def _default_lattice(extents: Array) -> Cells3:
     return nx, ny, nz
 
 
-def _tetrahedra(nodes: Array, lattice: Cells3) -> BodyMesh:
+def _tetrahedra(nodes: Array, lattice: Cells3, surface: trimesh.Trimesh) -> BodyMesh:
     """Six tetrahedra to a box around its diagonal (Kuhn's subdivision).
 
-    All diagonals point the same way, except in bodies where that leaves slivers: there they point away from the middle,
-    so that no cell has all its nodes on two faces of a box that the surface has made one.
+    Diagonals all point the same way or away from the middle: as the surface's own do, where it is the lattice's. Else
+    away from the middle, so that no cell has all its nodes on two faces of a box that the surface has made one.
     """
-    mesh = _around_diagonals(nodes, lattice, np.ones((int(np.prod(lattice)), 3), dtype=np.int64))
-    if mesh.volumes.min() > SLIVER * float(np.median(mesh.volumes)):
-        return mesh
     boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
-    return _around_diagonals(nodes, lattice, np.where(2 * boxes + 1 >= np.asarray(lattice), 1, -1))
+    away = _around_diagonals(nodes, lattice, np.where(2 * boxes + 1 >= np.asarray(lattice), 1, -1))
+    alike = _around_diagonals(nodes, lattice, np.ones_like(boxes))
+    if alike.volumes.min() < SLIVER * float(np.median(alike.volumes)):
+        return away
+    return alike if _shared_faces(alike, surface) > _shared_faces(away, surface) else away
+
+
+def _shared_faces(mesh: BodyMesh, surface: trimesh.Trimesh) -> int:
+    """How many triangles of ``surface`` are faces of cells."""
+    extent = float(np.ptp(surface.vertices, axis=0).max())
+    distance, nearest = cKDTree(mesh.nodes).query(surface.vertices)
+    if float(distance.max()) > 1e-3 * extent:
+        return 0
+    faces = {tuple(face) for face in mesh.faces().tolist()}
+    return sum(tuple(face) in faces for face in np.sort(nearest[surface.faces], axis=1).tolist())
 
 
 def _around_diagonals(nodes: Array, lattice: Cells3, towards: Indices) -> BodyMesh:

@@ -12,7 +12,7 @@ Each world is one thread's work from start to end, so that nothing is shared and
     yielding  tau = 2 mu dev e + K tr e 1, e = ln of the elastic stretch, radial return at sqrt(3/2)|dev tau| = Y
               (sim/effects/plastic_yield; Simo, Comput. Methods Appl. Mech. Eng. 99, 1992)
 
-Contact with the plane z = 0 of the world's own frame: a spring at every node that is below it, and Coulomb's friction
+Contact with the plane z = 0 of the world's own frame: springs, by area, at nodes of the surface that are below it, and Coulomb's friction
 as an impulse that at most stops the node.
 """
 
@@ -38,8 +38,8 @@ ADHESION, REACH, STEP, START = 28, 29, 30, 31
 WORLD_ROW = 32
 
 
-CONTACT_LIMIT = 0.5
-"""Largest stiffness of the ground's spring at a node over its mass and the squared step, for light nodes at corners."""
+CONTACT_LIMIT = 1.0
+"""Largest stiffness of the ground's spring at a node over its mass and the squared step, for what a step misjudges."""
 
 CRUSHED = 0.15
 """Volume ratio below which a cell is treated as if it had that one."""
@@ -188,6 +188,7 @@ def advance_worlds(
     volumes: Reals,
     centres: Vectors,
     shares: Reals,
+    areas: Reals,
     masses: Reals2,
     times: Reals2,
     counts: Integers2,
@@ -206,7 +207,7 @@ def advance_worlds(
 ):
     """Advance every world from its START through its ``times`` (worlds, frames) and write the tracked points.
 
-    counts (worlds, 1): frames of a world. holders (points, 4) and weights (points, 4): nodes of a point's cell.
+    areas (nodes,): of the surface, m². counts (worlds, 1): frames of a world. holders (points, 4) and weights (points, 4): nodes of a point's cell.
     keep: also write places and inner accelerations of all nodes; those of a world's last frame are not written.
     """
     ti.loop_config(block_dim=1)
@@ -253,7 +254,8 @@ def advance_worlds(
                     speed_n += dt * (f[w, n] / m + pushed)
                     depth = -x[w, n][2]
                     if depth > 0.0:
-                        press = ti.min(worlds[w, CONTACT_STIFFNESS] / m, CONTACT_LIMIT / (dt * dt)) * depth * dt
+                        spring = worlds[w, CONTACT_STIFFNESS] * areas[n] / m
+                        press = ti.min(spring, CONTACT_LIMIT / (dt * dt)) * depth * dt
                         slide = vec3(speed_n[0], speed_n[1], 0.0)
                         fast = slide.norm()
                         speed_n[2] += press
