@@ -10,20 +10,20 @@ from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectB
 from physgen.sim.diagnose.soft.airborne import fit_airborne
 from physgen.sim.diagnose.soft.body_mesh import body_mesh
 from physgen.sim.diagnose.soft.candidates import candidates
-from physgen.sim.diagnose.soft.fits import Cancelled, fit_soft
+from physgen.sim.diagnose.soft.fits import fit_soft
 from physgen.sim.diagnose.soft.flight import State
 from physgen.sim.diagnose.soft.laws import Laws
 from physgen.sim.diagnose.soft.takes import Flights, GroundFrame, take_of
 from physgen.sim.diagnose.soft.worlds import Job, SoftWorlds
-from physgen.sim.errors import InputError
+from physgen.sim.errors import Cancelled, InputError
 from scipy.spatial.transform import Rotation
 
 SIGMA = 5e-4
 NOMINAL = Laws(modulus=8e4, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
 
 
-def cube_surface(side=0.06, cells=4):
-    """A cube's surface whose vertices are those of a lattice."""
+def cube_surface(side=0.06, cells=4, away=False):
+    """A cube's surface whose vertices are those of a lattice; its diagonals alike, or ``away`` from the middle."""
     lattice = np.stack(np.meshgrid(*[np.linspace(-side / 2, side / 2, cells + 1)] * 3, indexing="ij"), -1).reshape(
         -1, 3
     )
@@ -32,7 +32,10 @@ def cube_surface(side=0.06, cells=4):
     for axis, end in itertools.product(range(3), (0, cells)):
         plane = np.take(index, end, axis=axis)
         a, b, c, d = (x.ravel() for x in (plane[:-1, :-1], plane[1:, :-1], plane[1:, 1:], plane[:-1, 1:]))
-        quads = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+        row, column = (2 * i.ravel() + 1 - cells for i in np.indices((cells, cells)))
+        alike = (row * column > 0)[:, None] if away else np.ones((len(a), 1), dtype=bool)
+        first = np.where(alike, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+        quads = np.concatenate([first, np.where(alike, np.stack([a, c, d], 1), np.stack([b, c, d], 1))])
         outward = (end > 0) == (axis != 1)
         faces.append(quads if outward else quads[:, ::-1])
     used, again = np.unique(np.concatenate(faces), return_inverse=True)
@@ -93,6 +96,53 @@ def fits(made, names, budget=120.0):
 
 def test_the_surface_gives_its_lattice_away():
     assert body_mesh(*cube_surface(cells=5)).lattice == (5, 5, 5)
+
+
+@pytest.mark.parametrize("away", [False, True])
+def test_the_cells_are_divided_as_the_surface_is(away):
+    vertices, faces = cube_surface(away=away)
+    mesh = body_mesh(vertices, faces)
+    nearest = np.linalg.norm(vertices[:, None] - mesh.nodes, axis=2).argmin(axis=1)
+    assert {tuple(f) for f in np.sort(nearest[faces], axis=1)} == {tuple(f) for f in mesh.faces()}
+    assert mesh.volumes.sum() == pytest.approx(0.06**3)
+    assert mesh.node_areas().sum() == pytest.approx(6 * 0.06**2)
+
+
+@pytest.mark.parametrize("turn", [(0.6, 0.4, 0.5), (0.3, 0.2, 0.5), (0.0, 0.0, 0.5)])
+def test_no_bounce_gains_energy(turn):
+    mesh = body_mesh(*cube_surface())
+    worlds = SoftWorlds(mesh, 400.0, mesh.nodes, threads=1)
+    start = State(
+        time=-1e-6,
+        place=np.array([0.0, 0.0, 0.42]),
+        velocity=np.array([0.8, -0.2, -0.3]),
+        turn=Rotation.from_euler("xyz", turn).as_matrix(),
+        spin=np.array([5.40490461, 3.94531129, 1.07214123]),
+    )
+    laws = dataclasses.replace(NOMINAL, factor=0.55)
+    times = np.arange(0, 0.38, 1 / 200)
+    (points,), _ = worlds.run([Job(start=start, laws=laws, times=times)])
+    share = worlds.masses / worlds.masses.sum()
+    place = np.einsum("n,tni->ti", share, points)
+    speed = (place[-1] - place[-3]) * 100
+    tensor = worlds.inertia.tensor / worlds.inertia.mass
+    spin = start.turn.T @ start.spin
+    before = 9.81 * 0.42 + 0.5 * start.velocity @ start.velocity + 0.5 * spin @ tensor @ spin
+    assert 9.81 * place[-2, 2] + 0.5 * speed @ speed < 1.005 * before
+    assert speed[2] > 0.5
+
+
+def test_where_a_world_comes_to_nothing_the_body_goes_on_rigid(monkeypatch):
+    made, _ = capture(NOMINAL, takes=1)
+    mesh = body_mesh(made.objects[0].vertices, made.objects[0].faces)
+    worlds = SoftWorlds(mesh, 400.0, made.trials[0].rest_points, threads=1)
+    flights = Flights([take_of(made.trials[0], GroundFrame(made), mesh.nodes)], worlds, SIGMA)
+    times = made.trials[0].predict_times
+    monkeypatch.setattr(worlds, "run", lambda jobs, **_: ([np.full((len(j.times), 14, 3), np.nan) for j in jobs], []))
+    assert np.isnan(flights.motion([0], [NOMINAL], [times])[0]).any()
+    (found,) = flights.lasting_motion([0], [NOMINAL], [times])
+    assert found.shape == (len(times), 14, 3)
+    assert np.isfinite(found).all() and found[:, :, 2].min() >= 0
 
 
 @pytest.mark.parametrize(

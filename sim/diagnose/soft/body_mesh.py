@@ -140,7 +140,7 @@ def _nodes(surface: trimesh.Trimesh, lattice: Cells3) -> Array:
     directions = rays[ok] / length[ok, None]
     radial = (level[ok] * _reach(surface, centre, directions))[:, None] * directions
     # Towards the middle the plain lattice takes over: stretched all the way in, cells at its edges would be slivers.
-    share = level[ok, None]
+    share = np.sqrt(level[ok, None])
     out[ok] += share * radial + (1 - share) * unit[ok] * half
     return np.asarray(out)
 

@@ -12,8 +12,8 @@ Each world is one thread's work from start to end, so that nothing is shared and
     yielding  tau = 2 mu dev e + K tr e 1, e = ln of the elastic stretch, radial return at sqrt(3/2)|dev tau| = Y
               (sim/effects/plastic_yield; Simo, Comput. Methods Appl. Mech. Eng. 99, 1992)
 
-Contact with the plane z = 0 of the world's own frame: springs, by area, at nodes of the surface that are below it, and Coulomb's friction
-as an impulse that at most stops the node.
+Contact with the plane z = 0 of the world's own frame: springs, by area, at nodes of the surface that are below it, and
+Coulomb's friction as an impulse that at most stops the node.
 """
 
 import taichi as ti
@@ -207,7 +207,8 @@ def advance_worlds(
 ):
     """Advance every world from its START through its ``times`` (worlds, frames) and write the tracked points.
 
-    areas (nodes,): of the surface, m². counts (worlds, 1): frames of a world. holders (points, 4) and weights (points, 4): nodes of a point's cell.
+    areas (nodes,): of the surface, m². counts (worlds, 1): frames of a world. holders (points, 4) and weights
+    (points, 4): nodes of a point's cell.
     keep: also write places and inner accelerations of all nodes; those of a world's last frame are not written.
     """
     ti.loop_config(block_dim=1)

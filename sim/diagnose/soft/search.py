@@ -23,9 +23,10 @@ from .takes import Flights
 
 Array = NDArray[np.float64]
 
-FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.12
-FRICTION_REACH, CONTACT_REACH = 0.3, 0.5
-"""Farthest that they may go, as logarithms: beyond it is another cause, which must not hide in them."""
+FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.4
+FRICTION_REACH, CONTACT_REACH = 0.3, 1.8
+"""Farthest that they may go, as logarithms. Another friction is another cause, which must not hide in it; how stiff the
+ground is in a recording's world nobody believes anything about."""
 
 COMMON_STEP = np.array([0.06, 0.1])
 LOST = 1e12
@@ -271,7 +272,7 @@ class Search:
 
     def covariance(self, fit: ContactFit) -> Array:
         """(p + 2, p + 2) of the free numbers."""
-        if fit.jacobians is None:
+        if fit.jacobians is None or fit.cost >= LOST:
             return np.asarray(np.diag(self.spread**2))
         return np.asarray(np.linalg.inv(self.normal_equations(fit)[1]))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..capture import Capture, Trial
 from .flight import Flight, FlightFit, Inertia, State, first_guess, fit_flight, fly, pose_of
 from .laws import Laws
-from .worlds import Job, SoftWorlds
+from .worlds import Job, SoftWorlds, sane
 
 Array = NDArray[np.float64]
 
@@ -197,3 +197,22 @@ class Flights:
             head = self.in_air(i, a, t[:ahead]) if ahead else tail[:0]
             out.append(np.concatenate([head, tail]))
         return out
+
+    def lasting_motion(self, indices: list[int], laws: list[Laws], times: list[Array]) -> list[Array]:
+        """As ``motion``; where a world comes to nothing, the body goes on as a rigid one that the ground stops."""
+        found = self.motion(indices, laws, times)
+        return [
+            p if sane(p) else self._stopped(i, a, t) for p, i, a, t in zip(found, indices, laws, times, strict=True)
+        ]
+
+    def _stopped(self, index: int, laws: Laws, times: Array) -> Array:
+        """Points (T, K, 3) of a flight under ``laws`` that is lifted wherever the body would be in the ground."""
+        points = self.in_air(index, laws, times)
+        depth = np.maximum(0.0, -points[:, :, 2].min(axis=1))
+        points[:, :, 2] += depth[:, None]
+        start = self.start(index, laws)
+        if start is not None:
+            # What touches rests: nothing carries it on along the ground.
+            touched = int(np.searchsorted(self.true_times(index, laws, times), start.time))
+            points[touched:] = points[min(touched, len(points) - 1)]
+        return points

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..analysis import DIRECTIONS, Discrepancy, Interval
 from .laws import Laws
 from .takes import Flights, Take
-from .worlds import Job, SoftWorlds
+from .worlds import Job, SoftWorlds, sane
 
 Array = NDArray[np.float64]
 
@@ -34,12 +34,13 @@ def discrepancy_of(
         air = flights.in_air(index, laws, take.times)
         whole = air.copy()
         low = np.full(frames, np.inf)
-        start = flights.start(index, laws)
+        start, history = flights.start(index, laws), None
         true = flights.true_times(index, laws, take.times)
         if start is not None and true[-1] > start.time:
             after = true > start.time + 1e-9
             times = np.append(true[after], true[-1] + 1e-4)
             points, (history,) = worlds.run([Job(start=start, laws=laws, times=times)], keep=True)
+        if history is not None and sane(points[0]):
             places = history.places[:-1]
             lacking = history.accelerations[:-1] - worlds.inner_accelerations(places, base)
             lacking += worlds.contact_difference(places, history.places, times, laws, base)
