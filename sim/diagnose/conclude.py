@@ -19,7 +19,7 @@ from .analysis import Array, CandidateFit, Discrepancy, Fits
 from .capture import Capture
 from .confirm import Confirmation, confirm
 from .diagnosis import NONE, UNKNOWN, Diagnosis, Gap, RankedEffect, TrialArrays
-from .evidence import Weighed, Weighing, kind_of, weigh
+from .evidence import Weighed, Weighing, kind_of, unchanged, weigh
 from .experiments import next_experiment
 from .gap import bootstrap_interval, controls_of, measured_gap
 from .places import where_of
@@ -130,13 +130,13 @@ def _fit(
 def _found(fits: Fits, weighed: Weighed) -> CandidateFit:
     """The fit that predicts ``after``: the verdict's.
 
-    For ``none`` that is the nominal model, for ``unknown`` the nominal model with its own numbers re-fitted where that
-    predicts better.
+    For ``none`` that is the model with nothing added, for ``unknown`` the same with its own numbers re-fitted where
+    that predicts better.
     """
     name = weighed.verdict.effect
-    if name == NONE or (name == UNKNOWN and not fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m):
-        return fits.nominal
-    return fits.refitted if name == UNKNOWN else weighed.best[name]
+    if name == UNKNOWN and fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m:
+        return fits.refitted
+    return unchanged(fits) if name in (NONE, UNKNOWN) else weighed.best[name]
 
 
 def _confirm(

@@ -78,7 +78,7 @@ class Weighed:
 
 def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     """Verdict and probabilities. A candidate of two effects counts for the first of its effects."""
-    candidates = [fits.nominal, *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
+    candidates = [unchanged(fits), *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
     weights = _weights(candidates, weighing)
     adequate = [_adequacy(c.misfit, weighing) for c in candidates]
     probabilities: dict[str, float] = {}
@@ -94,6 +94,12 @@ def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     probabilities = {name: p / total for name, p in probabilities.items()}
     found = {name: fit for name, (_, fit) in best.items()}
     return Weighed(verdict=_verdict(probabilities, found, weighing), probabilities=probabilities, best=found)
+
+
+def unchanged(fits: Fits) -> CandidateFit:
+    """The model with nothing added, its own numbers within their plausible range: what ``none`` stands for."""
+    within = not fits.refitted.effects and fits.refitted.log_evidence > fits.nominal.log_evidence
+    return fits.refitted if within else fits.nominal
 
 
 def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: Weighing) -> bool:
