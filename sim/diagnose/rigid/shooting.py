@@ -19,6 +19,7 @@ from scipy.special import gammaln
 
 from .candidates import BELIEFS, Freedom, Scene, Setting
 from .observation import Sight
+from .resting import height
 from .turning import between, from_vector, inverse, moved, product, to_vector
 from .worlds import Launcher
 
@@ -33,6 +34,9 @@ LONGEST_STEP = 2.0
 
 PLAUSIBLE = 3.0
 """Standard deviations within which the nominal model's own numbers may move; beyond that it is an effect."""
+
+SUNK = 1e-3
+"""m, that a state seen by one camera may lie in the ground."""
 
 FREEDOM_OF_GRAIN = 4.0
 """Degrees of freedom of the grain's Student distribution: few contacts go quite differently."""
@@ -214,6 +218,15 @@ class Problem:
                     spot = np.r_[where, 12 * (j + 1) : 12 * (j + 2)]
                     part.hessian[np.ix_(spot, spot)] += both.T @ scale @ both
                     part.slope[spot] += both.T @ scale @ defect
+            if take.sight.camera is not None:
+                # Pixels leave the depth open; under the ground it cannot be.
+                gap, rise = height(scene, states[i][j])
+                sunk = min(gap, 0.0) / SUNK
+                part.cost += sunk**2
+                if sunk < 0:
+                    low = slice(12 * j, 12 * j + 6)
+                    part.hessian[low, low] += np.outer(rise, rise) / SUNK**2
+                    part.slope[low] -= rise * sunk / SUNK
             if j == 0:
                 off = between(states[i][0], take.guess) / take.prior
                 part.cost += float(off @ off)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from .candidates import Scene
 from .grain import covariance, frame_weights, grain_of
 from .observation import Sight, frame_pose
+from .resting import resting_state
 from .shooting import Model, Problem, Segment, Take, reduce_take
 from .turning import moved, to_matrix
 from .worlds import Launcher
@@ -184,7 +185,15 @@ def track(
 
 def _set_down(scene: Scene, launcher: Launcher, takes: list[Take], model: Model, z: Array) -> None:
     """Begin on the ground where that explains the first frames better: pixels leave a start's height open."""
-    near = [t for t in takes if t.sight.camera is not None]
+    near = []
+    for take in takes:
+        if take.sight.camera is None:
+            continue
+        lying = None if model.setting(scene, z).camera is not None else resting_state(scene, take.sight)
+        if lying is None:
+            near.append(take)
+        else:
+            take.states, take.guess, take.prior = lying[0][None], lying[0].copy(), lying[1]
     if not near:
         return
     normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
