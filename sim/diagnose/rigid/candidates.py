@@ -26,7 +26,7 @@ AIR = 1.2
 RUB = 5.0 / np.pi
 """Sliding is taken up five times in a contact's half period: the surfaces do not shear."""
 
-FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.006, 0.006, 0.1
+FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.01, 0.01, 0.1
 """How far a believed coefficient may be off (of itself; absolute; of itself) before that is an effect."""
 
 UNKNOWN_RESTITUTION, UNKNOWN_RESTITUTION_SPREAD = 0.35, 0.2

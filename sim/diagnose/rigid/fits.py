@@ -7,7 +7,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,57 +17,29 @@ from ...errors import InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..analysis import CandidateFit, Discrepancy, Estimate
 from ..capture import Capture, Trial
-from .body import rigid_body
 from .candidates import BELIEFS, FREEDOMS, Freedom, Scene
 from .heldout import Heldout, heldout
 from .misfit import misfit
-from .observation import frame_pose, sights
 from .prediction import Points, believed_fit, numerics, predict_points, simulate_points
-from .shooting import FREEDOM_OF_GRAIN, Fit, Model, Problem, solve
-from .tracking import camera_guess, track, weigh
+from .search import (
+    BodyFits,
+    begin,
+    body_problem,
+    finish_best,
+    fit_nominal,
+    follow_best,
+    moved_camera,
+    pairs,
+    refine,
+    refit_beliefs,
+)
+from .shooting import Fit
 from .where import discrepancies
-from .worlds import Launcher
 
 Array = NDArray[np.float64]
 
-ROUNDS = 10
-
-CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion")
-"""Effects that act in contact alone."""
-
-FLIES = 6
-"""Frames without contact after a node, from which its state is known."""
-
-LOOSE = 300.0
-"""Factor on the grain while only flights count."""
-
-PROMISING = 12.0
-"""Nats below the best within which a single effect is refined, and combined with others."""
-
-FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
-"""Nats over the nominal model, and misfit, above which an effect is fitted with nodes of its own."""
-
-MOVED_GUESS = 0.3
-"""Standard deviations of the prior that poses alone must say a camera has moved, for that."""
-
-MOVED_MISFIT = 3.0
-"""Misfit of the nominal model above which a moved camera is followed on its own."""
-
-PAIR_SHARE = 0.85
-"""Of the nominal model's misfit that the best single effect must get below: where it explains next to nothing, a second
-one explains nothing either, and the cause is another."""
-
-PAIR_MISFIT = 1.6
-"""Misfit of the best single effect above which pairs are tried."""
-
-
-@dataclass(kw_only=True, eq=False)
-class BodyFits:
-    """All fits of one body: by effects; flown: with states that flights alone fix, by effects."""
-
-    problem: Problem
-    fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
-    flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+PAIR_GAIN, PAIR_CLEARS = 15.0, 0.85
+"""Nats by which two effects must beat the best one, and share of its misfit below which they must get."""
 
 
 class CancelledError(Exception):
@@ -130,7 +102,7 @@ def fit_rigid(
     bodies = []
     for index, item in enumerate(capture.objects):
         if item.belief.rigid and any((t.object_index == index).any() for t in capture.trials):
-            bodies.append(BodyFits(problem=_problem(capture, index)))
+            bodies.append(BodyFits(problem=body_problem(capture, index)))
     if not bodies:
         raise InputError("capture: none of its objects is rigid and tracked: fit it as deformable bodies")
     progress = StageProgress(on_event, "fit", len(bodies) * (len(wanted) + 2))
@@ -144,20 +116,20 @@ def fit_rigid(
             raise CancelledError
 
     for body in bodies:
-        _fit_nominal(body)
+        fit_nominal(body)
         tick("nominal")
         for freedom in wanted:
             if time.monotonic() - started < budget_s:
-                _fit(body, (freedom,))
+                begin(body, (freedom,))
                 if freedom.name == "camera_pose":
-                    _moved_camera(body)
+                    moved_camera(body)
             tick(freedom.name)
-        _refit_beliefs(body)
+        finish_best(body, started + budget_s)
+        refit_beliefs(body)
         tick("refitted")
-        if time.monotonic() - started < budget_s:
-            _follow_best(body)
-        _refine(body, started + budget_s)
-        _pairs(body, wanted, started + budget_s)
+        follow_best(body, started + budget_s)
+        refine(body, started + budget_s)
+        pairs(body, wanted, started + budget_s)
     return _assemble(capture, bodies)
 
 
@@ -173,223 +145,47 @@ def _wanted(capture: Capture, names: Sequence[str] | None) -> list[Freedom]:
     return chosen
 
 
-def _problem(capture: Capture, index: int) -> Problem:
-    body = rigid_body(capture.objects[index])
-    launcher = Launcher(body=body)
-    seen = [sights(capture, t, index, body.center) for t in capture.trials if (t.object_index == index).any()]
-    seen = [s for s in seen if np.isfinite(s.seen).all(axis=2).any()]
-    places = []
-    for sight in seen:
-        for frame in range(0, len(sight.times), max(1, len(sight.times) // 8)):
-            pose = frame_pose(sight, frame)
-            if pose is not None:
-                places.append(pose[0])
-    middle = np.median(places, axis=0) if places else np.zeros(3)
-    scene = Scene(capture=capture, body=body, middle=middle)
-    return Problem(scene=scene, launcher=launcher, takes=track(scene, launcher, seen))
-
-
-def _fit_nominal(body: BodyFits) -> None:
-    problem, model = body.problem, Model(freedoms=())
-    z = np.zeros(BELIEFS.size)
-    for _ in range(2):
-        weigh(problem, model, z)
-        fit = solve(problem, model, z, [t.states for t in problem.takes], rounds=6)
-        z = fit.z
-        for take, states in zip(problem.takes, fit.states, strict=True):
-            take.states = states
-    body.fits[()] = fit
-
-
-def _fit(body: BodyFits, freedoms: tuple[Freedom, ...], base: Fit | None = None) -> Fit:
-    """Fit ``freedoms`` from ``base`` (the nominal model), whose slopes serve throughout."""
-    problem, nominal = body.problem, body.fits[()]
-    begin = nominal if base is None else base
-    model = Model(freedoms=freedoms)
-    new = freedoms[len(begin.model.freedoms) :]
-    slopes = nominal.evaluation if begin.problem is problem else begin.evaluation
-    problem = begin.problem
-    starts: list[Array] = [begin.z]
-    for freedom in new:
-        starts = [np.concatenate([z, s]) for z in starts for s in freedom.starts]
-    if new[0].name not in CONTACTS:
-        # In flight everything is nearly linear: contacts join in once the forces are about right.
-        loose = _loosened(problem)
-        flown = [solve(loose, model, z, begin.states, rounds=3, held=slopes) for z in starts]
-        flown = sorted(flown, key=lambda f: -f.evidence)[:3]
-        fits = [(f.z, f.states) for f in flown]
-    else:
-        z, free = _scanned(body, begin, model, new[-1])
-        fits = [(z, free), (z, begin.states)]
-    if len(fits) > 1:
-        first = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
-        first.sort(key=lambda f: -f.evidence)
-        fits = [(f.z, f.states) for f in first[:2]]
-    done = [solve(problem, model, z, s, rounds=ROUNDS, held=slopes) for z, s in fits]
-    best = max(done, key=lambda f: f.evidence)
-    key = tuple(f.name for f in freedoms)
-    if key not in body.fits or body.fits[key].evidence < best.evidence:
-        body.fits[key] = best
-    return best
-
-
-def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: Freedom) -> tuple[Array, list[Array]]:
-    """Where to begin with an effect of contact: flights fix the states whatever it is, a grid its best numbers.
-
-    Begun from the nominal fit, states that were bent to wrong contacts would hold on to them.
-    """
-    problem = begin.problem
-    key = tuple(f.name for f in begin.model.freedoms)
-    if key not in body.flown:
-        body.flown[key] = solve(_loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
-    flown = body.flown[key]
-    spreads = _arrival_spreads(problem, flown)
-    base = begin.z.copy()
-    base[: BELIEFS.size] = 0.0
-    tried = [np.concatenate([base, s]) for s in freedom.grid]
-    costs = []
-    for z in tried:
-        look = problem.evaluate(model, z, flown.states, slopes=False)
-        squares = np.array(
-            [
-                s.defect @ np.linalg.solve(c, s.defect)
-                for s, c in zip(look.segments, spreads, strict=True)
-                if s.defect is not None and c is not None
-            ]
-        )
-        own = float(z[len(base) :] @ z[len(base) :])
-        costs.append(own + float(np.sum((FREEDOM_OF_GRAIN + 12) * np.log1p(squares / FREEDOM_OF_GRAIN))))
-    # A state that no flight follows is known by its contacts alone: it stays.
-    states = [s.copy() for s in begin.states]
-    for segment in flown.evaluation.segments:
-        if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
-            states[segment.take][segment.index] = flown.states[segment.take][segment.index]
-    return tried[int(np.argmin(costs))], states
-
-
-def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
-    """Covariances (12, 12) of the defects where flights alone fix the states: of both states and of the grain."""
-    found: list[Array | None] = []
-    for segment in flown.evaluation.segments:
-        if segment.defect is None or segment.come is None:
-            found.append(None)
-            continue
-        hessian = flown.evaluation.linear[segment.take].hessian
-        first, second = 12 * segment.index, 12 * segment.index + 12
-        here = np.linalg.pinv(hessian[first:second, first:second] + 1e-6 * np.eye(12))
-        there = np.linalg.pinv(hessian[second : second + 12, second : second + 12] + 1e-6 * np.eye(12))
-        come = segment.come[:, :12]
-        found.append(problem.takes[segment.take].covers[segment.index] + come @ here @ come.T + there)
-    return found
-
-
-def _moved_camera(body: BodyFits) -> None:
-    """Fit ``camera_pose`` with nodes of its own: seen from elsewhere, the body meets the ground at other times."""
-    problem, nominal = body.problem, body.fits[()]
-    if misfit(nominal).ratio < MOVED_MISFIT:
-        return
-    freedom = FREEDOMS["camera_pose"]
-    model = Model(freedoms=(freedom,))
-    guess = camera_guess(problem)
-    if float(np.abs(guess).max()) > MOVED_GUESS:
-        _followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
-
-
-def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
-    """``model`` fitted with nodes where it meets the ground itself, from the numbers ``z``; kept where it is better."""
-    problem = body.problem
-    takes = track(problem.scene, problem.launcher, [t.sight for t in problem.takes], model=model, z=z)
-    other = dataclasses.replace(problem, takes=takes)
-    weigh(other, model, z)
-    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=3)
-    begin = flown.z if model.freedoms[-1].name not in CONTACTS else z
-    fit = solve(other, model, begin, flown.states, rounds=2)
-    fit = solve(other, model, fit.z, fit.states, rounds=ROUNDS, held=fit.evaluation)
-    key = tuple(f.name for f in model.freedoms)
-    if key not in body.fits or body.fits[key].evidence < fit.evidence:
-        body.fits[key] = fit
-    return fit
-
-
-def _loosened(problem: Problem) -> Problem:
-    takes = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.takes]
-    return dataclasses.replace(problem, takes=takes)
-
-
-def _refine(body: BodyFits, until: float) -> None:
-    """Take the promising fits a few steps further, with slopes of their own."""
-    best = max(f.evidence for f in body.fits.values())
-    nominal = body.fits[()]
-    far = [f for k, f in body.fits.items() if k and f.evidence > max(best - PROMISING, nominal.evidence - 3)]
-    for fit in sorted(far, key=lambda f: -f.evidence)[:3]:
-        if time.monotonic() > until:
-            return
-        key = tuple(f.name for f in fit.model.freedoms)
-        new = solve(fit.problem, fit.model, fit.z, fit.states, rounds=4)
-        if new.evidence > fit.evidence:
-            body.fits[key] = new
-
-
-def _refit_beliefs(body: BodyFits) -> None:
-    """The nominal model with its own coefficients free: both contact effects, without a new one."""
-    asked = ("friction",) in body.fits
-    first = body.fits["friction",] if asked else _fit(body, (FREEDOMS["friction"],))
-    _fit(body, (FREEDOMS["friction"], FREEDOMS["restitution"]), first)
-    if not asked:
-        del body.fits["friction",]
-
-
-def _follow_best(body: BodyFits) -> None:
-    """The best effects once more with nodes of their own, where the nominal model's may stand in the way."""
-    nominal = body.fits[()]
-    singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:2]
-    for fit in singles:
-        gained = fit.evidence - nominal.evidence
-        if fit.problem is body.problem and gained > FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
-            _followed(body, fit.model, fit.z)
-
-
-def _pairs(body: BodyFits, wanted: list[Freedom], until: float) -> None:
-    """Two causes at once: the best one or two with each of the others, where one alone leaves too much."""
-    singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1]
-    if not singles:
-        return
-    singles.sort(key=lambda item: -item[1].evidence)
-    left = misfit(singles[0][1]).ratio
-    if left < PAIR_MISFIT or left > PAIR_SHARE * misfit(body.fits[()]).ratio:
-        return
-    for name, fit in singles[:2]:
-        for freedom in wanted:
-            if time.monotonic() > until:
-                return
-            if freedom.name == name or tuple(sorted((name, freedom.name))) in {tuple(sorted(k)) for k in body.fits}:
-                continue
-            if {name, freedom.name} == {"air_drag", "wind"}:
-                continue
-            _fit(body, (FREEDOMS[name], freedom), fit)
-
-
 def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
-    keys = [k for k in bodies[0].fits if all(k in b.fits for b in bodies)]
+    refits = ("friction", "restitution")
+    keys = _worth(bodies, [k for k in bodies[0].fits if all(k in b.fits for b in bodies)])
+    shown = {*keys, refits}
     made = {}
-    held = {k: [heldout(b.fits[k]) for b in bodies] for k in keys}
-    for k in keys:
+    held = {k: [heldout(b.fits[k]) for b in bodies] for k in shown}
+    for k in shown:
         made[k] = _candidate(capture, bodies, k, held[k])
     _level_twins(made)
     believed = [heldout(believed_fit(b.fits[()])) for b in bodies]
     floor = min(c.heldout_rms_m for c in made.values())
-    refit = made[("friction", "restitution")]
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
     return RigidFits(
         capture=capture,
         bodies=bodies,
         nominal=made[()],
-        refitted=refit,
+        refitted=made[refits],
         candidates=tuple(singles),
         floor_rms_m=min(floor, believed[0].floor_rms_m),
         numerics_rms_m=float(np.sqrt(np.mean([numerics(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
         believed_rms_m=float(np.sqrt(np.mean([b.rms_m**2 for b in believed]))),
     )
+
+
+def _worth(bodies: list[BodyFits], keys: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """``keys`` without the pairs whose second effect explains next to nothing."""
+
+    def evidence(key: tuple[str, ...]) -> float:
+        return sum(b.fits[key].evidence for b in bodies)
+
+    def left(key: tuple[str, ...]) -> float:
+        found = [misfit(b.fits[key]) for b in bodies]
+        squares = sum(m.flight + m.contact for m in found)
+        return math.sqrt(squares / max(1, sum(m.flight_count + m.contact_count for m in found)))
+
+    singles = [k for k in keys if len(k) == 1]
+    if not singles:
+        return keys
+    best = max(singles, key=evidence)
+    enough, most = evidence(best) + PAIR_GAIN, PAIR_CLEARS * left(best)
+    return [k for k in keys if len(k) < 2 or (evidence(k) > enough and left(k) < most)]
 
 
 def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:

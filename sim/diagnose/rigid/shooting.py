@@ -32,6 +32,9 @@ steps measure chatter."""
 LONGEST_STEP = 2.0
 """Of a number of an effect, in standard deviations of its prior."""
 
+MOST_FAILURES = 3
+"""Steps in vain, one after the other, after which a fit is as good as it gets."""
+
 PLAUSIBLE = 3.0
 """Standard deviations within which the nominal model's own numbers may move; beyond that it is an effect."""
 
@@ -142,15 +145,22 @@ class Problem:
         return np.repeat([SHIFT_STEP, TURN_STEP, SPEED_STEP, spin], 3)
 
     def evaluate(
-        self, model: Model, z: Array, states: list[Array], *, slopes: bool = True, held: Evaluation | None = None
+        self,
+        model: Model,
+        z: Array,
+        states: list[Array],
+        *,
+        slopes: bool = True,
+        held: Evaluation | None = None,
+        fixed: bool = False,
     ) -> Evaluation:
         """Residuals, and with ``slopes`` the normal equations, of ``model`` with numbers ``z`` (P,) at ``states``.
 
         z may be (takes, P), other numbers for each take. held: an evaluation near by, whose slopes with states and
-        beliefs are taken as they are (the chord method).
+        beliefs are taken as they are (the chord method). fixed: the numbers stay, slopes are with the states alone.
         """
-        scene, size = self.scene, model.size
-        many = [self._variants(model, row, slopes, held is not None) for row in np.atleast_2d(z)]
+        scene, size = self.scene, 0 if fixed else model.size
+        many = [self._variants(model, row, slopes, held is not None, fixed) for row in np.atleast_2d(z)]
         changes = many[0][0]
         around = [m[1] for m in many] if len(many) > 1 else [many[0][1]] * len(states)
         variants, settings = len(changes), many[0][1]
@@ -168,7 +178,7 @@ class Problem:
         numbers = np.concatenate([rows[i][owner] for i, _, _, _ in spans])
         out = self.launcher.run(np.concatenate(starts), numbers, times)
         out = out.reshape(len(spans), variants, *out.shape[1:])
-        steps = np.concatenate([self.state_steps(), model.steps])
+        steps = np.concatenate([self.state_steps(), model.steps[:size]])
         if held is not None:
             steps = model.steps[BELIEFS.size :]
         segments: list[Segment] = []
@@ -248,18 +258,19 @@ class Problem:
         total = (float(z @ z) if z.ndim == 1 else 0.0) + sum(part.cost for part in linear)
         return Evaluation(segments=segments, linear=linear, cost=total)
 
-    def _variants(self, model: Model, z: Array, slopes: bool, held: bool) -> tuple[Array, list[Setting]]:
+    def _variants(self, model: Model, z: Array, slopes: bool, held: bool, fixed: bool) -> tuple[Array, list[Setting]]:
         """Changes (V, 12) of the start and the settings of a segment's worlds: undisturbed, then up and down each."""
         settings = [model.setting(self.scene, z)]
         if not slopes:
             return np.zeros((1, 12)), settings
         steps = self.state_steps()
         first = BELIEFS.size if held else 0
-        changes = np.zeros((1 + 2 * ((0 if held else 12) + model.size - first), 12))
+        last = first if fixed else model.size
+        changes = np.zeros((1 + 2 * ((0 if held else 12) + last - first), 12))
         if not held:
             for c in range(12):
                 changes[1 + 2 * c, c], changes[2 + 2 * c, c] = steps[c], -steps[c]
-        for p, step in list(enumerate(model.steps))[first:]:
+        for p, step in list(enumerate(model.steps))[first:last]:
             for sign in (1, -1):
                 shifted = z.copy()
                 shifted[p] += sign * step
@@ -345,7 +356,7 @@ def solve(
     """Gauss and Newton's steps (Levenberg and Marquardt's damping) from ``z`` (P,) and ``states``."""
     size = model.size
     best = problem.evaluate(model, z, states, held=held)
-    damping = 1e-3
+    damping, failed = 1e-3, 0
     for _ in range(rounds):
         parts = [reduce_take(part, size, damping) for part in best.linear]
         matrix = np.eye(size) + sum(p[0] for p in parts)
@@ -359,15 +370,19 @@ def solve(
             moved(s, (own - answer @ step).reshape(-1, 12))
             for s, (_, _, answer, own) in zip(states, parts, strict=True)
         ]
-        new = problem.evaluate(model, z + step, tried, held=held)
+        # Slopes cost tens of worlds: where a step may well be in vain, one world says so first.
+        new = problem.evaluate(model, z + step, tried, held=held, slopes=held is not None and not failed)
         if np.isfinite(new.cost) and new.cost < best.cost:
             gain = best.cost - new.cost
-            z, states, best, damping = z + step, tried, new, max(damping / 5, 1e-6)
+            if held is None or failed:
+                new = problem.evaluate(model, z + step, tried, held=held)
+            z, states, best, damping, failed = z + step, tried, new, max(damping / 5, 1e-6), 0
             if gain < tolerance:
                 break
         else:
-            damping *= 10 if damping < 1 else 100
-            if damping > 1e4:
+            failed += 1
+            damping *= 20
+            if failed > MOST_FAILURES:
                 break
     parts = [reduce_take(part, size, 0.0) for part in best.linear]
     schur, pull = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])

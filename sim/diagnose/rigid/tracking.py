@@ -33,6 +33,9 @@ LONGEST_IMPACT = 0.05
 
 MOST_NODES = 24
 
+SETTLED = 1e-4
+"""Of the objective: smaller steps are not worth another."""
+
 LOST = 40.0
 """Standard deviations of the noise, root mean square, beyond which the body is not where the model goes."""
 
@@ -100,20 +103,22 @@ def used_frames(sight: Sight) -> int:
 
 def settle(problem: Problem, model: Model, z: Array, states: list[Array], rounds: int) -> list[Array]:
     """``states`` fitted with the numbers ``z`` held."""
-    best = problem.evaluate(model, z, states)
+    best = problem.evaluate(model, z, states, fixed=True)
     costs = np.array([part.cost for part in best.linear])
     damping = np.full(len(states), 1e-3)
-    for _ in range(rounds):
+    for number in range(rounds):
         tried = []
         for s, part, d in zip(states, best.linear, damping, strict=True):
-            own = reduce_take(part, model.size, float(d))[3]
+            own = reduce_take(part, 0, float(d))[3]
             tried.append(moved(s, own.reshape(-1, 12)))
-        new = problem.evaluate(model, z, tried)
+        new = problem.evaluate(model, z, tried, fixed=True, slopes=number < rounds - 1)
         better = np.array([part.cost for part in new.linear]) < costs
         states = [t if b else s for s, t, b in zip(states, tried, better, strict=True)]
         best.linear = [n if b else o for o, n, b in zip(best.linear, new.linear, better, strict=True)]
         damping = np.where(better, damping / 5, damping * 10)
-        costs = np.array([part.cost for part in best.linear])
+        before, costs = costs, np.array([part.cost for part in best.linear])
+        if (better & (before - costs < SETTLED * np.maximum(costs, 1.0))).all():
+            break
     return states
 
 
