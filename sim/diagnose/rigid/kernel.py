@@ -28,6 +28,9 @@ SWEEPS = 8
 CALM_STEP, CALM_SPEED, CALM_FORCE = 1e-3, 0.02, 40.0
 """Step in s, and what a body that touches may have to take it: speed in m/s towards or off the plane, m/s² of force."""
 
+LEAVES = 1e-3
+"""m/s away from the plane, from which adhesion holds a body back; its pull falls to none at its reach."""
+
 GRAVITY, DRAG, WIND, LIFT = 0, 3, 4, 7
 TETHER, LENGTH, ANCHOR, STRING = 8, 9, 10, 13
 FRICTION, ROLLING, PULL, REACH = 14, 15, 16, 17
@@ -158,8 +161,8 @@ def advance(
                             h = ti.min(left, CALM_STEP)
                             implicit = 1.0
                         a = acceleration(p, w, x, v, spin)
-                        if p[w, PULL] > 0 and gap < p[w, REACH]:
-                            a -= p[w, PULL] * n
+                        if p[w, PULL] > 0 and gap < p[w, REACH] and v.dot(n) > LEAVES:
+                            a -= p[w, PULL] * (1.0 - ti.max(gap, 0.0) / p[w, REACH]) * n
                         inverse = r @ mobility @ r.transpose()
                         before = v
                         spun = spin

@@ -138,7 +138,8 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
         lack -= (setting.rolling / scene.body.bound * rate)[:, None] * way
     if setting.pull > 0:
         gap = _gap(used.problem, record)
-        lack -= (_by_frame((gap < setting.reach)[:, None] * 1.0, nearest, frames) * setting.pull) * normal
+        held = (gap < setting.reach) * (record[:, 7:10] @ normal > 0) * (1 - np.maximum(gap, 0.0) / setting.reach)
+        lack -= (_by_frame(held[:, None], nearest, frames) * setting.pull) * normal
     if setting.fraction > 0:
         arm = np.einsum("fij,j->fi", to_matrix(record[:, 3:7]), setting.center)
         w = record[:, 10:13]
