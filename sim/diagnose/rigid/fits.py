@@ -18,7 +18,7 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..analysis import CandidateFit, Discrepancy, Estimate
 from ..capture import Capture, Trial
 from .candidates import BELIEFS, FREEDOMS, Freedom, Scene
-from .heldout import Heldout, heldout
+from .heldout import Heldout, heldout, noise_floor
 from .misfit import misfit
 from .prediction import Points, believed_fit, numerics, predict_points, simulate_points
 from .search import (
@@ -34,9 +34,13 @@ from .search import (
     refit_beliefs,
 )
 from .shooting import Fit
+from .spread import expected_points, expected_rms
 from .where import discrepancies
 
 Array = NDArray[np.float64]
+
+UNEXPLAINED = 1.5
+"""Misfit of the best candidate above which none is an explanation."""
 
 PAIR_GAIN, PAIR_CLEARS = 15.0, 0.85
 """Nats by which two effects must beat the best one, and share of its misfit below which they must get."""
@@ -48,7 +52,11 @@ class CancelledError(Exception):
 
 @dataclass(kw_only=True, eq=False)
 class RigidFits:
-    """Implements ``Fits`` for captures of rigid bodies that do not touch each other."""
+    """Implements ``Fits`` for captures of rigid bodies that do not touch each other.
+
+    expects: nothing explains the capture, and ``refitted`` predicts the mean over its numbers' plausible ranges, as
+    that does better on the complete takes.
+    """
 
     capture: Capture
     bodies: list[BodyFits]
@@ -58,10 +66,14 @@ class RigidFits:
     floor_rms_m: float
     numerics_rms_m: float
     believed_rms_m: float
+    expects: bool = False
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""
-        return self._joined(predict_points, fit, list(self.capture.predict_trials))
+        trials = list(self.capture.predict_trials)
+        if fit is self.refitted and self.expects:
+            return self._joined(expected_points, self.nominal, trials)
+        return self._joined(predict_points, fit, trials)
 
     def simulate(self, fit: CandidateFit) -> dict[str, Array]:
         """Points (T, K, 3) in m at the frames of every trial, by its name, started from its first frames."""
@@ -155,15 +167,24 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         made[k] = _candidate(capture, bodies, k, held[k])
     _level_twins(made)
     believed = [heldout(believed_fit(b.fits[()])) for b in bodies]
-    floor = min(c.heldout_rms_m for c in made.values())
+    top = max(made, key=lambda k: made[k].log_evidence)
+    floors = [noise_floor(b.fits[top]) for b in bodies]
+    floor = min([float(np.sqrt(np.mean(np.square(floors)))), *(c.heldout_rms_m for c in made.values())])
+    expects, gap = False, min(c.misfit for c in made.values())
+    if gap > UNEXPLAINED and not any(b.problem.scene.body.round for b in bodies):
+        expected = float(np.sqrt(np.mean([expected_rms(believed_fit(b.fits[()])) ** 2 for b in bodies])))
+        expects = expected < made[refits].heldout_rms_m
+        if expects:
+            made[refits] = dataclasses.replace(made[refits], heldout_rms_m=expected)
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
     return RigidFits(
         capture=capture,
         bodies=bodies,
+        expects=expects,
         nominal=made[()],
         refitted=made[refits],
         candidates=tuple(singles),
-        floor_rms_m=min(floor, believed[0].floor_rms_m),
+        floor_rms_m=floor,
         numerics_rms_m=float(np.sqrt(np.mean([numerics(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
         believed_rms_m=float(np.sqrt(np.mean([b.rms_m**2 for b in believed]))),
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .prediction import first_states, placed, run_on, shown_frames
+from .prediction import first_states, noise_spread, placed, run_on, shown_frames
 from .shooting import Fit
 
 Array = NDArray[np.float64]
@@ -16,11 +16,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Heldout:
-    """log_score: (fit takes,) nats. rms_m: predicted from the first frames. floor_rms_m: what noise alone leaves."""
+    """log_score: (fit takes,) nats. rms_m: predicted from the first frames."""
 
     log_score: Array
     rms_m: float
-    floor_rms_m: float
 
 
 def without_each(fit: Fit) -> Array:
@@ -47,7 +46,6 @@ def heldout(fit: Fit) -> Heldout:
             scores.append(-0.5 * cost)
     starts = first_states(fit, numbers)
     squares: list[Array] = []
-    floors: list[float] = []
     for i, take in enumerate(problem.takes):
         if take.sight.trial.role != "fit" or len(take.sight.times) < 5:
             continue
@@ -58,11 +56,18 @@ def heldout(fit: Fit) -> Heldout:
         off = (take.sight.seen if take.sight.camera is None else _followed(fit, i))[begin:] - points
         off = off[max(0, shown_frames(fit, take) - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
-        if take.sight.camera is None:
-            floors.append(3 * take.sight.sigma**2)
     rms = float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("nan")
-    floor = float(np.sqrt(np.mean(floors))) if floors else rms
-    return Heldout(log_score=np.array(scores), rms_m=rms, floor_rms_m=floor)
+    return Heldout(log_score=np.array(scores), rms_m=rms)
+
+
+def noise_floor(fit: Fit) -> float:
+    """Distance in m that noise alone leaves where ``fit`` predicts: in its first frames, and in 3D points themselves.
+
+    Pixels are compared with the path that was followed, which has next to no noise of its own.
+    """
+    takes = [t for t in fit.problem.takes if t.sight.trial.role == "fit"]
+    own = [0.0 if t.sight.camera is not None else 3 * t.sight.sigma**2 for t in takes]
+    return float(np.sqrt(np.mean(own) + noise_spread(fit) ** 2))
 
 
 def _followed(fit: Fit, index: int) -> Array:

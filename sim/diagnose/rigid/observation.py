@@ -138,10 +138,20 @@ def projection_slope(camera: Camera, points: Array) -> Array:
     return np.stack(rows, axis=-2) @ matrix[:3, :3].T
 
 
+def rigid_turn(places: Array, found: Array) -> Array:
+    """Rotation (3, 3) that takes ``places`` (K, 3) nearest to ``found`` (K, 3), both about their middles.
+
+    Kabsch, Acta Cryst. A 32 (1976).
+    """
+    u, _, vt = np.linalg.svd(places.T @ found)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return np.asarray((u @ flip @ vt).T)
+
+
 def frame_pose(sight: Sight, frame: int, guess: tuple[Array, Array] | None = None) -> tuple[Array, Array] | None:
     """Pose (x (3,), rotation (3, 3)) from one frame alone; None where too few points are seen.
 
-    Kabsch, Acta Cryst. A 32 (1976), for points; perspective-n-point for pixels, from ``guess`` where there is one.
+    Nearest rigid motion for points; perspective-n-point for pixels, from ``guess`` where there is one.
     """
     seen = sight.seen[frame]
     there = np.isfinite(seen).all(axis=1)
@@ -152,10 +162,7 @@ def frame_pose(sight: Sight, frame: int, guess: tuple[Array, Array] | None = Non
         if len(found) < 3 or not sight.poses_alone:
             turn = np.eye(3) if guess is None else guess[1]
             return found.mean(axis=0) - turn @ places.mean(axis=0), turn
-        a, b = places - places.mean(axis=0), found - found.mean(axis=0)
-        u, _, vt = np.linalg.svd(a.T @ b)
-        flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-        turn = (u @ flip @ vt).T
+        turn = rigid_turn(places - places.mean(axis=0), found - found.mean(axis=0))
         return found.mean(axis=0) - turn @ places.mean(axis=0), turn
     if len(found) < 4:
         return None

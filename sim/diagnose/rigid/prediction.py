@@ -9,13 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .candidates import BELIEFS
-from .shooting import Fit, Model, Take
+from .shooting import Fit, Model, Problem, Take
 from .tracking import settle
-from .turning import to_matrix
+from .turning import moved, to_matrix
 from .worlds import SLOTS
 
 Array = NDArray[np.float64]
 Points = dict[str, tuple[NDArray[np.int64], Array]]
+
+NOISE_DRAWS = 6
+"""First states tried for what noise in them amounts to."""
 
 SHOWN = 0.16
 """Seconds from which a complete take is predicted where no predict trial says how much there is to see."""
@@ -61,8 +64,8 @@ def shown_frames(fit: Fit, take: Take) -> int:
     return int(np.clip(count, min(4, take.end), take.end))
 
 
-def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
-    """(frame, state (13,) there) of all takes, known from no more than their first frames. z: (P,) or (takes, P)."""
+def _shortened(fit: Fit) -> tuple[Problem, list[Array]]:
+    """``fit``'s problem cut to the first frames of every take, with the states there."""
     short, states = [], []
     for take, whole in zip(fit.problem.takes, fit.states, strict=True):
         end = shown_frames(fit, take)
@@ -81,8 +84,35 @@ def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
             )
         )
         states.append(whole[: len(nodes)])
-    found = settle(dataclasses.replace(fit.problem, takes=short), fit.model, z, states, 3)
-    return [(t.nodes[-1], s[-1]) for t, s in zip(short, found, strict=True)]
+    return dataclasses.replace(fit.problem, takes=short), states
+
+
+def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
+    """(frame, state (13,) there) of all takes, known from no more than their first frames. z: (P,) or (takes, P)."""
+    short, states = _shortened(fit)
+    found = settle(short, fit.model, z, states, 3)
+    return [(t.nodes[-1], s[-1]) for t, s in zip(short.takes, found, strict=True)]
+
+
+def noise_spread(fit: Fit) -> float:
+    """Root mean square distance in m by which noise in the first frames alone moves what follows, in the fit takes."""
+    short, states = _shortened(fit)
+    states = settle(short, fit.model, fit.z, states, 3)
+    look = short.evaluate(fit.model, fit.z, states, fixed=True)
+    rng, squares = np.random.default_rng(0), []
+    for take, part, state in zip(short.takes, look.linear, states, strict=True):
+        times = take.sight.times[shown_frames(fit, take) :]
+        if take.sight.trial.role != "fit" or not len(times):
+            continue
+        cover = np.linalg.pinv(part.hessian, hermitian=True)[-12:, -12:]
+        values, vectors = np.linalg.eigh(0.5 * (cover + cover.T))
+        draws = rng.normal(size=(NOISE_DRAWS, 12)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        clock = times - take.sight.times[take.nodes[-1]]
+        middle = placed(take, run_on(fit, fit.z, state[-1], clock))
+        for draw in draws:
+            other = placed(take, run_on(fit, fit.z, moved(state[-1], draw), clock))
+            squares.append(np.sum((other - middle) ** 2, axis=-1).ravel())
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
 
 def simulate_points(fit: Fit) -> Points:

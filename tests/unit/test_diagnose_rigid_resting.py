@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that pixels show lying on the ground, and means over contacts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.rigid.body import rigid_body
+from physgen.sim.diagnose.rigid.candidates import Scene
+from physgen.sim.diagnose.rigid.observation import project, rigid_turn, sights
+from physgen.sim.diagnose.rigid.resting import height, resting_state
+from physgen.sim.diagnose.rigid.turning import from_vector, to_matrix
+
+SIZE = (0.12, 0.08, 0.05)
+LENS = {"width": 1280, "height": 720, "fx": 1200.0, "fy": 1200.0, "cx": 640.0, "cy": 360.0}
+
+
+def camera():
+    """Looks from (0, -1.5, 1) at the origin."""
+    forward = np.array([0.0, 1.5, -1.0]) / np.hypot(1.5, 1.0)
+    right = np.array([1.0, 0.0, 0.0])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    matrix[:3, 3] = [0.0, -1.5, 1.0]
+    return Camera(**LENS, world_from_camera=tuple(tuple(row) for row in matrix))
+
+
+def filmed(lift):
+    """(scene, sight) of a box that slides to the right and turns; ``lift`` (T,) m takes it off the ground."""
+    mesh = trimesh.creation.box(SIZE)
+    belief = ObjectBelief(name="body", mesh="body.obj", density_kg_m3=500.0, stiffness="hard")
+    thing = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    times = np.arange(len(lift)) / 240
+    yaw = from_vector((0.3 + 2.0 * times)[:, None] * np.array([0.0, 0.0, 1.0]))
+    middle = np.stack([-0.1 + 0.8 * times - 1.5 * times**2, 0.02 * np.ones_like(times), SIZE[2] / 2 + lift], axis=1)
+    points = middle[:, None] + np.einsum("fij,kj->fki", to_matrix(yaw), mesh.vertices)
+    noise = np.random.default_rng(1).normal(scale=0.4, size=(*points.shape[:2], 2))
+    trial = Trial(
+        name="take",
+        role="fit",
+        times=times,
+        points=None,
+        pixels=project(camera(), points) + noise,
+        object_index=np.zeros(len(mesh.vertices), dtype=np.int64),
+        rest_points=np.asarray(mesh.vertices),
+    )
+    capture = Capture(
+        gravity=(0.0, 0.0, -9.81),
+        ground=Ground(friction=0.3, restitution=0.2),
+        objects=(thing,),
+        noise_sigma=0.4,
+        camera=camera(),
+        trials=(trial,),
+    )
+    body = rigid_body(thing)
+    return Scene(capture=capture, body=body, middle=np.zeros(3)), sights(capture, trial, 0, body.center)
+
+
+def test_a_box_that_slides_is_on_the_ground_from_the_start():
+    found = resting_state(*filmed(np.zeros(30)))
+    assert found is not None
+    state, _ = found
+    assert state[:3] == pytest.approx([-0.1, 0.02, SIZE[2] / 2], abs=1e-3)
+    assert state[7:10] == pytest.approx([0.8, 0.0, 0.0], abs=0.03)
+    assert state[12] == pytest.approx(2.0, abs=0.15)
+
+
+def test_a_box_that_rises_does_not_lie():
+    times = np.arange(30) / 240
+    assert resting_state(*filmed(1.2 * times - 4.9 * times**2)) is None
+
+
+def test_height_changes_as_its_slope_says():
+    scene, _ = filmed(np.zeros(5))
+    state = np.array([0.0, 0.0, 0.1, *from_vector(np.array([0.3, 0.2, 0.1])), *np.zeros(6)])
+    here, slope = height(scene, state)
+    moved = state.copy()
+    moved[2] += 0.01
+    assert height(scene, moved)[0] == pytest.approx(here + 0.01 * slope[2])
+    assert slope[:3] == pytest.approx([0, 0, 1])
+
+
+def test_the_nearest_turn_of_turned_points_is_theirs():
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(6, 3))
+    turn = to_matrix(from_vector(rng.normal(size=3)))
+    assert rigid_turn(places, places @ turn.T) == pytest.approx(turn, abs=1e-9)
