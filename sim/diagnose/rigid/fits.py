@@ -42,6 +42,9 @@ Array = NDArray[np.float64]
 UNEXPLAINED = 1.5
 """Misfit of the best candidate above which none is an explanation."""
 
+WORSE = 1.2
+"""Times the believed model's error on the complete takes up to which the mean over plausible contacts is preferred."""
+
 PAIR_GAIN, PAIR_CLEARS = 15.0, 0.85
 """Nats by which two effects must beat the best one, and share of its misfit below which they must get."""
 
@@ -54,8 +57,7 @@ class CancelledError(Exception):
 class RigidFits:
     """Implements ``Fits`` for captures of rigid bodies that do not touch each other.
 
-    expects: nothing explains the capture, and ``refitted`` predicts the mean over its numbers' plausible ranges, as
-    that does better on the complete takes.
+    expects: nothing explains the capture, and ``refitted`` predicts the mean over its numbers' plausible ranges.
     """
 
     capture: Capture
@@ -173,7 +175,9 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     expects, gap = False, min(c.misfit for c in made.values())
     if gap > UNEXPLAINED and not any(b.problem.scene.body.round for b in bodies):
         expected = float(np.sqrt(np.mean([expected_rms(believed_fit(b.fits[()])) ** 2 for b in bodies])))
-        expects = expected < made[refits].heldout_rms_m
+        # A handful of takes that tumble hardly tells which refitted numbers predict better: the believed ones are the
+        # measure, and what was refitted to a motion that is not understood is not taken along.
+        expects = expected < WORSE * float(np.sqrt(np.mean([b.rms_m**2 for b in believed])))
         if expects:
             made[refits] = dataclasses.replace(made[refits], heldout_rms_m=expected)
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
