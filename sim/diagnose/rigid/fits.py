@@ -209,7 +209,7 @@ def _worth(bodies: list[BodyFits], keys: list[tuple[str, ...]]) -> list[tuple[st
     if not singles:
         return keys
     best = max(singles, key=evidence)
-    enough, most = evidence(best) + PAIR_GAIN, PAIR_CLEARS * left(best)
+    enough, most = evidence(best) + PAIR_GAIN, PAIR_CLEARS * min(left(best), left(()))
     return [k for k in keys if len(k) < 2 or (evidence(k) > enough and left(k) < most)]
 
 
