@@ -32,7 +32,8 @@ class Weighing:
 
     temperature: T above, at least 1. fee: d above, nats.
     predicts: share of the nominal model's held-out error below which an effect has to come.
-    enough: misfit at which the chance that the right candidate leaves that much is one half.
+    enough: misfit at which the chance that the right candidate leaves that much is one half, where it hardly lowers the
+        nominal model's; enough_explained: the same where it takes most of that away.
     sharpness: slope of that curve in ln m.
     prior_none: prior probability that nothing is missing; the effects share the rest.
     second_gain, second_misfit: a candidate of two effects counts only where it gains more nats than this over each of
@@ -43,7 +44,8 @@ class Weighing:
     temperature: float = 4.0
     fee: float = 8.0
     predicts: float = 0.97
-    enough: float = 3.0
+    enough: float = 1.7
+    enough_explained: float = 3.0
     sharpness: float = 8.0
     prior_none: float = 0.3
     second_gain: float = 15.0
@@ -80,7 +82,7 @@ def weigh(fits: Fits, weighing: Weighing) -> Weighed:
     """Verdict and probabilities. A candidate of two effects counts for the first of its effects."""
     candidates = [unchanged(fits), *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
     weights = _weights(candidates, weighing)
-    adequate = [_adequacy(c.misfit, weighing) for c in candidates]
+    adequate = [_adequacy(c.misfit, candidates[0].misfit, weighing) for c in candidates]
     probabilities: dict[str, float] = {}
     best: dict[str, tuple[float, CandidateFit]] = {}
     for fit, weight, chance in zip(candidates, weights, adequate, strict=True):
@@ -139,10 +141,15 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: Weighing) -> float
     return gain - weighing.fee
 
 
-def _adequacy(misfit: float, weighing: Weighing) -> float:
+def _adequacy(misfit: float, nominal: float, weighing: Weighing) -> float:
+    """Chance that the right candidate would leave ``misfit`` where the nominal model leaves ``nominal``."""
     if not math.isfinite(misfit) or misfit <= 0:
         return 0.0
-    exponent = weighing.sharpness * math.log(misfit / weighing.enough)
+    # What explains nine tenths of a large misfit may leave more than what merely shaves a little off.
+    left = misfit / nominal if math.isfinite(nominal) and nominal > 0 else 1.0
+    explained = min(max((0.6 - left) / 0.3, 0.0), 1.0)
+    enough = weighing.enough + explained * (weighing.enough_explained - weighing.enough)
+    exponent = weighing.sharpness * math.log(misfit / enough)
     return 1.0 / (1.0 + math.exp(min(max(exponent, -60.0), 60.0)))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...effects.registry import effect
-from ...errors import InputError
+from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..analysis import CandidateFit, Discrepancy, Estimate
 from ..capture import Capture, Trial
@@ -47,10 +47,6 @@ WORSE = 1.2
 
 PAIR_GAIN, PAIR_CLEARS = 15.0, 0.85
 """Nats by which two effects must beat the best one, and share of its misfit below which they must get."""
-
-
-class CancelledError(Exception):
-    """The caller no longer wants the fits."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -109,7 +105,7 @@ def fit_rigid(
     """Every effect of ``names`` (None: all that mean something for a rigid body) fitted to ``capture``.
 
     budget_s: seconds after which no further candidate is begun. Raises InputError where no body is rigid or a name is
-    unknown, and whatever ``cancelled`` makes of it: ``CancelledError``.
+    unknown, Cancelled when ``cancelled()`` became true.
     """
     started = time.monotonic()
     wanted = _wanted(capture, names)
@@ -127,7 +123,7 @@ def fit_rigid(
         done += 1
         progress.report(done, what)
         if cancelled():
-            raise CancelledError
+            raise Cancelled("cancelled while fitting; nothing was written")
 
     for body in bodies:
         fit_nominal(body)
