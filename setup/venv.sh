@@ -2,7 +2,9 @@
 # venv.sh PYTHON VENV: a virtual environment with the project and everything it needs, made again when the
 # interpreter or the requirements changed.
 set -eu
-python=$1 venv=$2
+venv=$2
+# The interpreter may be that of the very environment that is made anew, where it is active: take what it stands on.
+python=$("$1" -c 'import sys; print(getattr(sys, "_base_executable", sys.executable))')
 wanted="$("$python" -c 'import sys; print(sys.version)' | head -n 1) $(cksum <pyproject.toml)"
 [ -f "$venv/.ready" ] && [ "$(cat "$venv/.ready")" = "$wanted" ] && exit 0
 echo "setting up $venv with $("$python" --version) (downloads about 700 MB the first time)"
