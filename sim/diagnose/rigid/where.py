@@ -129,7 +129,8 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     if setting.friction != base.friction:
         way = velocity - (velocity @ normal)[:, None] * normal
         way /= np.linalg.norm(way, axis=1, keepdims=True) + 1e-9
-        share = np.where(touched > 0, slid / np.maximum(touched, 1e-9), 0.0)
+        moving = (touched > 0) & (speed >= REST_SPEED)
+        share = np.where(moving, slid / np.maximum(touched, 1e-9), 0.0)
         lack += ((base.friction - setting.friction) * rate * share)[:, None] * way
     if setting.restitution != base.restitution:
         lack += np.where(blow > 0.01, (setting.restitution - base.restitution) * blow / spacing, 0.0)[:, None] * normal
