@@ -30,6 +30,7 @@ from .search import (
     follow_best,
     moved_camera,
     pairs,
+    reconsider_nominal,
     refine,
     refit_beliefs,
 )
@@ -139,6 +140,7 @@ def fit_rigid(
         tick("refitted")
         follow_best(body, started + budget_s)
         refine(body, started + budget_s)
+        reconsider_nominal(body, started + budget_s)
         pairs(body, wanted, started + budget_s)
     return _assemble(capture, bodies)
 

@@ -38,6 +38,9 @@ PROMISING = 12.0
 FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
 """Nats over the nominal model, and misfit, above which an effect is fitted with nodes of its own."""
 
+RECONSIDERED = 3
+"""Best effects from whose states the nominal model is begun again."""
+
 MOVED_GUESS = 0.3
 """Standard deviations of the prior that poses alone must say a camera has moved, for that."""
 
@@ -99,6 +102,21 @@ def fit_nominal(body: BodyFits) -> None:
         for take, states in zip(problem.takes, fit.states, strict=True):
             take.states = states
     body.fits[()] = fit
+
+
+def reconsider_nominal(body: BodyFits, until: float) -> None:
+    """Begin the nominal model again where the best effects ended; kept where it is better.
+
+    Every effect contains the nominal model. One that gains although its own share is nothing has only found better
+    states, and these are the nominal model's as well.
+    """
+    singles = [f for k, f in body.fits.items() if len(k) == 1 and f.problem is body.problem]
+    for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
+        if time.monotonic() > until:
+            return
+        again = solve(body.problem, Model(freedoms=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
+        if again.evidence > body.fits[()].evidence:
+            body.fits[()] = again
 
 
 def begin(body: BodyFits, freedoms: tuple[Freedom, ...], base: Fit | None = None) -> Fit:
