@@ -61,6 +61,8 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: holds no triangles; export it again as a triangle mesh")
+    if np.ndim(mesh.vertices) != 2 or np.shape(mesh.vertices)[1] != 3:
+        raise InputError(f"{path}: has vertices without three coordinates; export it again")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path}: has vertices that are not finite; export it again")
     faces = np.asarray(mesh.faces)

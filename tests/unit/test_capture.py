@@ -196,6 +196,14 @@ def test_a_take_without_enough_frames_is_left_out(tmp_path):
     assert [t.name for t in found.trials] == ["take01"] and "'lost'" in found.warnings[0]
 
 
+def test_a_mesh_with_flat_vertices_is_refused(folder):
+    path = folder / "body.obj"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(" ".join(n.split()[:3]) if n.startswith("v ") else n for n in lines))
+    with pytest.raises(InputError, match=r"body\.obj"):
+        load_capture(folder)
+
+
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_garbage_gives_a_clear_error(folder, data):
