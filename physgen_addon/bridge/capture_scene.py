@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trimesh.remesh import subdivide_to_size
 
 from ...sim.diagnose.capture import Camera, Capture, CaptureObject, Trial
+from ...sim.diagnose.rotation import nearest_rotation
 from ...sim.errors import InputError
 from ...sim.scene.model import Camera as SceneCamera
 from . import capture_materials as materials
@@ -208,9 +209,8 @@ def _add_camera(scene: bpy.types.Scene, root: bpy.types.Collection, camera: Came
 
 def _orthonormal(matrix: Array) -> Any:
     """A capture's rotation may be rounded more than a scene's; the nearest exact one."""
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
     exact = matrix.copy()
-    exact[:3, :3] = u @ vt
+    exact[:3, :3] = nearest_rotation(matrix[:3, :3])
     return tuple(tuple(float(x) for x in row) for row in exact)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.diagnose.capture import Camera
+from ...sim.diagnose.rotation import nearest_rotation
 from ...sim.errors import InputError
 from ...sim.skinning.binding import bind
 
@@ -100,8 +101,7 @@ def _rotation(rest: Array, points: Array, before: Array) -> Array:
     moment = points.T @ rest
     if len(rest) < 3 or spread[1] < FLAT * max(spread[0], 1e-12):
         moment = moment + 1e-3 * max(float(spread[0]) ** 2, 1e-12) * before
-    u, _, vt = np.linalg.svd(moment)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return nearest_rotation(moment)
 
 
 def body_shifts(rest: Array, points: Array, poses: Poses) -> Array:

@@ -7,10 +7,10 @@ import dataclasses
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from .capture import Array, Capture, CaptureObject, Trial
+from .rotation import nearest_rotation
 
 LARGEST_M = 20.0
 """Extent of a mesh above which it is taken to be in millimetres."""
@@ -112,7 +112,5 @@ def _spread(points: Array) -> float:
 def _misfit(a: Array, b: Array, hand: float) -> float:
     """Root mean square distance in m of ``b`` from ``a`` turned (hand 1) or turned and mirrored (hand -1)."""
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    signs: NDArray[np.float64] = np.array([1.0, 1.0, hand * np.sign(np.linalg.det(u @ vt))])
-    turn = (u * signs) @ vt
+    turn = nearest_rotation(b.T @ a, hand=hand)
     return float(np.sqrt(((b - a @ turn.T) ** 2).sum(axis=1).mean()))

@@ -25,9 +25,6 @@ from .gap import bootstrap_interval, controls_of, measured_gap
 from .places import where_of
 from .summary import summary_of
 
-RIGID_WEIGHING = Weighing()
-SOFT_WEIGHING = Weighing()
-
 CONFIRMED_TAKES = 2
 """Takes that the engine runs again: each costs seconds, and the second tells chance from confirmation."""
 
@@ -69,8 +66,8 @@ def diagnose(
     """
     options = options or DiagnoseOptions()
     started = time.monotonic()
-    fits, weighing = _fit(capture, options, on_event, cancelled)
-    weighed = weigh(fits, weighing)
+    fits = _fit(capture, options, on_event, cancelled)
+    weighed = weigh(fits, Weighing())
     warnings = list(capture.warnings)
     verdict, found = weighed.verdict, _found(fits, weighed)
     gap = measured_gap(capture, fits, found)
@@ -103,18 +100,13 @@ def diagnose(
     )
 
 
-def _fit(
-    capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelled: IsCancelled
-) -> tuple[Fits, Weighing]:
+def _fit(capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelled: IsCancelled) -> Fits:
     # Taichi is imported only when something is fitted.
     rigid = [item.belief.rigid for item in capture.objects]
     if all(rigid):
         from .rigid.fits import fit_rigid
 
-        fits: Fits = fit_rigid(
-            capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s
-        )
-        return fits, RIGID_WEIGHING
+        return fit_rigid(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
     if len(capture.objects) > 1:
         soft = capture.objects[rigid.index(False)].name
         raise InputError(
@@ -123,8 +115,7 @@ def _fit(
         )
     from .soft.fits import fit_soft
 
-    fits = fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
-    return fits, SOFT_WEIGHING
+    return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
 
 
 def _found(fits: Fits, weighed: Weighed) -> CandidateFit:

@@ -31,6 +31,7 @@ from ..scene.model import Effect as SceneEffect
 from .analysis import CandidateFit
 from .capture import Array, Capture, CaptureObject, Trial
 from .projection import observed_distance
+from .rotation import nearest_pose
 
 HORIZON_S = 1.0
 """How long a rigid body, or one that touches nothing, is followed."""
@@ -204,10 +205,7 @@ def starting_state(trial: Trial, points: Array, rate: float = 1.0) -> StartingSt
 def _pose(rest: Array, points: Array) -> tuple[Array, Array]:
     if len(rest) < 3:
         return np.eye(3), points.mean(axis=0) - rest.mean(axis=0)
-    a, b = rest - rest.mean(axis=0), points - points.mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    turn = (u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])) @ vt
-    return turn, points.mean(axis=0) - turn @ rest.mean(axis=0)
+    return nearest_pose(rest, points)
 
 
 def world_setup(

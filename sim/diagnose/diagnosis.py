@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..errors import InputError
-from ..scene.json_fields import read_json
+from ..scene.json_fields import read_json, to_json
 from .analysis import Estimate
 from .capture import read_arrays
 
@@ -164,19 +163,19 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
         parameters = {
             name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]} for name, e in item.parameters.items()
         }
-        effects.append({**_fields(item), "parameters": parameters})
+        effects.append({**to_json(item), "parameters": parameters})
     return _plain(
         {
             "format": FORMAT,
-            "verdict": _fields(diagnosis.verdict),
+            "verdict": to_json(diagnosis.verdict),
             "summary": diagnosis.summary,
             "effects": effects,
-            "gap": _fields(diagnosis.gap),
+            "gap": to_json(diagnosis.gap),
             "controls": dict(diagnosis.controls),
             "next_experiment": diagnosis.next_experiment,
             "where": {
-                "objects": [_fields(o) for o in diagnosis.where.objects],
-                "intervals": [_fields(i) for i in diagnosis.where.intervals],
+                "objects": [to_json(o) for o in diagnosis.where.objects],
+                "intervals": [to_json(i) for i in diagnosis.where.intervals],
                 "direction": dict(diagnosis.where.direction),
             },
             "confirmation": dict(diagnosis.confirmation),
@@ -199,10 +198,6 @@ def read_diagnosis(out: Path) -> tuple[dict[str, Any], Mapping[str, NDArray[Any]
         if not isinstance(report.get(key), kind):
             raise InputError(f"{path}.{key}: missing or malformed; run `physgen diagnose` again")
     return report, read_arrays(out / WHERE_FILE), read_arrays(out / PREDICTION_FILE)
-
-
-def _fields(item: Any) -> dict[str, Any]:
-    return {f.name: getattr(item, f.name) for f in dataclasses.fields(item)}
 
 
 def _plain(value: Any) -> Any:

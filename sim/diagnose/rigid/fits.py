@@ -64,7 +64,6 @@ class RigidFits:
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
     numerics_rms_m: float
-    believed_rms_m: float
     expects: bool = False
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
@@ -188,7 +187,6 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         candidates=tuple(singles),
         floor_rms_m=floor,
         numerics_rms_m=float(np.sqrt(np.mean([numerics(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
-        believed_rms_m=float(np.sqrt(np.mean([b.rms_m**2 for b in believed]))),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, Trial
+from ..rotation import nearest_rotation
 from .turning import skew, to_matrix
 
 Array = NDArray[np.float64]
@@ -139,13 +140,8 @@ def projection_slope(camera: Camera, points: Array) -> Array:
 
 
 def rigid_turn(places: Array, found: Array) -> Array:
-    """Rotation (3, 3) that takes ``places`` (K, 3) nearest to ``found`` (K, 3), both about their middles.
-
-    Kabsch, Acta Cryst. A 32 (1976).
-    """
-    u, _, vt = np.linalg.svd(places.T @ found)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return np.asarray((u @ flip @ vt).T)
+    """Rotation (3, 3) that takes ``places`` (K, 3) nearest to ``found`` (K, 3), both about their middles."""
+    return nearest_rotation(found.T @ places)
 
 
 def frame_pose(sight: Sight, frame: int, guess: tuple[Array, Array] | None = None) -> tuple[Array, Array] | None:

@@ -63,7 +63,6 @@ class SoftFits:
             rms = self._rms(takes, whole[2 + i]) if i < 2 and len(whole) > 2 + i else None
             fits.append(self._candidate_fit(entry, rms))
         self.candidates = tuple(fits)
-        self.believed_rms_m = self._whole_nominal
         self.floor_rms_m = math.sqrt(3) * self._flights.sigma
 
     def _candidate_fit(self, found: Found, rms: float | None, *, believed: bool = False) -> CandidateFit:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..rotation import nearest_pose
 from .laws import Laws
 
 Array = NDArray[np.float64]
@@ -180,22 +181,13 @@ class _Field:
         return np.asarray(a)
 
 
-def pose_of(rest: Array, seen: Array) -> tuple[Array, Array]:
-    """Turn (3, 3) and shift (3,) that carry ``rest`` (K, 3) to ``seen`` (K, 3) best (Kabsch, Acta Cryst. A32, 1976)."""
-    a, b = rest.mean(axis=0), seen.mean(axis=0)
-    u, _, vt = np.linalg.svd((rest - a).T @ (seen - b))
-    fix = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(vt.T @ u.T)))])
-    turn = vt.T @ fix @ u.T
-    return turn, b - turn @ a
-
-
 def first_guess(times: Array, rest: Array, points: Array, inertia: Inertia, gravity: Array) -> State:
     """A rigid state at the first of ``times`` (T,) from ``points`` (T, K, 3), NaN where not seen."""
     turns, places, used = [], [], []
     for time, frame in zip(times, points, strict=True):
         seen = np.isfinite(frame).all(axis=1)
         if seen.sum() >= 3:
-            turn, shift = pose_of(rest[seen], frame[seen])
+            turn, shift = nearest_pose(rest[seen], frame[seen])
             turns.append(turn)
             places.append(turn @ inertia.centre + shift)
             used.append(time)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture, Trial
-from .flight import Flight, FlightFit, Inertia, State, first_guess, fit_flight, fly, pose_of
+from ..rotation import nearest_pose
+from .flight import Flight, FlightFit, Inertia, State, first_guess, fit_flight, fly
 from .laws import Laws
 from .worlds import Job, SoftWorlds, sane
 
@@ -80,7 +81,7 @@ def take_of(trial: Trial, frame: GroundFrame, nodes: Array) -> Take:
     for seen in points:
         there = np.isfinite(seen).all(axis=1)
         if there.sum() >= 3:
-            turn, shift = pose_of(trial.rest_points[there], seen[there])
+            turn, shift = nearest_pose(trial.rest_points[there], seen[there])
             if float((nodes @ turn[2]).min() + shift[2]) < CLEAR:
                 break
         flying += 1
