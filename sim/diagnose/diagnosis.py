@@ -134,12 +134,6 @@ class Diagnosis:
     seconds: float = 0.0
     confirmation: Mapping[str, Any] = field(default_factory=dict)
 
-    def parameters(self) -> Mapping[str, Mapping[str, float]]:
-        """What the verdict adds to a scene: effect → parameter → value; empty for ``none`` and ``unknown``."""
-        ranked = {e.name: e for e in self.effects}
-        names = self.verdict.effects if self.verdict.effects else ()
-        return {n: {k: v.value for k, v in ranked[n].parameters.items()} for n in names if n in ranked}
-
 
 def write_diagnosis(diagnosis: Diagnosis, out: Path) -> None:
     """Write ``report.json``, ``where.npz`` and ``prediction.npz`` into the folder ``out``."""

@@ -23,7 +23,6 @@ from .style import page_style
 from .timeline import bands
 from .words import (
     DIRECTIONS,
-    OBSERVATION,
     PHASES,
     alternatives_sentence,
     closure_sentence,
@@ -277,7 +276,8 @@ def _next(diagnosis: Diagnosis) -> Markup:
 
 def _use(diagnosis: Diagnosis) -> Markup:
     found = found_effects(diagnosis.verdict)
-    observed = [name for name in found if name in OBSERVATION]
+    kinds = {item.name: item.kind for item in diagnosis.effects}
+    observed = [name for name in found if kinds.get(name) == "observation"]
     entry = scene_effects_json(diagnosis)
     parts: list[Markup | None] = []
     if observed:

@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from ..diagnosis import Diagnosis
-from .words import OBSERVATION, found_effects
+from .words import found_effects
 
 
 def scene_effects(diagnosis: Diagnosis) -> list[dict[str, Any]]:
@@ -19,7 +19,7 @@ def scene_effects(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     ranked = {item.name: item for item in diagnosis.effects}
     entries = []
     for name in found_effects(diagnosis.verdict):
-        if name in OBSERVATION or name not in ranked:
+        if name not in ranked or ranked[name].kind == "observation":
             continue
         values = {key: estimate.value for key, estimate in ranked[name].parameters.items()}
         if not values or not all(math.isfinite(value) for value in values.values()):

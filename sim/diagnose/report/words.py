@@ -62,9 +62,6 @@ _MEANING = MappingProxyType(
     }
 )
 
-OBSERVATION = ("time_scale", "camera_pose")
-"""Effects that concern the recording, so that adding them to a scene moves nothing."""
-
 PHASES = MappingProxyType({"flight": "in flight", "impact": "at impacts", "contact": "in contact", "rest": "at rest"})
 
 DIRECTIONS = MappingProxyType(
