@@ -40,6 +40,13 @@ LIFT_PX = 3.0
 """Median distance of an object's tracks from its fitted pose above which no later track can be put on its mesh."""
 MISFIT = 0.1
 """How far tracks may be off the fitted pose and still count for it, over the picture's width."""
+DISTORTION = {
+    "POLYNOMIAL": ("k1", "k2", "k3"),
+    "DIVISION": ("division_k1", "division_k2"),
+    "NUKE": ("nuke_k1", "nuke_k2", "nuke_p1", "nuke_p2"),
+    "BROWN": ("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2"),
+}
+"""The numbers of each of Blender's lens models that are zero where nothing is bent."""
 
 Array = NDArray[np.float64]
 
@@ -160,12 +167,8 @@ def _undistorted(clip: bpy.types.MovieClip, pixels: Array, camera: Camera, warni
     """``pixels`` (T, N, 2) as a lens without distortion would show them, by what the clip says of its lens."""
     lens = clip.tracking.camera
     model = lens.distortion_model
-    numbers = {
-        "POLYNOMIAL": (lens.k1, lens.k2, lens.k3),
-        "DIVISION": (lens.division_k1, lens.division_k2),
-        "NUKE": (lens.nuke_k1, lens.nuke_k2, lens.nuke_p1, lens.nuke_p2),
-        "BROWN": (lens.brown_k1, lens.brown_k2, lens.brown_k3, lens.brown_k4, lens.brown_p1, lens.brown_p2),
-    }.get(model, ())
+    # By name, as Blender 4.5's lens has no tangential terms of the Nuke model.
+    numbers = [getattr(lens, name, 0.0) for name in DISTORTION.get(model, ())]
     if not any(numbers):
         return pixels
     if model == "POLYNOMIAL":
