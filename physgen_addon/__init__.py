@@ -11,6 +11,8 @@ from types import ModuleType
 
 MODULES = (
     "props.preferences",
+    "props.body",
+    "props.scene",
     "props.diagnose",
     "jobs",
     "operators.capture",

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What PhysGen knows of a scene: where it comes from, its world, how it is simulated and rendered.
+
+Blender reads the classes' annotations as properties, so they must not be postponed to strings.
+"""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ...sim.effects.registry import effect, effects
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+def _effect_items() -> list[tuple[str, str, str]]:
+    return [
+        (name, name.replace("_", " ").capitalize(), item.summary)
+        for name, item in effects().items()
+        if item.kind != "observation"
+    ]
+
+
+def _on_effect(self: "PHYSGEN_PG_effect_entry", context: bpy.types.Context) -> None:
+    self.parameters.clear()
+    for parameter in effect(self.effect).parameters:
+        item = self.parameters.add()
+        item.name, item.value = parameter.name, parameter.default
+
+
+class PHYSGEN_PG_number(bpy.types.PropertyGroup):
+    """A parameter of an effect; ``name`` is the registry's, which knows its unit and range."""
+
+    value: FloatProperty(name="Value", precision=4)
+
+
+class PHYSGEN_PG_target(bpy.types.PropertyGroup):
+    """An object that an effect acts on."""
+
+    item: PointerProperty(name="Object", description="Object that the effect acts on", type=bpy.types.Object)
+
+
+class PHYSGEN_PG_effect_entry(bpy.types.PropertyGroup):
+    """An entry of the effect stack."""
+
+    enabled: BoolProperty(name="On", description="Let the effect act", default=True)
+    effect: EnumProperty(name="Effect", description="What acts", items=_effect_items(), update=_on_effect)
+    parameters: CollectionProperty(type=PHYSGEN_PG_number)
+    targets: CollectionProperty(type=PHYSGEN_PG_target)
+    """Empty: all that it can act on."""
+
+
+class PHYSGEN_PG_world(bpy.types.PropertyGroup):
+    """Ground and effects. Gravity is Blender's own (``Scene.gravity``)."""
+
+    use_ground: BoolProperty(name="Ground", description="A floor without end", default=True)
+    ground_object: PointerProperty(
+        name="Plane",
+        description="Object through whose origin the ground goes, across its own Z axis. None: the plane below",
+        type=bpy.types.Object,
+    )
+    ground_point: FloatVectorProperty(
+        name="Point", description="A point of the ground", subtype="TRANSLATION", unit="LENGTH"
+    )
+    ground_normal: FloatVectorProperty(
+        name="Up", description="The side on which objects stand", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
+    )
+    friction: FloatProperty(
+        name="Friction",
+        description="Coulomb's coefficient while sliding: ice 0.03, wood on wood 0.4, rubber 1",
+        default=0.4,
+        min=0.0,
+        max=10.0,
+        soft_max=1.5,
+    )
+    static_friction: FloatProperty(
+        name="Static Friction",
+        description="Coulomb's coefficient before it slides; never below the sliding one",
+        default=0.4,
+        min=0.0,
+        max=10.0,
+        soft_max=1.5,
+    )
+    restitution: FloatProperty(
+        name="Bounce",
+        description="Speed after over speed before an impact of rigid objects",
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    effects: CollectionProperty(type=PHYSGEN_PG_effect_entry)
+    effect_index: IntProperty(name="Effect")
+
+
+class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
+    """How the scene is simulated, and the bake that it shows."""
+
+    quality: EnumProperty(
+        name="Quality",
+        description="How finely the scene is simulated",
+        items=[
+            ("preview", "Preview", "Seconds: to see whether a motion is the right one"),
+            ("standard", "Standard", "For most scenes on a laptop"),
+            ("fine", "Fine", "Thin parts and wrinkles; several times as slow"),
+            ("papers", "Papers", "256 cells along a box four times as wide as all that moves"),
+        ],
+        default="standard",
+    )
+    frame_start: IntProperty(
+        name="Start", description="Frame that shows the scene at rest", default=1, min=0, soft_max=250
+    )
+    frame_end: IntProperty(name="End", description="Last frame that is simulated", default=48, min=0, soft_max=500)
+    device: EnumProperty(
+        name="Device",
+        description="Where the simulation runs; what is not there falls back to the processor",
+        items=[
+            ("cpu", "CPU", "The processor"),
+            ("cuda", "CUDA", "An NVIDIA graphics card"),
+            ("vulkan", "Vulkan", "A graphics card with Vulkan"),
+            ("metal", "Metal", "Apple's graphics"),
+        ],
+    )
+    seed: IntProperty(name="Seed", description="Of the particles' places", min=0)
+    cache: StringProperty(
+        name="Cache",
+        description="Folder of the bakes; // is beside the .blend",
+        subtype="DIR_PATH",
+        default="//physgen_cache",
+        options=RELATIVE,
+    )
+    bake: StringProperty(
+        name="Bake", description="Folder of the bake that is shown; empty: none", subtype="DIR_PATH", options=RELATIVE
+    )
+
+
+class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
+    """How a scene with a photo is rendered into it."""
+
+    engine: EnumProperty(
+        name="Engine", description="Render engine", items=[("cycles", "Cycles", "Path tracing, matched to the photo")]
+    )
+    samples: IntProperty(
+        name="Samples", description="Rays and light samples a pixel; 0 is the engine's own choice", min=0, soft_max=256
+    )
+    scale: FloatProperty(
+        name="Size", description="Of the photo's resolution", default=1.0, min=0.05, max=4.0, soft_max=1.0
+    )
+    output: StringProperty(
+        name="Output",
+        description="Folder of the frames; // is beside the .blend",
+        subtype="DIR_PATH",
+        default="//physgen_render",
+        options=RELATIVE,
+    )
+
+
+class PHYSGEN_PG_scene(bpy.types.PropertyGroup):
+    """All that PhysGen knows of a scene; ``Scene.physgen``."""
+
+    folder: StringProperty(
+        name="Scene Folder",
+        description="Scene folder that this scene was imported from; empty for scenes without a photo",
+        subtype="DIR_PATH",
+        options=RELATIVE,
+    )
+    photo_root: PointerProperty(type=bpy.types.Collection)
+    """Collection of what was imported with the photo."""
+    body_index: IntProperty(name="Object", description="The chosen object")
+    world: PointerProperty(type=PHYSGEN_PG_world)
+    simulation: PointerProperty(type=PHYSGEN_PG_simulation)
+    rendering: PointerProperty(type=PHYSGEN_PG_rendering)
+
+
+CLASSES = (
+    PHYSGEN_PG_number,
+    PHYSGEN_PG_target,
+    PHYSGEN_PG_effect_entry,
+    PHYSGEN_PG_world,
+    PHYSGEN_PG_simulation,
+    PHYSGEN_PG_rendering,
+    PHYSGEN_PG_scene,
+)
+
+
+def register() -> None:
+    """Let every scene have a ``physgen``."""
+    bpy.types.Scene.physgen = PointerProperty(type=PHYSGEN_PG_scene)
+
+
+def unregister() -> None:
+    """Take it away again; what a file has stored stays stored."""
+    del bpy.types.Scene.physgen
