@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -18,7 +17,6 @@ import bpy
 import numpy as np
 
 from ...sim.errors import InputError
-from ...sim.scene.json_fields import to_json
 from ..props.body import bodies
 from .animation import TRANSFORM, Channel, channels, curves, drivers
 from .export_meshes import read_corners, read_points
@@ -78,7 +76,7 @@ class _Digest:
     def _add_checked(self, *values: Callable[[], Any]) -> None:
         for value in values:
             try:
-                self._add(json.dumps(to_json(value())))
+                self._add(value())
             except InputError as error:
                 self._add(str(error))
 
@@ -268,8 +266,7 @@ class _Digest:
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """``fields`` as JSON has them, without the name of the material's preset."""
-    plain = {name: to_json(value) for name, value in fields.items()}
-    if "material" in plain:
-        del plain["material"]["preset"]
-    return plain
+    """``fields`` without the name of the material's preset."""
+    if "material" not in fields:
+        return fields
+    return {**fields, "material": {name: n for name, n in vars(fields["material"]).items() if name != "preset"}}

@@ -1,5 +1,6 @@
 """Any Blender scene as a scene folder: exact where it can be, refused with a way out where it cannot."""
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -12,13 +13,14 @@ bpy = pytest.importorskip("bpy")
 import physgen  # noqa: E402
 from mathutils import Matrix  # noqa: E402
 from physgen.physgen_addon.bridge import camera as bridge_camera  # noqa: E402
+from physgen.physgen_addon.bridge import compat  # noqa: E402
 from physgen.physgen_addon.bridge.export import export_names, export_scene, fingerprint  # noqa: E402
 from physgen.sim.app.bake_inputs import BakeOptions, inputs_hash  # noqa: E402
 from physgen.sim.app.collider_motion import vertices_at  # noqa: E402
 from physgen.sim.app.setup_world import prepare_world  # noqa: E402
 from physgen.sim.cache.pc2 import Pc2Reader  # noqa: E402
 from physgen.sim.errors import InputError  # noqa: E402
-from physgen.sim.scene.folder import load_scene  # noqa: E402
+from physgen.sim.scene.folder import load_scene, save_scene  # noqa: E402
 from physgen.sim.scene.meshes import load_object_mesh, read_mesh  # noqa: E402
 from physgen.sim.scene.model import Camera  # noqa: E402
 
@@ -524,14 +526,46 @@ def test_a_second_export_replaces_the_first_and_nothing_else(scene, tmp_path):
     assert sorted(p.name for p in (tmp_path / "scene" / "meshes").iterdir()) == ["a.ply", "mine.txt"]
 
 
-def test_a_scene_with_a_photo_is_never_overwritten(scene, tmp_path, world):
-    # The photo's world reads an empty file; the add-on stays registered.
-    scene = bpy.context.scene
+def test_a_scene_with_a_photo_is_never_overwritten(scene, tmp_path):
     add()
-    before = (world.folder.root / "scene.json").read_bytes()
+    with_photo = dataclasses.replace(exported(scene, tmp_path)[0].scene, photo="photo.png", background="background.png")
+    save_scene(tmp_path / "scene", with_photo)
+    before = (tmp_path / "scene" / "scene.json").read_bytes()
     with pytest.raises(InputError, match="photo"):
-        export_scene(scene, world.folder.root)
-    assert (world.folder.root / "scene.json").read_bytes() == before
+        export_scene(scene, tmp_path / "scene")
+    assert (tmp_path / "scene" / "scene.json").read_bytes() == before
+    scene.physgen.folder = str(tmp_path / "imported")
+    with pytest.raises(InputError, match="imported from"):
+        export_scene(scene, tmp_path / "imported")
+
+
+def test_the_second_scene_of_a_file_is_exported_as_it_is(scene, tmp_path):
+    add("here")
+    other = bpy.data.scenes.new("other")
+    item = add("there")
+    scene.collection.objects.unlink(item)
+    other.collection.objects.link(item)
+    other.gravity = (0, 0, -2)
+    animate(other, "gravity", (0, 0, -2), (0, 0, -1))
+    item.location = (3, 0, 1)
+    folder, objects = exported(other, tmp_path)
+    assert set(objects) == {"there"}
+    assert load_object_mesh(folder, objects["there"]).vertices.mean(axis=0) == pytest.approx((3, 0, 1))
+    assert folder.scene.gravity_track[-1].value == (0, 0, -1)
+    assert bpy.context.scene == scene
+
+
+def test_what_is_linked_from_another_file_needs_an_override(scene, tmp_path):
+    library = tmp_path / "library.blend"
+    bpy.data.libraries.write(str(library), {add("brick")})
+    bpy.data.objects.remove(bpy.data.objects["brick"])
+    with bpy.data.libraries.load(str(library), link=True) as (_, chosen):
+        chosen.objects = ["brick"]
+    item = bpy.data.objects["brick"]
+    scene.collection.objects.link(item)
+    refused(scene, tmp_path, "'brick'", "library override")
+    item.override_create(remap_local_usages=True)
+    exported(scene, tmp_path)
 
 
 # Fingerprint
@@ -622,6 +656,68 @@ def test_the_fingerprint_does_not_change_with_anything_else(scene, tmp_path):
     assert fingerprint(scene) == before
 
 
+def lattice(item):
+    """Let a lattice bend ``item`` whose point is driven by a property, after nodes with an animated input."""
+    data = bpy.data.lattices.new("cage")
+    cage = bpy.data.objects.new("cage", data)
+    bpy.context.scene.collection.objects.link(cage)
+    item.modifiers.new("cage", "LATTICE").object = cage
+    cage["amount"] = 1.0
+    driver = cage.driver_add("scale", 0).driver
+    variable = driver.variables.new()
+    variable.targets[0].id, variable.targets[0].data_path = cage, '["amount"]'
+    driver.expression = "var + frame / 10"
+    return cage
+
+
+def nodes(item):
+    """Geometry nodes that shift ``item`` by their input; the modifier."""
+    tree = bpy.data.node_groups.new("shift", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Shift", in_out="INPUT", socket_type="NodeSocketVector")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    start, end = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    shift = tree.nodes.new("GeometryNodeTransform")
+    tree.links.new(start.outputs[0], shift.inputs[0])
+    tree.links.new(start.outputs[1], shift.inputs["Translation"])
+    tree.links.new(shift.outputs[0], end.inputs[0])
+    modifier = item.modifiers.new("shift", "NODES")
+    modifier.node_group = tree
+    return modifier, tree.interface.items_tree["Shift"].identifier
+
+
+def test_colliders_with_rigs_are_told_by_their_settings(scene, tmp_path):
+    add("falls", (20, 0, 1))
+    item = add("rigged", role="collider")
+    cage = lattice(item)
+    modifier, identifier = nodes(item)
+    wave = item.modifiers.new("wave", "WAVE")
+    animate(wave, "height", 0.0, 1.0)
+    item.constraints.new("COPY_ROTATION").target = add_empty("guide")
+    bpy.context.view_layer.update()
+    seen = {fingerprint(scene)}
+    for frame in (3, 7):
+        scene.frame_set(frame)
+        seen.add(fingerprint(scene))
+    assert len(seen) == 1
+    _, objects = exported(scene, tmp_path)
+    assert objects["rigged"].motion.vertices_file
+    assert fingerprint(scene) in seen
+    changes = [
+        lambda: cage.__setitem__("amount", 2.0),
+        lambda: setattr(cage.data.points[0], "co_deform", (-1, -1, -1)),
+        lambda: compat.set_modifier_input(modifier, identifier, (0.0, 0.0, 0.5)),
+        lambda: setattr(modifier.node_group.nodes["Transform Geometry"].inputs["Scale"], "default_value", (1, 1, 2)),
+        lambda: setattr(wave, "speed", 0.1),
+        lambda: setattr(bpy.data.objects["guide"], "rotation_euler", (1, 0, 0)),
+        lambda: setattr(item.constraints[0], "use_x", False),
+    ]
+    for number, change in enumerate(changes):
+        change()
+        assert fingerprint(scene) not in seen, number
+        seen.add(fingerprint(scene))
+
+
 def test_the_fingerprint_never_raises(scene):
     empty = fingerprint(scene)
     item = add(faces=[])
@@ -652,9 +748,9 @@ def test_an_export_bakes(scene, tmp_path):
     assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
     cube, plate = (Pc2Reader(out / f"{name}.pc2") for name in ("Würfel_001", "lift"))
     assert cube.vertex_count == 8
-    assert np.abs(cube.read(0) - world_vertices(item)).max() < 1e-6
-    plate_top = plate.read(8)[:, 2].max()
+    assert np.abs(cube.sample(0) - world_vertices(item)).max() < 1e-6
+    plate_top = plate.sample(8)[:, 2].max()
     assert plate_top == pytest.approx(0.7, abs=1e-4)
     # It would have fallen below where the plate is now.
-    assert cube.read(8)[:, 2].min() > plate_top - 0.03
+    assert cube.sample(8)[:, 2].min() > plate_top - 0.03
     assert inputs_hash(folder, BakeOptions()) == inputs_hash(exported(scene, tmp_path, "again")[0], BakeOptions())
