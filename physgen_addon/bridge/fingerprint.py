@@ -15,6 +15,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...sim.errors import InputError
 from ..props.body import bodies
@@ -255,8 +256,12 @@ class _Digest:
             self._reference(value)
         elif isinstance(value, bool | int | float | str):
             self._add(value)
-        elif isinstance(value, bpy.types.bpy_prop_array) or hasattr(value, "to_tuple"):
-            self._add([float(number) for number in value])
+        elif isinstance(value, Matrix):
+            self._add([tuple(row) for row in value])
+        elif hasattr(value, "__len__"):
+            # Vectors, turns, colours and arrays, of which there is a type each; what holds no numbers is passed over.
+            with contextlib.suppress(TypeError, ValueError):
+                self._add([float(number) for number in value])
 
     def _reference(self, value: bpy.types.ID | None) -> None:
         if isinstance(value, bpy.types.Object):
