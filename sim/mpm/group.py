@@ -19,6 +19,7 @@ from .options import SolverOptions
 from .setup import WorldSetup
 from .solids import SolidPose, Solids
 from .stepping import SOLID_LOST
+from .tracks import SAME_TIME
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -28,8 +29,8 @@ CHECKPOINT_FORMAT = 2
 SOLIDS = "solids."
 """What the names of the solids' arrays in a checkpoint begin with."""
 
-INSTANT = 1e-12
-"""Times closer than this in s are the same."""
+ROUNDING = 1e-12
+"""What sums of times in s may be off."""
 
 
 class Group:
@@ -120,7 +121,7 @@ class Group:
             raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
         self._check_generation()
         end = self._times[0] + duration
-        while (self._times < end - INSTANT).any():
+        while (self._times < end - ROUNDING).any():
             stops = np.array([self._next_stop(place, end) for place in self._places])
             self._engine.set_rows(
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
@@ -156,8 +157,8 @@ class Group:
             single += [body.start_time, *(time for time, _ in body.material_track)]
         for collider in setup.colliders:
             tracks += [collider.translations, collider.rotations, collider.vertices]
-        knots = [t for t in single if now + INSTANT < t < end - INSTANT]
-        knots += [t for track in tracks if track is not None for t in track.knots(now + INSTANT, end - INSTANT)]
+        knots = [t for t in single if now + SAME_TIME < t < end - SAME_TIME]
+        knots += [t for track in tracks if track is not None for t in track.knots(now + SAME_TIME, end - SAME_TIME)]
         return min([end, *knots])
 
     def _reach_times(self, before: Array) -> None:
@@ -165,7 +166,7 @@ class Group:
         fresh = []
         moved = [place for place in self._places if self._times[place.world] > before[place.world]]
         for place in moved:
-            now = float(self._times[place.world]) + INSTANT
+            now = float(self._times[place.world]) + SAME_TIME
             for i, body in enumerate(place.setup.bodies):
                 number = int(self._first_body[place.world]) + i
                 if not self._started[number] and body.start_time <= now:
@@ -177,14 +178,15 @@ class Group:
             self._engine.add(fresh)
             self._host = None
         for place in moved:
-            now, then = float(self._times[place.world]) + INSTANT, float(before[place.world]) + INSTANT
+            now, then = float(self._times[place.world]) + SAME_TIME, float(before[place.world]) + SAME_TIME
             for i, body in enumerate(place.setup.bodies):
                 if self._started[int(self._first_body[place.world]) + i] and not body.rigid:
                     if any(then < time <= now for time, _ in body.material_track):
                         self._change_material(place, i, now)
                     keys = body.velocity_keys
-                    if keys is not None and any(then < t <= now for t in keys.times):
-                        self._set_velocity(place, i, keys.at(now))
+                    due = [] if keys is None else [k for k, t in enumerate(keys.times) if then < t <= now]
+                    if keys is not None and due:
+                        self._set_velocity(place, i, keys.values[due[-1]])
 
     @staticmethod
     def _material_choice(place: packing.Place, body_index: int, now: float) -> NDArray[np.int32]:
@@ -197,7 +199,7 @@ class Group:
 
     def material_choice(self, world: int, index: int) -> NDArray[np.int32]:
         """Present material of each particle of body ``index``, counted as in ``material_index``."""
-        return self._material_choice(self._places[world], index, float(self._times[world]) + INSTANT)
+        return self._material_choice(self._places[world], index, float(self._times[world]) + SAME_TIME)
 
     def _rows_of(self, state: State, number: int) -> NDArray[np.bool_]:
         ids = np.asarray(state["ids"], dtype=np.int64)

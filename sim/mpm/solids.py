@@ -22,6 +22,7 @@ from .mass import mass_properties
 from .rigid import move_worlds, search_worlds
 from .setup import WorldSetup
 from .solid_shapes import NO_POINTS, PointSet, lattice_of, points_of, tables
+from .tracks import SAME_TIME
 
 Array = NDArray[np.float64]
 
@@ -364,7 +365,7 @@ class Solids:
             elif kinds[i, at.KIND] == at.KINEMATIC:
                 self._set_pose(solid, start, end, state[i])
         for w, (start, end) in segments.items():
-            self._keys_done[w] = start + 1e-12
+            self._keys_done[w] = start + SAME_TIME
             self._segments[w] = (start, end)
         self._put("world_numbers", world, ti.f64)
         self._put("solid_kinds", kinds, ti.i32)
@@ -378,13 +379,13 @@ class Solids:
     ) -> None:
         body, scale = solid.source, self.scales[solid.world]
         assert isinstance(body, BodyParticles)
-        starts = body.start_time <= start + 1e-12
+        starts = body.start_time <= start + SAME_TIME
         kinds[at.KIND] = at.DYNAMIC if starts else at.WAITING
         if body.acceleration is not None:
             numbers[at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
         if body.velocity_keys is not None and starts:
             done = self._keys_done[solid.world]
-            due = [k for k, t in enumerate(body.velocity_keys.times) if done < t <= start + 1e-12]
+            due = [k for k, t in enumerate(body.velocity_keys.times) if done < t <= start + SAME_TIME]
             if due:
                 state[at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
 

@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
+SAME_TIME = 1e-5
+"""Events closer than this in s happen together. Contacts take out overlap within a substep, so that one which only
+fills the gap between two keyframes that were meant to be one, 1e-7 s long, would throw what it touches."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:

@@ -147,6 +147,23 @@ def test_a_moving_platform_carries_and_a_rising_one_lifts(box, options, similari
     assert lowest(world, 0) == pytest.approx(0.08, abs=0.1 * cell)
 
 
+def test_keyframes_that_were_meant_for_a_frame_throw_nothing(box, options, similarity, cell):
+    """Keyframes that rounding put 10 ns beside the frames change the motion of what they lift by nothing to speak of."""
+    times = np.arange(4) / 24
+    way = np.stack([0 * times, 0 * times, 0.2 * cell * np.arange(4) ** 2], axis=1)
+    heights = []
+    for off in (0.0, 1e-8):
+        track = Track(times=times + off * np.array([0.0, 1.0, -1.0, 1.0]), values=way)
+        platform = Collider(
+            name="platform", surface=block((8 * cell, 8 * cell, 4 * cell), (0.0, 0.0, -4 * cell)), translations=track
+        )
+        world = World(bodies=[box(cells=(4, 4, 3))], colliders=[platform], similarity=similarity, options=options)
+        for frame in range(1, 4):
+            world.advance(frame / 24 - world.time)
+        heights.append(world.positions(0)[:, 2].mean())
+    assert heights[1] == pytest.approx(heights[0], abs=1e-3 * cell)
+
+
 def test_a_collider_that_deforms_pushes(box, options, similarity, cell):
     """A slab whose top rises in the middle of its life, given by vertices over time: the jelly on it goes along."""
     slab = block((8 * cell, 8 * cell, 4 * cell), (0.0, 0.0, -4 * cell))
