@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -42,14 +43,15 @@ CHECKPOINT_SECONDS = 20.0
 """At most about this much computing is lost when a run is killed."""
 
 KEEP_SECONDS = 2.0
-"""At most about this much computing is lost when a run is cancelled."""
+"""About this much computing, and a part of a frame besides, is lost when a run is cancelled."""
 
 MANIFEST_SECONDS = 0.5
 """How often ``frames_done`` in the manifest is brought up to date."""
 
-ADVANCE_PARTS = 4
-"""A frame of stiff matter can take minutes; its state can be kept this many times in it. A fixed number, not a time, so
-that the same input gives the same bytes."""
+LEAST_PARTS, MOST_PARTS = 4, 1000
+PART_WORK = 2e7
+"""A frame of stiff matter can take minutes. It is advanced in parts of about so many particle substeps, a few seconds,
+between which its state can be kept; by the estimate, not by the clock, so that the same input gives the same bytes."""
 
 
 def is_up_to_date(scene_root: Path, out: Path, options: BakeOptions) -> bool:
@@ -228,14 +230,19 @@ class _Run:
     def _advance_to(self, index: int, cancelled: IsCancelled) -> None:
         """Advance to the time of sample ``index`` in a fixed number of parts; Cancelled, at any moment, when asked."""
         world = self.simulation.world
-        for part in range(1, ADVANCE_PARTS + 1):
+        parts = self._parts()
+        for part in range(1, parts + 1):
             if cancelled():
                 raise Cancelled("asked to stop")
-            target = (index - 1 + part / ADVANCE_PARTS) / self.manifest.fps
+            target = (index - 1 + part / parts) / self.manifest.fps
             if target > world.time:
                 world.advance(target - world.time, cancelled)
-            if part < ADVANCE_PARTS and time.monotonic() - self.kept_at > KEEP_SECONDS:
+            if part < parts and time.monotonic() - self.kept_at > KEEP_SECONDS:
                 self._keep()
+
+    def _parts(self) -> int:
+        work = self.simulation.prepared.cost.particle_substeps / max(1, self.manifest.frames - 1)
+        return int(np.clip(math.ceil(work / PART_WORK), LEAST_PARTS, MOST_PARTS))
 
     def _append_samples(self, index: int, writers: Mapping[str, Pc2Writer], cancelled: IsCancelled) -> None:
         """Append the present state to every cache as sample ``index``."""

@@ -37,8 +37,8 @@ class SceneObject:
     occlusion_order: 0 is frontmost.
     roughness: of the surface, 0 (polished) to 1 (coarse); gives its friction where ``friction`` is None.
     friction, static_friction: Coulomb's coefficients of the surface, 0 to 10; restitution: 0 to 1; contact_mode: one of
-        ``CONTACT_MODES``. None takes the ground's, or where there is none the ``Ground`` defaults. docs/file-formats.md says how those of
-        two surfaces combine.
+        ``CONTACT_MODES``. None takes the ground's, or those of ``Ground()`` where there is no ground.
+        docs/file-formats.md says how those of two surfaces combine.
     motion: of a collider; None stands still.
 
     Of dynamic objects only:
