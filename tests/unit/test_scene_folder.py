@@ -453,5 +453,5 @@ def test_any_matrix_that_can_be_undone_places_a_mesh(scale):
     tilted = rows.copy()
     tilted[3, 0] = 0.5
     for matrix in (flat, tilted, np.full((4, 4), np.nan)):
-        with pytest.raises(InputError, match="object cup: world_from_mesh.*invertible"):
+        with pytest.raises(InputError, match=r"object cup: world_from_mesh.*invertible"):
             placed(tuple(map(tuple, matrix.tolist())))
