@@ -29,7 +29,7 @@ class BakeOptions:
     fps: frames a second, above 0 and up to 1000.
     quality: name of a preset in ``presets/qualities``.
     arch: ``cpu``, ``cuda``, ``vulkan`` or ``metal``; what is not there falls back to ``cpu`` with a notice.
-    seed: of the particle sampling.
+    seed: of the particles' places, 0 or more; 0 is the even lattice, every other moves each a little its own way.
     space: what samples are in, ``world`` (metres) or ``mesh`` (the coordinates of the object's mesh file, so that an
         object that stands by its matrix goes on standing by it).
     points: whether all particles of what flows (sand, fluid, snow) get caches of their own.

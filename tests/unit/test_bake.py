@@ -145,7 +145,7 @@ def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
 
 @pytest.mark.parametrize("until", ["sampling", "about"])
 def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until):
-    """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and the next bake is not in its way."""
+    """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and is in no later bake's way."""
     folder = ball_scene()
     job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
     (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))

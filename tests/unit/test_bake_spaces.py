@@ -274,6 +274,19 @@ def test_space_and_points_are_inputs_only_where_they_are_asked_for(ball_scene):
             dataclasses.replace(QUICK, **wrong)
 
 
+def test_a_seed_moves_the_particles_and_nothing_else(ball_scene):
+    folder = ball_scene()
+    lattice, one, again, two = (
+        estimate_bake(folder, dataclasses.replace(QUICK, seed=seed)).setup.bodies[0] for seed in (0, 1, 1, 2)
+    )
+    spacing = (lattice.volumes.sum() / lattice.count) ** (1 / 3)
+    assert np.array_equal(one.positions, again.positions) and np.array_equal(one.volumes, lattice.volumes)
+    for body, other in ((one, lattice), (two, lattice), (one, two)):
+        moved = np.abs(body.positions - other.positions)
+        assert 0.05 * spacing < moved.mean() and moved.max() < 0.5 * spacing
+    assert one.positions[:, 2].min() - one.contact_radii[one.positions[:, 2].argmin()] >= 0.0
+
+
 def test_old_scenes_hash_as_they_did(ball_scene):
     """Bakes of earlier versions stay up to date: the hash of a scene whose every field is fixed here."""
     folder = ball_scene()
