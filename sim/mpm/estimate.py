@@ -38,8 +38,8 @@ PARTICLE_BYTES = 400
 """State of a particle twice (sorting copies it), what belongs to its contacts, and its host copies."""
 
 SAMPLING_BYTES = 2500
-"""Of main memory, a particle, while a mesh is filled: 27 test points each, and their nearest particles. Measured: 2300 to
-2500 from 30 to 500 thousand particles. Given back before the engine starts, so the larger of the two counts."""
+"""Of main memory, a particle, while a mesh is filled: 27 test points each, and their nearest particles. Measured: 2300
+to 2500 from 30 to 500 thousand particles. Given back before the engine starts, so the larger of the two counts."""
 
 BLOCK_BYTES = 64 * 64
 """A grid block of 4 x 4 x 4 nodes with 64 bytes each."""
