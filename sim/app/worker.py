@@ -30,6 +30,13 @@ UNHEARD_S = 0.5
 """A bake that was asked to stop looks up within a tenth of a second. What has not by then is compiling kernels or
 preparing the scene: nothing of that is kept anyway, so the process ends as it stands, as after a crash."""
 
+RUNNING_UNHEARD_S = 3.0
+"""The same once frames are made: of millions of particles, or on a busy machine, a launch takes longer, and there is
+something to keep."""
+
+RUNNING_LOOKS = 50
+"""A bake that has looked up so often is making frames."""
+
 LAST_GRACE_S = 15.0
 """Longer than the asker waits before it kills (process.py), for when there is no asker any more."""
 MODULE = __name__ if __name__ != "__main__" else f"{__package__}.worker"
@@ -76,6 +83,7 @@ class _Wish:
     def __init__(self) -> None:
         self.asked = threading.Event()
         self.heard = threading.Event()
+        self.looks = 0
         self._parent = os.getppid()
 
     def listen(self) -> None:
@@ -99,6 +107,7 @@ class _Wish:
 
     def cancelled(self) -> bool:
         """The same, asked by the work itself, which then stops in good order."""
+        self.looks += 1
         if self.pending():
             self.heard.set()
         return self.heard.is_set()
@@ -108,9 +117,9 @@ def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
     """End the process when it was asked to stop and does not."""
     while not wish.pending():
         time.sleep(0.05)
-    if not wish.heard.wait(UNHEARD_S):
+    if not wish.heard.wait(UNHEARD_S if wish.looks < RUNNING_LOOKS else RUNNING_UNHEARD_S):
         with contextlib.suppress(OSError):
-            emit(_error(Cancelled("bake cancelled while preparing; run it again to continue")))
+            emit(_error(Cancelled("bake cancelled in the middle of a long step; run it again to continue")))
     else:
         time.sleep(LAST_GRACE_S)
     os._exit(Cancelled.exit_code)
