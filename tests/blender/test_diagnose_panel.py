@@ -447,7 +447,8 @@ def interpreter(tmp_path, monkeypatch):
             + textwrap.dedent(f"""
             import json, shutil, sys
             sys.path[:0] = {[str(Path(physgen.__file__).resolve().parents[1])]!r}
-            if sys.argv[1] == "-c":
+            if sys.argv[2] == "sim.app.requirements":
+                print(json.dumps({{"python": "3.13.0", "missing": [], "trouble": None, "installs": True}}))
                 sys.exit(0)
             verb, source = sys.argv[3:5]
             out = sys.argv[sys.argv.index("--out") + 1]
