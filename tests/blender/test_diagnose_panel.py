@@ -500,7 +500,7 @@ def test_an_interpreter_that_cannot_simulate_is_named(throw, monkeypatch):
     _, folder = throw
     load(folder)
     monkeypatch.setenv("PHYSGEN_PYTHON", "/nowhere/python")
-    with pytest.raises(RuntimeError, match=r"/nowhere/python \(from PHYSGEN_PYTHON\): No such file"):
+    with pytest.raises(RuntimeError, match="/nowhere/python, named in PHYSGEN_PYTHON, is no Python"):
         bpy.ops.physgen.diagnose("EXEC_DEFAULT")
 
 
