@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,6 @@ import bpy
 import numpy as np
 
 TAB = "PhysGen"
-SIDEBAR = 380
-"""Pixels of the sidebar, as an artist would have it."""
 
 
 def window() -> bpy.types.Window:
@@ -83,8 +83,7 @@ def shoot(folder: Path, name: str) -> Generator[float, None, None]:
         area.tag_redraw()
     yield 0.7
     path = folder / f"{name}.png"
-    with bpy.context.temp_override(window=window()):
-        bpy.ops.screen.screenshot(filepath=str(path))
+    picture(window(), path)
     bar = region(viewport(), "UI")
     if bar.width > 1:
         crop(path, folder / f"{name}_sidebar.png", (bar.x, bar.y, bar.width, bar.height))
@@ -100,10 +99,29 @@ def shoot_preferences(folder: Path, name: str, addon: str) -> Generator[float, N
     bpy.ops.preferences.addon_expand(module=addon)
     yield 1.5
     own = next(item for item in bpy.context.window_manager.windows if item not in before)
+    picture(own, folder / f"{name}.png")
     with bpy.context.temp_override(window=own):
-        bpy.ops.screen.screenshot(filepath=str(folder / f"{name}.png"))
         bpy.ops.wm.window_close()
     yield 0.5
+
+
+def picture(shown: bpy.types.Window, path: Path) -> None:
+    """Write what ``shown`` shows to ``path``.
+
+    Blender's own screenshots are black where Mesa draws in software, so the X server is asked where ImageMagick can.
+    """
+    ask = shutil.which("import")
+    if ask is None:
+        with bpy.context.temp_override(window=shown):
+            bpy.ops.screen.screenshot(filepath=str(path))
+    else:
+        # Nobody manages the windows: the newest lies on top, and their places are those of the screen.
+        subprocess.run([ask, "-silent", "-window", "root", str(path)], check=True)
+        screen = read(path)
+        if (shown.width, shown.height) != (screen.shape[1], screen.shape[0]):
+            crop(path, path, (shown.x, shown.y, shown.width, shown.height))
+    pixels = read(path)[..., :3]
+    assert float(pixels.max() - pixels.min()) > 0.1, f"{path.name} shows nothing"
 
 
 def read(path: Path) -> np.ndarray:
