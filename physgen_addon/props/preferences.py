@@ -36,9 +36,9 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         """The preferences' page."""
         layout = self.layout
         layout.label(text="Simulations run in a Python of their own, beside Blender.")
-        row = layout.row(align=True)
-        row.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
-        row.operator("physgen.check_python", icon="CHECKMARK")
+        split = layout.split(factor=0.85, align=True)
+        split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
+        split.operator("physgen.check_python")
         if not self.check:
             return
         box = layout.box()

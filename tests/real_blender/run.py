@@ -65,6 +65,8 @@ class Run:
         """Run Blender, keep its log; its text. Raises Failed where it fails or its log holds a fault."""
         began = time.monotonic()
         settings = {"BLENDER_USER_RESOURCES": str(self.out / "user"), **environment}
+        # Without this folder Blender would take the preferences of whoever uses this machine.
+        (Path(settings["BLENDER_USER_RESOURCES"]) / "config").mkdir(parents=True, exist_ok=True)
         surroundings = {k: v for k, v in os.environ.items() if k != "PHYSGEN_PYTHON"}
         log = self.out / f"{name}.log"
         with log.open("w", encoding="utf-8") as stream:

@@ -93,10 +93,7 @@ def shoot_preferences(folder: Path, name: str, addon: str) -> Generator[float, N
     """Write ``NAME.png``: the add-on's page in a preferences window of its own, which is closed again."""
     before = set(bpy.context.window_manager.windows)
     with bpy.context.temp_override(window=window()):
-        bpy.ops.screen.userpref_show("INVOKE_DEFAULT")
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "PhysGen"
-    bpy.ops.preferences.addon_expand(module=addon)
+        bpy.ops.preferences.addon_show(module=addon)
     yield 1.5
     own = next(item for item in bpy.context.window_manager.windows if item not in before)
     picture(own, folder / f"{name}.png")

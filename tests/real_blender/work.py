@@ -99,6 +99,7 @@ def scene_of_two():
     simulation.quality, simulation.frame_start, simulation.frame_end = "preview", 1, LAST
     bpy.context.view_layer.objects.active = cube
     cube.select_set(True)
+    screens.viewport().spaces.active.region_3d.view_perspective = "CAMERA"
     bpy.ops.wm.save_as_mainfile(filepath=str(OUT / "saved.blend"))
     yield from screens.shoot(SCREENS, "3_scene")
 
