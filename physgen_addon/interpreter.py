@@ -2,7 +2,8 @@
 """The Python that runs simulations: never Blender's own process, because Taichi and bpy do not share one.
 
 It needs the third-party packages only; PhysGen's code is the extension's own (``sim/app/launch.py``). It is the one
-named in the preferences or in PHYSGEN_PYTHON, else Blender's, with the wheels that the extension was installed with.
+named in the preferences or in PHYSGEN_PYTHON, else Blender's with the wheels that the extension was installed with,
+else the environment that ``install_command`` makes in the home folder.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from ..sim.app.requirements import MODULE, NEWEST, OLDEST, REQUIREMENTS
 from ..sim.errors import InputError
 
 VARIABLE = "PHYSGEN_PYTHON"
+TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
+"""Where commands are typed: Windows' other one, PowerShell, knows no ``&&``."""
 _TIMEOUT_S = 60.0
 
 
@@ -30,12 +33,12 @@ class NoPython(InputError):
     """No interpreter that simulates. reason: what is wrong; command: what to type to mend it, in one line."""
 
     def __init__(self, reason: str, command: str) -> None:
-        super().__init__(f"{reason}. In a terminal: {command}")
+        super().__init__(f"{reason}. In {TERMINAL}: {command}")
         self.reason, self.command = reason, command
 
 
 def find_python(preferred: str = "") -> Path:
-    """The interpreter that simulates: the one named in the preferences, in PHYSGEN_PYTHON, or Blender's.
+    """The interpreter that simulates: named in the preferences or in PHYSGEN_PYTHON, Blender's, or ~/physgen-python.
 
     Takes seconds the first time, because it is started and asked; call it in a job. Raises NoPython if it cannot.
     One that somebody named is never quietly replaced by another.
@@ -49,7 +52,25 @@ def find_python(preferred: str = "") -> Path:
                 reason = f"{python}, named {where}, cannot simulate: {error}"
                 raise NoPython(reason, install_command(python if error.lacks else None, error.installs)) from None
             return python
-    return _blenders()
+    return _unnamed()
+
+
+def _unnamed() -> Path:
+    """Blender's own Python or the one in the home folder; NoPython with what is wrong with the one that comes last."""
+    python = Path(sys.executable)
+    try:
+        _checked(str(python), _wheels_for(python))
+        return python
+    except _Unfit as error:
+        reason = why_not(sys.version_info[:2], wheel_folder(), str(error))
+    if not _home_python().is_file():
+        raise NoPython(reason, install_command())
+    try:
+        _checked(str(_home_python()), "")
+        return _home_python()
+    except _Unfit as error:
+        reason = f"{_home_python()} cannot simulate: {error}"
+        raise NoPython(reason, install_command(_home_python() if error.lacks else None, error.lacks)) from None
 
 
 def python_version(python: Path) -> str:
@@ -82,22 +103,18 @@ def install_command(python: Path | None = None, installs: bool = False) -> str:
     wanted = " ".join(f'"{requirement}"' for requirement in REQUIREMENTS.values())
     if python is not None and installs:
         return f'"{python}" -m pip install {wanted}'
-    folder = Path.home() / "physgen-python"
-    if os.name == "nt":
-        start = f"py -{_dotted(NEWEST)}" if python is None else f'"{python}"'
-        return f'{start} -m venv "{folder}" && "{folder}\\Scripts\\python" -m pip install {wanted}'
-    start = f"python{_dotted(NEWEST)}" if python is None else f'"{python}"'
-    return f'{start} -m venv "{folder}" && "{folder}/bin/python" -m pip install {wanted}'
+    newest = f"py -{_dotted(NEWEST)}" if os.name == "nt" else f"python{_dotted(NEWEST)}"
+    start = newest if python is None else f'"{python}"'
+    return f'{start} -m venv "{home_folder()}" && "{_home_python()}" -m pip install {wanted}'
 
 
-def _blenders() -> Path:
-    """Blender's own Python, or NoPython with what is the matter: its version, or a zip without wheels."""
-    python = Path(sys.executable)
-    try:
-        _checked(str(python), _wheels_for(python))
-        return python
-    except _Unfit as error:
-        raise NoPython(why_not(sys.version_info[:2], wheel_folder(), str(error)), install_command()) from None
+def home_folder() -> Path:
+    """Where ``install_command`` makes an environment; looked for there when nothing else simulates."""
+    return Path.home() / "physgen-python"
+
+
+def _home_python() -> Path:
+    return home_folder() / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
 def why_not(version: tuple[int, int], wheels: str, trouble: str) -> str:

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..interpreter import TERMINAL, home_folder
 from ..panels import text
 
 ADDON = __package__.removesuffix(".physgen_addon.props")
@@ -22,8 +23,8 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         name="Python",
         description=(
             "Interpreter that simulates and diagnoses, or the folder of its virtual environment. It needs the "
-            "packages that Check names, not PhysGen itself. "
-            "Empty: the one in the environment variable PHYSGEN_PYTHON, else Blender's own"
+            "packages that Check names, not PhysGen itself. Empty: the one in the environment variable "
+            "PHYSGEN_PYTHON, else Blender's own, else the folder physgen-python in your home folder"
         ),
         subtype="FILE_PATH",
         update=_forget,
@@ -44,7 +45,8 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         box = layout.box()
         text.sentences(box, context, self.check_text, icon="CHECKMARK" if self.check == "YES" else "ERROR")
         if self.check_command:
-            box.label(text="In a terminal, then Check again:")
+            emptied = "empty the field above and " if self.python and str(home_folder()) in self.check_command else ""
+            box.label(text=f"Type this into {TERMINAL}; when it has ended, {emptied}press Check again:")
             row = box.row(align=True)
             row.prop(self, "check_command", text="")
             row.operator("physgen.copy_command", text="", icon="COPYDOWN").command = self.check_command

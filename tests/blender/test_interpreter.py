@@ -67,6 +67,29 @@ def test_why_blenders_own_will_not_do():
     assert "(Taichi does not load)" in interpreter.why_not((3, 11), "/wheels", "Taichi does not load")
 
 
+def test_the_environment_that_the_command_makes_is_found_unnamed(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", "/bin/echo")
+    with pytest.raises(interpreter.NoPython, match="Blender's own Python cannot simulate") as raised:
+        interpreter.find_python()
+    assert (
+        f'-m venv "{tmp_path}/physgen-python" && "{tmp_path}/physgen-python/bin/python" -m pip' in raised.value.command
+    )
+    (tmp_path / "physgen-python").symlink_to(sys.prefix)
+    assert interpreter.find_python() == tmp_path / "physgen-python" / "bin" / "python"
+
+
+def test_one_that_lies_there_half_done_is_completed(bare, monkeypatch):
+    monkeypatch.setenv("HOME", str(bare.parent))
+    monkeypatch.setattr(sys, "executable", "/bin/echo")
+    (bare.parent / "physgen-python").symlink_to(bare)
+    with pytest.raises(
+        interpreter.NoPython, match="physgen-python/bin/python cannot simulate: it lacks numpy"
+    ) as raised:
+        interpreter.find_python()
+    assert raised.value.command.startswith(f'"{bare.parent}/physgen-python/bin/python" -m pip install')
+
+
 def test_check_reports_and_fails_with_the_remedy(bare, monkeypatch):
     physgen.register()
     try:
