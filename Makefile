@@ -39,5 +39,8 @@ benchmark: setup
 extension: setup
 	@$(BIN)/python setup/extension.py $(if $(ZIPS),--zips $(ZIPS))
 
+test-blender-app: extension
+	$(BIN)/python tests/real_blender/run.py --blender "$(BLENDER)" --python "$(abspath $(BIN)/python)"
+
 clean:
 	rm -rf build dist .venv .venv-* demo_out .pytest_cache .mypy_cache .ruff_cache

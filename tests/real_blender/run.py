@@ -1,6 +1,6 @@
 """The extension in a real Blender with its windows open: install, work, save, open again without it, look at it.
 
-    python tests/real_blender/run.py --zip dist/physgen-VERSION.zip [--blender blender] [--python PYTHON] [--out DIR]
+    python tests/real_blender/run.py [--zip ZIP] [--blender blender] [--python PYTHON] [--out DIR]
 
 Needs the standard library only, so that it also runs where nothing but Blender is installed. Without a display it
 starts Xvfb. docs/extension.md says how to set up a container for it. Everything is written below DIR: ``report.json``,
@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -105,9 +106,8 @@ class Run:
             self.start("work", *window, *script, timeout=self.options.timeout, **screen)
         self.require("work.json")
         # Another user, who has never heard of the extension.
-        blend = str(self.out / "saved.blend")
         script = ("--python-exit-code", "1", "-P", str(HERE / "reopen.py"), "--", str(task))
-        self.start("reopen", "-b", blend, *script, timeout=300, BLENDER_USER_RESOURCES=str(self.out / "user_without"))
+        self.start("reopen", "-b", *script, timeout=300, BLENDER_USER_RESOURCES=str(self.out / "user_without"))
         self.require("reopen.json")
 
     def require(self, name: str) -> None:
@@ -121,11 +121,17 @@ class Run:
             raise Failed(f"{name}: {said['trouble']}")
 
 
+def default_zip() -> Path:
+    """What ``make extension`` builds for every Blender."""
+    manifest = tomllib.loads((HERE.parents[1] / "blender_manifest.toml").read_text(encoding="utf-8"))
+    return HERE.parents[1] / "dist" / f"{manifest['id']}-{manifest['version']}.zip"
+
+
 def main() -> int:
     """Entry of the script."""
     parser = argparse.ArgumentParser(prog="run.py", description="The extension in a real Blender.")
     parser.add_argument("--blender", default="blender", help="program or command line that starts Blender")
-    parser.add_argument("--zip", type=Path, required=True, help="the extension")
+    parser.add_argument("--zip", type=Path, default=default_zip(), help="the extension (default: %(default)s)")
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x2000", help="of Blender's window, tall enough for every panel")
