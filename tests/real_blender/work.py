@@ -109,11 +109,13 @@ def bake(name: str) -> session.Step:
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
     running = extension("physgen_addon.jobs").running
-    yield from session.until(lambda: running() is None or (running().fraction or 0) > 0.2, 200, "the bake to begin")
+    job = running()
+    yield from session.until(lambda: running() is None or (job.fraction or 0) > 0.2, 200, "the bake to begin")
     if running() is not None:
         yield from screens.shoot(SCREENS, f"{name}_baking")
     blocked = yield from session.until(lambda: running() is None, 400, "the bake")
     yield from screens.shoot(SCREENS, f"{name}_baked")
+    job.result()
     return {"longest_without_answer_s": round(blocked, 3)}
 
 
