@@ -27,15 +27,19 @@ CANCEL_GRACE_S = 10.0
 
 _ERRORS: dict[str, type[PhysGenError]] = {e.__name__: e for e in (InputError, SimulationError, RenderError, Cancelled)}
 _STRIPPED = ("PYTHON", "LD_", "DYLD_")
-_KEPT = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX", "PYTHONUTF8")
+_KEPT = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
 NO_WINDOW = 0x08000000 if os.name == "nt" else 0
 """``creationflags`` of every child: no console window flashes up on Windows."""
 _LAUNCHER = Path(__file__).with_name("launch.py")
 
 
 def child_environment() -> dict[str, str]:
-    """This process's environment without what would make another interpreter load the wrong libraries or wait."""
-    return {key: value for key, value in os.environ.items() if key in _KEPT or not key.upper().startswith(_STRIPPED)}
+    """This process's environment without what would make another interpreter load the wrong libraries or wait.
+
+    Events are lines of UTF-8, also on Windows, where Python would write something else into a pipe.
+    """
+    kept = {key: value for key, value in os.environ.items() if key in _KEPT or not key.upper().startswith(_STRIPPED)}
+    return {**kept, "PYTHONUTF8": "1"}
 
 
 def own_command(
