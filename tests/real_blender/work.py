@@ -254,6 +254,7 @@ def capture_loaded():
         role="fit",
         times=times,
         points=corners[None] + places[:, None],
+        pixels=None,
         object_index=np.zeros(len(corners), dtype=np.int64),
         rest_points=corners,
     )
