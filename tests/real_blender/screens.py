@@ -79,9 +79,11 @@ def show_sidebar() -> Generator[float, None, None]:
 def shoot(folder: Path, name: str) -> Generator[float, None, None]:
     """Write ``NAME.png``, the window, and ``NAME_sidebar.png``, the sidebar alone, as they look when all is drawn."""
     folder.mkdir(exist_ok=True)
-    for area in window().screen.areas:
-        area.tag_redraw()
-    yield 0.7
+    # Panels slide to their places over several drawings.
+    for _ in range(6):
+        for area in window().screen.areas:
+            area.tag_redraw()
+        yield 0.3
     path = folder / f"{name}.png"
     picture(window(), path)
     bar = region(viewport(), "UI")
