@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 
-from ..sim.app.process import child_environment
+from ..sim.app.process import NO_WINDOW, child_environment
 
 Finding = tuple[str, bool, str]
 
@@ -67,6 +67,7 @@ def _import(name: str, code: str, remedy: str) -> Finding:
             timeout=120,
             env=child_environment(),
             check=False,
+            creationflags=NO_WINDOW,
         )
     except subprocess.TimeoutExpired:
         return name, False, f"no answer within 120 s; {remedy}"

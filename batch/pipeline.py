@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from pathlib import Path
 from ..physgen_addon.bridge.options import RenderOptions
 from ..sim.app import worker
 from ..sim.app.bake_inputs import BakeOptions, inputs_hash
-from ..sim.app.process import run_stage
+from ..sim.app.process import own_command, run_stage
 from ..sim.app.quality import load_quality
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
 from ..sim.errors import InputError, RenderError, SimulationError
@@ -25,8 +24,6 @@ from ..sim.reconstruct.pipeline import object_names
 from ..sim.scene.folder import SceneFolder, load_scene, require_photo
 from ..sim.scene.model import Vector
 from ..sim.scene.overrides import check_overrides
-
-RENDER_SCRIPT = Path(__file__).with_name("render.py")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +58,7 @@ def bake_stage(
     with tempfile.TemporaryDirectory(prefix="physgen-") as temporary:
         path = Path(temporary) / "job.json"
         path.write_text(json.dumps(worker.job_to_json(job)), encoding="utf-8")
-        return run_stage([sys.executable, "-m", worker.MODULE, str(path)], on_event, cancelled, failure=SimulationError)
+        return run_stage(own_command("sim.app.worker", str(path)), on_event, cancelled, failure=SimulationError)
 
 
 def check_render(request: RenderRequest, video: Path | None) -> None:
@@ -88,15 +85,8 @@ def render_stage(
     """
     check_render(request, video)
     require_photo(load_scene(scene))
-    command = [
-        sys.executable,
-        str(RENDER_SCRIPT),
-        str(scene.resolve()),
-        "--bake",
-        str(bake.resolve()),
-        "--out",
-        str(out.resolve()),
-    ]
+    command = own_command("batch.render", str(scene.resolve()), "--bake", str(bake.resolve()))
+    command += ["--out", str(out.resolve())]
     command += ["--engine", request.engine, "--scale", repr(request.scale), "--json", "--parent", str(os.getpid())]
     if request.samples is not None:
         command += ["--samples", str(request.samples)]

@@ -15,6 +15,7 @@ MODULES = (
     "props.scene",
     "props.diagnose",
     "jobs",
+    "operators.check_python",
     "operators.capture",
     "operators.diagnose",
     "operators.effect",

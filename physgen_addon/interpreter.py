@@ -1,72 +1,191 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Python that runs simulations: never Blender's own process, because Taichi and bpy do not share one."""
+"""The Python that runs simulations: never Blender's own process, because Taichi and bpy do not share one.
+
+It needs the third-party packages only; PhysGen's code is the extension's own (``sim/app/launch.py``). It is the one
+named in the preferences or in PHYSGEN_PYTHON, else Blender's with the wheels that the extension was installed with,
+else the environment that ``install_command`` makes in the home folder.
+"""
 
 from __future__ import annotations
 
 import functools
+import importlib.util
+import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..sim.app.process import child_environment
+from ..sim.app.process import NO_WINDOW, child_environment, own_command
+from ..sim.app.requirements import MODULE, NEWEST, OLDEST, REQUIREMENTS
 from ..sim.errors import InputError
 
 VARIABLE = "PHYSGEN_PYTHON"
-_CHECK = "import physgen.batch.cli, importlib.util as u, sys; sys.exit(u.find_spec('taichi') is None)"
+TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
+"""Where commands are typed: Windows' other one, PowerShell, knows no ``&&``."""
 _TIMEOUT_S = 60.0
 
 
-def find_python(preferred: str = "") -> Path:
-    """The first interpreter that can run ``physgen``: the one named in the preferences, in PHYSGEN_PYTHON, this one's.
+class NoPython(InputError):
+    """No interpreter that simulates. reason: what is wrong; command: what to type to mend it, in one line."""
 
-    Takes seconds the first time, because it starts each of them; call it in a job. Raises InputError if none can.
+    def __init__(self, reason: str, command: str) -> None:
+        super().__init__(f"{reason}. In {TERMINAL}: {command}")
+        self.reason, self.command = reason, command
+
+
+def find_python(preferred: str = "") -> Path:
+    """The interpreter that simulates: named in the preferences or in PHYSGEN_PYTHON, Blender's, or ~/physgen-python.
+
+    Takes seconds the first time, because it is started and asked; call it in a job. Raises NoPython if it cannot.
+    One that somebody named is never quietly replaced by another.
     """
-    named = [("the preferences", preferred), (VARIABLE, os.environ.get(VARIABLE, "")), ("Blender", sys.executable)]
-    tried = []
-    for where, name in named:
-        if not name:
-            continue
-        trouble = _trouble(name)
-        if trouble is None:
-            return Path(name)
-        tried.append(f"{name} (from {where}): {trouble}")
-        if where != "Blender":
-            # Somebody chose it: say what is wrong with it rather than quietly take another.
-            break
-    raise InputError(
-        "no Python that can simulate; install physgen into one and name it in the add-on's preferences. "
-        + "; ".join(tried)
-    )
+    for where, name in (("in the preferences", preferred), (f"in {VARIABLE}", os.environ.get(VARIABLE, ""))):
+        if name.strip():
+            python = _located(name.strip(), where)
+            try:
+                _checked(str(python), _wheels_for(python))
+            except _Unfit as error:
+                reason = f"{python}, named {where}, cannot simulate: {error}"
+                raise NoPython(reason, install_command(python if error.lacks else None, error.installs)) from None
+            return python
+    return _unnamed()
+
+
+def _unnamed() -> Path:
+    """Blender's own Python or the one in the home folder; NoPython with what is wrong with the one that comes last."""
+    python = Path(sys.executable)
+    try:
+        _checked(str(python), _wheels_for(python))
+        return python
+    except _Unfit as error:
+        reason = why_not(sys.version_info[:2], wheel_folder(), str(error))
+    if not _home_python().is_file():
+        raise NoPython(reason, install_command())
+    try:
+        _checked(str(_home_python()), "")
+        return _home_python()
+    except _Unfit as error:
+        reason = f"{_home_python()} cannot simulate: {error}"
+        raise NoPython(reason, install_command(_home_python() if error.lacks else None, error.lacks)) from None
+
+
+def python_version(python: Path) -> str:
+    """Such as ``3.13.1``, of an interpreter that ``find_python`` gave."""
+    return _checked(str(python), _wheels_for(python))
+
+
+def forget() -> None:
+    """Ask anew the next time, because somebody has installed something."""
+    _checked.cache_clear()
 
 
 def cli_command(python: Path, *arguments: str) -> Sequence[str]:
-    """``physgen ARGUMENTS --json`` as a command of that interpreter."""
-    return [str(python), "-m", "physgen.batch.cli", *arguments, "--json"]
+    """``physgen ARGUMENTS --json`` as a command of that interpreter, running this extension's own code."""
+    return own_command("batch.cli", *arguments, "--json", python=str(python), packages=_wheels_for(python))
 
 
-def _trouble(name: str) -> str | None:
-    try:
-        return _checked(name)
-    except OSError as error:
-        return str(error.strerror or error)
-    except subprocess.TimeoutExpired:
-        return f"did not answer within {_TIMEOUT_S:g} s"
+def wheel_folder() -> str:
+    """Where Blender has unpacked the extension's wheels, found without importing any; empty where there are none."""
+    found = importlib.util.find_spec("taichi")
+    return str(Path(found.origin).parents[1]) if found is not None and found.origin else ""
+
+
+def install_command(python: Path | None = None, installs: bool = False) -> str:
+    """One line for a terminal that makes a Python that simulates.
+
+    python: it gets what it lacks, or, where pip may not install into it, a virtual environment is made with it in the
+    home folder; None for one made with the newest Python that will do.
+    """
+    wanted = " ".join(f'"{requirement}"' for requirement in REQUIREMENTS.values())
+    if python is not None and installs:
+        return f'"{python}" -m pip install {wanted}'
+    newest = f"py -{_dotted(NEWEST)}" if os.name == "nt" else f"python{_dotted(NEWEST)}"
+    start = newest if python is None else f'"{python}"'
+    return f'{start} -m venv "{home_folder()}" && "{_home_python()}" -m pip install {wanted}'
+
+
+def home_folder() -> Path:
+    """Where ``install_command`` makes an environment; looked for there when nothing else simulates."""
+    return Path.home() / "physgen-python"
+
+
+def _home_python() -> Path:
+    return home_folder() / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def why_not(version: tuple[int, int], wheels: str, trouble: str) -> str:
+    """Why Blender's own Python of that version, with those wheels, does not simulate, and what to do about it."""
+    remedy = f"name a Python {_dotted(OLDEST)} to {_dotted(NEWEST)} that has its packages in PhysGen's preferences"
+    if not OLDEST <= version <= NEWEST:
+        return f"Taichi, which simulates, has no build for Blender's Python {_dotted(version)}: {remedy}"
+    if not wheels:
+        return f"PhysGen was installed without what simulates: install the zip that has it, or {remedy}"
+    return f"Blender's own Python cannot simulate ({trouble}): {remedy}"
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return ".".join(str(number) for number in version)
+
+
+def _located(name: str, where: str) -> Path:
+    """The program that somebody meant by ``name``: a file, a command, or the folder of an environment."""
+    path = Path(name).expanduser()
+    inside = [path / "bin" / "python", path / "Scripts" / "python.exe", path / "python.exe"]
+    for candidate in inside if path.is_dir() else [path]:
+        found = shutil.which(candidate)
+        if found is not None:
+            # Not resolved: the environment of a link is where the link lies.
+            return Path(found).absolute()
+    raise NoPython(f"{name}, named {where}, is no Python that can be started", install_command())
+
+
+def _wheels_for(python: Path) -> str:
+    """The extension's wheels fit Blender's own Python and no other."""
+    return wheel_folder() if python == Path(sys.executable) else ""
+
+
+class _Unfit(Exception):
+    """An interpreter that cannot simulate. lacks: but would if more were installed; installs: which pip may do."""
+
+    def __init__(self, reason: str, *, lacks: bool = False, installs: bool = False) -> None:
+        super().__init__(reason)
+        self.lacks, self.installs = lacks, installs
 
 
 @functools.lru_cache(maxsize=8)
-def _checked(name: str) -> str | None:
-    """None when it can; what it says otherwise. Kept, because it is asked before every job."""
-    done = subprocess.run(
-        [name, "-c", _CHECK],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        env=child_environment(),
-        timeout=_TIMEOUT_S,
-        creationflags=0x08000000 if os.name == "nt" else 0,  # no console window
-    )
-    if done.returncode == 0:
-        return None
-    words = done.stderr.decode("utf-8", "replace").strip().splitlines()
-    return words[-1] if words else "it has no taichi"
+def _checked(python: str, packages: str) -> str:
+    """The version of an interpreter that can simulate; raises _Unfit. What is good is kept, it is asked before jobs."""
+    try:
+        done = subprocess.run(
+            own_command(MODULE, python=python, packages=packages),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=child_environment(),
+            timeout=_TIMEOUT_S,
+            creationflags=NO_WINDOW,
+        )
+    except OSError as error:
+        raise _Unfit(str(error.strerror or error)) from None
+    except subprocess.TimeoutExpired:
+        raise _Unfit(f"it did not answer within {_TIMEOUT_S:g} s") from None
+    lines = done.stdout.decode("utf-8", "replace").strip().splitlines()
+    if done.returncode != 0 or not lines:
+        words = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        raise _Unfit(words[-1] if words else f"it ended with code {done.returncode} when Taichi was loaded")
+    try:
+        answer = json.loads(lines[-1])
+        version, missing = str(answer["python"]), list(answer["missing"])
+    except (ValueError, TypeError, KeyError):
+        raise _Unfit(f"it answered {lines[-1][:80]!r}") from None
+    if missing and tuple(int(n) for n in version.split(".")[:2]) > NEWEST:
+        raise _Unfit(f"Python {version} is too new: {_dotted(OLDEST)} to {_dotted(NEWEST)} are needed")
+    if missing:
+        names = ", ".join(re.split("[<>=]", requirement)[0] for requirement in missing)
+        raise _Unfit(f"it lacks {names}", lacks=True, installs=bool(answer["installs"]))
+    if answer["trouble"]:
+        raise _Unfit(str(answer["trouble"]))
+    return version

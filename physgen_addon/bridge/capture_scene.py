@@ -17,7 +17,6 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Quaternion
 from numpy.typing import NDArray
-from trimesh.remesh import subdivide_to_size
 
 from ...sim.diagnose.capture import Camera, Capture, CaptureObject, Trial
 from ...sim.diagnose.rotation import nearest_rotation
@@ -219,6 +218,9 @@ def _refined(item: CaptureObject) -> bpy.types.Mesh:
     vertices, faces = item.vertices, item.faces
     longest = float(np.ptp(vertices, axis=0).max()) / EDGES_ACROSS
     if len(vertices) < MAX_VERTICES / 8:
+        # Late: a panel that only draws needs no trimesh.
+        from trimesh.remesh import subdivide_to_size
+
         vertices, faces = subdivide_to_size(vertices, faces, max_edge=max(longest, 1e-9), max_iter=12)
     mesh = bpy.data.meshes.new(item.name)
     mesh.from_pydata(np.asarray(vertices).tolist(), [], np.asarray(faces).tolist())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...sim.diagnose.capture import Camera
 from ...sim.diagnose.rotation import nearest_rotation
 from ...sim.errors import InputError
-from ...sim.skinning.binding import bind
+from ...sim.skinning.binding import compact_weights
 
 Array = NDArray[np.float64]
 
@@ -118,12 +118,26 @@ def body_shifts(rest: Array, points: Array, poses: Poses) -> Array:
 def carriers(vertices: Array, points: Array) -> tuple[NDArray[np.int64], Array]:
     """Which ``points`` (K, 3) a vertex listens to and how much: indices and weights, both (V, n), rows sum to 1."""
     if len(points) > 4:
-        found = bind(vertices, points, neighbours=min(CARRIERS, len(points) - 1))
-        return found.particles, found.weights
+        index, distance = _nearest(vertices, points, min(CARRIERS + 1, len(points)))
+        return index[:, :-1], compact_weights(distance)
     distance = np.linalg.norm(vertices[:, None] - points[None], axis=2)
     weights = 1.0 / np.maximum(distance, 1e-6) ** 2
     index = np.tile(np.arange(len(points)), (len(vertices), 1))
     return index, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _nearest(vertices: Array, points: Array, count: int) -> tuple[NDArray[np.int64], Array]:
+    """The ``count`` points (K, 3) nearest to each vertex (V, 3), nearest first: indices and distances, both (V, count).
+
+    Tracked points are a few hundred, so every distance is looked at, some vertices at a time.
+    """
+    indices, distances = [], []
+    for rows in np.array_split(vertices, max(1, len(vertices) * len(points) // 2**20)):
+        every = np.linalg.norm(rows[:, None] - points[None], axis=2)
+        order = np.argsort(every, axis=1, kind="stable")[:, :count]
+        indices.append(order)
+        distances.append(np.take_along_axis(every, order, axis=1))
+    return np.concatenate(indices), np.concatenate(distances)
 
 
 def in_space(pixels: Array, camera: Camera, depth: Array) -> Array:

@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The add-on's preferences."""
+"""The add-on's preferences: which Python simulates, and what came of asking it."""
 
 import bpy
 
+from ..interpreter import TERMINAL, home_folder
+from ..panels import text
+
 ADDON = __package__.removesuffix(".physgen_addon.props")
 """Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` where it is installed."""
+
+
+def _forget(self: "PHYSGEN_AP_preferences", context: bpy.types.Context) -> None:
+    self.check = self.check_text = self.check_command = ""
 
 
 class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
@@ -15,23 +22,57 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
     python: bpy.props.StringProperty(
         name="Python",
         description=(
-            "Interpreter with physgen installed that runs simulations and diagnoses. "
-            "Empty: the one in the environment variable PHYSGEN_PYTHON, else Blender's own"
+            "Interpreter that simulates and diagnoses, or the folder of its virtual environment. It needs the "
+            "packages that Check names, not PhysGen itself. Empty: the one in the environment variable "
+            "PHYSGEN_PYTHON, else Blender's own, else the folder physgen-python in your home folder"
         ),
         subtype="FILE_PATH",
+        update=_forget,
     )
+    check: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
+    check_text: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
+    check_command: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     def draw(self, context: bpy.types.Context) -> None:
         """The preferences' page."""
-        self.layout.prop(self, "python")
+        layout = self.layout
+        layout.label(text="Simulations run in a Python of their own, beside Blender.")
+        split = layout.split(factor=0.85, align=True)
+        split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
+        split.operator("physgen.check_python")
+        if not self.check:
+            return
+        box = layout.box()
+        text.sentences(box, context, self.check_text, icon="CHECKMARK" if self.check == "YES" else "ERROR")
+        if self.check_command:
+            emptied = "empty the field above and " if self.python and str(home_folder()) in self.check_command else ""
+            box.label(text=f"Type this into {TERMINAL}; when it has ended, {emptied}press Check again:")
+            row = box.row(align=True)
+            row.prop(self, "check_command", text="")
+            row.operator("physgen.copy_command", text="", icon="COPYDOWN").command = self.check_command
+
+
+def _own(context: bpy.types.Context) -> PHYSGEN_AP_preferences | None:
+    addon = context.preferences.addons.get(ADDON)
+    return addon.preferences if addon else None
 
 
 def python(context: bpy.types.Context) -> str:
     """The interpreter named in the preferences; empty where none is, or the add-on was registered by a script."""
-    addon = context.preferences.addons.get(ADDON)
-    return (
-        bpy.path.abspath(addon.preferences.python) if addon and addon.preferences and addon.preferences.python else ""
-    )
+    own = _own(context)
+    return bpy.path.abspath(own.python) if own and own.python else ""
+
+
+def show_check(context: bpy.types.Context, answer: str, sentence: str, command: str) -> None:
+    """Show what a check found on the preferences' page. answer: YES, NO, or empty for none."""
+    own = _own(context)
+    if own is None:
+        return
+    own.check, own.check_text, own.check_command = answer, sentence, command
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "PREFERENCES":
+                area.tag_redraw()
 
 
 CLASSES = (PHYSGEN_AP_preferences,)

@@ -11,10 +11,12 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path
 from queue import Empty, Queue
 
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
@@ -24,12 +26,33 @@ CANCEL_GRACE_S = 10.0
 """How long a stage may take to put things in order before it is killed."""
 
 _ERRORS: dict[str, type[PhysGenError]] = {e.__name__: e for e in (InputError, SimulationError, RenderError, Cancelled)}
-_STRIPPED = ("PYTHONHOME", "PYTHONPATH", "LD_PRELOAD", "LD_LIBRARY_PATH")
+_STRIPPED = ("PYTHON", "LD_", "DYLD_")
+_KEPT = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
+NO_WINDOW = 0x08000000 if os.name == "nt" else 0
+"""``creationflags`` of every child: no console window flashes up on Windows."""
+_LAUNCHER = Path(__file__).with_name("launch.py")
 
 
 def child_environment() -> dict[str, str]:
-    """This process's environment without what would make another interpreter load the wrong libraries."""
-    return {key: value for key, value in os.environ.items() if key not in _STRIPPED}
+    """This process's environment without what would make another interpreter load the wrong libraries or wait.
+
+    Events are lines of UTF-8, also on Windows, where Python would write something else into a pipe.
+    """
+    kept = {key: value for key, value in os.environ.items() if key in _KEPT or not key.upper().startswith(_STRIPPED)}
+    return {**kept, "PYTHONUTF8": "1"}
+
+
+def own_command(
+    module: str, *arguments: str, python: str = sys.executable, packages: str = "", folder: Path | None = None
+) -> list[str]:
+    """The command that runs ``module`` of this very tree, whatever the package is called in this process.
+
+    module: from the tree's root, such as ``sim.app.worker``. python: interpreter, this one's by default. packages: a
+    site-packages folder that it would not find by itself; those that this process was launched with are passed on by
+    the environment. folder: where it runs, here by default.
+    """
+    options = [*(["--packages", packages] if packages else []), *(["--folder", str(folder)] if folder else [])]
+    return [python, str(_LAUNCHER), *options, module, *arguments]
 
 
 def run_stage(
@@ -71,7 +94,7 @@ def _run_once(
     command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
 ) -> tuple[Event | None, int, deque[str]]:
     """The final event of ``command`` if it gave one, its exit code and the last lines of its chatter."""
-    flags = 0x00000200 | 0x08000000 if os.name == "nt" else 0  # new process group, no console window
+    flags = 0x00000200 | NO_WINDOW if os.name == "nt" else 0  # a process group of its own
     # Own session: Ctrl-C reaches this process alone, which then asks the stage to stop in good order.
     process = subprocess.Popen(
         list(command),

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ..atomic import replacing, write_json
@@ -262,6 +261,8 @@ def load_capture(root: Path) -> Capture:
 
 def save_capture(capture: Capture, root: Path) -> None:
     """Write ``capture`` as a new folder ``root``, whole or not at all; InputError when it is there already."""
+    import trimesh
+
     if root.exists():
         raise InputError(f"{root}: is there already; choose another folder")
     with replacing(root) as partial:

@@ -14,7 +14,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from .schema import Effect, Values, leave, vector, vector_parameters
 
@@ -27,6 +26,9 @@ def true_camera(
     pivot: world point about which ``rotation`` turns. One among the points seen, such as their mean, keeps rotation and
         shift from standing in for each other.
     """
+    # Late, so that listing the effects, as Blender does when it starts, loads no scipy.
+    from scipy.spatial.transform import Rotation
+
     complete = EFFECT.checked(values)
     moved = np.array(world_from_camera, dtype=np.float64)
     rotation = Rotation.from_rotvec(vector(complete, "rotation")).as_matrix()

@@ -5,14 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from .folder import SceneFolder
 from .model import SceneObject
+
+if TYPE_CHECKING:
+    import trimesh
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 MAX_MESH_BYTES = 512 * 2**20
@@ -48,8 +51,13 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     """Read one mesh file as it is: no vertex is merged, moved or reordered.
 
     Raises InputError when the file is missing, too large, of an unknown kind, not readable, holds no triangle or
-    coordinates that are not finite.
+    coordinates that are not finite; and where trimesh, which reads them, is missing.
     """
+    # Late: Blender draws its panels without ever reading a mesh, and this takes a tenth of a second.
+    try:
+        import trimesh
+    except ModuleNotFoundError as error:
+        raise InputError(f"{path}: cannot be read without the Python package {error.name}; install it") from None
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: mesh files are {', '.join(MESH_SUFFIXES)}, not {path.suffix or 'without suffix'!r}")
     try:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..errors import InputError
 
@@ -52,6 +51,9 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
     neighbours: how many particles carry a vertex, 4 to 64; more is smoother, fewer follows detail.
     Raises InputError when there are fewer particles than 4 or anything is not finite.
     """
+    # Late: inside Blender ``compact_weights`` is enough, and scipy may be missing there.
+    from scipy.spatial import cKDTree
+
     rest: Array = np.array(vertices, dtype=np.float64)
     particles = np.asarray(particles, dtype=np.float64)
     if len(particles) < 4:
@@ -60,21 +62,27 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
         raise InputError("skinning: vertices or particles are not finite")
     count = min(neighbours, len(particles) - 1)
     distance, index = cKDTree(particles).query(rest, k=count + 1)
-    # The first particle left out sets the support: weights vanish where the set of neighbours changes, which
-    # keeps them continuous along the surface.
-    support = np.maximum(distance[:, -1:], 1e-12)
-    weights = (1.0 - np.minimum(distance[:, :-1] / support, 1.0) ** 2) ** 3 + 1e-9
-    weights /= weights.sum(axis=1, keepdims=True)
     index = index[:, :-1].astype(np.int64)
-    # k particles fill about a ball of radius ``support``.
-    spacing = support[:, 0] * (4.0 / 3.0 * np.pi / count) ** (1.0 / 3.0)
+    # k particles fill about a ball that reaches to the first one left out.
+    spacing = np.maximum(distance[:, -1], 1e-12) * (4.0 / 3.0 * np.pi / count) ** (1.0 / 3.0)
     return Binding(
         particles=index,
-        weights=weights,
+        weights=compact_weights(distance),
         offsets=rest[:, None, :] - particles[index],
         spacing=spacing,
         rest=rest,
     )
+
+
+def compact_weights(distance: Array) -> Array:
+    """Weights (V, k) of k neighbours from the sorted distances (V, k + 1) to them and to the first one left out.
+
+    That one sets the support: weights vanish where the set of neighbours changes, which keeps them continuous along
+    the surface. Rows sum to 1.
+    """
+    support = np.maximum(distance[:, -1:], 1e-12)
+    weights = (1.0 - np.minimum(distance[:, :-1] / support, 1.0) ** 2) ** 3 + 1e-9
+    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> Array:

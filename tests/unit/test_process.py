@@ -97,7 +97,17 @@ def test_much_output_on_both_pipes_does_not_block():
 
 def test_the_child_does_not_inherit_what_would_break_it(monkeypatch):
     monkeypatch.setenv("PYTHONHOME", "/nowhere")
-    monkeypatch.setenv("LD_PRELOAD", "")
+    for name in ("LD_PRELOAD", "LD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES", "PYTHONPATH", "PYTHONINSPECT"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setenv("PYTHONPYCACHEPREFIX", "/elsewhere")
     environment = process.child_environment()
-    assert not {"PYTHONHOME", "PYTHONPATH", "LD_PRELOAD", "LD_LIBRARY_PATH"} & set(environment)
+    found = {key for key in environment if key.startswith(("PYTHON", "LD_", "DYLD_"))} - {"PYTHONDONTWRITEBYTECODE"}
+    assert found == {"PYTHONPYCACHEPREFIX", "PYTHONUTF8"}
     assert environment["PATH"] == os.environ["PATH"]
+
+
+def test_events_are_utf8_whatever_the_locale(monkeypatch):
+    monkeypatch.setenv("LC_ALL", "C")
+    monkeypatch.setenv("PYTHONIOENCODING", "latin-1")
+    said = run_stage(stage("""print('{"event": "done", "path": "Bäll"}')"""), print, lambda: False)
+    assert said["path"] == "Bäll"

@@ -7,7 +7,6 @@ import hashlib
 import os
 import secrets
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...app.process import run_stage
+from ...app.process import own_command, run_stage
 from ...atomic import write_json
 from ...errors import Cancelled, InputError, PhysGenError, SimulationError
 from ...events import IsCancelled, OnEvent, StageProgress
@@ -66,9 +65,9 @@ def own_diagnosis(budget: str | None) -> Diagnose:
     """The command line of ``physgen diagnose``, started in the folder of the captures."""
 
     def command(capture: Path, report: Path) -> list[str]:
-        start = [sys.executable, "-m", "physgen.sim.diagnose.blind.launch", str(capture.parent), "physgen.batch.cli"]
-        rest = ["diagnose", str(capture), "--out", str(report), "--json"]
-        return [*start, *rest, *(["--budget", budget] if budget else [])]
+        words = ["diagnose", str(capture), "--out", str(report), "--json", *(["--budget", budget] if budget else [])]
+        # Where its captures lie, and nowhere near the labels.
+        return own_command("batch.cli", *words, folder=capture.parent)
 
     return command
 

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""``PYTHON launch.py [--packages DIR] [--folder DIR] MODULE ARGS…``: run a module of the tree that this file lies in.
+
+An installed extension is called ``bl_ext.<repository>.physgen``, and the interpreter that simulates may have no
+``physgen``, or another version of it. Here the tree becomes the package ``physgen``, whatever else is installed, so
+that the code that works is the code that asked.
+
+MODULE: from the tree's root, such as ``batch.cli``. --packages: a folder of packages that the interpreter would not
+look in, such as the extension's wheels; asked last, and inherited by what is started from here. --folder: the working
+folder. No syntax newer than Python 3.6, so that an old interpreter is told apart from a broken one.
+"""
+
+import importlib.util
+import os
+import runpy
+import sys
+from pathlib import Path
+
+PACKAGE = "physgen"
+PACKAGES_VARIABLE = "PHYSGEN_PACKAGES"
+OLDEST = (3, 11)
+
+
+def main(arguments: "list[str]") -> None:
+    """Take the options off ``arguments`` and run the module as ``__main__``."""
+    if sys.version_info[:2] < OLDEST:
+        sys.exit("Python {}.{} is too old: 3.11 to 3.13 are needed".format(*sys.version_info[:2]))
+    # Python has put this folder first in its search path, where it would hide other modules called process or shell.
+    here = Path(__file__).absolute().parent
+    sys.path[:] = [entry for entry in sys.path if Path(entry).absolute() != here]
+    while arguments and arguments[0].startswith("--"):
+        option, value = arguments[:2]
+        arguments = arguments[2:]
+        if option == "--packages":
+            os.environ[PACKAGES_VARIABLE] = value
+        elif option == "--folder":
+            os.chdir(value)
+        else:
+            sys.exit(f"launch.py: unknown option {option}")
+    packages = os.environ.get(PACKAGES_VARIABLE, "")
+    if packages and packages not in sys.path:
+        sys.path.append(packages)
+    load_tree(here.parents[1])
+    sys.argv = arguments
+    runpy.run_module(PACKAGE + "." + arguments[0], run_name="__main__", alter_sys=True)
+
+
+def load_tree(root: Path) -> None:
+    """Make the folder ``root`` the package ``physgen``."""
+    spec = importlib.util.spec_from_file_location(
+        PACKAGE, str(root / "__init__.py"), submodule_search_locations=[str(root)]
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[PACKAGE] = module
+    spec.loader.exec_module(module)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

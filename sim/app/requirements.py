@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Which packages an interpreter needs to simulate, and whether this one has them.
+
+As a module, ``launch.py sim.app.requirements`` answers with one line of JSON: ``python`` (its version), ``missing``
+(requirements that are not there), ``trouble`` (why Taichi does not load, or null) and ``installs`` (whether pip may
+install into it: Linux distributions and Blender keep theirs to themselves).
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import sys
+import sysconfig
+from pathlib import Path
+
+MODULE = "sim.app.requirements"
+"""From the tree's root, as ``process.own_command`` takes it."""
+
+REQUIREMENTS = {
+    "numpy": "numpy>=1.26",
+    "taichi": "taichi>=1.7.4,<1.8",
+    "trimesh": "trimesh>=4.4,<6",
+    "scipy": "scipy>=1.11",
+    "skimage": "scikit-image>=0.24",
+    "PIL": "pillow>=10.3",
+    "patchmatch": "pypatchmatch>=2.0,<3",
+    "cv2": "opencv-python-headless>=4.10",
+    "OpenImageIO": "openimageio>=3.0",
+}
+"""Name to import → what to ask pip for; the widest of pyproject.toml."""
+
+OLDEST, NEWEST = (3, 11), (3, 13)
+"""Python versions that all of them have wheels for; Taichi 1.7.4 ends at 3.13."""
+
+
+def missing() -> list[str]:
+    """The requirements that this interpreter lacks, as pip takes them."""
+    return [wanted for name, wanted in REQUIREMENTS.items() if importlib.util.find_spec(name) is None]
+
+
+def installs() -> bool:
+    """Whether pip may install into this interpreter (PEP 668)."""
+    own = sys.prefix != sys.base_prefix
+    return own or not (Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED").exists()
+
+
+def main() -> None:
+    """Answer. A Taichi whose libraries do not fit the machine may end the process here, which is an answer too."""
+    lacking, trouble = missing(), None
+    if not lacking:
+        try:
+            importlib.import_module("taichi")
+        except Exception as error:
+            trouble = f"Taichi does not load ({type(error).__name__}: {error})"
+    version = ".".join(str(number) for number in sys.version_info[:3])
+    answer = {"python": version, "missing": lacking, "trouble": trouble, "installs": installs()}
+    sys.stdout.write(json.dumps(answer) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""Which Python simulates: the one that somebody named or none, and what is said where it cannot."""
+
+import subprocess
+import sys
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+import physgen  # noqa: E402
+from physgen.physgen_addon import interpreter  # noqa: E402
+from physgen.physgen_addon.props import preferences  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def unnamed(monkeypatch):
+    monkeypatch.delenv(interpreter.VARIABLE, raising=False)
+    interpreter.forget()
+
+
+@pytest.fixture
+def bare(tmp_path):
+    """An environment without packages."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "bäre env")], check=True)
+    return tmp_path / "bäre env"
+
+
+def test_blenders_own_is_taken_with_its_wheels():
+    python = interpreter.find_python()
+    assert str(python) == sys.executable
+    assert interpreter.python_version(python).split(".")[:2] == [str(n) for n in sys.version_info[:2]]
+    command = interpreter.cli_command(python, "effects")
+    assert command[command.index("--packages") + 1] == interpreter.wheel_folder()
+    assert b'"event": "done"' in subprocess.run(command, capture_output=True, check=True).stdout
+
+
+def test_a_folder_of_an_environment_is_as_good_as_its_python(bare):
+    with pytest.raises(interpreter.NoPython, match=r"named in the preferences, cannot simulate: it lacks numpy"):
+        interpreter.find_python(str(bare))
+
+
+def test_one_that_was_named_is_never_replaced_and_the_command_mends_it(bare, monkeypatch):
+    monkeypatch.setenv(interpreter.VARIABLE, str(bare))
+    with pytest.raises(interpreter.NoPython, match=r"named in PHYSGEN_PYTHON.*taichi.*In a terminal: ") as raised:
+        interpreter.find_python()
+    assert raised.value.command.startswith(f'"{bare / "bin" / "python"}" -m pip install ')
+    assert '"taichi>=1.7.4,<1.8"' in raised.value.command and "\n" not in raised.value.command
+    assert interpreter.find_python(sys.executable) == interpreter.find_python(sys.executable), "preferences come first"
+
+
+@pytest.mark.parametrize("name", ["/nowhere/python", "/", "no-such-python"])
+def test_what_cannot_be_started_is_named(name):
+    with pytest.raises(interpreter.NoPython, match=rf"{name}, named in the preferences, is no Python"):
+        interpreter.find_python(name)
+
+
+def test_what_is_no_python_is_quoted():
+    with pytest.raises(interpreter.NoPython, match="cannot simulate: "):
+        interpreter.find_python("/bin/cat")
+    with pytest.raises(interpreter.NoPython, match="it answered '/"):
+        interpreter.find_python("/bin/echo")
+
+
+def test_why_blenders_own_will_not_do():
+    reason = interpreter.why_not((3, 14), "", "it lacks numpy")
+    assert "no build for Blender's Python 3.14: name a Python 3.11 to 3.13" in reason
+    assert "without what simulates: install the zip that has it" in interpreter.why_not((3, 13), "", "it lacks taichi")
+    assert "(Taichi does not load)" in interpreter.why_not((3, 11), "/wheels", "Taichi does not load")
+
+
+def test_the_environment_that_the_command_makes_is_found_unnamed(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", "/bin/echo")
+    with pytest.raises(interpreter.NoPython, match="Blender's own Python cannot simulate") as raised:
+        interpreter.find_python()
+    assert (
+        f'-m venv "{tmp_path}/physgen-python" && "{tmp_path}/physgen-python/bin/python" -m pip' in raised.value.command
+    )
+    (tmp_path / "physgen-python").symlink_to(sys.prefix)
+    assert interpreter.find_python() == tmp_path / "physgen-python" / "bin" / "python"
+
+
+def test_one_that_lies_there_half_done_is_completed(bare, monkeypatch):
+    monkeypatch.setenv("HOME", str(bare.parent))
+    monkeypatch.setattr(sys, "executable", "/bin/echo")
+    (bare.parent / "physgen-python").symlink_to(bare)
+    with pytest.raises(
+        interpreter.NoPython, match="physgen-python/bin/python cannot simulate: it lacks numpy"
+    ) as raised:
+        interpreter.find_python()
+    assert raised.value.command.startswith(f'"{bare.parent}/physgen-python/bin/python" -m pip install')
+
+
+def test_check_reports_and_fails_with_the_remedy(bare, monkeypatch):
+    physgen.register()
+    try:
+        assert bpy.ops.physgen.check_python() == {"FINISHED"}
+        monkeypatch.setenv(interpreter.VARIABLE, str(bare))
+        with pytest.raises(RuntimeError, match=r"it lacks numpy(.|\n)*pip install"):
+            bpy.ops.physgen.check_python()
+        assert preferences.python(bpy.context) == ""
+    finally:
+        physgen.unregister()

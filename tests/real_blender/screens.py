@@ -1,0 +1,144 @@
+"""Inside Blender: its windows, the sidebar, the preferences, and pictures of them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+TAB = "PhysGen"
+
+
+def window() -> bpy.types.Window:
+    """The main window."""
+    return bpy.context.window_manager.windows[0]
+
+
+def viewport() -> bpy.types.Area:
+    """The largest 3D viewport."""
+    areas = [area for area in window().screen.areas if area.type == "VIEW_3D"]
+    return max(areas, key=lambda area: area.width * area.height)
+
+
+def region(area: bpy.types.Area, kind: str) -> bpy.types.Region:
+    """Its region of that type."""
+    return next(item for item in area.regions if item.type == kind)
+
+
+def focus() -> Any:
+    """Context as if the mouse were over the viewport."""
+    area = viewport()
+    return bpy.context.temp_override(window=window(), area=area, region=region(area, "WINDOW"))
+
+
+def panels() -> list[type[bpy.types.Panel]]:
+    """All registered panels of the tab, parents before their children."""
+    found, waiting = [], list(bpy.types.Panel.__subclasses__())
+    while waiting:
+        kind = waiting.pop(0)
+        waiting += kind.__subclasses__()
+        if getattr(kind, "bl_category", "") == TAB and getattr(kind, "is_registered", False):
+            found.append(kind)
+    return sorted(found, key=lambda kind: bool(getattr(kind, "bl_parent_id", "")))
+
+
+def open_all() -> list[str]:
+    """Let panels that begin closed begin open, because no script can open one; names of the panels of the tab."""
+    kinds = panels()
+    for kind in reversed(kinds):
+        bpy.utils.unregister_class(kind)
+    for kind in kinds:
+        options = getattr(kind, "bl_options", None)
+        if options and "DEFAULT_CLOSED" in options:
+            kind.bl_options = set(options) - {"DEFAULT_CLOSED"}
+        bpy.utils.register_class(kind)
+    return [kind.__name__ for kind in kinds]
+
+
+def show_sidebar() -> Generator[float, None, None]:
+    """Open the sidebar on the extension's tab; a tab can only be chosen after the region has drawn once."""
+    area = viewport()
+    with bpy.context.temp_override(window=window(), area=area):
+        if not bpy.context.screen.show_fullscreen:
+            bpy.ops.screen.screen_full_area()
+    yield 1.0
+    area = viewport()
+    area.spaces.active.show_region_ui = True
+    area.tag_redraw()
+    yield 1.0
+    region(viewport(), "UI").active_panel_category = TAB
+    viewport().tag_redraw()
+    yield 0.5
+
+
+def shoot(folder: Path, name: str) -> Generator[float, None, None]:
+    """Write ``NAME.png``, the window, and ``NAME_sidebar.png``, the sidebar alone, as they look when all is drawn."""
+    folder.mkdir(exist_ok=True)
+    # Panels slide to their places over several drawings.
+    for _ in range(6):
+        for area in window().screen.areas:
+            area.tag_redraw()
+        yield 0.3
+    path = folder / f"{name}.png"
+    picture(window(), path)
+    bar = region(viewport(), "UI")
+    if bar.width > 1:
+        crop(path, folder / f"{name}_sidebar.png", (bar.x, bar.y, bar.width, bar.height))
+
+
+def shoot_preferences(folder: Path, name: str, addon: str) -> Generator[float, None, None]:
+    """Write ``NAME.png``: the add-on's page in a preferences window of its own, which is closed again."""
+    before = set(bpy.context.window_manager.windows)
+    with bpy.context.temp_override(window=window()):
+        bpy.ops.preferences.addon_show(module=addon)
+    yield 1.5
+    own = next(item for item in bpy.context.window_manager.windows if item not in before)
+    picture(own, folder / f"{name}.png")
+    with bpy.context.temp_override(window=own):
+        bpy.ops.wm.window_close()
+    yield 0.5
+
+
+def picture(shown: bpy.types.Window, path: Path) -> None:
+    """Write what ``shown`` shows to ``path``.
+
+    Blender's own screenshots are black where Mesa draws in software, so the X server is asked where ImageMagick can.
+    """
+    ask = shutil.which("import")
+    if ask is None:
+        with bpy.context.temp_override(window=shown):
+            bpy.ops.screen.screenshot(filepath=str(path))
+    else:
+        # Nobody manages the windows: the newest lies on top, and their places are those of the screen.
+        subprocess.run([ask, "-silent", "-window", "root", str(path)], check=True)
+        screen = read(path)
+        if (shown.width, shown.height) != (screen.shape[1], screen.shape[0]):
+            crop(path, path, (shown.x, shown.y, shown.width, shown.height))
+    pixels = read(path)[..., :3]
+    assert float(pixels.max() - pixels.min()) > 0.1, f"{path.name} shows nothing"
+
+
+def read(path: Path) -> np.ndarray:
+    """A picture as floats (H, W, 4), first row at the bottom."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    pixels = np.empty(width * height * 4, dtype=np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)
+
+
+def crop(source: Path, target: Path, box: tuple[int, int, int, int]) -> None:
+    """Write the part ``box`` (x, y, width, height, from the lower left) of ``source`` to ``target``."""
+    x, y, width, height = box
+    part = read(source)[y : y + height, x : x + width]
+    image = bpy.data.images.new("part", part.shape[1], part.shape[0], alpha=False)
+    image.pixels.foreach_set(np.ascontiguousarray(part).ravel())
+    image.filepath_raw, image.file_format = str(target), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
