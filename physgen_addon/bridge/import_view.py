@@ -100,6 +100,7 @@ def show(scene: bpy.types.Scene, collection: bpy.types.Collection, view: View, c
     collection.objects.link(item)
     item.lock_location = item.lock_rotation = item.lock_scale = (True, True, True)
     item.data.passepartout_alpha = 0.9
+    item.data.display_size = 0.15 * max((item.matrix_world.translation - view.ground.location).length, 1e-3)
     item.data.show_background_images = True
     for image, depth, shown in ((view.background, "BACK", True), (view.photo, "FRONT", False)):
         # The photo lies in front, hidden: one click compares.
@@ -181,8 +182,17 @@ def _add_sun(
     data.angle = light.sun_angle
     item = made.add(bpy.data.objects.new("sun", data))
     turn = Vector(direction.tolist()).to_track_quat("Z", "Y").to_matrix().to_4x4()
-    item.matrix_world = Matrix.Translation((direction * 2.0).tolist()) @ turn
+    # Where a sun stands does not matter: behind the camera its line is out of the picture.
+    camera = folder.scene.camera
+    item.matrix_world = Matrix.Translation((2 * camera.position - _target(camera, folder)).tolist()) @ turn
     return item
+
+
+def _target(camera: Camera, folder: SceneFolder) -> NDArray[np.float64]:
+    """The point (3,) on the optical axis as far away as the ground's point."""
+    forward = np.asarray(camera.world_from_camera)[:3, 2]
+    away = float(np.linalg.norm(np.asarray(folder.scene.ground.point) - camera.position))
+    return np.asarray(camera.position + max(away, 1e-3) * forward)
 
 
 def _ground(
