@@ -31,3 +31,52 @@ def look_through_camera(context: bpy.types.Context) -> None:
     for space in viewports(context):
         if space.region_3d is not None:
             space.region_3d.view_perspective = "CAMERA"
+
+
+def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
+    """Let the window's viewports show ``scene`` through its camera, textures as they are, the picture as a whole."""
+    if context.window is None or context.window.scene != scene:
+        return
+    look_through_camera(context)
+    for area in context.window.screen.areas:
+        space = area.spaces.active
+        if area.type != "VIEW_3D" or space.region_3d is None:
+            continue
+        space.use_local_camera = False
+        space.shading.color_type, space.shading.light = "TEXTURE", "FLAT"
+        region = next((region for region in area.regions if region.type == "WINDOW"), None)
+        with context.temp_override(window=context.window, area=area, region=region):
+            if bpy.ops.view3d.view_center_camera.poll():
+                bpy.ops.view3d.view_center_camera()
+
+
+def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
+    """Show ``image`` and the sidebar's ``tab`` in an image editor; if there is none, beside the 3D viewport."""
+    if context.window is None:
+        return
+    areas = context.window.screen.areas
+    area = next((area for area in areas if area.type == "IMAGE_EDITOR"), None) or _beside_viewport(context)
+    if area is None:
+        return
+    space = area.spaces.active
+    space.image, space.show_region_ui = image, True
+    for region in area.regions:
+        # A sidebar that was never drawn has no tabs to choose from yet.
+        if region.type == "UI" and region.active_panel_category not in ("", "UNSUPPORTED"):
+            region.active_panel_category = tab
+
+
+def _beside_viewport(context: bpy.types.Context) -> bpy.types.Area | None:
+    """A new image editor in the left half of the largest 3D viewport; None where there is none."""
+    views = [area for area in context.window.screen.areas if area.type == "VIEW_3D"]
+    if not views:
+        return None
+    before = set(context.window.screen.areas)
+    view = max(views, key=lambda area: area.width * area.height)
+    region = next(region for region in view.regions if region.type == "WINDOW")
+    with context.temp_override(window=context.window, area=view, region=region):
+        bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
+    new = next((area for area in context.window.screen.areas if area not in before), None)
+    if new is not None:
+        new.type = "IMAGE_EDITOR"
+    return new

@@ -17,9 +17,9 @@ from ...sim.effects.registry import effect
 from ...sim.scene.control import Box, Keys, Motion
 from ...sim.scene.matter import Material
 from ...sim.scene.model import Ground, Scene, SceneObject
+from ..props.body import CUSTOM, get_material, set_material
 from . import compat
 
-CUSTOM = "custom"
 MAX_GRAVITY = 200.0
 """Strongest gravity that Blender keeps, along each axis, m/s²."""
 
@@ -112,10 +112,7 @@ def _fill_body(
 
 
 def _fill_material(target: bpy.types.PropertyGroup, material: Material) -> None:
-    # Late: the fields are defined where the extension is registered.
-    from ..props.body import get_material, set_material
-
-    presets = {name for name, *_ in target.bl_rna.properties["preset"].enum_items.items()}
+    presets = target.bl_rna.properties["preset"].enum_items
     target.preset = material.preset if material.preset in presets else CUSTOM
     usual = get_material(target)
     set_material(target, material)

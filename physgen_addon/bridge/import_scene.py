@@ -104,7 +104,10 @@ def _read(root: Path) -> _Read:
     folder = load_scene(root)
     for entry in folder.scene.effects:
         known = effect(entry.name)
-        known.checked({**known.defaults, **dict(entry.parameters)})
+        try:
+            known.checked({**known.defaults, **dict(entry.parameters)})
+        except InputError as error:
+            raise InputError(f"effect {entry.name!r}: {error}") from None
     meshes = []
     for item in folder.scene.objects:
         try:

@@ -127,10 +127,13 @@ def _write_object(
 
 
 def _material(item: Physgen3dObject) -> Material:
-    changes = {"youngs_modulus": item.youngs_modulus, "density": item.density}
-    given = {key: value for key, value in changes.items() if value is not None}
+    usual = load_preset("medium")
     try:
-        return dataclasses.replace(load_preset("medium"), **given)
+        return dataclasses.replace(
+            usual,
+            youngs_modulus=usual.youngs_modulus if item.youngs_modulus is None else item.youngs_modulus,
+            density=usual.density if item.density is None else item.density,
+        )
     except InputError as error:
         raise InputError(f"object {item.name}: {error}") from None
 

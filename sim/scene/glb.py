@@ -24,7 +24,12 @@ MAX_JSON_BYTES = 16 * 2**20
 MAX_NODES = 10_000
 PICTURES = ("image/png", "image/jpeg")
 _MAGIC, _JSON, _BINARY, _TRIANGLES = b"glTF", b"JSON", b"BIN\0", 4
-_COMPONENTS = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+_COMPONENTS: dict[int, np.dtype[Any]] = {
+    5121: np.dtype("u1"),
+    5123: np.dtype("<u2"),
+    5125: np.dtype("<u4"),
+    5126: np.dtype("<f4"),
+}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 _GARBAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error, RecursionError)
 """What following the references of a damaged file leads to."""
@@ -212,7 +217,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, width: int) -
         raise ValueError("an accessor that reaches beyond its data")
     values = np.ndarray((count, width), dtype, data, offset=start, strides=(stride, dtype.itemsize))
     if accessor.get("normalized") and dtype.kind == "u":
-        return np.asarray(values / float(np.iinfo(dtype).max))
+        return np.asarray(values / float(2 ** (8 * dtype.itemsize) - 1))
     return values
 
 

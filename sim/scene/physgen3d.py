@@ -6,8 +6,8 @@ What the files mean is read from its source (github.com/by-luckk/PhysGen3D at 72
 
 - ``transform.json``: ``object_names``; ``matrices``, for each a 4x4 similarity from its mesh to the camera's axes
   (OpenCV: x right, y down, z forward), columns as in p' = M p; ``plane_model`` [a, b, c, d], the ground
-  a x + b y + c z + d = 0 on those axes; ``fov``, the photo's borders [left, top, right, bottom] as x/z and y/z, of which
-  rendering takes ``right`` as the tangent of half the horizontal angle of view, the principal point in the middle;
+  a x + b y + c z + d = 0 on those axes; ``fov``, the photo's borders [left, top, right, bottom] as x/z and y/z, of
+  which rendering takes ``right`` as the tangent of half the horizontal angle of view, about the photo's middle;
   ``matrices_optimized``, which its simulation does not use either; perhaps ``E`` in Pa and ``density`` in kg/m³, one an
   object. Lengths are those of DUSt3R's depth, of no known unit.
 - ``raw_image.jpg``, ``inpaint/inpainted_all.jpg``, ``mask/mask_I.jpg``, ``meshes/NAME.obj`` and its texture
