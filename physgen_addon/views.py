@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import bpy
 from mathutils import Vector
+
+WIDE_PX = 800
+"""Width from which an image editor has room for its sidebar."""
 
 
 def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
@@ -59,11 +64,27 @@ def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> 
     if area is None:
         return
     space = area.spaces.active
-    space.image, space.show_region_ui = image, True
+    space.image = image
+    # In a narrow editor a sidebar would cover the picture; the viewport's own has the same panel.
+    if area.width > WIDE_PX * context.preferences.system.ui_scale:
+        space.show_region_ui = True
     for region in area.regions:
         # A sidebar that was never drawn has no tabs to choose from yet.
         if region.type == "UI" and region.active_panel_category not in ("", "UNSUPPORTED"):
             region.active_panel_category = tab
+    # Once the editor has got its size.
+    bpy.app.timers.register(functools.partial(_fit, image.name), first_interval=0.1)
+
+
+def _fit(name: str) -> None:
+    """Let the image editors that show the image ``name`` show the whole of it."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            shown = area.spaces.active.image if area.type == "IMAGE_EDITOR" else None
+            if shown is not None and shown.name == name:
+                region = next(region for region in area.regions if region.type == "WINDOW")
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    bpy.ops.image.view_all(fit_view=True)
 
 
 def _beside_viewport(context: bpy.types.Context) -> bpy.types.Area | None:

@@ -18,6 +18,7 @@ from ..bridge.import_scene import import_notes, import_scene
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
 from ..paths import folder_beside, require_folder
+from ..props.body import bodies
 from ..props.preferences import python
 from ..views import show_photo
 
@@ -34,12 +35,24 @@ def show_scene(scene: bpy.types.Scene, root: Path, *, hide_others: bool = True) 
     visible = [item for item in others if not item.hide_viewport]
     for item in visible:
         item.hide_viewport = item.hide_render = True
+    found = bodies(scene)
+    _choose(scene, [item for item in found if item.name in collection.all_objects])
     show_photo(bpy.context, scene)
-    bodies = sum(item.physgen.enabled for item in collection.all_objects)
-    text = f"{bodies} {'object' if bodies == 1 else 'objects'} imported"
+    text = f"{len(found)} {'object' if len(found) == 1 else 'objects'} imported"
     if visible:
         text += f"; {', '.join(item.name for item in visible[:3])}{' …' if len(visible) > 3 else ''} hidden"
     return ". ".join([text, *import_notes(collection)])
+
+
+def _choose(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> None:
+    """Make the first of ``items`` the chosen object, the others unselected."""
+    layer = bpy.context.view_layer
+    if bpy.context.scene != scene or not items:
+        return
+    for item in layer.objects:
+        item.select_set(item == items[0])
+    layer.objects.active = items[0]
+    scene.physgen.body_index = 0
 
 
 class PHYSGEN_OT_import_scene(bpy.types.Operator):
