@@ -49,6 +49,8 @@ def _choose(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> None:
     layer = bpy.context.view_layer
     if bpy.context.scene != scene or not items:
         return
+    # Until then it lists objects that an earlier import's removal has taken away.
+    layer.update()
     for item in layer.objects:
         item.select_set(item == items[0])
     layer.objects.active = items[0]

@@ -392,3 +392,44 @@ def test_what_is_no_photo_is_refused(tmp_path):
     with pytest.raises(RuntimeError, match="there is no such photo"):
         bpy.ops.physgen.open_photo(filepath=str(tmp_path / "b.png"))
     assert not bpy.data.images
+
+
+def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
+    """The whole way, blocking as a script has it: boxes, child process, import."""
+    photo = tmp_path / "ball.png"
+    Image.open(world.folder.file("photo.png")).resize((320, 240)).save(photo)
+    scene = bpy.context.scene
+    set_photo(scene, photo)
+    rows, columns = np.nonzero(np.asarray(Image.open(world.folder.file("masks/ball.png"))))
+    corners = (2 * columns.min() - 8, 2 * rows.min() - 8, 2 * columns.max() + 10, 2 * rows.max() + 10)
+    add_box(scene, tuple(map(int, corners)), "ball").size_m = 0.1
+    assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
+    item = scene.physgen.photo_root.objects["ball"]
+    assert max(item.dimensions) == pytest.approx(0.1, rel=0.01)
+    assert load_scene(tmp_path / "ball_scene").scene.objects[0].name == item.physgen.source
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (320, 240)
+
+
+def test_an_output_folder_of_physgen3d_becomes_a_scene_in_the_worker(world, tmp_path):
+    root = tmp_path / "teddy"
+    (root / "meshes").mkdir(parents=True)
+    Image.open(world.folder.file("photo.png")).save(root / "raw_image.jpg")
+    import trimesh
+
+    trimesh.creation.box((0.2, 0.2, 0.2)).export(root / "meshes" / "teddy1.obj")
+    place = np.eye(4)
+    place[:3, 3] = (0, 0.3, 1.0)
+    told = {
+        "matrices": [place.tolist()],
+        "plane_model": [0, -1, 0, 0.4],
+        "fov": [-0.4, -0.3, 0.4, 0.3],
+        "object_names": ["teddy1"],
+    }
+    (root / "transform.json").write_text(json.dumps(told))
+    assert bpy.ops.physgen.import_physgen3d(directory=str(root), size_m=0.5) == {"FINISHED"}
+    item = bpy.context.scene.physgen.photo_root.objects["teddy1"]
+    bpy.context.view_layer.update()
+    assert tuple(item.dimensions) == pytest.approx((0.5, 0.5, 0.5), rel=1e-5)
+    assert world_vertices(item)[:, 2].min() == pytest.approx(0, abs=1e-6)
+    with pytest.raises(RuntimeError, match=r"there is no transform\.json"):
+        bpy.ops.physgen.import_physgen3d(directory=str(tmp_path))
