@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 
 import bpy
@@ -63,23 +64,25 @@ def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> 
     area = next((area for area in areas if area.type == "IMAGE_EDITOR"), None) or _beside_viewport(context)
     if area is None:
         return
-    space = area.spaces.active
-    space.image = image
+    area.spaces.active.image = image
     # In a narrow editor a sidebar would cover the picture; the viewport's own has the same panel.
-    if area.width > WIDE_PX * context.preferences.system.ui_scale:
-        space.show_region_ui = True
-    for region in area.regions:
-        # A sidebar that was never drawn has no tabs to choose from yet.
-        if region.type == "UI" and region.active_panel_category not in ("", "UNSUPPORTED"):
-            region.active_panel_category = tab
-    # Once the editor has got its size.
-    bpy.app.timers.register(functools.partial(_fit, image.name), first_interval=0.1)
+    if area.width < WIDE_PX * context.preferences.system.ui_scale:
+        area = next((area for area in areas if area.type == "VIEW_3D"), area)
+    area.spaces.active.show_region_ui = True
+    # Once the editor has got its size, and the sidebar its tabs.
+    bpy.app.timers.register(functools.partial(_settle, image.name, tab), first_interval=0.5)
 
 
-def _fit(name: str) -> None:
-    """Let the image editors that show the image ``name`` show the whole of it."""
+def _settle(name: str, tab: str) -> None:
+    """Let the image editors that show the image ``name`` show the whole of it, and open sidebars the tab ``tab``."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
+            for region in area.regions:
+                if region.type == "UI" and getattr(area.spaces.active, "show_region_ui", False):
+                    # A sidebar without it refuses the name.
+                    with contextlib.suppress(TypeError, AttributeError):
+                        region.active_panel_category = tab
+                        area.tag_redraw()
             shown = area.spaces.active.image if area.type == "IMAGE_EDITOR" else None
             if shown is not None and shown.name == name:
                 region = next(region for region in area.regions if region.type == "WINDOW")

@@ -32,6 +32,8 @@ class _Read:
 
 def scene_root(path: Path) -> Path:
     """The scene folder that ``path``, a folder or its scene.json, stands for. Raises InputError where it is none."""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder; choose a PhysGen scene folder")
     root = path if path.is_dir() else path.parent
     if path.is_file() and path.name != SCENE_FILE:
         raise InputError(f"{path.name}: is no scene; choose the file {SCENE_FILE} of a PhysGen scene folder")
@@ -67,11 +69,9 @@ def import_scene(scene: bpy.types.Scene, root: Path) -> bpy.types.Collection:
         item[MARK] = True
     if old is not None:
         remove_import(scene, old)
-    for item in collection.all_objects:
-        # Without the ".001" that an earlier import's names have caused; none of these names has a full stop.
-        for named in (item, item.data):
-            if named is not None:
-                named.name = named.name.split(".")[0]
+    # Without the ".001" that an earlier import's names have caused; none of these names has a full stop.
+    for named in (view.world, *(owner for item in collection.all_objects for owner in (item, item.data) if owner)):
+        named.name = named.name.split(".")[0]
     state = scene.physgen
     state.photo_root, state.folder, state.simulation.bake = collection, _stored(read.folder.root), ""
     collection[NOTES] = "\n".join(notes)

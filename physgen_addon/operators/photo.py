@@ -124,3 +124,17 @@ class PHYSGEN_FH_photo(bpy.types.FileHandler):
 
 
 CLASSES = (PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, PHYSGEN_OT_remove_box, PHYSGEN_FH_photo)
+
+
+def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    self.layout.operator(PHYSGEN_OT_open_photo.bl_idname, text="PhysGen Photo (.jpg, .png)")
+
+
+def register() -> None:
+    """Into File > Import."""
+    bpy.types.TOPBAR_MT_file_import.append(_draw_menu)
+
+
+def unregister() -> None:
+    """Out of it."""
+    bpy.types.TOPBAR_MT_file_import.remove(_draw_menu)

@@ -246,7 +246,7 @@ def test_importing_again_replaces_and_keeps_what_people_added(copy):
     after = census()
     assert [len(after[kind]) for kind in KINDS] == [len(before[kind]) for kind in KINDS]
     assert after["objects"] == before["objects"] and after["collections"] != []
-    assert scene.camera.name == "photo camera"
+    assert (scene.camera.name, scene.world.name) == ("photo camera", "environment")
 
 
 def test_two_scenes_of_one_file_do_not_disturb_each_other(copy):
@@ -284,7 +284,8 @@ DAMAGES = {
     ),
     "missing": (lambda folder: folder.file("background.png").unlink(), "background.png"),
     "newer": (newer, "update PhysGen"),
-    "no scene": (lambda folder: (folder.root / "scene.json").unlink(), "choose a PhysGen scene folder"),
+    "no scene": (lambda folder: (folder.root / "scene.json").unlink(), "there is no scene.json in it"),
+    "nothing": (lambda folder: shutil.rmtree(folder.root), "no such file or folder"),
 }
 
 
