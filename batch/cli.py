@@ -16,6 +16,7 @@ from typing import Any
 
 from ..sim.app.bake_estimate import bake_cost
 from ..sim.app.bake_inputs import BakeOptions
+from ..sim.app.import_physgen3d import import_physgen3d
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics, with_physics
 from ..sim.app.setup_world import cost_text
 from ..sim.cache.folder import free_bake
@@ -148,6 +149,12 @@ def build_parser() -> argparse.ArgumentParser:
     _add_physics(reconstruct)
     reconstruct.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
 
+    foreign = command("import", _import, "output folder of PhysGen3D → scene folder")
+    foreign.add_argument("folder", type=Path, metavar="FOLDER", help="with transform.json, meshes, mask and inpaint")
+    foreign.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+    scale = "largest extent of the first object; sets the scale of the scene (default 0.15)"
+    foreign.add_argument("--size", type=float, metavar="METRES", help=scale)
+
     bake = command("bake", _bake, "scene folder → bake folder")
     bake.add_argument("scene", type=Path, metavar="SCENE")
     bake.add_argument("--out", type=Path, metavar="BAKE", help="the bake folder")
@@ -259,6 +266,13 @@ def _reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     check_overrides(object_names(requests), options.overrides)
     reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
     set_all_physics(options.out, **_physics(options), friction=settings.friction)
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def _import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    import_physgen3d(options.folder, options.out, size_m=options.size, on_event=terminal)
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0

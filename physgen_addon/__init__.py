@@ -13,12 +13,18 @@ MODULES = (
     "props.preferences",
     "props.body",
     "props.scene",
+    "props.photo",
     "props.diagnose",
     "jobs",
     "operators.check_python",
     "operators.capture",
     "operators.diagnose",
     "operators.effect",
+    "operators.import_scene",
+    "operators.photo",
+    "operators.draw_box",
+    "operators.reconstruct",
+    "panels.photo",
     "panels.diagnose",
 )
 """All that Blender must know, in the order in which it must learn it; each has CLASSES, some a ``register`` too."""

@@ -3,8 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+
 import bpy
 from mathutils import Vector
+
+WIDE_PX = 800
+"""Width from which an image editor has room for its sidebar."""
 
 
 def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
@@ -31,3 +37,70 @@ def look_through_camera(context: bpy.types.Context) -> None:
     for space in viewports(context):
         if space.region_3d is not None:
             space.region_3d.view_perspective = "CAMERA"
+
+
+def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
+    """Let the window's viewports show ``scene`` through its camera, textures as they are, the picture as a whole."""
+    if context.window is None or context.window.scene != scene:
+        return
+    look_through_camera(context)
+    for area in context.window.screen.areas:
+        space = area.spaces.active
+        if area.type != "VIEW_3D" or space.region_3d is None:
+            continue
+        space.use_local_camera = False
+        space.shading.color_type, space.shading.light = "TEXTURE", "FLAT"
+        region = next((region for region in area.regions if region.type == "WINDOW"), None)
+        with context.temp_override(window=context.window, area=area, region=region):
+            if bpy.ops.view3d.view_center_camera.poll():
+                bpy.ops.view3d.view_center_camera()
+
+
+def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
+    """Show ``image`` and the sidebar's ``tab`` in an image editor; if there is none, beside the 3D viewport."""
+    if context.window is None:
+        return
+    areas = context.window.screen.areas
+    area = next((area for area in areas if area.type == "IMAGE_EDITOR"), None) or _beside_viewport(context)
+    if area is None:
+        return
+    area.spaces.active.image = image
+    # In a narrow editor a sidebar would cover the picture; the viewport's own has the same panel.
+    if area.width < WIDE_PX * context.preferences.system.ui_scale:
+        area = next((area for area in areas if area.type == "VIEW_3D"), area)
+    area.spaces.active.show_region_ui = True
+    # Once the editor has got its size, and the sidebar its tabs.
+    bpy.app.timers.register(functools.partial(_settle, image.name, tab), first_interval=0.5)
+
+
+def _settle(name: str, tab: str) -> None:
+    """Let the image editors that show the image ``name`` show the whole of it, and open sidebars the tab ``tab``."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions:
+                if region.type == "UI" and getattr(area.spaces.active, "show_region_ui", False):
+                    # A sidebar without it refuses the name.
+                    with contextlib.suppress(TypeError, AttributeError):
+                        region.active_panel_category = tab
+                        area.tag_redraw()
+            shown = area.spaces.active.image if area.type == "IMAGE_EDITOR" else None
+            if shown is not None and shown.name == name:
+                region = next(region for region in area.regions if region.type == "WINDOW")
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    bpy.ops.image.view_all(fit_view=True)
+
+
+def _beside_viewport(context: bpy.types.Context) -> bpy.types.Area | None:
+    """A new image editor in the left half of the largest 3D viewport; None where there is none."""
+    views = [area for area in context.window.screen.areas if area.type == "VIEW_3D"]
+    if not views:
+        return None
+    before = set(context.window.screen.areas)
+    view = max(views, key=lambda area: area.width * area.height)
+    region = next(region for region in view.regions if region.type == "WINDOW")
+    with context.temp_override(window=context.window, area=view, region=region):
+        bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
+    new = next((area for area in context.window.screen.areas if area not in before), None)
+    if new is not None:
+        new.type = "IMAGE_EDITOR"
+    return new
