@@ -77,3 +77,8 @@ def items(chosen: str) -> list[tuple[str, str, str, str, int]]:
     if chosen not in (row[0] for row in rows):
         rows.append((chosen, f"{chosen} (missing)", "Not on this computer; the object keeps its numbers", "ERROR"))
     return [_items.setdefault((row[0], repr((row, index))), (*row, index)) for index, row in enumerate(rows)]
+
+
+def title(name: str) -> str:
+    """What people call the preset ``name``."""
+    return name.capitalize() if name in _SHIPPED.good or name == CUSTOM else name

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render the bake into the photo: ``batch/render.py`` in a Blender of its own, so that this one stays usable."""
+
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import bpy
+
+from ...sim.app.process import run_stage
+from ...sim.cache.manifest import MANIFEST_FILE, load_manifest
+from ...sim.errors import InputError, RenderError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ..jobs import JobOperator, Work
+from ..paths import require_folder
+from ..views import show_image
+
+SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
+NEEDED = {"numpy": "numpy", "scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV"}
+"""Modules that rendering into a photo imports, and what people call them."""
+EXR = {"OpenImageIO": "OpenImageIO"}
+
+VIDEO_FILE = "video.mp4"
+
+
+def missing_modules() -> list[str]:
+    """What this Blender's Python lacks for rendering into a photo, as people call it."""
+    wanted = {**NEEDED, **EXR}
+    return [wanted[name] for name in wanted if importlib.util.find_spec(name) is None]
+
+
+def render_command(*arguments: str) -> Sequence[str]:
+    """The command that runs ``batch/render.py``: this Python where it has bpy as a module, else this Blender."""
+    arguments = (*arguments, "--json")
+    if not bpy.app.binary_path:
+        return [sys.executable, str(SCRIPT), *arguments]
+    # A factory start-up does not load extensions, so it would not find their wheels.
+    paths = f"import sys; sys.path += [p for p in {json.dumps([p for p in sys.path if p])} if p not in sys.path]"
+    blender = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
+    return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--", *arguments]
+
+
+def photo_scene_folder(scene: bpy.types.Scene, bake: Path) -> Path:
+    """The scene folder that ``bake`` was made from: beside its ``bakes`` folder, else the one that was imported."""
+    exported = bake.parent.parent / "scene"
+    if (exported / "scene.json").is_file():
+        return exported
+    return require_folder(scene.physgen.folder, "Scene Folder")
+
+
+def _output_folder(scene: bpy.types.Scene) -> Path:
+    path = scene.physgen.rendering.output
+    if path.startswith("//") and not bpy.data.filepath:
+        raise InputError(f"Output is {path!r}, beside a file that is not saved yet: save it, or choose a folder")
+    return require_folder(path, "Output")
+
+
+class _Render(JobOperator):
+    job_title = "Render"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A scene with a photo, a bake to render, nothing else under way."""
+        state = context.scene.physgen
+        if not state.folder:
+            cls.poll_message_set("This scene has no photo: render it as any scene of Blender")
+            return False
+        if not state.simulation.bake:
+            cls.poll_message_set("Bake first (see Simulate)")
+            return False
+        return super().poll(context)
+
+    def _work(self, scene: bpy.types.Scene, *choices: str) -> Work:
+        lacking = missing_modules()
+        if lacking:
+            raise RenderError(
+                f"this Blender's Python lacks {', '.join(lacking)}, needed to render into a photo: install PhysGen "
+                "from the zip for your system, which brings them, or render with `physgen render`"
+            )
+        rendering = scene.physgen.rendering
+        bake = require_folder(scene.physgen.simulation.bake, "Bake")
+        if not (bake / MANIFEST_FILE).is_file():
+            raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost Bakes")
+        folder = photo_scene_folder(scene, bake)
+        out = _output_folder(scene)
+        arguments = [str(folder), "--bake", str(bake), "--out", str(out)]
+        arguments += ["--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}", "--parent", str(os.getpid())]
+        if rendering.samples:
+            arguments += ["--samples", str(rendering.samples)]
+        command = render_command(*arguments, *choices)
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            # Which frames were asked for is not in the result.
+            return {**run_stage(command, on_event, cancelled, failure=RenderError), "out": str(out)}
+
+        return work
+
+
+class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
+    """Render the current frame into the photo"""
+
+    bl_idname = "physgen.render_still"
+    bl_label = "Render Still"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """The current frame."""
+        scene = context.scene
+        simulation = scene.physgen.simulation
+        manifest = load_manifest(require_folder(simulation.bake, "Bake"))
+        first = simulation.frame_start
+        sample = scene.frame_current - first
+        if not 0 <= sample < manifest.frames_done:
+            last = first + manifest.frames_done - 1
+            raise InputError(f"frame {scene.frame_current} is not baked: go to one from {first} to {last}")
+        number = str(manifest.frame_start + sample)
+        work = self._work(scene, "--frames", number)
+        name = f"{int(number):04d}.png"
+        return lambda on_event, cancelled: {**work(on_event, cancelled), "still": name}
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show it."""
+        path = Path(str(final["out"])) / str(final["still"])
+        if not path.is_file():
+            raise RenderError(f"{path}: is not there, although rendering has ended; render again")
+        scene.physgen.rendering.result = str(path)
+        show_image(bpy.context, path)
+        return f"rendered {path}"
+
+
+class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
+    """Render all baked frames into the photo, and a video of them. Frames that are up to date are not rendered again"""
+
+    bl_idname = "physgen.render_video"
+    bl_label = "Render Video"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """All frames."""
+        scene = context.scene
+        work = self._work(scene, "--video", str(_output_folder(scene) / VIDEO_FILE))
+        return lambda on_event, cancelled: {**work(on_event, cancelled), "video": VIDEO_FILE}
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Say where it is."""
+        path = Path(str(final["out"])) / str(final["video"])
+        scene.physgen.rendering.result = str(path)
+        return f"rendered {path}"
+
+
+CLASSES = (PHYSGEN_OT_render_still, PHYSGEN_OT_render_video)
