@@ -63,7 +63,7 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split = column.split(factor=0.4)
             split.label(text="")
             split.active = False
-            split.label(text=f"{turns:.3g} turns a second")
+            split.label(text=f"rad/s: {turns:.3g} turns a second")
         column.prop(body, "start_frame")
         column.operator(PHYSGEN_OT_clear_motion.bl_idname, icon="X")
 

@@ -46,7 +46,7 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
     ) -> None:
         """Role, name, material, whether it is shown."""
         body = item.physgen
-        split = layout.split(factor=0.6)
+        split = layout.split(factor=0.5)
         split.prop(item, "name", text="", emboss=False, icon=ROLE_ICONS[body.role])
         row = split.row()
         words = "Collider" if body.role == "collider" else presets.title(body.material.preset_name)
@@ -131,10 +131,7 @@ class PHYSGEN_PT_material(_Part, bpy.types.Panel):
         for name in LAW_FIELDS[material.law]:
             if name == "fibre_axis" and material.fibre_modulus == 0:
                 continue
-            if name in UNITS:
-                _number(column, material, name, UNITS[name](getattr(material, name)))
-            else:
-                column.prop(material, name)
+            _number(column, material, name, UNITS[name](getattr(material, name)) if name in UNITS else "")
         if any(is_body(o) and o != context.active_object for o in context.selected_objects):
             column.operator(PHYSGEN_OT_copy_material.bl_idname, icon="COPYDOWN")
 
@@ -164,11 +161,11 @@ def _draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, materia
 
 
 def _number(layout: bpy.types.UILayout, data: Any, name: str, words: str) -> None:
-    """A field with its value in words beside it."""
+    """A field with its unit or its value in words beside it; all fields end at the same place."""
     row = layout.row(align=True)
     row.prop(data, name)
     words_row = row.row()
-    words_row.ui_units_x = 3.4
+    words_row.ui_units_x = 3.8
     words_row.active = False
     words_row.label(text=words)
 

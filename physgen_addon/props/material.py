@@ -129,8 +129,8 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         precision=1,
     )
     youngs_modulus: FloatProperty(
-        name="Young's Modulus",
-        description="Stiffness in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
+        name="Stiffness",
+        description="Young's modulus E in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
         default=5e5,
         min=1e2,
         max=1e12,
@@ -172,7 +172,7 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         subtype="ANGLE",
     )
     critical_compression: FloatProperty(
-        name="Critical Compression",
+        name="Compression",
         description="Strain that snow bears before it packs for good",
         default=0.025,
         min=1e-4,
@@ -180,7 +180,7 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         precision=4,
     )
     critical_stretch: FloatProperty(
-        name="Critical Stretch",
+        name="Stretch",
         description="Strain that snow bears before it tears",
         default=0.0075,
         min=1e-4,
