@@ -94,8 +94,9 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):
         warnings += surface_warnings(_surface(mesh), item.name, cell)
-    for i in moving:
-        require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
+    if scene.ground is not None:
+        for i in moving:
+            require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
     bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
     warnings += overlap_warnings(bodies, spacing, cell)
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
