@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -34,7 +35,9 @@ def replacing(path: Path) -> Iterator[Path]:
         if partial.is_dir():
             shutil.rmtree(partial, ignore_errors=True)
         else:
-            partial.unlink(missing_ok=True)
+            # The folder may be a file, or gone.
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> None:

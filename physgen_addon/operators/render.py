@@ -5,31 +5,33 @@ import importlib.util
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 
+from ...sim.app.placed_bake import place_bake
 from ...sim.app.process import run_stage
 from ...sim.cache.manifest import MANIFEST_FILE, load_manifest
 from ...sim.errors import InputError, RenderError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.folder import SCENE_FILE
 from ..jobs import JobOperator, Work
 from ..paths import require_folder
+from ..props.body import bodies
 from ..views import show_image
 
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
-NEEDED = {"numpy": "numpy", "scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV"}
+NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
 """Modules that rendering into a photo imports, and what people call them."""
-EXR = {"OpenImageIO": "OpenImageIO"}
 
 VIDEO_FILE = "video.mp4"
 
 
 def missing_modules() -> list[str]:
     """What this Blender's Python lacks for rendering into a photo, as people call it."""
-    wanted = {**NEEDED, **EXR}
-    return [wanted[name] for name in wanted if importlib.util.find_spec(name) is None]
+    return [title for module, title in NEEDED.items() if importlib.util.find_spec(module) is None]
 
 
 def render_command(*arguments: str) -> Sequence[str]:
@@ -43,12 +45,15 @@ def render_command(*arguments: str) -> Sequence[str]:
     return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--", *arguments]
 
 
-def photo_scene_folder(scene: bpy.types.Scene, bake: Path) -> Path:
-    """The scene folder that ``bake`` was made from: beside its ``bakes`` folder, else the one that was imported."""
-    exported = bake.parent.parent / "scene"
-    if (exported / "scene.json").is_file():
-        return exported
-    return require_folder(scene.physgen.folder, "Scene Folder")
+def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
+    """By name in the photo's scene folder, the name under which the object was baked."""
+    names: dict[str, str] = {}
+    for item in bodies(scene):
+        body = item.physgen
+        if body.source:
+            # A duplicate is not in the photo; what comes first by name is what was imported.
+            names.setdefault(body.source, getattr(body, "cache", "") or item.name)
+    return names
 
 
 def _output_folder(scene: bpy.types.Scene) -> Path:
@@ -84,18 +89,27 @@ class _Render(JobOperator):
         rendering = scene.physgen.rendering
         bake = require_folder(scene.physgen.simulation.bake, "Bake")
         if not (bake / MANIFEST_FILE).is_file():
-            raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost Bakes")
-        folder = photo_scene_folder(scene, bake)
+            raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost (see Simulate, Cache)")
+        photo, baked_scene = require_folder(scene.physgen.folder, "Scene Folder"), bake.parent.parent / "scene"
+        names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)
-        arguments = [str(folder), "--bake", str(bake), "--out", str(out)]
-        arguments += ["--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}", "--parent", str(os.getpid())]
+        arguments = ["--out", str(out), "--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}"]
+        arguments += ["--parent", str(os.getpid()), *choices]
         if rendering.samples:
             arguments += ["--samples", str(rendering.samples)]
-        command = render_command(*arguments, *choices)
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
-            # Which frames were asked for is not in the result.
-            return {**run_stage(command, on_event, cancelled, failure=RenderError), "out": str(out)}
+            if strangers:
+                message = f"not in the photo, so not rendered into it: {', '.join(strangers)}"
+                on_event({"event": "notice", "message": message})
+            with tempfile.TemporaryDirectory(prefix="physgen-render-") as scratch:
+                rendered = bake
+                if (baked_scene / SCENE_FILE).is_file():
+                    rendered = Path(scratch) / "bake"
+                    place_bake(photo, baked_scene, bake, rendered, names, on_event)
+                command = render_command(str(photo), "--bake", str(rendered), *arguments)
+                # Which frames were asked for is not in the result.
+                return {**run_stage(command, on_event, cancelled, failure=RenderError), "out": str(out)}
 
         return work
 

@@ -129,7 +129,9 @@ class PHYSGEN_PT_material(_Part, bpy.types.Panel):
         column.prop(material, "law")
         _number(column, material, "density", "kg/m³")
         for name in LAW_FIELDS[material.law]:
-            if name == "fibre_axis" and material.fibre_modulus == 0:
+            if name == "fibre_axis":
+                if material.fibre_modulus > 0:
+                    column.prop(material, name)
                 continue
             _number(column, material, name, UNITS[name](getattr(material, name)) if name in UNITS else "")
         if any(is_body(o) and o != context.active_object for o in context.selected_objects):
@@ -162,12 +164,16 @@ def _draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, materia
 
 def _number(layout: bpy.types.UILayout, data: Any, name: str, words: str) -> None:
     """A field with its unit or its value in words beside it; all fields end at the same place."""
-    row = layout.row(align=True)
-    row.prop(data, name)
-    words_row = row.row()
-    words_row.ui_units_x = 3.8
-    words_row.active = False
-    words_row.label(text=words)
+    split = layout.split(factor=0.4, align=True)
+    split.use_property_split = False
+    title = split.row()
+    title.alignment = "RIGHT"
+    title.label(text=data.bl_rna.properties[name].name)
+    field = split.split(factor=0.58, align=True)
+    field.prop(data, name, text="")
+    unit = field.row()
+    unit.active = False
+    unit.label(text=words)
 
 
 class PHYSGEN_PT_inside(_Part, bpy.types.Panel):

@@ -41,7 +41,9 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     choices = layout.column()
     choices.enabled = under_way is None
     choices.prop(rendering, "engine")
-    choices.prop(rendering, "samples", text="Samples" if rendering.samples else "Samples (0: Auto)")
+    choices.prop(rendering, "samples")
+    if not rendering.samples:
+        text.sentences(choices, context, "Samples 0: as many as the engine thinks right.")
     choices.prop(rendering, "scale")
     choices.prop(rendering, "output")
     if rendering.output.startswith("//") and not bpy.data.filepath:

@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..jobs import draw_job, running
+from ..jobs import progress_text, running
 from ..operators.world import PHYSGEN_OT_frames_from_scene
 from ..props.body import bodies
 from . import text
@@ -66,7 +66,7 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: An
             # Another Blender, or one that was killed, whose bake goes on.
             text.sentences(layout, context, found.message, icon="INFO")
             return
-        draw_job(layout)
+        _draw_progress(layout)
         row = layout.row(align=True)
         button(row, "physgen.pause_bake", text="Pause", icon="PAUSE")
         button(row, "physgen.cancel_job", text="Cancel", icon="CANCEL")
@@ -88,6 +88,18 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: An
         text.sentences(layout, context, found.estimate_text)
 
 
+def _draw_progress(layout: bpy.types.UILayout) -> None:
+    job = running()
+    if job is None:
+        return
+    column = layout.column(align=True)
+    row = column.row()
+    row.scale_y = 1.4
+    row.progress(factor=job.fraction or 0.0, text=progress_text(job))
+    if job.message:
+        column.label(text=job.message)
+
+
 def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: Any, status: str) -> None:
     """What is there, in a box, with what can be done about it."""
     if status == "none":
@@ -96,12 +108,12 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     words, icon = {
         "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
         "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
-        "stale": (f"{found.frames_done} baked frames play, but they are out of date", "ERROR"),
-        "missing": ("The bake's files are not there", "ERROR"),
+        "stale": (f"Out of date: {found.frames_done} frames, which still play", "ERROR"),
+        "missing": (found.message or "The bake's files are not there", "ERROR"),
     }[status]
     box = layout.box()
     text.sentences(box, context, words, icon=icon)
-    if found.message:
+    if found.message and status != "missing":
         text.sentences(box, context, found.message)
     row = box.row(align=True)
     if status == "missing":
@@ -127,7 +139,9 @@ class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
             words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
             text.sentences(column, context, words, icon="INFO")
         column.prop(simulation, "seed")
-        button(layout, "physgen.relink_caches", text="Find Lost Bakes", icon="FILE_FOLDER")
+        row = layout.row(align=True)
+        button(row, "physgen.relink_caches", text="Find Lost", icon="FILE_FOLDER")
+        button(row, "physgen.free_old_bakes", text="Free Old", icon="TRASH")
 
 
 CLASSES = (PHYSGEN_PT_simulate, PHYSGEN_PT_cache)

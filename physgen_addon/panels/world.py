@@ -41,10 +41,10 @@ class PHYSGEN_PT_world(Sidebar, bpy.types.Panel):
         """Gravity, which is the scene's own."""
         scene = context.scene
         column = settings(self.layout, context, why=True)
-        column.prop(scene, "use_gravity")
+        column.prop(scene, "use_gravity", text="Gravity")
         vector = column.column()
         vector.active = scene.use_gravity
-        vector.prop(scene, "gravity", text="Gravity")
+        vector.prop(scene, "gravity", text="Pull")
 
 
 class _Part(Sidebar):
@@ -200,7 +200,7 @@ def _stem(name: str) -> str:
 
 def _draw_parameter(layout: bpy.types.UILayout, name: str, parameter: Parameter, number: Any, *, first: bool) -> None:
     stem = _stem(parameter.name)
-    title = readable(stem)
+    title = readable(stem).replace(" per mass", " / mass")
     if stem != parameter.name:
         title = f"{title} {parameter.name[-1].upper()}" if first else parameter.name[-1].upper()
     row = layout.row(align=True)

@@ -130,7 +130,7 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
     )
     youngs_modulus: FloatProperty(
         name="Stiffness",
-        description="Young's modulus E in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
+        description="Young's modulus in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
         default=5e5,
         min=1e2,
         max=1e12,
