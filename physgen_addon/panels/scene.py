@@ -66,7 +66,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row.prop(state, "folder", text="")
     there = folder.is_dir()
     if there:
-        row.operator("wm.path_open", text="", icon="FILEBROWSER").filepath = str(folder)
+        row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
     else:
         row.alert = True
         text.sentences(

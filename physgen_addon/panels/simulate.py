@@ -108,13 +108,14 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     words, icon = {
         "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
         "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
-        "stale": (f"Out of date: {found.frames_done} frames, which still play", "ERROR"),
+        "stale": (f"{found.frames_done} frames are baked and still play", "ERROR"),
         "missing": (found.message or "The bake's files are not there", "ERROR"),
     }[status]
     box = layout.box()
     text.sentences(box, context, words, icon=icon)
-    if found.message and status != "missing":
-        text.sentences(box, context, found.message)
+    message = found.message or ("Out of date: something has changed since." if status == "stale" else "")
+    if message and status != "missing":
+        text.sentences(box, context, message)
     row = box.row(align=True)
     if status == "missing":
         button(row, "physgen.relink_caches", text="Find It", icon="FILE_FOLDER")
@@ -136,7 +137,7 @@ class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
         column = settings(layout, context)
         column.prop(simulation, "cache", text="Folder")
         if simulation.cache.startswith("//") and not bpy.data.filepath:
-            words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
+            words = "Until this file is saved, bakes wait in a temporary folder."
             text.sentences(column, context, words, icon="INFO")
         column.prop(simulation, "seed")
         row = layout.row(align=True)

@@ -41,10 +41,10 @@ class PHYSGEN_PT_world(Sidebar, bpy.types.Panel):
         """Gravity, which is the scene's own."""
         scene = context.scene
         column = settings(self.layout, context, why=True)
-        column.prop(scene, "use_gravity", text="Gravity")
+        column.prop(scene, "use_gravity", text="Use Gravity")
         vector = column.column()
         vector.active = scene.use_gravity
-        vector.prop(scene, "gravity", text="Pull")
+        vector.prop(scene, "gravity", text="Gravity")
 
 
 class _Part(Sidebar):
