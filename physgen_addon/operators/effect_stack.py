@@ -19,10 +19,9 @@ def chosen_effect(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
 
 
 def explain(parameter: Parameter) -> str:
-    """What it is and its range, such as ``Velocity of the air. From -100 to 100 m/s``."""
+    """What it is and its range, such as ``velocity of the air, from -100 to 100 m/s``."""
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    text = parameter.description[:1].upper() + parameter.description[1:]
-    return f"{text}. From {parameter.low:g} to {parameter.high:g}{unit}"
+    return f"{parameter.description}, from {parameter.low:g} to {parameter.high:g}{unit}"
 
 
 class PHYSGEN_OT_add_stack_effect(bpy.types.Operator):

@@ -46,9 +46,10 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
     ) -> None:
         """Role, name, material, whether it is shown."""
         body = item.physgen
-        split = layout.split(factor=0.5)
-        split.prop(item, "name", text="", emboss=False, icon=ROLE_ICONS[body.role])
-        row = split.row()
+        row = layout.row(align=True)
+        row.prop(item, "name", text="", emboss=False, icon=ROLE_ICONS[body.role])
+        row = row.row()
+        row.alignment = "RIGHT"
         words = "Collider" if body.role == "collider" else presets.title(body.material.preset_name)
         row.label(text=words + ("*" if body.role == "dynamic" and is_modified(body.material) else ""))
         row.prop(item, "hide_viewport", text="", emboss=False)
