@@ -29,10 +29,11 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Three ways to begin; later the folder of the scene."""
         layout, state = self.layout, context.scene.physgen
-        if photo is not None:
-            photo.draw_photo(layout, context)
         if state.folder:
             _draw_folder(layout, context, state)
+            return
+        if photo is not None and context.scene.physgen_photo.image is not None:
+            photo.draw_photo(layout, context)
             return
         count = len(bodies(context.scene))
         if count == 0:
