@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from mathutils import Vector
 
@@ -33,25 +31,3 @@ def look_through_camera(context: bpy.types.Context) -> None:
     for space in viewports(context):
         if space.region_3d is not None:
             space.region_3d.view_perspective = "CAMERA"
-
-
-def show_image(context: bpy.types.Context, path: Path) -> None:
-    """Show the picture at ``path`` in an image editor; in a window of its own where none is open.
-
-    Where the preferences keep rendered pictures in the interface (Render In: Keep User Interface), none is opened.
-    """
-    image = bpy.data.images.load(str(path), check_existing=True)
-    image.reload()
-    if bpy.app.background or context.window is None:
-        return
-    screens = [window.screen for window in context.window_manager.windows]
-    areas = [area for screen in screens for area in screen.areas if area.type == "IMAGE_EDITOR"]
-    if not areas:
-        if context.preferences.view.render_display_type == "NONE":
-            return
-        before = set(context.window_manager.windows)
-        bpy.ops.wm.window_new()
-        areas = [window.screen.areas[0] for window in context.window_manager.windows if window not in before]
-    for area in areas[:1]:
-        area.type = "IMAGE_EDITOR"
-        area.spaces.active.image = image

@@ -20,7 +20,6 @@ from ...sim.scene.folder import SCENE_FILE
 from ..jobs import JobOperator, Work
 from ..paths import require_folder
 from ..props.body import bodies
-from ..views import show_image
 
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
 NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
@@ -61,6 +60,28 @@ def _output_folder(scene: bpy.types.Scene) -> Path:
     if path.startswith("//") and not bpy.data.filepath:
         raise InputError(f"Output is {path!r}, beside a file that is not saved yet: save it, or choose a folder")
     return require_folder(path, "Output")
+
+
+def _show_image(context: bpy.types.Context, path: Path) -> None:
+    """Show the picture at ``path`` in an image editor; in a window of its own where none is open.
+
+    Where the preferences keep rendered pictures in the interface (Render In: Keep User Interface), none is opened.
+    """
+    image = bpy.data.images.load(str(path), check_existing=True)
+    image.reload()
+    if bpy.app.background or context.window is None:
+        return
+    screens = [window.screen for window in context.window_manager.windows]
+    areas = [area for screen in screens for area in screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        if context.preferences.view.render_display_type == "NONE":
+            return
+        before = set(context.window_manager.windows)
+        bpy.ops.wm.window_new()
+        areas = [window.screen.areas[0] for window in context.window_manager.windows if window not in before]
+    for area in areas[:1]:
+        area.type = "IMAGE_EDITOR"
+        area.spaces.active.image = image
 
 
 class _Render(JobOperator):
@@ -141,7 +162,7 @@ class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
         if not path.is_file():
             raise RenderError(f"{path}: is not there, although rendering has ended; render again")
         scene.physgen.rendering.result = str(path)
-        show_image(bpy.context, path)
+        _show_image(bpy.context, path)
         return f"rendered {path}"
 
 
