@@ -103,19 +103,21 @@ def _draw_progress(layout: bpy.types.UILayout) -> None:
 def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: Any, status: str) -> None:
     """What is there, in a box, with what can be done about it."""
     if status == "none":
-        text.sentences(layout, context, found.message if found is not None and found.message else "Not baked yet.")
+        text.sentences(
+            layout, context, text.brief(found.message) if found is not None and found.message else "Not baked yet."
+        )
         return
     words, icon = {
         "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
         "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
         "stale": (f"{found.frames_done} frames are baked and still play", "ERROR"),
-        "missing": (found.message or "The bake's files are not there", "ERROR"),
+        "missing": (text.brief(found.message) or "The bake's files are not there", "ERROR"),
     }[status]
     box = layout.box()
     text.sentences(box, context, words, icon=icon)
     message = found.message or ("Out of date: something has changed since." if status == "stale" else "")
     if message and status != "missing":
-        text.sentences(box, context, message)
+        text.sentences(box, context, text.brief(message))
     row = box.row(align=True)
     if status == "missing":
         button(row, "physgen.relink_caches", text="Find It", icon="FILE_FOLDER")

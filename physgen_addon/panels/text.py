@@ -20,6 +20,14 @@ def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str,
         column.label(text=line, icon=icon if index == 0 else ("NONE" if icon == "NONE" else "BLANK1"))
 
 
+def brief(message: str, most: int = 300) -> str:
+    """``message`` for a panel: of many lines, as a crashed process leaves them, the first and the last."""
+    lines = message.strip().splitlines()
+    if len(lines) > 3:
+        message = f"{lines[0]} … {lines[-1]}"
+    return message if len(message) <= most else f"{message[: most // 2]} … {message[-most // 2 :]}"
+
+
 def paragraph(layout: bpy.types.UILayout, text: str, room: int) -> None:
     """``text`` on lines of up to ``room`` characters, for popups, whose width is known beforehand."""
     column = layout.column(align=True)

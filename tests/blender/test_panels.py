@@ -318,6 +318,13 @@ def test_pressures_are_readable(pascals, words):
     assert text.pressure(pascals) == words
 
 
+def test_a_crash_does_not_flood_a_panel():
+    assert text.brief("Nothing is baked yet") == "Nothing is baked yet"
+    crash = "\n".join(["ended with code 1: Traceback", *["  line"] * 40, "KeyError: 'x'"])
+    assert text.brief(crash) == "ended with code 1: Traceback … KeyError: 'x'"
+    assert len(text.brief("word " * 500)) < 310 and text.brief("") == ""
+
+
 # -- motion -----------------------------------------------------------------------------------------------------------
 
 
