@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -38,7 +39,9 @@ def replacing(path: Path) -> Iterator[Path]:
         if partial.is_dir():
             shutil.rmtree(partial, ignore_errors=True)
         else:
-            partial.unlink(missing_ok=True)
+            # The folder may be a file, or gone.
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
 
 
 def _replace(partial: Path, path: Path) -> None:

@@ -21,15 +21,12 @@ from ..operators.diagnose import PHYSGEN_OT_diagnose
 from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_clear_overlay, PHYSGEN_OT_show_overlay
 from ..props.report import readable
 from . import text
+from .sidebar import DIAGNOSE, Sidebar
 
 TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "Found"}
 ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_04"}
 SURE = 0.005
 """Effects less probable than this are summed up in the list's last words rather than shown as 0 %."""
-
-
-class _Sidebar:
-    bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", "PhysGen"
 
 
 class PHYSGEN_UL_effects(bpy.types.UIList):
@@ -51,11 +48,13 @@ class PHYSGEN_UL_effects(bpy.types.UIList):
         split.progress(factor=item.probability, text=f"{100 * item.probability:.0f} %")
 
 
-class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
+class PHYSGEN_PT_diagnose(Sidebar, bpy.types.Panel):
     """A recording of the real motion, and what it says of the simulation"""
 
     bl_idname = "PHYSGEN_PT_diagnose"
     bl_label = "Diagnose"
+    bl_order = DIAGNOSE
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
         """Capture, trial, Diagnose, the verdict in a sentence."""
@@ -92,7 +91,7 @@ class PHYSGEN_PT_diagnose(_Sidebar, bpy.types.Panel):
             _draw_verdict(layout, context, state)
 
 
-class _Part(_Sidebar):
+class _Part(Sidebar):
     bl_parent_id = "PHYSGEN_PT_diagnose"
 
 

@@ -20,6 +20,38 @@ def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str,
         column.label(text=line, icon=icon if index == 0 else ("NONE" if icon == "NONE" else "BLANK1"))
 
 
+def brief(message: str, most: int = 300) -> str:
+    """``message`` for a panel: of many lines, as a crashed process leaves them, the first and the last."""
+    lines = message.strip().splitlines()
+    if len(lines) > 3:
+        message = f"{lines[0]} … {lines[-1]}"
+    return message if len(message) <= most else f"{message[: most // 2]} … {message[-most // 2 :]}"
+
+
+def paragraph(layout: bpy.types.UILayout, text: str, room: int) -> None:
+    """``text`` on lines of up to ``room`` characters, for popups, whose width is known beforehand."""
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for line in textwrap.wrap(text, room):
+        column.label(text=line)
+
+
+def pressure(pascals: float) -> str:
+    """Such as ``25 kPa`` or ``70 GPa``."""
+    for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
+        if pascals >= size * 0.9995:
+            return f"{pascals / size:.3g} {unit}"
+    return f"{pascals:.3g} Pa"
+
+
+def storage(count: int) -> str:
+    """Bytes, such as ``12 MB``."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count} bytes"
+
+
 def length(metres: float) -> str:
     """Such as ``1.2 mm`` or ``34 cm``; a dash for what is not known (below zero)."""
     if not math.isfinite(metres) or metres < 0:

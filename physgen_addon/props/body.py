@@ -16,178 +16,16 @@ from bpy.props import (
     PointerProperty,
     StringProperty,
 )
+from mathutils import Vector
 
-from ...sim.scene.materials import load_preset, preset_names
-from ...sim.scene.matter import Material
+from .material import PHYSGEN_PG_material, get_material, set_material
+from .presets import CUSTOM
 
-CUSTOM = "custom"
-LAW_ITEMS = [
-    ("fixed_corotated", "Elastic", "Returns to its shape: rubber, jelly, foam, most things"),
-    ("neo_hookean", "Elastic, Large Strain", "For matter that is squashed or stretched far beyond its shape"),
-    ("von_mises", "Plastic", "Keeps a dent once it is pressed hard enough: clay, metal"),
-    ("snow", "Snow", "Packs, crumbles and breaks"),
-    ("sand", "Sand", "Dry grains that flow and pile up"),
-    ("fluid", "Fluid", "Water, honey"),
-    ("rigid", "Rigid", "Moves as one and never changes shape: wood, stone"),
-]
-NUMBERS = (
-    "density",
-    "youngs_modulus",
-    "poisson_ratio",
-    "law",
-    "damping_time",
-    "yield_stress",
-    "friction_angle",
-    "critical_compression",
-    "critical_stretch",
-    "hardening",
-    "bulk_modulus",
-    "viscosity",
-    "fibre_modulus",
-    "fibre_axis",
-)
-"""The fields of ``sim.scene.matter.Material`` that the user may set."""
+__all__ = ["CLASSES", "CUSTOM", "bodies", "get_material", "is_body", "set_material"]
 
 
-def _on_preset(self: "PHYSGEN_PG_material", context: bpy.types.Context) -> None:
-    if self.preset != CUSTOM:
-        set_material(self, load_preset(self.preset))
-
-
-def _preset_items() -> list[tuple[str, str, str]]:
-    items = [(name, name.capitalize(), f"The preset {name}") for name in preset_names()]
-    return [*items, (CUSTOM, "Custom", "Numbers of your own")]
-
-
-def set_material(target: "PHYSGEN_PG_material", material: Material) -> None:
-    """Take the numbers of ``material``; its preset's name is not touched."""
-    for name in NUMBERS:
-        setattr(target, name, getattr(material, name))
-
-
-def get_material(source: "PHYSGEN_PG_material") -> Material:
-    """The matter as the simulation takes it. Raises InputError for a number out of range."""
-    values = {name: _number(getattr(source, name)) for name in NUMBERS if name != "fibre_axis"}
-    values["fibre_axis"] = tuple(_number(number) for number in source.fibre_axis)
-    return Material(preset=source.preset, **values)
-
-
-def _number(value: float | str) -> float | str:
-    """Blender keeps 32 bits: 0.4 comes back as 0.4000000059604645."""
-    return float(f"{value:.7g}") if isinstance(value, float) else value
-
-
-class PHYSGEN_PG_material(bpy.types.PropertyGroup):
-    """What an object is made of."""
-
-    preset: EnumProperty(
-        name="Material",
-        description="Where the numbers come from",
-        items=_preset_items(),
-        default="medium",
-        update=_on_preset,
-    )
-    law: EnumProperty(name="Behaviour", description="How the matter responds", items=LAW_ITEMS)
-    density: FloatProperty(
-        name="Density",
-        description="Mass per volume in kg/m³: water 1000, wood 500, steel 7800",
-        default=1000.0,
-        min=1e-3,
-        max=3e4,
-        soft_min=10.0,
-        soft_max=8000.0,
-        precision=1,
-    )
-    youngs_modulus: FloatProperty(
-        name="Young's Modulus",
-        description="Stiffness in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
-        default=5e5,
-        min=1e2,
-        max=1e12,
-        soft_max=1e8,
-        precision=0,
-    )
-    poisson_ratio: FloatProperty(
-        name="Poisson's Ratio",
-        description="How much it bulges sideways when pressed: cork 0, most things 0.3, rubber 0.45",
-        default=0.3,
-        min=0.0,
-        max=0.49,
-        precision=3,
-    )
-    damping_time: FloatProperty(
-        name="Damping",
-        description="How fast vibrations die away, in seconds: viscosity over stiffness (Kelvin-Voigt). 0 is none",
-        min=0.0,
-        max=10.0,
-        soft_max=0.1,
-        precision=4,
-        unit="TIME_ABSOLUTE",
-    )
-    yield_stress: FloatProperty(
-        name="Yield Stress",
-        description="Tension in Pa above which it keeps its new shape",
-        default=1e4,
-        min=1.0,
-        max=1e12,
-        soft_max=1e8,
-        precision=0,
-    )
-    friction_angle: FloatProperty(
-        name="Friction Angle",
-        description="Of the grains on each other; a heap stays about as steep as this",
-        default=0.6,
-        min=0.01,
-        max=1.4,
-        subtype="ANGLE",
-    )
-    critical_compression: FloatProperty(
-        name="Critical Compression",
-        description="Strain that snow bears before it packs for good",
-        default=0.025,
-        min=1e-4,
-        max=0.5,
-        precision=4,
-    )
-    critical_stretch: FloatProperty(
-        name="Critical Stretch",
-        description="Strain that snow bears before it tears",
-        default=0.0075,
-        min=1e-4,
-        max=0.5,
-        precision=4,
-    )
-    hardening: FloatProperty(
-        name="Hardening", description="How much stiffer packed snow becomes", default=10.0, min=0.0, max=30.0
-    )
-    bulk_modulus: FloatProperty(
-        name="Bulk Modulus",
-        description="Resistance of a fluid to compression in Pa. Real water has 2.2e9; 2e5 is enough here, and faster",
-        default=2e5,
-        min=10.0,
-        max=1e12,
-        soft_max=1e7,
-        precision=0,
-    )
-    viscosity: FloatProperty(
-        name="Viscosity",
-        description="Thickness of a fluid in Pa s: water 0.001, honey 10",
-        min=0.0,
-        max=1e5,
-        soft_max=100.0,
-        precision=3,
-    )
-    fibre_modulus: FloatProperty(
-        name="Fibre Modulus",
-        description="Stiffness in Pa that fibres add along their axis; 0 for none",
-        min=0.0,
-        max=1e12,
-        soft_max=1e8,
-        precision=0,
-    )
-    fibre_axis: FloatVectorProperty(
-        name="Fibre Axis", description="Direction of the fibres at rest", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
-    )
+def _is_empty(self: "PHYSGEN_PG_pin", item: bpy.types.Object) -> bool:
+    return item.type == "EMPTY"
 
 
 class PHYSGEN_PG_pin(bpy.types.PropertyGroup):
@@ -200,7 +38,24 @@ class PHYSGEN_PG_pin(bpy.types.PropertyGroup):
             "Animate the empty to move what it holds"
         ),
         type=bpy.types.Object,
+        poll=_is_empty,
     )
+
+
+def _on_friction(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
+    # Only upwards and only from here, so that the two can be set in any order.
+    if self.static_friction < self.friction:
+        self.static_friction = self.friction
+
+
+def _get_speed(self: "PHYSGEN_PG_body") -> float:
+    return Vector(self.velocity).length
+
+
+def _set_speed(self: "PHYSGEN_PG_body", speed: float) -> None:
+    velocity = Vector(self.velocity)
+    direction = velocity.normalized() if velocity.length > 0 else Vector((1.0, 0.0, 0.0))
+    self.velocity = direction * speed
 
 
 class PHYSGEN_PG_body(bpy.types.PropertyGroup):
@@ -243,6 +98,7 @@ class PHYSGEN_PG_body(bpy.types.PropertyGroup):
         min=0.0,
         max=10.0,
         soft_max=1.5,
+        update=_on_friction,
     )
     static_friction: FloatProperty(
         name="Static Friction",
@@ -276,6 +132,16 @@ class PHYSGEN_PG_body(bpy.types.PropertyGroup):
         unit="VELOCITY",
         soft_min=-10.0,
         soft_max=10.0,
+    )
+    speed: FloatProperty(
+        name="Speed",
+        description="Length of the velocity; its direction stays. At rest: along X",
+        min=0.0,
+        max=1e4,
+        soft_max=10.0,
+        unit="VELOCITY",
+        get=_get_speed,
+        set=_set_speed,
     )
     spin: FloatVectorProperty(
         name="Spin",
@@ -322,7 +188,11 @@ def unregister() -> None:
     del bpy.types.Object.physgen
 
 
+def is_body(item: bpy.types.Object | None) -> bool:
+    """Whether ``item`` takes part in the simulation."""
+    return item is not None and item.type == "MESH" and item.physgen.enabled
+
+
 def bodies(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The objects of ``scene`` that take part, in the order of their names."""
-    found = [item for item in scene.objects if item.type == "MESH" and item.physgen.enabled]
-    return sorted(found, key=lambda item: item.name)
+    return sorted(filter(is_body, scene.objects), key=lambda item: item.name)

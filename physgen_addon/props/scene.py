@@ -4,6 +4,8 @@
 Blender reads the classes' annotations as properties, so they must not be postponed to strings.
 """
 
+import math
+
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -16,7 +18,8 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...sim.effects.registry import effect, effects
+from ...sim.effects.registry import Parameter, effect, effects
+from .body import is_body
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -36,10 +39,61 @@ def _on_effect(self: "PHYSGEN_PG_effect_entry", context: bpy.types.Context) -> N
         item.name, item.value = parameter.name, parameter.default
 
 
-class PHYSGEN_PG_number(bpy.types.PropertyGroup):
-    """A parameter of an effect; ``name`` is the registry's, which knows its unit and range."""
+def parameter_of(number: "PHYSGEN_PG_number") -> Parameter | None:
+    """What the registry says of ``number``; None while it has no name, or one of an older registry."""
+    # A property group does not know its owner, but where it is.
+    owner = number.id_data.path_resolve(number.path_from_id().rpartition(".parameters")[0])
+    return next((p for p in effect(owner.effect).parameters if p.name == number.name), None)
 
-    value: FloatProperty(name="Value", precision=4)
+
+def _clamped(value: float, parameter: Parameter) -> float:
+    value = min(max(value, parameter.low), parameter.high)
+    return float(round(value)) if parameter.whole else value
+
+
+def _on_number(self: "PHYSGEN_PG_number", context: bpy.types.Context) -> None:
+    parameter = parameter_of(self)
+    if parameter is None:
+        return
+    value = _clamped(self.value, parameter)
+    # Blender keeps 32 bits, in which a bound may lie just beyond itself.
+    if not math.isclose(value, self.value, rel_tol=1e-6, abs_tol=1e-9):
+        self.value = value
+
+
+def _get_value(self: "PHYSGEN_PG_number") -> float:
+    return self.value
+
+
+def _set_value(self: "PHYSGEN_PG_number", value: float) -> None:
+    self.value = value
+
+
+def _get_switch(self: "PHYSGEN_PG_number") -> bool:
+    return self.value >= 0.5
+
+
+class PHYSGEN_PG_number(bpy.types.PropertyGroup):
+    """A parameter of an effect; ``name`` is the registry's, which knows its unit and range.
+
+    ``value`` is what is kept, in the registry's unit; the others show the same as an angle and as yes or no.
+    """
+
+    value: FloatProperty(name="Value", description="Kept within the effect's range", precision=4, update=_on_number)
+    angle: FloatProperty(
+        name="Angle",
+        description="Kept within the effect's range",
+        subtype="ANGLE",
+        get=_get_value,
+        set=_set_value,
+    )
+    switch: BoolProperty(name="On", get=_get_switch, set=_set_value)
+
+
+def effect_values(entry: "PHYSGEN_PG_effect_entry") -> dict[str, float]:
+    """The parameters of ``entry`` as the registry takes them: complete, in range, 0.4 as 0.4."""
+    given = {number.name: float(f"{number.value:.7g}") for number in entry.parameters}
+    return {p.name: _clamped(given.get(p.name, p.default), p) for p in effect(entry.effect).parameters}
 
 
 class PHYSGEN_PG_target(bpy.types.PropertyGroup):
@@ -56,6 +110,12 @@ class PHYSGEN_PG_effect_entry(bpy.types.PropertyGroup):
     parameters: CollectionProperty(type=PHYSGEN_PG_number)
     targets: CollectionProperty(type=PHYSGEN_PG_target)
     """Empty: all that it can act on."""
+
+
+def _on_friction(self: "PHYSGEN_PG_world", context: bpy.types.Context) -> None:
+    # Only upwards and only from here, so that the two can be set in any order.
+    if self.static_friction < self.friction:
+        self.static_friction = self.friction
 
 
 class PHYSGEN_PG_world(bpy.types.PropertyGroup):
@@ -80,6 +140,7 @@ class PHYSGEN_PG_world(bpy.types.PropertyGroup):
         min=0.0,
         max=10.0,
         soft_max=1.5,
+        update=_on_friction,
     )
     static_friction: FloatProperty(
         name="Static Friction",
@@ -160,6 +221,28 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         default="//physgen_render",
         options=RELATIVE,
     )
+    result: StringProperty(name="Result", description="What was rendered last", subtype="FILE_PATH", options=RELATIVE)
+
+
+def _get_body_index(self: "PHYSGEN_PG_scene") -> int:
+    """Nothing of its own is kept, so that list and viewport cannot come apart."""
+    scene, layer = self.id_data, getattr(bpy.context, "view_layer", None)
+    active = layer.objects.active if layer is not None and bpy.context.scene == scene else None
+    return scene.objects.find(active.name) if is_body(active) else -1
+
+
+def _set_body_index(self: "PHYSGEN_PG_scene", index: int) -> None:
+    scene, layer = self.id_data, getattr(bpy.context, "view_layer", None)
+    if layer is None or bpy.context.scene != scene or not 0 <= index < len(scene.objects):
+        return
+    item = scene.objects[index]
+    # What is in an excluded collection cannot be selected.
+    if layer.objects.get(item.name) != item or bpy.context.mode != "OBJECT":
+        return
+    for other in layer.objects.selected:
+        other.select_set(False)
+    item.select_set(True)
+    layer.objects.active = item
 
 
 class PHYSGEN_PG_scene(bpy.types.PropertyGroup):
@@ -173,7 +256,10 @@ class PHYSGEN_PG_scene(bpy.types.PropertyGroup):
     )
     photo_root: PointerProperty(type=bpy.types.Collection)
     """Collection of what was imported with the photo."""
-    body_index: IntProperty(name="Object", description="The chosen object")
+    body_index: IntProperty(
+        name="Object", description="The chosen object, active in the viewport", get=_get_body_index, set=_set_body_index
+    )
+    """Place in ``Scene.objects`` of the active object; -1 when that is none that takes part."""
     world: PointerProperty(type=PHYSGEN_PG_world)
     simulation: PointerProperty(type=PHYSGEN_PG_simulation)
     rendering: PointerProperty(type=PHYSGEN_PG_rendering)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render: into the photo, or as any scene of Blender; and the ways out to other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..jobs import draw_job, running
+from ..operators.render import PHYSGEN_OT_render_still, PHYSGEN_OT_render_video, missing_modules
+from . import text
+from .sidebar import RENDER, Sidebar, button, exists
+
+OUT = ("physgen.export_alembic", "physgen.export_usd", "physgen.make_independent")
+
+
+class PHYSGEN_PT_render(Sidebar, bpy.types.Panel):
+    """Pictures of it"""
+
+    bl_idname = "PHYSGEN_PT_render"
+    bl_label = "Render"
+    bl_order = RENDER
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Settings and buttons, of the photo's renderer or Blender's own."""
+        column = self.layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        if context.scene.physgen.folder:
+            _draw_photo_render(column, context)
+        else:
+            _draw_own_render(column, context)
+
+
+def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    state = context.scene.physgen
+    rendering = state.rendering
+    under_way = running()
+    choices = layout.column()
+    choices.enabled = under_way is None
+    choices.prop(rendering, "engine")
+    choices.prop(rendering, "samples")
+    if not rendering.samples:
+        text.sentences(choices, context, "Samples 0: as many as the engine thinks right.")
+    choices.prop(rendering, "scale")
+    choices.prop(rendering, "output")
+    if rendering.output.startswith("//") and not bpy.data.filepath:
+        words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
+        text.sentences(layout, context, words, icon="INFO")
+    lacking = missing_modules()
+    if lacking:
+        words = f"Blender's Python lacks {', '.join(lacking)}: install PhysGen from the zip for your system."
+        text.sentences(layout, context, words, icon="ERROR")
+    if under_way is not None and under_way.title == "Render":
+        draw_job(layout)
+    elif under_way is not None:
+        text.sentences(layout, context, f"{under_way.title} is running; render when it is done.", icon="INFO")
+    elif not state.simulation.bake:
+        text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = not lacking
+    row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
+    row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
+    _draw_result(layout, context, rendering)
+
+
+def _draw_result(layout: bpy.types.UILayout, context: bpy.types.Context, rendering: Any) -> None:
+    if not rendering.result:
+        return
+    path = Path(bpy.path.abspath(rendering.result))
+    if not path.is_file():
+        return
+    row = layout.row(align=True)
+    row.label(text=path.name, icon="CHECKMARK")
+    row.operator("wm.path_open", text="Open").filepath = str(path)
+    row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
+
+
+def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    scene = context.scene
+    text.sentences(layout, context, "No photo: rendered as any scene of Blender, with its own settings.")
+    layout.prop(scene.render, "engine")
+    layout.prop(scene.render, "resolution_percentage", text="Size")
+    layout.prop(scene.render, "filepath", text="Output")
+    layout.prop(scene.render, "use_motion_blur")
+    if scene.camera is None:
+        text.sentences(layout, context, "The scene has no camera: add one (Shift A).", icon="ERROR")
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = scene.camera is not None
+    row.operator("render.render", text="Render Still", icon="RENDER_STILL").use_viewport = True
+    video = row.operator("render.render", text="Render Video", icon="RENDER_ANIMATION")
+    video.animation, video.use_viewport = True, True
+
+
+class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
+    """The motion for other programs, and for people without PhysGen"""
+
+    bl_parent_id = "PHYSGEN_PT_render"
+    bl_label = "Export"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a way out in this build."""
+        return any(exists(operator) for operator in OUT)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """A button each."""
+        layout = self.layout
+        if not context.scene.physgen.simulation.bake:
+            text.sentences(layout, context, "Bake first (see Simulate); then the motion can go elsewhere.", icon="INFO")
+        row = layout.row(align=True)
+        button(row, OUT[0], text="Alembic", icon="EXPORT")
+        button(row, OUT[1], text="USD", icon="EXPORT")
+        button(layout, OUT[2], text="Make Independent", icon="UNLINKED")
+        text.sentences(layout, context, "Independent: the file plays and renders without PhysGen.")
+
+
+CLASSES = (PHYSGEN_PT_render, PHYSGEN_PT_out)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scene: where to begin, and where this scene comes from."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import bpy
+
+from ..operators.body import PHYSGEN_OT_add_bodies
+from ..props.body import bodies
+from . import text
+from .sidebar import SCENE, Sidebar, button
+
+if importlib.util.find_spec(f"{__package__}.photo") is None:
+    photo = None
+else:
+    from . import photo
+
+
+class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
+    """Where the scene comes from"""
+
+    bl_idname = "PHYSGEN_PT_scene"
+    bl_label = "Scene"
+    bl_order = SCENE
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Three ways to begin; later the folder of the scene."""
+        layout, state = self.layout, context.scene.physgen
+        if state.folder:
+            _draw_folder(layout, context, state)
+            return
+        if photo is not None and context.scene.physgen_photo.image is not None:
+            photo.draw_photo(layout, context)
+            return
+        count = len(bodies(context.scene))
+        if count == 0:
+            _draw_beginning(layout, context)
+            return
+        what = "1 object" if count == 1 else f"{count} objects"
+        text.sentences(layout, context, f"{what} in the simulation, without a photo.", icon="CHECKMARK")
+        row = layout.row(align=True)
+        button(row, "physgen.open_photo", text="Open Photo", icon="IMAGE_DATA")
+        button(row, "physgen.import_scene", text="Import", icon="IMPORT")
+
+
+def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    text.sentences(layout, context, "Three ways to begin:")
+    for title, operator, label, icon in (
+        ("A photo: draw a box around each object in it", "physgen.open_photo", "Open Photo", "IMAGE_DATA"),
+        ("A scene folder that was made before", "physgen.import_scene", "Import Scene Folder", "IMPORT"),
+        ("The meshes that are selected", PHYSGEN_OT_add_bodies.bl_idname, "Simulate Selected", "MESH_MONKEY"),
+    ):
+        box = layout.box()
+        text.sentences(box, context, title)
+        row = box.row()
+        row.scale_y = 1.3
+        if button(row, operator, text=label, icon=icon) is None:
+            row.label(text="Not in this build")
+
+
+def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
+    folder = Path(bpy.path.abspath(state.folder))
+    row = layout.row(align=True)
+    row.prop(state, "folder", text="")
+    there = folder.is_dir()
+    if there:
+        row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
+    else:
+        row.alert = True
+        text.sentences(
+            layout, context, "This folder is not there: choose where it is now, or import it again.", icon="ERROR"
+        )
+    count = len(bodies(context.scene))
+    what = "1 object" if count == 1 else f"{count} objects"
+    text.sentences(layout, context, f"{what} in the simulation.")
+    row = layout.row(align=True)
+    row.operator("view3d.view_camera", text="Look Through Camera", icon="VIEW_CAMERA")
+    if state.photo_root is not None:
+        row.prop(state.photo_root, "hide_viewport", text="")
+    button(layout, "physgen.import_scene", text="Import Another", icon="IMPORT")
+
+
+CLASSES = (PHYSGEN_PT_scene,)

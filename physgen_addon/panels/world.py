@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""World: gravity, ground, colliders, and the effects that act besides."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import bpy
+
+from ...sim.effects.registry import KINDS, Parameter, effect, effects
+from ..operators.body import PHYSGEN_OT_add_colliders, PHYSGEN_OT_remove_body
+from ..operators.effect_stack import (
+    STACK_ITEMS,
+    PHYSGEN_OT_add_effect_targets,
+    PHYSGEN_OT_add_stack_effect,
+    PHYSGEN_OT_explain_effect,
+    PHYSGEN_OT_move_stack_effect,
+    PHYSGEN_OT_remove_effect_target,
+    PHYSGEN_OT_remove_stack_effect,
+    chosen_effect,
+)
+from ..operators.world import PHYSGEN_OT_ground_below
+from ..props.body import bodies, is_body
+from ..props.report import readable
+from . import text
+from .sidebar import WORLD, Sidebar, is_in, settings
+
+KIND_ICONS = {"force": "FORCE_WIND", "contact": "MOD_PHYSICS", "material": "MATERIAL", "mass": "PIVOT_CURSOR"}
+
+
+class PHYSGEN_PT_world(Sidebar, bpy.types.Panel):
+    """What acts on all objects"""
+
+    bl_idname = "PHYSGEN_PT_world"
+    bl_label = "World"
+    bl_order = WORLD
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Gravity, which is the scene's own."""
+        scene = context.scene
+        column = settings(self.layout, context, why=True)
+        column.prop(scene, "use_gravity", text="Use Gravity")
+        vector = column.column()
+        vector.active = scene.use_gravity
+        vector.prop(scene, "gravity", text="Gravity")
+
+
+class _Part(Sidebar):
+    bl_parent_id = "PHYSGEN_PT_world"
+
+
+class PHYSGEN_PT_ground(_Part, bpy.types.Panel):
+    """A floor without end"""
+
+    bl_label = "Ground"
+    bl_order = 0
+
+    def draw_header(self, context: bpy.types.Context) -> None:
+        """On or off."""
+        row = settings(self.layout, context)
+        row.use_property_split = False
+        row.prop(context.scene.physgen.world, "use_ground", text="")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Where it is and how it rubs."""
+        world = context.scene.physgen.world
+        column = settings(self.layout, context)
+        column.active = world.use_ground
+        column.prop(world, "ground_object", text="Plane")
+        if world.ground_object is None:
+            column.prop(world, "ground_point")
+            column.prop(world, "ground_normal")
+            column.operator(PHYSGEN_OT_ground_below.bl_idname, icon="TRIA_DOWN_BAR")
+        elif not is_in(world.ground_object, context.scene):
+            text.sentences(column, context, "The plane is deleted: choose another, or clear the field.", icon="ERROR")
+        column.prop(world, "friction")
+        column.prop(world, "static_friction")
+        if world.static_friction < world.friction:
+            words = f"Static friction counts as {world.friction:.3g}: it is never below the sliding one."
+            text.sentences(column, context, words, icon="INFO")
+        column.prop(world, "restitution")
+
+
+class PHYSGEN_PT_colliders(_Part, bpy.types.Panel):
+    """What others hit and what yields to nobody"""
+
+    bl_label = "Colliders"
+    bl_order = 1
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Each with a button that takes it out; add what is selected."""
+        column = settings(self.layout, context)
+        found = [item for item in bodies(context.scene) if item.physgen.role == "collider"]
+        if not found:
+            text.sentences(column, context, "Walls, tables, hands: objects that others hit.")
+        names = column.column(align=True)
+        for item in found:
+            row = names.row(align=True)
+            row.label(text=item.name, icon="MOD_PHYSICS")
+            row.operator(PHYSGEN_OT_remove_body.bl_idname, text="", icon="X", emboss=False).name = item.name
+        column.operator(PHYSGEN_OT_add_colliders.bl_idname, icon="ADD")
+
+
+class PHYSGEN_UL_effect_stack(bpy.types.UIList):
+    """The effects, in the order in which they act."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Name, on how many objects, on or off."""
+        row = layout.row()
+        row.active = item.enabled
+        row.label(text=readable(item.effect), icon=KIND_ICONS[effect(item.effect).kind])
+        if item.targets:
+            row.label(text=f"{len(item.targets)} obj.")
+        row.prop(item, "enabled", text="")
+
+
+class PHYSGEN_MT_add_effect(bpy.types.Menu):
+    """All effects, by kind"""
+
+    bl_label = "Add Effect"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """One heading a kind."""
+        names = {name for name, _, _ in STACK_ITEMS}
+        for kind in KINDS:
+            of_kind = [name for name, item in effects().items() if item.kind == kind and name in names]
+            if not of_kind:
+                continue
+            if kind != KINDS[0]:
+                self.layout.separator()
+            self.layout.label(text=kind.capitalize(), icon=KIND_ICONS[kind])
+            for name in of_kind:
+                self.layout.operator(PHYSGEN_OT_add_stack_effect.bl_idname, text=readable(name)).effect = name
+
+
+class PHYSGEN_PT_effects(_Part, bpy.types.Panel):
+    """What acts besides gravity and contact"""
+
+    bl_label = "Effects"
+    bl_order = 2
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """The stack; parameters and objects of the chosen one."""
+        column, world = settings(self.layout, context), context.scene.physgen.world
+        if not world.effects:
+            text.sentences(column, context, "What acts besides gravity and contact: wind, a tether, stickiness.")
+            column.menu("PHYSGEN_MT_add_effect", icon="ADD")
+            return
+        row = column.row()
+        row.template_list("PHYSGEN_UL_effect_stack", "", world, "effects", world, "effect_index", rows=4)
+        side = row.column(align=True)
+        side.menu("PHYSGEN_MT_add_effect", text="", icon="ADD")
+        side.operator(PHYSGEN_OT_remove_stack_effect.bl_idname, text="", icon="REMOVE")
+        side.separator()
+        side.operator(PHYSGEN_OT_move_stack_effect.bl_idname, text="", icon="TRIA_UP").direction = "UP"
+        side.operator(PHYSGEN_OT_move_stack_effect.bl_idname, text="", icon="TRIA_DOWN").direction = "DOWN"
+        entry = chosen_effect(context.scene)
+        if entry is not None:
+            _draw_entry(column, context, entry)
+
+
+def _draw_entry(layout: bpy.types.UILayout, context: bpy.types.Context, entry: Any) -> None:
+    item = effect(entry.effect)
+    box = layout.box().column()
+    box.active = entry.enabled
+    row = box.row()
+    row.label(text=readable(item.name))
+    row.operator(PHYSGEN_OT_explain_effect.bl_idname, text="", icon="QUESTION", emboss=False).effect = item.name
+    text.sentences(box, context, item.summary)
+    known = {parameter.name: parameter for parameter in item.parameters}
+    lines = [(known[number.name], number) for number in entry.parameters if number.name in known]
+    # The three numbers of a vector stand together, as Blender's own do.
+    for _, group in itertools.groupby(lines, key=lambda line: _stem(line[0].name)):
+        column = box.column(align=True)
+        for index, (parameter, number) in enumerate(group):
+            _draw_parameter(column, item.name, parameter, number, first=index == 0)
+    if item.name == "sandy":
+        start = next(number.value for parameter, number in lines if parameter.name == "start")
+        simulation, render = context.scene.physgen.simulation, context.scene.render
+        frame = simulation.frame_start + start * render.fps / render.fps_base
+        text.sentences(box, context, f"That is frame {frame:.0f}.")
+    _draw_targets(box, context, entry, of_world=item.of_world)
+
+
+def _stem(name: str) -> str:
+    stem, _, axis = name.rpartition("_")
+    return stem if axis in ("x", "y", "z") else name
+
+
+def _draw_parameter(layout: bpy.types.UILayout, name: str, parameter: Parameter, number: Any, *, first: bool) -> None:
+    stem = _stem(parameter.name)
+    title = readable(stem).replace(" per mass", " / mass")
+    if stem != parameter.name:
+        title = f"{title} {parameter.name[-1].upper()}" if first else parameter.name[-1].upper()
+    row = layout.row(align=True)
+    if parameter.whole and (parameter.low, parameter.high) == (0.0, 1.0):
+        row.prop(number, "switch", text=title)
+    elif parameter.unit == "rad":
+        row.prop(number, "angle", text=title)
+    else:
+        row.prop(number, "value", text=title)
+    words = row.row()
+    words.ui_units_x = 2.4
+    words.active = False
+    words.label(text="" if parameter.unit in ("1", "rad") else parameter.unit)
+    info = row.operator(PHYSGEN_OT_explain_effect.bl_idname, text="", icon="INFO", emboss=False)
+    info.effect, info.parameter = name, parameter.name
+
+
+def _draw_targets(layout: bpy.types.UILayout, context: bpy.types.Context, entry: Any, *, of_world: bool) -> None:
+    if of_world:
+        text.sentences(layout, context, "Acts on the whole world.")
+        return
+    if not entry.targets:
+        text.sentences(layout, context, "Acts on all objects that it can act on.")
+    names = layout.column(align=True)
+    for index, target in enumerate(entry.targets):
+        item = target.item
+        good = is_body(item) and item.physgen.role == "dynamic" and is_in(item, context.scene)
+        row = names.row(align=True)
+        row.alert = not good
+        row.label(text=item.name if item is not None else "Deleted", icon="OBJECT_DATA" if good else "ERROR")
+        row.operator(PHYSGEN_OT_remove_effect_target.bl_idname, text="", icon="X", emboss=False).index = index
+        if not good:
+            text.sentences(names, context, "It does not move in the simulation: remove it here, or add it there.")
+    layout.operator(PHYSGEN_OT_add_effect_targets.bl_idname, icon="RESTRICT_SELECT_OFF")
+
+
+CLASSES = (
+    PHYSGEN_UL_effect_stack,
+    PHYSGEN_MT_add_effect,
+    PHYSGEN_PT_world,
+    PHYSGEN_PT_ground,
+    PHYSGEN_PT_colliders,
+    PHYSGEN_PT_effects,
+)

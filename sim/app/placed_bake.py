@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""A bake of a scene that Blender wrote, as a bake of the photo's scene that was imported there.
+
+Blender bakes what stands in it: meshes in their own space, under the names they have there. The render stage takes the
+scene folder of the photo and world metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..cache.manifest import MESH_SPACE, WORLD_SPACE, BakedObject, BakeManifest, load_manifest, save_manifest
+from ..cache.pc2 import Pc2Reader, Pc2Writer
+from ..errors import InputError
+from ..events import OnEvent, ignore
+from ..scene.folder import SceneFolder, load_scene
+from ..scene.meshes import load_object_mesh
+from ..scene.model import SceneObject
+from .bake_inputs import geometry_hash
+
+MOVED = 0.01
+"""Of an object's size: what stands farther from its place in the photo is said to have been moved."""
+
+
+def place_bake(
+    photo: Path, baked_scene: Path, bake: Path, out: Path, names: Mapping[str, str], on_event: OnEvent = ignore
+) -> BakeManifest:
+    """Write ``bake`` of the scene folder ``baked_scene`` into ``out`` as one of the scene folder ``photo``.
+
+    names: by name in ``photo``, the object's name in ``baked_scene``; those left out stay where the photo shows them.
+    out: a folder that does not exist yet.
+
+    Raises InputError when the bake is of another scene than ``baked_scene`` is now, lacks an object, or an object has
+    other vertices than in the photo's scene.
+    """
+    target, source, manifest = load_scene(photo), load_scene(baked_scene), load_manifest(bake)
+    if manifest.geometry_hash and manifest.geometry_hash != geometry_hash(source):
+        raise InputError(f"{bake}: was baked from other meshes or places than there are now; bake the scene again")
+    files = {item.name: item for item in manifest.objects}
+    bodies = {item.name: item for item in source.scene.objects}
+    out.mkdir(parents=True)
+    placed = []
+    for item in target.scene.objects:
+        name = names.get(item.name)
+        if name is not None and (name not in files or name not in bodies):
+            raise InputError(f"{bake}: holds no cache of object {name!r}; bake the scene again")
+        cache = None if name is None else (Pc2Reader(bake / files[name].file), files[name], bodies[name])
+        placed.append(_place(target, item, cache, manifest.frames_done, out, on_event))
+    result = dataclasses.replace(manifest, objects=tuple(placed), geometry_hash=geometry_hash(target))
+    save_manifest(out, result)
+    return result
+
+
+def _place(
+    folder: SceneFolder,
+    item: SceneObject,
+    cache: tuple[Pc2Reader, BakedObject, SceneObject] | None,
+    samples: int,
+    out: Path,
+    on_event: OnEvent,
+) -> BakedObject:
+    rest = load_object_mesh(folder, item).vertices
+    result = BakedObject(name=item.name, file=f"{item.name}.pc2", vertices=len(rest), space=WORLD_SPACE)
+    with Pc2Writer(out / result.file, vertex_count=len(rest)) as writer:
+        if cache is None:
+            for _ in range(samples):
+                writer.append(rest)
+            return result
+        reader, baked, body = cache
+        if reader.vertex_count != len(rest):
+            raise InputError(
+                f"object {item.name!r}: its mesh has {reader.vertex_count} vertices and had {len(rest)} in the photo's "
+                "scene, whose picture it wears: undo the change of the mesh and bake again"
+            )
+        matrix = np.asarray(body.world_from_mesh) if baked.space == MESH_SPACE else np.eye(4)
+        for index in range(samples):
+            world = reader.sample(index).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+            writer.append(world)
+            if index == 0 and np.abs(world - rest).max() > MOVED * item.size_m:
+                message = f"{item.name} does not begin where the photo shows it; frames differ from the photo there"
+                on_event({"event": "notice", "stage": "render", "message": message})
+    return result
