@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..sim.app import preview
 from ..sim.app.bake_estimate import estimate_bake
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics, with_physics
@@ -145,6 +146,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_physics(bake)
     _add_bake(bake)
 
+    previews = command("preview", _preview, "coarse runs as they are asked for on standard input (docs/cli.md)")
+    previews.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs")
+
     render = command("render", _render, "scene and bake → frames, video")
     render.add_argument("scene", type=Path, metavar="SCENE")
     render.add_argument("--bake", type=Path, required=True, metavar="BAKE")
@@ -265,6 +269,10 @@ def _estimate(options: argparse.Namespace, terminal: Terminal) -> int:
     terminal.line(cost_text(prepared))
     prepared.require_affordable()
     return 0
+
+
+def _preview(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    return preview.serve(options.out, cancelled)
 
 
 def _render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""The warm worker of the live preview: requests as JSON lines on standard input, events on standard output.
+
+It keeps compiled kernels, meshes and what was worked out of them, so that only the first run of a scene is slow. Only
+the newest request counts: whatever runs is dropped when another one comes. It ends when its input is closed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+from ..errors import Cancelled, InputError, PhysGenError, SimulationError
+from ..events import Event, IsCancelled, OnEvent, never
+from .preview_request import PreviewRequest, parse_request, read_line, request_id
+
+LAST_GRACE_S = 5.0
+"""How long a run may still take to notice that nobody waits for it any more, before the process ends itself."""
+
+PARENT_CHECK_S = 0.5
+
+
+class _Inbox:
+    """The newest request, as a thread reads them."""
+
+    def __init__(self, stream: BinaryIO, on_event: OnEvent) -> None:
+        self._stream, self._on_event = stream, on_event
+        self._news = threading.Condition()
+        self._newest: PreviewRequest | None = None
+        self._stop_running = False
+        self._closed = self._ended = False
+        self._reader = threading.Thread(target=self._read, daemon=True)
+
+    def start(self, cancelled: IsCancelled) -> None:
+        """Begin to read; ``cancelled`` ends it as the end of the stream does."""
+        self._reader.start()
+        threading.Thread(target=self._watch, args=(os.getppid(), cancelled), daemon=True).start()
+
+    @property
+    def reading(self) -> bool:
+        """Whether the thread still waits for input."""
+        return not self._ended
+
+    def next(self) -> PreviewRequest | None:
+        """Wait for a request and take it; None when no more will come."""
+        with self._news:
+            while self._newest is None and not self._closed:
+                self._news.wait()
+            request, self._newest = self._newest, None
+            self._stop_running = False
+            return None if self._closed else request
+
+    def superseded(self) -> bool:
+        """Whether the request that was taken last is of no interest any more."""
+        return self._stop_running or self._closed
+
+    def _read(self) -> None:
+        while True:
+            line = b""
+            try:
+                found = read_line(self._stream)
+                if found is None:
+                    break
+                line = found
+                if not line.strip():
+                    continue
+                request = parse_request(line)
+            except PhysGenError as error:
+                self._on_event(_failure(request_id(line), error))
+                continue
+            except (OSError, ValueError):
+                break
+            with self._news:
+                self._newest, self._stop_running = request, True
+                self._news.notify()
+        self._ended = True
+        self._close()
+
+    def _watch(self, parent: int, cancelled: IsCancelled) -> None:
+        while os.getppid() == parent and not cancelled():
+            time.sleep(PARENT_CHECK_S)
+        self._close()
+
+    def _close(self) -> None:
+        with self._news:
+            self._closed = True
+            self._news.notify()
+        # A kernel that is being compiled cannot be asked to stop.
+        threading.Thread(target=_end_at_last, daemon=True).start()
+
+
+def _end_at_last() -> None:
+    time.sleep(LAST_GRACE_S)
+    os._exit(Cancelled.exit_code)
+
+
+def _failure(number: int | None, error: PhysGenError) -> Event:
+    return {"event": "error", "id": number, "kind": type(error).__name__, "message": str(error)}
+
+
+def serve(out: Path, cancelled: IsCancelled = never) -> int:
+    """Answer requests from standard input until it is closed or ``cancelled()``; the exit code.
+
+    Runs go to folders ``out/run-NUMBER``; all but the newest are removed again, that one too at the end. Every event
+    carries the ``id`` of its request (docs/file-formats.md). Raises InputError when ``out`` cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: {error.strerror or error}; choose another folder") from error
+    # Libraries print to standard output; events get a descriptor of their own.
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+    writing = threading.Lock()
+
+    def emit(event: Event) -> None:
+        try:
+            with writing:
+                events.write(json.dumps(event, ensure_ascii=False) + "\n")
+        except OSError:
+            # The asker is gone; its end of the input closes as well, and that ends the process.
+            return
+
+    inbox = _Inbox(sys.stdin.buffer, emit)
+    inbox.start(cancelled)
+    # Imported late: Taichi takes a second, in which requests are already read and wrong ones answered.
+    from .preview_run import PreviewRunner
+
+    emit({"event": "ready"})
+    _answer(inbox, PreviewRunner().run, out, emit)
+    if inbox.reading:
+        # Python refuses to end in good order while a thread waits for standard input.
+        os._exit(Cancelled.exit_code)
+    return 0
+
+
+Run = Callable[[PreviewRequest, Path, OnEvent, IsCancelled], None]
+
+
+def _answer(inbox: _Inbox, run: Run, out: Path, emit: OnEvent) -> None:
+    number, previous = 0, None
+    while (request := inbox.next()) is not None:
+        number += 1
+        folder = out / f"run-{number}"
+        shutil.rmtree(folder, ignore_errors=True)
+        current = request.id
+        try:
+            run(request, folder, lambda event, current=current: emit({**event, "id": current}), inbox.superseded)  # type: ignore[misc]
+        except Cancelled:
+            emit({"event": "cancelled", "id": request.id})
+        except PhysGenError as error:
+            emit(_failure(request.id, error))
+        except Exception as error:
+            # The worker outlives whatever a single scene does to it.
+            failure = SimulationError(
+                f"preview: {type(error).__name__}: {error}; change the scene or restart the preview"
+            )
+            emit(_failure(request.id, failure))
+        if previous is not None:
+            shutil.rmtree(previous, ignore_errors=True)
+        previous = folder
+    if previous is not None:
+        shutil.rmtree(previous, ignore_errors=True)
