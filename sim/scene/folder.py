@@ -104,7 +104,7 @@ def save_scene(root: Path, scene: Scene) -> SceneFolder:
 
 def referenced_files(scene: Scene) -> list[str]:
     """Names of all files that ``scene`` needs, photo first."""
-    names = [scene.photo, scene.background]
+    names = [name for name in (scene.photo, scene.background) if name is not None]
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None
         names += [name for name in (item.mesh, item.mask, item.shadow, track) if name is not None]

@@ -218,12 +218,12 @@ class Scene:
 
     camera: Camera
     objects: tuple[SceneObject, ...]
-    ground: Ground = field(default_factory=Ground)
+    ground: Ground | None = field(default_factory=Ground)
     gravity: Vector = (0.0, 0.0, -9.81)
     effects: tuple[Effect, ...] = ()
     light: Light = field(default_factory=Light)
-    photo: str = "photo.png"
-    background: str = "background.png"
+    photo: str | None = "photo.png"
+    background: str | None = "background.png"
     depth: str | None = None
     gravity_track: Keys = ()
     contacts: tuple[Contact, ...] = ()
