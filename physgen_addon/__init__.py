@@ -18,6 +18,9 @@ MODULES = (
     "operators.capture",
     "operators.diagnose",
     "operators.effect",
+    "preview.live",
+    "operators.preview",
+    "gizmos",
     "panels.diagnose",
 )
 """All that Blender must know, in the order in which it must learn it; each has CLASSES, some a ``register`` too."""
