@@ -4,8 +4,9 @@
 Shift keeps the tip at its height, Ctrl moves it up and down. Escape or the right button gives the old value back.
 """
 
+import itertools
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 import numpy as np
@@ -19,7 +20,7 @@ SHOW_ARROWS = "physgen_show_arrows"
 """Name of the switch, a property of the window manager."""
 
 STEM_PIXELS, TIP_PIXELS, GRAB_PIXELS = 1.6, 9.0, 14.0
-ZERO_PIXELS = 6.0
+ZERO_PIXELS = 7.5
 NO_LENGTH_PIXELS = 4.0
 """An arrow shorter than this is drawn as a knob."""
 
@@ -53,11 +54,11 @@ def _knob() -> list[tuple[float, float, float]]:
 
 def _sides() -> list[tuple[tuple[float, float], tuple[float, float]]]:
     ring = [(math.cos(maths.TURN * i / SIDES), math.sin(maths.TURN * i / SIDES)) for i in range(SIDES + 1)]
-    return list(zip(ring, ring[1:], strict=False))
+    return list(itertools.pairwise(ring))
 
 
 def box_of(item: bpy.types.Object) -> tuple[np.ndarray, float, float]:
-    """Of ``item`` in the world: middle (3,) of its bounding box, size (largest extent), height of its highest corner."""
+    """Of ``item`` in the world: middle (3,) of its bounding box, its largest extent, height of its highest corner."""
     corners = np.array([item.matrix_world @ Vector(corner) for corner in item.bound_box])
     low, high = corners.min(axis=0), corners.max(axis=0)
     return 0.5 * (low + high), max(float((high - low).max()), 1e-9), float(high[2])
@@ -67,7 +68,7 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
     """An arrow for a vector property of the active body; its tip can be dragged."""
 
     bl_idname = "PHYSGEN_GT_arrow"
-    __slots__ = ("before", "cone", "cylinder", "grabbed", "grabbed_tip", "knob", "key", "title")
+    __slots__ = ("before", "cone", "cylinder", "grabbed", "grabbed_tip", "key", "knob", "title")
 
     def setup(self) -> None:
         """Shapes, once."""
@@ -128,7 +129,9 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
         if under is not None:
             base, _ = self._arrow(context)
             tip = under + self.grabbed
-            if mode == maths.UPRIGHT:
+            if mode == maths.LEVEL:
+                tip[2] = self.grabbed_tip[2]
+            elif mode == maths.UPRIGHT:
                 tip[:2] = self.grabbed_tip[:2]
             value = (tip - base) / self._length(context, item)
             setattr(item.physgen, self.key, value)
@@ -187,7 +190,7 @@ class PHYSGEN_GGT_arrows(bpy.types.GizmoGroup):
     bl_label = "PhysGen Motion"
     bl_space_type = "VIEW_3D"
     bl_region_type = "WINDOW"
-    bl_options = {"3D", "PERSISTENT", "SHOW_MODAL_ALL"}
+    bl_options: ClassVar[set[str]] = {"3D", "PERSISTENT", "SHOW_MODAL_ALL"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

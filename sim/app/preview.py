@@ -28,10 +28,10 @@ PARENT_CHECK_S = 0.5
 
 
 class _Inbox:
-    """The newest request, as a thread reads them."""
+    """The newest request, as a thread reads them. clean: what is left to do when the process must end itself."""
 
-    def __init__(self, stream: BinaryIO, on_event: OnEvent) -> None:
-        self._stream, self._on_event = stream, on_event
+    def __init__(self, stream: BinaryIO, on_event: OnEvent, clean: Callable[[], None]) -> None:
+        self._stream, self._on_event, self._clean = stream, on_event, clean
         self._news = threading.Condition()
         self._newest: PreviewRequest | None = None
         self._stop_running = False
@@ -93,12 +93,12 @@ class _Inbox:
             self._closed = True
             self._news.notify()
         # A kernel that is being compiled cannot be asked to stop.
-        threading.Thread(target=_end_at_last, daemon=True).start()
+        threading.Thread(target=self._end_at_last, daemon=True).start()
 
-
-def _end_at_last() -> None:
-    time.sleep(LAST_GRACE_S)
-    os._exit(Cancelled.exit_code)
+    def _end_at_last(self) -> None:
+        time.sleep(LAST_GRACE_S)
+        self._clean()
+        os._exit(Cancelled.exit_code)
 
 
 def _failure(number: int | None, error: PhysGenError) -> Event:
@@ -108,7 +108,7 @@ def _failure(number: int | None, error: PhysGenError) -> Event:
 def serve(out: Path, cancelled: IsCancelled = never) -> int:
     """Answer requests from standard input until it is closed or ``cancelled()``; the exit code.
 
-    Runs go to folders ``out/run-NUMBER``; all but the newest are removed again, that one too at the end. Every event
+    Runs go to folders ``out/run-NUMBER``; all but the newest two are removed again, those too at the end. Every event
     carries the ``id`` of its request (docs/file-formats.md). Raises InputError when ``out`` cannot be written.
     """
     try:
@@ -128,43 +128,57 @@ def serve(out: Path, cancelled: IsCancelled = never) -> int:
             # The asker is gone; its end of the input closes as well, and that ends the process.
             return
 
-    inbox = _Inbox(sys.stdin.buffer, emit)
+    runs = _Runs(out)
+    inbox = _Inbox(sys.stdin.buffer, emit, runs.remove)
     inbox.start(cancelled)
     # Imported late: Taichi takes a second, in which requests are already read and wrong ones answered.
     from .preview_run import PreviewRunner
 
     emit({"event": "ready"})
-    _answer(inbox, PreviewRunner().run, out, emit)
+    _answer(inbox, PreviewRunner().run, runs, emit)
+    runs.remove()
     if inbox.reading:
         # Python refuses to end in good order while a thread waits for standard input.
         os._exit(Cancelled.exit_code)
     return 0
 
 
+class _Runs:
+    """The folders of the runs in ``out``: only the newest two exist, the one before in case somebody still reads it."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._count = out, 0
+        self._kept: list[Path] = []
+
+    def new(self) -> Path:
+        """A folder for the next run, not yet made."""
+        self._count += 1
+        folder = self._out / f"run-{self._count}"
+        shutil.rmtree(folder, ignore_errors=True)
+        self._kept.append(folder)
+        while len(self._kept) > 2:
+            shutil.rmtree(self._kept.pop(0), ignore_errors=True)
+        return folder
+
+    def remove(self) -> None:
+        """Remove them all."""
+        while self._kept:
+            shutil.rmtree(self._kept.pop(), ignore_errors=True)
+
+
 Run = Callable[[PreviewRequest, Path, OnEvent, IsCancelled], None]
 
 
-def _answer(inbox: _Inbox, run: Run, out: Path, emit: OnEvent) -> None:
-    number, previous = 0, None
+def _answer(inbox: _Inbox, run: Run, runs: _Runs, emit: OnEvent) -> None:
     while (request := inbox.next()) is not None:
-        number += 1
-        folder = out / f"run-{number}"
-        shutil.rmtree(folder, ignore_errors=True)
-        current = request.id
+        number = request.id
         try:
-            run(request, folder, lambda event, current=current: emit({**event, "id": current}), inbox.superseded)  # type: ignore[misc]
+            run(request, runs.new(), lambda event, number=number: emit({**event, "id": number}), inbox.superseded)  # type: ignore[misc]
         except Cancelled:
-            emit({"event": "cancelled", "id": request.id})
+            emit({"event": "cancelled", "id": number})
         except PhysGenError as error:
-            emit(_failure(request.id, error))
+            emit(_failure(number, error))
         except Exception as error:
             # The worker outlives whatever a single scene does to it.
-            failure = SimulationError(
-                f"preview: {type(error).__name__}: {error}; change the scene or restart the preview"
-            )
-            emit(_failure(request.id, failure))
-        if previous is not None:
-            shutil.rmtree(previous, ignore_errors=True)
-        previous = folder
-    if previous is not None:
-        shutil.rmtree(previous, ignore_errors=True)
+            reason = f"preview: {type(error).__name__}: {error}; change the scene or restart the preview"
+            emit(_failure(number, SimulationError(reason)))
