@@ -136,6 +136,7 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
             value = (tip - base) / self._length(context, item)
             setattr(item.physgen, self.key, value)
             self._say(context, value)
+            _redraw(None, context)
         return {"RUNNING_MODAL"}
 
     def exit(self, context: bpy.types.Context, cancel: bool) -> None:

@@ -62,6 +62,8 @@ class Client:
 
     def join(self, timeout: float) -> bool:
         """Wait for the worker's end, for at most ``timeout`` s; whether it has ended."""
+        if self._thread.ident is None:
+            return True
         self._thread.join(timeout)
         return not self._thread.is_alive()
 

@@ -62,6 +62,9 @@ class Session:
         """Let the worker end; what was written goes with it. Returns at once."""
         self._client.stop()
         self.clip = self._coming = None
+        if self._client.join(0.0):
+            # It was gone before the last export.
+            self._remove_files()
 
     def join(self, timeout: float) -> bool:
         """Wait for the worker's end after ``stop``; whether it has ended within ``timeout`` s."""

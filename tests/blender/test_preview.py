@@ -172,7 +172,9 @@ def test_a_clip_waits_for_the_worker_and_then_begins_again(tmp_path):
     clip.read(10)
     assert [float(sample[0, 0]) for sample in clip.proxies[0].samples] == list(range(10))
     shown = [clip.frame_at(now) for now in np.arange(1.0, 3.0, 0.1)]
-    assert shown[:7] == [3, 4, 5, 6, 7, 8, 9] and shown[10:13] == [9, 0, 1] and max(shown) == 9
+    again = shown.index(0)
+    assert shown[:again] == [3, 4, 5, 6, 7, 8] + [9] * (again - 6) and 9 <= again <= 12
+    assert shown[again:] == list(range(20 - again))
     np.save(tmp_path / "a.faces.npy", np.array([[0, 1, 3]], dtype=np.int32))
     with pytest.raises(InputError, match="damaged"):
         Clip(tmp_path, {"objects": [{"name": "a", "vertices": 3}]}, frames=10, fps=10.0)

@@ -191,11 +191,8 @@ def test_results_are_kept_as_long_as_their_owner():
 
     kept, made = Kept(most=2), []
     owner = Owner()
-
-    def make(value):
-        return kept.get(owner, value, lambda: made.append(value) or value)
-
-    assert [make(1), make(1), make(2), make(3), make(3), make(1)] == [1, 1, 2, 3, 3, 1]
+    for value in (1, 1, 2, 3, 3, 1):
+        assert kept.get(owner, value, lambda value=value: made.append(value) or value) == value
     assert made == [1, 2, 3, 1]
     del owner
     assert len(kept._of) == 0
