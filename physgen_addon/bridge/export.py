@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
-from ...sim.scene.folder import SCENE_FILE, SceneFolder, load_scene, referenced_files, save_scene
+from ...sim.scene.folder import SCENE_FILE, SceneFolder, parse_scene, referenced_files, save_scene
+from ...sim.scene.json_fields import read_json
 from ...sim.scene.model import Ground, Scene, SceneObject
 from ..props.body import bodies
 from . import export_world
@@ -170,16 +171,17 @@ def _previous_files(scene: bpy.types.Scene, root: Path) -> set[str]:
     imported = scene.physgen.folder
     if imported and Path(bpy.path.abspath(imported)).resolve() == root.resolve():
         raise InputError(f"{root}: is the folder that this scene was imported from; choose another for its export")
-    if not (root / SCENE_FILE).exists():
+    path = root / SCENE_FILE
+    if not path.exists():
         return set()
-    try:
-        before = load_scene(root).scene
-    except InputError:
-        # One that is damaged is overwritten; what it needed stays, as nobody knows what that was.
-        return set()
-    if before.photo is not None:
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("photo", "") is not None:
         raise InputError(f"{root}: holds a scene with a photo, which is never overwritten; choose another folder")
-    return set(referenced_files(before))
+    try:
+        return set(referenced_files(parse_scene(content, str(path))))
+    except InputError:
+        # Another version's export is replaced; what it needed stays, as nobody knows what that was.
+        return set()
 
 
 def _to_world(mesh: Triangles, matrix: NDArray[np.float64]) -> NDArray[np.float64]:

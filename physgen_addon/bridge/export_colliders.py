@@ -96,7 +96,7 @@ class Collider:
                 f"{self._clock.start}, and a collider must keep them: hide the modifier that does this in the viewport"
             )
         points = read_points(mesh)
-        if not np.isfinite(points).all():
+        if len(self._matrices) > 1 and not np.isfinite(points).all():
             raise InputError(f"object {self.item.name!r}: has vertices that are nowhere at frame {self._frame}")
         self._points.append(points)
 

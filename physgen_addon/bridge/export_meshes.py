@@ -37,15 +37,25 @@ class Triangles:
 def read_points(mesh: bpy.types.Mesh) -> Points:
     """Coordinates (V, 3) of the vertices of ``mesh`` in their order."""
     points = np.empty((len(mesh.vertices), 3), dtype=np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", points.ravel())
+    # Attributes are copied hundreds of times as fast, but in edit mode they are those of the unfinished mesh.
+    if mesh.is_editmode:
+        mesh.vertices.foreach_get("co", points.ravel())
+    else:
+        mesh.attributes["position"].data.foreach_get("vector", points.ravel())
     return points
 
 
-def read_corners(mesh: bpy.types.Mesh, what: str = ".corner_vert") -> Indices:
-    """The vertex (or with ``.corner_edge`` the edge) of every corner of every polygon."""
+def read_corners(mesh: bpy.types.Mesh) -> Indices:
+    """The vertex of every corner of every polygon."""
+    return _corners(mesh, ".corner_vert", "vertex_index")
+
+
+def _corners(mesh: bpy.types.Mesh, attribute: str, field: str) -> Indices:
     corners = np.empty(len(mesh.loops), dtype=np.int32)
-    if len(corners):
-        mesh.attributes[what].data.foreach_get("value", corners)
+    if mesh.is_editmode:
+        mesh.loops.foreach_get(field, corners)
+    elif len(corners):
+        mesh.attributes[attribute].data.foreach_get("value", corners)
     return corners
 
 
@@ -54,7 +64,7 @@ def read_triangles(mesh: bpy.types.Mesh) -> Triangles:
     mesh.calc_loop_triangles()
     faces = np.empty((len(mesh.loop_triangles), 3), dtype=np.int32)
     mesh.loop_triangles.foreach_get("vertices", faces.ravel())
-    edges = np.bincount(read_corners(mesh, ".corner_edge"))
+    edges = np.bincount(_corners(mesh, ".corner_edge", "edge_index"))
     return Triangles(points=read_points(mesh), faces=faces, edges=edges[edges > 0])
 
 

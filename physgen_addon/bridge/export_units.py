@@ -61,8 +61,8 @@ class Clock:
         return range(self.start, self.end + 1)
 
     def seconds(self, frame: float) -> float:
-        """When ``frame`` is, in s after the first one."""
-        return float(f"{(frame - self.start) / self.fps:.10g}")
+        """When ``frame`` is, in s after the first one; to the last bit when a bake's sample of it is."""
+        return (frame - self.start) / self.fps
 
     def from_frame(self, frame: int) -> float:
         """When what begins with ``frame`` begins; frames before the first are the first."""

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 from collections.abc import Callable, Collection
 from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...sim.errors import InputError
-from ...sim.scene.json_fields import to_json
 from ..props.body import bodies
 from .animation import TRANSFORM, Channel, channels, curves, drivers
 from .export_meshes import read_corners, read_points
@@ -78,7 +77,7 @@ class _Digest:
     def _add_checked(self, *values: Callable[[], Any]) -> None:
         for value in values:
             try:
-                self._add(json.dumps(to_json(value())))
+                self._add(value())
             except InputError as error:
                 self._add(str(error))
 
@@ -257,8 +256,12 @@ class _Digest:
             self._reference(value)
         elif isinstance(value, bool | int | float | str):
             self._add(value)
-        elif isinstance(value, bpy.types.bpy_prop_array) or hasattr(value, "to_tuple"):
-            self._add([float(number) for number in value])
+        elif isinstance(value, Matrix):
+            self._add([tuple(row) for row in value])
+        elif hasattr(value, "__len__"):
+            # Vectors, turns, colours and arrays, of which there is a type each; what holds no numbers is passed over.
+            with contextlib.suppress(TypeError, ValueError):
+                self._add([float(number) for number in value])
 
     def _reference(self, value: bpy.types.ID | None) -> None:
         if isinstance(value, bpy.types.Object):
@@ -268,8 +271,7 @@ class _Digest:
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """``fields`` as JSON has them, without the name of the material's preset."""
-    plain = {name: to_json(value) for name, value in fields.items()}
-    if "material" in plain:
-        del plain["material"]["preset"]
-    return plain
+    """``fields`` without the name of the material's preset."""
+    if "material" not in fields:
+        return fields
+    return {**fields, "material": {name: n for name, n in vars(fields["material"]).items() if name != "preset"}}
