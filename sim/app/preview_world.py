@@ -15,7 +15,7 @@ from ..mpm.estimate import stable_step
 from ..mpm.options import SolverOptions
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
-from ..scene.model import Material, Scene
+from ..scene.model import Box, Material, Scene
 from .bake_inputs import BakeOptions
 from .quality import Quality
 from .setup_resolution import cell_size, mesh_volume
@@ -53,10 +53,11 @@ def prepare_preview(
     """
     options = BakeOptions(frames=frames, fps=fps)
     quality = preview_quality(folder.scene, meshes, particles)
-    prepared = prepare_world(folder, meshes, options, quality)
-    scene, notices = _softened(folder.scene, prepared)
-    if scene != folder.scene:
-        prepared = prepare_world(SceneFolder(root=folder.root, scene=scene), meshes, options, quality)
+    coarse = _coarsened(folder.scene, meshes, quality)
+    prepared = prepare_world(SceneFolder(root=folder.root, scene=coarse), meshes, options, quality)
+    soft, notices = _softened(coarse, prepared)
+    if soft != coarse:
+        prepared = prepare_world(SceneFolder(root=folder.root, scene=soft), meshes, options, quality)
     return dataclasses.replace(prepared, solver=_faster(prepared.solver)), [*prepared.warnings, *notices]
 
 
@@ -80,7 +81,30 @@ def preview_quality(scene: Scene, meshes: Sequence[ObjectMesh], particles: int) 
     return dataclasses.replace(quality, smallest_cells=2)
 
 
+def _coarsened(scene: Scene, meshes: Sequence[ObjectMesh], quality: Quality) -> Scene:
+    """``scene`` with walls and pins that few particles still make out: a cell thick, and a particle wider."""
+    moving = [mesh for item, mesh in zip(scene.objects, meshes, strict=True) if item.role == "dynamic"]
+    if not moving:
+        return scene
+    cell = cell_size(moving, quality)
+    objects = []
+    for item in scene.objects:
+        if item.shell_thickness is not None and item.shell_thickness < cell:
+            item = dataclasses.replace(item, shell_thickness=cell)
+        if item.pins:
+            item = dataclasses.replace(item, pins=tuple(_wider(box, 0.5 * cell) for box in item.pins))
+        objects.append(item)
+    return dataclasses.replace(scene, objects=tuple(objects))
+
+
+def _wider(box: Box, margin: float) -> Box:
+    (a, b, c), (d, e, f) = box.low, box.high
+    return Box(low=(a - margin, b - margin, c - margin), high=(d + margin, e + margin, f + margin))
+
+
 def _flows(scene: Scene) -> bool:
+    if any(effect.name == "sandy" for effect in scene.effects):
+        return True
     return any(item.role == "dynamic" and item.material.law in FLOWING for item in scene.objects)
 
 

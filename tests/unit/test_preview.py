@@ -1,5 +1,6 @@
 """The preview's worker as Blender meets it: a real process, requests on its input, events on its output."""
 
+import dataclasses
 import json
 import queue
 import subprocess
@@ -18,7 +19,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.kept import Kept
 from physgen.sim.scene.folder import SceneFolder, save_scene
 from physgen.sim.scene.meshes import ObjectMesh, load_object_mesh
-from physgen.sim.scene.model import IDENTITY4, Camera, Material, Scene, SceneObject
+from physgen.sim.scene.model import IDENTITY4, Box, Camera, Material, Scene, SceneObject
 
 WAIT_S = 120.0
 """A worker that compiles on a busy machine takes its time; a test that waits this long has failed."""
@@ -37,6 +38,10 @@ def scene_folder(root: Path, **fields) -> SceneFolder:
     camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0, world_from_camera=IDENTITY4)
     scene = Scene(camera=camera, objects=(item,), photo="photo.png", background="background.png")
     return save_scene(root, scene)
+
+
+SMALL = ((0.1, 0.0, 0.0, 0.3), (0.0, 0.1, 0.0, 0.0), (0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0, 1.0))
+"""A tenth of the size, 30 cm aside."""
 
 
 class Worker:
@@ -166,6 +171,27 @@ def test_stiff_matter_is_softened_to_the_steps_that_there_are(tmp_path, law):
     assert any("ball" in text and "softer" in text for text in notices)
     soft = scene_folder(tmp_path / "soft", material=Material(youngs_modulus=1e4))
     assert prepare_preview(soft, meshes, frames=24, fps=24.0, particles=2000)[1] == []
+
+
+def test_thin_walls_and_small_pins_do_not_stop_a_coarse_run(tmp_path):
+    pin = Box(low=(0.0, 0.0, 0.145), high=(0.001, 0.001, 0.146))
+    folder = scene_folder(tmp_path / "scene", material=Material(), fill=False, shell_thickness=1e-4, pins=(pin,))
+    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    prepared, _ = prepare_preview(folder, meshes, frames=24, fps=24.0, particles=2000)
+    pinned = prepared.setup.bodies[0].pins
+    assert 0 < pinned.sum() < 0.05 * prepared.particle_count
+
+
+def test_a_small_object_beside_a_large_one_is_there_too(tmp_path):
+    folder = scene_folder(tmp_path / "scene", material=Material())
+    small = dataclasses.replace(folder.scene.objects[0], name="small", world_from_mesh=SMALL)
+    folder = SceneFolder(
+        root=folder.root, scene=dataclasses.replace(folder.scene, objects=(*folder.scene.objects, small))
+    )
+    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    prepared, _ = prepare_preview(folder, meshes, frames=24, fps=24.0, particles=2000)
+    large, little = (body.count for body in prepared.setup.bodies)
+    assert little >= 8 and large <= 8000
 
 
 def test_a_fine_mesh_gets_a_proxy_of_its_shape():
