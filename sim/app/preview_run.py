@@ -28,7 +28,7 @@ from ..skinning.binding import Binding, bind, deform
 from .collider_motion import moves, vertices_at
 from .preview_proxy import proxy
 from .preview_request import PreviewRequest
-from .preview_world import prepare_preview
+from .preview_world import prepare_preview, without_tiny
 from .simulation import Simulation, start_world
 
 PARTS_A_SECOND = 96.0
@@ -52,6 +52,8 @@ class PreviewRunner:
         folder = load_scene(Path(request.scene))
         folder = SceneFolder(root=folder.root, scene=apply_overrides(folder.scene, request.overrides))
         pairs = [self._mesh(folder, item) for item in folder.scene.objects]
+        scene, left, gone = without_tiny(folder.scene, [mesh for mesh, _ in pairs], request.particles)
+        folder, pairs = SceneFolder(root=folder.root, scene=scene), [pairs[i] for i in left]
         prepared, notices = prepare_preview(
             folder, [mesh for mesh, _ in pairs], frames=request.frames, fps=request.fps, particles=request.particles
         )
@@ -72,7 +74,7 @@ class PreviewRunner:
                     {"name": name, "vertices": len(small.vertices), "triangles": len(small.faces)}
                     for name, small, _ in shown
                 ]
-                on_event({"event": "started", "objects": objects, "notices": notices, "folder": str(out)})
+                on_event({"event": "started", "objects": objects, "notices": [*gone, *notices], "folder": str(out)})
                 on_event({"event": "frame", "done": 1, "total": request.frames})
                 for frame in range(1, request.frames):
                     _advance(simulation, frame / request.fps, cancelled)

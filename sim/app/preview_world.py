@@ -15,7 +15,7 @@ from ..mpm.estimate import stable_step
 from ..mpm.options import SolverOptions
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
-from ..scene.model import Box, Material, Scene
+from ..scene.model import GROUND, Box, Material, Scene
 from .bake_inputs import BakeOptions
 from .quality import Quality
 from .setup_resolution import cell_size, mesh_volume
@@ -39,6 +39,9 @@ FLOWING_SHARE = 0.6
 
 WORTH_SAYING = 0.7
 """A body whose stiffness is cut to less than this share is told of."""
+
+MOST_EXCESS = 3.0
+"""Small objects may cost this many times as many particles as are wanted; beyond that they are left out."""
 
 MOST_RIGID = 10
 """Rigid bodies are sampled as finely as the soft ones, but with at most this many times as many particles in all."""
@@ -106,6 +109,44 @@ def _flows(scene: Scene) -> bool:
     if any(effect.name == "sandy" for effect in scene.effects):
         return True
     return any(item.role == "dynamic" and item.material.law in FLOWING for item in scene.objects)
+
+
+def without_tiny(scene: Scene, meshes: Sequence[ObjectMesh], particles: int) -> tuple[Scene, list[int], list[str]]:
+    """``scene`` without moving objects so small beside the others that these would take far too many particles.
+
+    Returns the scene, which of its objects are left, and a sentence for each that is not.
+    """
+    left = list(range(len(scene.objects)))
+    small = scene
+    while True:
+        shapes = [meshes[i] for i in left]
+        moving = [i for i in left if scene.objects[i].role == "dynamic"]
+        if len(moving) < 2:
+            break
+        quality = preview_quality(small, shapes, particles)
+        volume = sum(abs(mesh_volume(meshes[i])) for i in moving)
+        cell = cell_size([meshes[i] for i in moving], quality)
+        if volume / cell**3 * PARTICLES_PER_CELL <= MOST_EXCESS * max(quality.particles, particles):
+            break
+        left.remove(min(moving, key=lambda i: float(np.ptp(meshes[i].vertices, axis=0).max())))
+        small = _only(scene, {scene.objects[i].name for i in left})
+    gone = [item.name for i, item in enumerate(scene.objects) if i not in left]
+    return small, left, [f"{name}: too small beside the other objects for a preview; it is left out" for name in gone]
+
+
+def _only(scene: Scene, names: set[str]) -> Scene:
+    """``scene`` with the objects of these ``names``, and what concerns them."""
+    effects = []
+    for effect in scene.effects:
+        objects = tuple(name for name in effect.objects if name in names)
+        if objects or not effect.objects:
+            effects.append(dataclasses.replace(effect, objects=objects))
+    return dataclasses.replace(
+        scene,
+        objects=tuple(item for item in scene.objects if item.name in names),
+        effects=tuple(effects),
+        contacts=tuple(c for c in scene.contacts if all(name in names or name == GROUND for name in c.between)),
+    )
 
 
 def _faster(solver: SolverOptions) -> SolverOptions:

@@ -13,13 +13,13 @@ import pytest
 import trimesh
 from physgen.sim.app.preview_proxy import proxy
 from physgen.sim.app.preview_request import MAX_LINE, parse_request, read_line
-from physgen.sim.app.preview_world import STEPS_A_SECOND, prepare_preview
+from physgen.sim.app.preview_world import STEPS_A_SECOND, prepare_preview, without_tiny
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import InputError
 from physgen.sim.kept import Kept
 from physgen.sim.scene.folder import SceneFolder, save_scene
 from physgen.sim.scene.meshes import ObjectMesh, load_object_mesh
-from physgen.sim.scene.model import IDENTITY4, Box, Camera, Material, Scene, SceneObject
+from physgen.sim.scene.model import IDENTITY4, Box, Camera, Contact, Effect, Material, Scene, SceneObject
 
 WAIT_S = 120.0
 """A worker that compiles on a busy machine takes its time; a test that waits this long has failed."""
@@ -38,10 +38,6 @@ def scene_folder(root: Path, **fields) -> SceneFolder:
     camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0, world_from_camera=IDENTITY4)
     scene = Scene(camera=camera, objects=(item,), photo="photo.png", background="background.png")
     return save_scene(root, scene)
-
-
-SMALL = ((0.1, 0.0, 0.0, 0.3), (0.0, 0.1, 0.0, 0.0), (0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0, 1.0))
-"""A tenth of the size, 30 cm aside."""
 
 
 class Worker:
@@ -182,16 +178,30 @@ def test_thin_walls_and_small_pins_do_not_stop_a_coarse_run(tmp_path):
     assert 0 < pinned.sum() < 0.05 * prepared.particle_count
 
 
-def test_a_small_object_beside_a_large_one_is_there_too(tmp_path):
+@pytest.mark.parametrize(("share", "stays"), [(0.4, True), (0.1, False)])
+def test_objects_of_several_sizes_take_a_bounded_number_of_particles(tmp_path, share, stays):
     folder = scene_folder(tmp_path / "scene", material=Material())
-    small = dataclasses.replace(folder.scene.objects[0], name="small", world_from_mesh=SMALL)
-    folder = SceneFolder(
-        root=folder.root, scene=dataclasses.replace(folder.scene, objects=(*folder.scene.objects, small))
+    rows = ((share, 0.0, 0.0, 0.3), (0.0, share, 0.0, 0.0), (0.0, 0.0, share, 0.1), (0.0, 0.0, 0.0, 1.0))
+    large = folder.scene.objects[0]
+    scene = dataclasses.replace(
+        folder.scene,
+        objects=(large, dataclasses.replace(large, name="small", world_from_mesh=rows)),
+        effects=(Effect(name="wind", objects=("small",)), Effect(name="wind", objects=("ball", "small"))),
+        contacts=(Contact(between=("ball", "small"), friction=0.1), Contact(between=("ball", "ground"), friction=0.1)),
     )
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
-    prepared, _ = prepare_preview(folder, meshes, frames=24, fps=24.0, particles=2000)
-    large, little = (body.count for body in prepared.setup.bodies)
-    assert little >= 8 and large <= 8000
+    folder = SceneFolder(root=folder.root, scene=scene)
+    meshes = [load_object_mesh(folder, item) for item in scene.objects]
+    scene, left, notices = without_tiny(scene, meshes, 2000)
+    assert left == ([0, 1] if stays else [0]) and len(notices) == (0 if stays else 1)
+    assert len(scene.effects) == len(scene.contacts) == (2 if stays else 1)
+    prepared, _ = prepare_preview(
+        SceneFolder(root=folder.root, scene=dataclasses.replace(scene, effects=())),
+        [meshes[i] for i in left],
+        frames=24,
+        fps=24.0,
+        particles=2000,
+    )
+    assert 1000 < prepared.particle_count < 7000
 
 
 def test_a_fine_mesh_gets_a_proxy_of_its_shape():
