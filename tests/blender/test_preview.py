@@ -90,6 +90,8 @@ def test_what_cannot_be_simulated_is_said_and_mending_it_goes_on():
     bpy.context.view_layer.update()
     session.step(10.0)
     assert session._number == 1
+    session.stop()
+    assert not session._root.exists()
 
 
 def test_a_worker_that_cannot_start_is_an_error_and_no_hang():
@@ -111,6 +113,8 @@ def test_a_worker_that_dies_says_its_last_words():
     session.start()
     step_until(session, lambda: session.state == "error")
     assert "out of luck" in session.message
+    session.stop()
+    assert session.join(5.0) and not session._root.exists()
 
 
 def test_the_operator_needs_a_body_and_toggles():
