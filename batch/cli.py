@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..sim.app import preview
 from ..sim.app.bake_estimate import bake_cost
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.app.import_physgen3d import import_physgen3d
@@ -173,6 +174,9 @@ def build_parser() -> argparse.ArgumentParser:
     free = command("free", _free, "delete a bake: what its manifest lists, and nothing else")
     free.add_argument("bake", type=Path, metavar="BAKE")
 
+    previews = command("preview", _preview, "coarse runs as they are asked for on standard input (docs/cli.md)")
+    previews.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs")
+
     render = command("render", _render, "scene and bake → frames, video")
     render.add_argument("scene", type=Path, metavar="SCENE")
     render.add_argument("--bake", type=Path, required=True, metavar="BAKE")
@@ -307,6 +311,10 @@ def _free(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelle
     terminal({"event": "done", "stage": "free", "bytes": freed})
     terminal.line(f"{freed / 2**20:.1f} MiB are free again: {options.bake}")
     return 0
+
+
+def _preview(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    return preview.serve(options.out, cancelled)
 
 
 def _render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:

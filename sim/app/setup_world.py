@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..effects.registry import apply_effects
 from ..errors import InputError
+from ..kept import Kept
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface
 from ..mpm.estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
@@ -30,11 +31,15 @@ from ..scene.vertex_tracks import load_vertex_track
 from .bake_inputs import BakeOptions
 from .collider_motion import vertices_at
 from .engine_material import engine_material
-from .quality import load_quality
+from .quality import Quality, load_quality
 from .setup_checks import collider_warnings, overlap_warnings, require_above_ground, surface_warnings
 from .setup_contacts import contact_table
 from .setup_resolution import resolve
 from .shell import SHELL_CELLS, keep_shell
+
+_SURFACES: Kept[ObjectMesh, Surface] = Kept()
+_SAMPLES: Kept[ObjectMesh, InteriorSample] = Kept()
+_WARNINGS: Kept[ObjectMesh, list[str]] = Kept()
 
 JUMP = 1e-3
 """Share of its size by which a collider's motion may begin off the place of its mesh."""
@@ -78,8 +83,13 @@ class PreparedWorld:
         return dataclasses.replace(self, arch=arch, cost=cost)
 
 
-def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: BakeOptions) -> PreparedWorld:
+def prepare_world(
+    folder: SceneFolder, meshes: Sequence[ObjectMesh], options: BakeOptions, quality: Quality | None = None
+) -> PreparedWorld:
     """The world of the scene in ``folder``, whose objects have ``meshes``.
+
+    quality: in place of the preset that ``options`` name. What depends on a mesh alone is worked out once for each of
+    ``meshes``, as long as the caller keeps it.
 
     Raises InputError for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that
     stand in the ground or in each other, and for what no machine could compute.
@@ -90,13 +100,13 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     if not moving:
         raise InputError("objects: none has the role 'dynamic', so nothing would move")
     warnings: list[str] = []
-    quality = load_quality(options.quality)
+    quality = quality or load_quality(options.quality)
     solver, similarity = resolve(
         [scene.objects[i].name for i in moving], [meshes[i] for i in moving], quality, options.arch
     )
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):
-        warnings += surface_warnings(_surface(mesh), item.name, cell)
+        warnings += _surface_warnings(mesh, item.name, cell)
     if scene.ground is not None:
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
@@ -145,7 +155,11 @@ def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed
             "out; role 'collider' with motion holds or leads a rigid thing"
         )
     try:
-        sample = sample_interior(mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed)
+        sample = _SAMPLES.get(
+            mesh,
+            (spacing, seed),
+            lambda: sample_interior(mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed),
+        )
         if not item.fill:
             thickness = SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness
             sample = keep_shell(sample, mesh, thickness, spacing)
@@ -213,7 +227,11 @@ def _jump(collider: Collider) -> list[str]:
 
 
 def _surface(mesh: ObjectMesh) -> Surface:
-    return Surface(vertices=mesh.vertices, faces=mesh.faces)
+    return _SURFACES.get(mesh, None, lambda: Surface(vertices=mesh.vertices, faces=mesh.faces))
+
+
+def _surface_warnings(mesh: ObjectMesh, name: str, cell: float) -> list[str]:
+    return _WARNINGS.get(mesh, (name, cell), lambda: surface_warnings(_surface(mesh), name, cell))
 
 
 def _track(keys: Keys) -> Track | None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,6 +80,18 @@ def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> 
         progress.notice(warning)
     prepared.require_affordable()
     progress.notice(cost_text(prepared))
+    simulation = start_world(prepared)
+    found = simulation.world.arch
+    if found != arch:
+        prepared = prepared.on(found)
+        prepared.require_affordable()
+        progress.notice(f"{arch} is not available here; simulating on {found}, {cost_text(prepared)}")
+        simulation = dataclasses.replace(simulation, prepared=prepared)
+    return simulation
+
+
+def start_world(prepared: PreparedWorld) -> Simulation:
+    """The world that ``prepared`` describes, ready to run."""
     setup = prepared.setup
     world = World(
         bodies=setup.bodies,
@@ -90,13 +103,8 @@ def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> 
         similarity=prepared.similarity,
         options=prepared.solver,
     )
-    if world.arch != arch:
-        prepared = prepared.on(world.arch)
-        prepared.require_affordable()
-        progress.notice(f"{arch} is not available here; simulating on {world.arch}, {cost_text(prepared)}")
-    bodies = prepared.setup.bodies
     return Simulation(
         world=world,
         prepared=prepared,
-        rest_positions=tuple(None if i is None else bodies[i].positions for i in prepared.body_of_object),
+        rest_positions=tuple(None if i is None else setup.bodies[i].positions for i in prepared.body_of_object),
     )

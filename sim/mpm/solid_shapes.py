@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from ..kept import Kept
 from .colliders import Surface
 from .contact_points import surface_points
 from .curvature import PATCH, patches
@@ -64,6 +65,10 @@ NO_POINTS = PointSet(
 )
 
 
+_LATTICES: Kept[Surface, DistanceLattice] = Kept()
+_POINTS: Kept[Surface, PointSet] = Kept()
+
+
 def spacing_of(vertices: Array, nodes: int) -> float:
     """Distance between ``nodes`` nodes along the side of a cube as large as the bounding box of vertices (V, 3)."""
     extent = np.ptp(vertices, axis=0)
@@ -76,11 +81,16 @@ def spacing_of(vertices: Array, nodes: int) -> float:
 def lattice_of(surface: Surface, *, margin: float = 0.0) -> DistanceLattice:
     """Distances to ``surface`` on a lattice of the usual fineness, ``margin`` farther out than need be."""
     spacing = spacing_of(surface.vertices, NODES)
-    return signed_distance(surface, spacing, margin=MARGIN * spacing + margin)
+    reach = MARGIN * spacing + margin
+    return _LATTICES.get(surface, reach, lambda: signed_distance(surface, spacing, margin=reach))
 
 
 def points_of(surface: Surface, center: Array) -> PointSet:
     """Points of ``surface`` relative to ``center`` (3,), those of its convex hull first."""
+    return _POINTS.get(surface, center.tobytes(), lambda: _points_of(surface, center))
+
+
+def _points_of(surface: Surface, center: Array) -> PointSet:
     spacing = spacing_of(surface.vertices, POINTS)
     points, normals = surface_points(surface, spacing)
     local = points - center

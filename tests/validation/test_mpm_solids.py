@@ -148,7 +148,7 @@ def test_a_moving_platform_carries_and_a_rising_one_lifts(box, options, similari
 
 
 def test_keyframes_that_were_meant_for_a_frame_throw_nothing(box, options, similarity, cell):
-    """Keyframes that rounding put 10 ns beside the frames change the motion of what they lift by nothing to speak of."""
+    """Keyframes that rounding put 10 ns beside the frames change the motion of what they lift hardly at all."""
     times = np.arange(4) / 24
     way = np.stack([0 * times, 0 * times, 0.2 * cell * np.arange(4) ** 2], axis=1)
     heights = []

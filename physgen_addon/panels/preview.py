@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The live preview's button and what it is doing, for the panel that simulates; the arrows' switch."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..gizmos import SHOW_ARROWS
+from ..operators.preview import PHYSGEN_OT_toggle_preview
+from ..preview import live
+from . import text
+
+WORDS = {
+    "starting": ("Starting the worker", "TIME"),
+    "compiling": ("Preparing: seconds, once", "TIME"),
+    "running": ("Simulating", "PLAY"),
+    "playing": ("Playing", "PLAY"),
+}
+
+
+def draw_preview(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The button; below it what the preview is doing, and what differs from the bake."""
+    session = live.session()
+    column = layout.column(align=True)
+    column.operator(
+        PHYSGEN_OT_toggle_preview.bl_idname,
+        text="Stop Live Preview" if session is not None else "Live Preview",
+        icon="PAUSE" if session is not None else "PLAY",
+        depress=session is not None,
+    )
+    if session is None:
+        return
+    if session.scene_name != context.scene.name:
+        column.label(text=f"On in scene {session.scene_name}", icon="INFO")
+        return
+    if session.state == "error":
+        text.sentences(column, context, session.message, icon="ERROR")
+        return
+    words, icon = WORDS[session.state]
+    column.label(text=f"{words}: {session.message}" if session.message else words, icon=icon)
+    for notice in session.notices[:3]:
+        text.sentences(column, context, notice, icon="INFO")
+
+
+def draw_arrows(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The switch of the arrows in the viewport, for the panel of the motion."""
+    layout.prop(context.window_manager, SHOW_ARROWS, icon="EMPTY_SINGLE_ARROW")
