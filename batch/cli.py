@@ -14,10 +14,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..sim.app.bake_estimate import estimate_bake
+from ..sim.app.bake_estimate import bake_cost
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics, set_physics, with_physics
 from ..sim.app.setup_world import cost_text
+from ..sim.cache.folder import free_bake
+from ..sim.cache.manifest import SPACES
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
@@ -98,6 +100,15 @@ def _add_bake(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--arch", default=defaults.arch, choices=["cpu", "cuda", "vulkan", "metal"], help="where to simulate"
     )
+    parser.add_argument("--seed", type=int, default=defaults.seed, metavar="N", help="of the particles' places")
+
+
+def _add_samples(parser: argparse.ArgumentParser) -> None:
+    defaults = BakeOptions()
+    space = "what the samples are in: world metres, or the coordinates of each object's mesh file"
+    parser.add_argument("--space", default=defaults.space, choices=SPACES, help=f"{space} (default {defaults.space})")
+    points = "also keep the particles of what is sand, fluid or snow, or turns to sand"
+    parser.add_argument("--points", action="store_true", default=defaults.points, help=points)
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
@@ -140,10 +151,20 @@ def build_parser() -> argparse.ArgumentParser:
     bake = command("bake", _bake, "scene folder → bake folder")
     bake.add_argument("scene", type=Path, metavar="SCENE")
     bake.add_argument("--out", type=Path, metavar="BAKE", help="the bake folder")
-    bake.add_argument("--estimate", action="store_true", help="only say what it would cost; nothing is written")
+    bake.add_argument("--estimate", action="store_true", help="the same as physgen estimate")
     bake.set_defaults(wrong_usage=bake.error)
     _add_physics(bake)
     _add_bake(bake)
+    _add_samples(bake)
+
+    cost = command("estimate", _estimate, "what a bake would cost in time, memory and disk; nothing is written")
+    cost.add_argument("scene", type=Path, metavar="SCENE")
+    _add_physics(cost)
+    _add_bake(cost)
+    _add_samples(cost)
+
+    free = command("free", _free, "delete a bake: what its manifest lists, and nothing else")
+    free.add_argument("bake", type=Path, metavar="BAKE")
 
     render = command("render", _render, "scene and bake → frames, video")
     render.add_argument("scene", type=Path, metavar="SCENE")
@@ -201,7 +222,8 @@ def _reconstruct_options(options: argparse.Namespace) -> ReconstructOptions:
 
 
 def _bake_options(options: argparse.Namespace) -> BakeOptions:
-    return BakeOptions(frames=options.frames, fps=options.fps, quality=options.quality, arch=options.arch)
+    names = ("frames", "fps", "quality", "arch", "seed", "space", "points")
+    return BakeOptions(**{name: getattr(options, name) for name in names if hasattr(options, name)})
 
 
 def _render_request(options: argparse.Namespace, frames: str | None = None) -> pipeline.RenderRequest:
@@ -244,7 +266,7 @@ def _reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
 
 def _bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     if options.estimate:
-        return _estimate(options, terminal)
+        return _estimate(options, terminal, cancelled)
     if options.out is None:
         options.wrong_usage("the following arguments are required: --out (or --estimate)")
     folder = set_physics(options.scene, **_physics(options))
@@ -254,16 +276,22 @@ def _bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelle
     return 0
 
 
-def _estimate(options: argparse.Namespace, terminal: Terminal) -> int:
+def _estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     folder = load_scene(options.scene)
     scene = with_physics(folder.scene, **_physics(options))
-    prepared = estimate_bake(SceneFolder(root=folder.root, scene=scene), _bake_options(options))
-    for warning in prepared.warnings:
+    cost = bake_cost(SceneFolder(root=folder.root, scene=scene), _bake_options(options))
+    for warning in cost.prepared.warnings:
         terminal({"event": "notice", "stage": "estimate", "message": warning})
-    cost = {"particles": prepared.particle_count, **dataclasses.asdict(prepared.cost)}
-    terminal({"event": "done", "stage": "estimate", "estimate": cost})
-    terminal.line(cost_text(prepared))
-    prepared.require_affordable()
+    terminal({"event": "done", "stage": "estimate", **cost.to_json()})
+    terminal.line(f"{cost_text(cost.prepared)}; {cost.disk_bytes / 2**20:.0f} MiB on the disk")
+    cost.prepared.require_affordable()
+    return 0
+
+
+def _free(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    freed = free_bake(options.bake)
+    terminal({"event": "done", "stage": "free", "bytes": freed})
+    terminal.line(f"{freed / 2**20:.1f} MiB are free again: {options.bake}")
     return 0
 
 

@@ -22,7 +22,7 @@ from ..sim.errors import InputError, RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.pipeline import object_names
-from ..sim.scene.folder import SceneFolder
+from ..sim.scene.folder import SceneFolder, load_scene, require_photo
 from ..sim.scene.model import Vector
 from ..sim.scene.overrides import check_overrides
 
@@ -82,8 +82,12 @@ def render_stage(
     *,
     video: Path | None = None,
 ) -> Event:
-    """Render frames, and ``video`` from them, in a process that holds bpy."""
+    """Render frames, and ``video`` from them, in a process that holds bpy.
+
+    Raises InputError, before that process starts, for a scene without a photo and for options that cannot be used.
+    """
     check_render(request, video)
+    require_photo(load_scene(scene))
     command = [
         sys.executable,
         str(RENDER_SCRIPT),

@@ -6,12 +6,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+
+WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
+"""Seconds between attempts: Windows refuses to replace a file that somebody reads at that moment."""
 
 
 @contextmanager
@@ -25,7 +29,7 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        partial.replace(path)
+        _replace(partial, path)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror or error}); free space or choose another folder"
@@ -35,6 +39,18 @@ def replacing(path: Path) -> Iterator[Path]:
             shutil.rmtree(partial, ignore_errors=True)
         else:
             partial.unlink(missing_ok=True)
+
+
+def _replace(partial: Path, path: Path) -> None:
+    for pause in WINDOWS_PAUSES:
+        try:
+            partial.replace(path)
+            return
+        except PermissionError:
+            if os.name != "nt":
+                raise
+            time.sleep(pause)
+    partial.replace(path)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...sim.app.bake_inputs import geometry_hash
-from ...sim.cache.manifest import BakeManifest, load_manifest
+from ...sim.cache.manifest import WORLD_SPACE, BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
 from ...sim.scene.folder import SceneFolder
@@ -64,6 +64,16 @@ def require_scene(bake: Bake, folder: SceneFolder) -> None:
         )
 
 
+def require_world(bake: Bake) -> None:
+    """Raise InputError unless the samples of ``bake`` are in world metres."""
+    other = next((item for item in bake.manifest.objects if item.space != WORLD_SPACE), None)
+    if other is not None:
+        raise InputError(
+            f"{bake.folder}: the samples of {other.name!r} are in the space of its mesh, and are needed in the "
+            f"world's; bake again with space {WORLD_SPACE!r} (physgen bake without --space)"
+        )
+
+
 def require_fit(cache: Pc2Reader, vertex_count: int, name: str) -> None:
     """Raise InputError unless ``cache`` has the vertices of the mesh: Blender would only warn on the console."""
     if cache.vertex_count != vertex_count:
@@ -75,8 +85,8 @@ def require_fit(cache: Pc2Reader, vertex_count: int, name: str) -> None:
 def attach(item: bpy.types.Object, cache: Pc2Reader, first_frame: int) -> bpy.types.Modifier:
     """Let ``item`` follow ``cache``, which must fit its mesh (``require_fit``); sample 0 shows at ``first_frame``.
 
-    The object's matrix must be the identity, because samples are in world metres. An earlier PhysGen cache is
-    replaced.
+    Samples are in the object's own space: its matrix must be the identity for a bake of the space "world", and the
+    scene's ``world_from_mesh`` for one of the space "mesh". An earlier PhysGen cache is replaced.
     """
     require_fit(cache, len(item.data.vertices), item.name)
     modifier = item.modifiers.get(MODIFIER) or item.modifiers.new(MODIFIER, "MESH_CACHE")

@@ -13,7 +13,7 @@ from ...sim.cache.lock import folder_lock
 from ...sim.composite import transfer
 from ...sim.errors import Cancelled
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
-from ...sim.scene.folder import SceneFolder
+from ...sim.scene.folder import SceneFolder, require_photo
 from ...sim.scene.meshes import load_object_mesh
 from . import caches, compat
 from .ledger import Ledger
@@ -40,7 +40,9 @@ def render_frames(
     Cancelled when asked to stop; complete frames are kept then.
     """
     options = options or RenderOptions()
+    require_photo(scene)
     opened = caches.open_bake(bake, scene.scene)
+    caches.require_world(opened)
     caches.require_scene(opened, scene)
     for source, cache in zip(scene.scene.objects, opened.caches, strict=True):
         caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)

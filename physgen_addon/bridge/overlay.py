@@ -28,6 +28,7 @@ def build(scene: bpy.types.Scene, scene_root: Path, bake: Path, which: str) -> b
     """
     folder = load_scene(scene_root)
     opened = caches.open_bake(bake, folder.scene)
+    caches.require_world(opened)
     caches.require_scene(opened, folder)
     root = bpy.data.collections.new(f"PhysGen {which}")
     root[WHICH] = which

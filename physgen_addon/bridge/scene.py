@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import bpy
 
-from ...sim.scene.folder import SceneFolder
+from ...sim.scene.folder import SceneFolder, require_photo
 from . import caches, compat, passes
 from .camera import add_camera, render_size
 from .ground import add_ground
@@ -53,8 +53,10 @@ def _size(scene: bpy.types.Scene) -> tuple[int, int]:
 def build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions) -> BlenderScene:
     """Build ``folder`` beside whatever is in the .blend; with ``bake`` its objects follow their caches.
 
-    Raises InputError for a mesh, texture, light or cache that cannot be used; nothing is left behind then.
+    Raises InputError for a scene without a photo or ground, and for a mesh, texture, light or cache that cannot be
+    used; nothing is left behind then.
     """
+    require_photo(folder)
     compat.enable_cycles()
     before = _everything()
     try:

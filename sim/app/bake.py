@@ -5,39 +5,53 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import shutil
+import math
 import time
-import zipfile
-import zlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..atomic import replacing, write_json
+from ..atomic import write_json
+from ..cache.folder import remove_leftovers, remove_listed
 from ..cache.lock import folder_lock
-from ..cache.manifest import MANIFEST_FILE, BakedObject, BakeManifest, load_manifest, save_manifest
+from ..cache.manifest import (
+    CHECKPOINT_FILE,
+    MANIFEST_FILE,
+    METRICS_FILE,
+    BakeManifest,
+    load_manifest,
+    save_manifest,
+)
 from ..cache.pc2 import Pc2Reader, Pc2Writer
-from ..errors import Cancelled, InputError, SimulationError
+from ..errors import Cancelled, InputError, PhysGenError, SimulationError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..scene.folder import SceneFolder, load_scene
-from ..scene.meshes import ObjectMesh, load_object_mesh
-from ..skinning.binding import Binding, bind, deform
+from ..scene.meshes import load_object_mesh
 from ..version import VERSION
+from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
+from .bake_estimate import disk_bytes, require_disk_space
 from .bake_inputs import BakeOptions, geometry_hash, inputs_hash
+from .bake_samples import ObjectSampler, baked_objects
+from .setup_world import prepare_world
 
-__all__ = ["BakeOptions", "bake", "is_up_to_date"]
+__all__ = ["CHECKPOINT_FILE", "BakeOptions", "bake", "is_up_to_date"]
 
-CHECKPOINT_FILE = "checkpoints/state.npz"
 CHECKPOINT_SECONDS = 20.0
 """At most about this much computing is lost when a run is killed."""
 
-ADVANCE_PARTS = 4
-"""A frame of stiff matter can take many seconds; cancelling is looked for this many times in it. A fixed number, not
-a time, so that the same input gives the same bytes."""
+KEEP_SECONDS = 2.0
+"""About this much computing, and a part of a frame besides, is lost when a run is cancelled."""
 
-METRICS_FILE = "metrics.json"
+MANIFEST_SECONDS = 0.5
+"""How often ``frames_done`` in the manifest is brought up to date."""
+
+LEAST_PARTS, MOST_PARTS = 4, 1000
+PART_WORK = 2e7
+"""A frame of stiff matter can take minutes. It is advanced in parts of about so many particle substeps, a few seconds,
+between which its state can be kept; by the estimate, not by the clock, so that the same input gives the same bytes."""
 
 
 def is_up_to_date(scene_root: Path, out: Path, options: BakeOptions) -> bool:
@@ -50,9 +64,9 @@ def _complete(folder: SceneFolder, out: Path, options: BakeOptions) -> BakeManif
         manifest = load_manifest(out)
         if manifest.state != "complete" or manifest.inputs_hash != inputs_hash(folder, options):
             return None
-        for item in manifest.objects:
-            cache = Pc2Reader(out / item.file)
-            if cache.sample_count < manifest.frames or cache.vertex_count != item.vertices:
+        for name, count in manifest.files.items():
+            cache = Pc2Reader(out / name)
+            if cache.sample_count < manifest.frames or cache.vertex_count != count:
                 return None
     except InputError:
         return None
@@ -71,7 +85,7 @@ def bake(
     Nothing happens when ``out`` already holds it; a run that was stopped goes on from its last checkpoint.
 
     Raises InputError for a scene, option or folder that cannot be used, SimulationError when the run diverged (the
-    frames that were good are kept), Cancelled when asked to stop.
+    frames that were good are kept), Cancelled when asked to stop. ``cancelled`` is asked often, so it must be cheap.
     """
     options = options or BakeOptions()
     progress = StageProgress(on_event, "bake", options.frames)
@@ -81,7 +95,7 @@ def bake(
         progress.notice(f"up to date: {out}")
         return done
     _refuse_foreign_folder(out)
-    with folder_lock(out):
+    with folder_lock(out), _named_errors(out):
         return _bake_locked(folder, out, options, progress, cancelled)
 
 
@@ -93,16 +107,36 @@ def _refuse_foreign_folder(out: Path) -> None:
         raise InputError(f"{out}: holds other files and no bake; choose an empty or new folder")
 
 
+@contextlib.contextmanager
+def _named_errors(out: Path) -> Iterator[None]:
+    """What the operating system refuses, as an InputError that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror or error}); free space and run again to continue"
+        ) from error
+
+
 def _bake_locked(
     folder: SceneFolder, out: Path, options: BakeOptions, progress: StageProgress, cancelled: IsCancelled
 ) -> BakeManifest:
     # Imported here, because opening Blender or rendering a frame must never pay for Taichi.
     from .simulation import build_world
 
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
-    _require_disk_space(out, meshes, options.frames)
+    def go_on() -> None:
+        if cancelled():
+            raise Cancelled("bake cancelled before its first frame; run it again to start")
+
     progress.report(0, "sampling particles")
-    simulation = build_world(folder, meshes, options, progress)
+    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    go_on()
+    prepared = prepare_world(folder, meshes, options)
+    objects = baked_objects(folder, meshes, prepared, options)
+    require_disk_space(out, disk_bytes(objects, prepared.particle_count, options.frames))
+    go_on()
+    simulation = build_world(prepared, options.arch, progress)
+    go_on()
     manifest = BakeManifest(
         inputs_hash=inputs_hash(folder, options),
         fps=options.fps,
@@ -114,174 +148,145 @@ def _bake_locked(
         version=VERSION,
         particles=simulation.particle_count,
         geometry_hash=geometry_hash(folder),
-        objects=tuple(
-            BakedObject(name=item.name, file=f"{item.name}.pc2", vertices=len(mesh.vertices))
-            for item, mesh in zip(folder.scene.objects, meshes, strict=True)
-        ),
+        objects=objects,
     )
-    first, metrics = _resume(out, manifest, simulation.world)
+    samplers = [
+        ObjectSampler(slot, baked, mesh, np.asarray(item.world_from_mesh), simulation)
+        for slot, (baked, mesh, item) in enumerate(zip(objects, meshes, folder.scene.objects, strict=True))
+    ]
+    remove_leftovers(out)
+    first, metrics = resume(out, manifest, simulation.world)
     if first:
         progress.notice(f"continuing at frame {first + 1} of {options.frames}")
     else:
-        _remove_previous(out)
-        (out / "checkpoints").mkdir(parents=True, exist_ok=True)
-    bindings = [
-        None if rest is None else bind(mesh.vertices, rest)
-        for mesh, rest in zip(meshes, simulation.rest_positions, strict=True)
-    ]
-    manifest = dataclasses.replace(manifest, frames_done=first)
-    save_manifest(out, manifest)
-    run = _Run(out=out, manifest=manifest, simulation=simulation, meshes=meshes, bindings=bindings, metrics=metrics)
-    return run.frames(first, progress, cancelled)
+        remove_listed(out)
+    run = _Run(out=out, manifest=manifest, simulation=simulation, samplers=samplers, metrics=metrics, frames_done=first)
+    run.save("running")
+    return run.frames(progress, cancelled)
 
 
 @dataclasses.dataclass
 class _Run:
-    """The frame loop's state; everything of it that lasts is on disk."""
+    """The frame loop's state; everything of it that lasts is on disk.
+
+    frames_done: samples that every cache holds.
+    kept: the latest whole state of the engine and its ``frames_done``, for when it is stopped in the middle of a step.
+    """
 
     out: Path
     manifest: BakeManifest
     simulation: Any
-    meshes: list[ObjectMesh]
-    bindings: list[Binding | None]
+    samplers: list[ObjectSampler]
     metrics: list[dict[str, Any]]
+    frames_done: int
+    kept: tuple[int, State] | None = None
+    kept_at: float = 0.0
+    checkpoint_at: float = 0.0
+    saved_at: float = 0.0
     frame_started: float = 0.0
 
-    def frames(self, first: int, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
-        """Bake from sample ``first`` to the end; the final manifest."""
+    def frames(self, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
+        """Bake from sample ``frames_done`` to the end; the final manifest."""
         try:
             with contextlib.ExitStack() as stack:
-                writers = [stack.enter_context(self._writer(item, first)) for item in self.manifest.objects]
-                self._loop(first, writers, progress, cancelled)
+                writers = {name: stack.enter_context(self._writer(name)) for name in self.manifest.files}
+                self._loop(writers, progress, cancelled)
             write_json(self.out / METRICS_FILE, {"frames": self.metrics})
-            (self.out / CHECKPOINT_FILE).unlink(missing_ok=True)
-        except OSError as error:
-            reason = error.strerror or error
-            raise InputError(
-                f"{self.out}: cannot be written ({reason}); free space and run again to continue"
-            ) from error
+            drop_checkpoint(self.out)
+        except (Cancelled, SimulationError):
+            raise
+        except (OSError, PhysGenError):
+            # The disk is full, or was taken away: what still can be kept is.
+            with contextlib.suppress(OSError, PhysGenError):
+                self._stop(keep_state=True)
+            raise
         if self.metrics and self.metrics[-1].get("outside"):
             progress.notice("matter has left the box around the scene; it flies on, and the camera may not see it")
         progress.report(self.manifest.frames)
-        return self._save("complete", self.manifest.frames)
+        return self.save("complete")
 
-    def _writer(self, item: BakedObject, keep: int) -> Pc2Writer:
-        return Pc2Writer(
-            self.out / item.file, vertex_count=item.vertices, start_frame=self.manifest.frame_start, keep=keep
-        )
+    def _writer(self, name: str) -> Pc2Writer:
+        count, start = self.manifest.files[name], self.manifest.frame_start
+        return Pc2Writer(self.out / name, vertex_count=count, start_frame=start, keep=self.frames_done)
 
-    def _loop(self, first: int, writers: list[Pc2Writer], progress: StageProgress, cancelled: IsCancelled) -> None:
-        last_checkpoint = time.monotonic()
-        index = first
+    def _loop(self, writers: Mapping[str, Pc2Writer], progress: StageProgress, cancelled: IsCancelled) -> None:
+        self.checkpoint_at = time.monotonic()
+        self._keep()
         try:
-            for index in range(first, self.manifest.frames):
+            for index in range(first := self.frames_done, self.manifest.frames):
                 progress.report(index, "compiling" if index <= max(first, 1) else "")
+                self.frame_started = time.monotonic()
                 self._advance_to(index, cancelled)
-                self._append_samples(index, writers)
-                if time.monotonic() - last_checkpoint > CHECKPOINT_SECONDS:
-                    self._checkpoint(index + 1)
-                    last_checkpoint = time.monotonic()
-        except (Cancelled, SimulationError) as error:
-            self._checkpoint(index, keep_state=isinstance(error, Cancelled))
-            self._save("cancelled", index)
+                self._append_samples(index, writers, cancelled)
+                self._keep()
+        except Cancelled:
+            self._stop(keep_state=True)
+            done, frames = self.frames_done, self.manifest.frames
+            raise Cancelled(f"bake cancelled at frame {done + 1} of {frames}; run it again to continue") from None
+        except SimulationError:
+            self._stop(keep_state=False)
             raise
 
     def _advance_to(self, index: int, cancelled: IsCancelled) -> None:
-        """Advance to the time of sample ``index`` in a fixed number of parts; cancelling is looked for between them."""
-        self.frame_started = time.monotonic()
+        """Advance to the time of sample ``index`` in a fixed number of parts; Cancelled, at any moment, when asked."""
         world = self.simulation.world
-        for part in range(1, ADVANCE_PARTS + 1):
+        parts = self._parts()
+        for part in range(1, parts + 1):
             if cancelled():
-                raise Cancelled(
-                    f"bake cancelled at frame {index + 1} of {self.manifest.frames}; run it again to continue"
-                )
-            target = (index - 1 + part / ADVANCE_PARTS) / self.manifest.fps
+                raise Cancelled("asked to stop")
+            target = (index - 1 + part / parts) / self.manifest.fps
             if target > world.time:
-                world.advance(target - world.time)
+                world.advance(target - world.time, cancelled)
+            if part < parts and time.monotonic() - self.kept_at > KEEP_SECONDS:
+                self._keep()
 
-    def _append_samples(self, index: int, writers: list[Pc2Writer]) -> None:
+    def _parts(self) -> int:
+        work = self.simulation.prepared.cost.particle_substeps / max(1, self.manifest.frames - 1)
+        return int(np.clip(math.ceil(work / PART_WORK), LEAST_PARTS, MOST_PARTS))
+
+    def _append_samples(self, index: int, writers: Mapping[str, Pc2Writer], cancelled: IsCancelled) -> None:
         """Append the present state to every cache as sample ``index``."""
-        world = self.simulation.world
-        for slot, (mesh, binding, writer) in enumerate(zip(self.meshes, self.bindings, writers, strict=True)):
-            body = self.simulation.body_of_object[slot]
-            if index == 0:
-                # Frame 1 is the scene at rest to the last bit, so that it renders as the photo.
-                writer.append(mesh.vertices)
-            elif binding is None or body is None:
-                moved = self.simulation.collider_vertices(slot)
-                writer.append(mesh.vertices if moved is None else moved)
+        samples: dict[str, NDArray[np.float64]] = {}
+        for sampler in self.samplers:
+            if cancelled():
+                raise Cancelled("asked to stop")
+            samples |= sampler.samples(index)
+        for name, sample in samples.items():
+            writers[name].append(sample)
+        seconds = round(time.monotonic() - self.frame_started, 3)
+        self.metrics.append({**self.simulation.metrics(), "frame": index + 1, "seconds": seconds})
+        self.frames_done = index + 1
+
+    def _keep(self) -> None:
+        """Remember the engine's state, and write what is due to be written."""
+        now = self.kept_at = time.monotonic()
+        self.kept = (self.frames_done, self.simulation.world.checkpoint())
+        if now - self.checkpoint_at > CHECKPOINT_SECONDS:
+            self._checkpoint()
+            self.checkpoint_at = now
+        elif now - self.saved_at > MANIFEST_SECONDS:
+            self.save("running")
+
+    def _checkpoint(self) -> None:
+        if self.kept is not None and self.kept[0] > 0:
+            frames_done, state = self.kept
+            checkpoint = Checkpoint(frames_done=frames_done, metrics=self.metrics[:frames_done], state=state)
+            save_checkpoint(self.out, self.manifest.inputs_hash, checkpoint)
+        self.save("running")
+
+    def _stop(self, *, keep_state: bool) -> None:
+        """Leave the folder as one to go on from, or with ``keep_state`` off, to look at and start anew."""
+        try:
+            if keep_state:
+                self._checkpoint()
             else:
-                writer.append(deform(binding, world.positions(body), world.deformation_gradients(body)))
-        self.metrics.append(
-            {
-                **self.simulation.metrics(),
-                "frame": index + 1,
-                "seconds": round(time.monotonic() - self.frame_started, 3),
-            }
-        )
+                drop_checkpoint(self.out)
+        finally:
+            self.save("cancelled")
 
-    def _checkpoint(self, frames_done: int, *, keep_state: bool = True) -> None:
-        path = self.out / CHECKPOINT_FILE
-        if not keep_state or frames_done == 0:
-            path.unlink(missing_ok=True)
-            return
-        with replacing(path) as partial:
-            np.savez(
-                partial,
-                inputs_hash=np.array(self.manifest.inputs_hash),
-                frames_done=np.array(frames_done),
-                metrics=np.array(json.dumps(self.metrics[:frames_done])),
-                **{f"state.{key}": value for key, value in self.simulation.world.checkpoint().items()},
-            )
-        self._save("running", frames_done)
-
-    def _save(self, state: str, frames_done: int) -> BakeManifest:
-        self.manifest = dataclasses.replace(self.manifest, state=state, frames_done=frames_done)
+    def save(self, state: str) -> BakeManifest:
+        """Write the manifest as of now."""
+        self.saved_at = time.monotonic()
+        self.manifest = dataclasses.replace(self.manifest, state=state, frames_done=self.frames_done)
         save_manifest(self.out, self.manifest)
         return self.manifest
-
-
-def _resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[dict[str, Any]]]:
-    """Restore the last checkpoint if it belongs to these inputs: frames already done and their metrics, or 0."""
-    path = out / CHECKPOINT_FILE
-    try:
-        previous = load_manifest(out)
-        if previous.inputs_hash != manifest.inputs_hash or not path.is_file():
-            return 0, []
-        with np.load(path, allow_pickle=False) as data:
-            frames_done = int(data["frames_done"])
-            metrics = json.loads(str(data["metrics"]))
-            state = {key.removeprefix("state."): data[key] for key in data.files if key.startswith("state.")}
-            matches = str(data["inputs_hash"]) == manifest.inputs_hash
-        if not matches or not 0 < frames_done <= manifest.frames or len(metrics) != frames_done:
-            return 0, []
-        for item in manifest.objects:
-            if Pc2Reader(out / item.file).sample_count < frames_done:
-                return 0, []
-        world.restore(state)
-    except (InputError, OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
-        # A checkpoint that a crash left unreadable costs a fresh start, never the run.
-        return 0, []
-    return frames_done, metrics
-
-
-def _remove_previous(out: Path) -> None:
-    """Delete what the previous manifest lists, and nothing else."""
-    try:
-        previous = load_manifest(out)
-    except InputError:
-        return
-    for item in previous.objects:
-        (out / item.file).unlink(missing_ok=True)
-    for name in (CHECKPOINT_FILE, METRICS_FILE):
-        (out / name).unlink(missing_ok=True)
-
-
-def _require_disk_space(out: Path, meshes: list[ObjectMesh], frames: int) -> None:
-    needed = sum(len(mesh.vertices) for mesh in meshes) * 12 * frames + 64 * 2**20
-    free = shutil.disk_usage(out).free
-    if free < needed:
-        raise InputError(
-            f"{out}: the bake needs about {needed >> 20} MiB and {free >> 20} MiB are free; free space, bake fewer "
-            "frames, or choose another disk"
-        )

@@ -3,16 +3,83 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..cache.manifest import BakedObject
+from ..errors import InputError
 from ..scene.folder import SceneFolder
 from ..scene.meshes import load_object_mesh
 from .bake_inputs import BakeOptions
+from .bake_samples import baked_objects
 from .setup_world import PreparedWorld, prepare_world
+
+STATE_BYTES = 190
+"""Of a checkpoint, a particle, with all that any law keeps."""
+
+FRAME_BYTES = 512
+"""Of ``metrics.json``, a frame, rounded up."""
+
+SPARE_BYTES = 64 * 2**20
+"""That stay free, for what else happens on the disk."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeCost:
+    """What a bake will take.
+
+    prepared: the world that it would begin with; its ``cost`` says substeps, seconds and bytes of memory.
+    disk_bytes: of the finished bake and its largest checkpoint.
+    """
+
+    prepared: PreparedWorld
+    disk_bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs: particles, cells (filled, and their side in m), substeps, seconds, bytes, warnings."""
+        prepared, cost = self.prepared, self.prepared.cost
+        return {
+            "particles": prepared.particle_count,
+            "cells": -(-prepared.particle_count // prepared.solver.particles_per_cell),
+            "cell_size_m": prepared.solver.cell_size(prepared.similarity),
+            "substeps": cost.substeps,
+            "seconds": cost.seconds,
+            "memory_bytes": cost.bytes,
+            "disk_bytes": self.disk_bytes,
+            "warnings": list(prepared.warnings),
+        }
 
 
 def estimate_bake(folder: SceneFolder, options: BakeOptions) -> PreparedWorld:
-    """The world that a bake of ``folder`` would begin with; its ``cost`` is the answer.
+    """The world that a bake of ``folder`` would begin with; its ``cost`` is time and memory.
 
     Raises InputError as ``setup_world.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
     """
+    return bake_cost(folder, options).prepared
+
+
+def bake_cost(folder: SceneFolder, options: BakeOptions) -> BakeCost:
+    """What a bake of ``folder`` will take. Raises InputError as ``estimate_bake`` does."""
     meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
-    return prepare_world(folder, meshes, options)
+    prepared = prepare_world(folder, meshes, options)
+    objects = baked_objects(folder, meshes, prepared, options)
+    return BakeCost(prepared=prepared, disk_bytes=disk_bytes(objects, prepared.particle_count, options.frames))
+
+
+def disk_bytes(objects: Iterable[BakedObject], particles: int, frames: int) -> int:
+    """Bytes of the caches of ``objects``, and of two checkpoints: one is only given up when the next is whole."""
+    points = sum(sum(item.files.values()) for item in objects)
+    return frames * (12 * points + FRAME_BYTES) + 2 * STATE_BYTES * particles
+
+
+def require_disk_space(out: Path, needed: int) -> None:
+    """Raise InputError unless ``needed`` bytes and some to spare are free where the folder ``out`` is."""
+    free = shutil.disk_usage(out).free
+    if free < needed + SPARE_BYTES:
+        raise InputError(
+            f"{out}: the bake needs about {(needed + SPARE_BYTES) >> 20} MiB and {free >> 20} MiB are free; free "
+            "space, bake fewer frames, or choose another disk"
+        )

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What a bake depends on, as one hash: the same inputs never run twice, and any change runs again."""
+"""What a bake depends on, as one hash: the same inputs never run twice, and any change runs again.
+
+Asked by Blender's own process, which has neither SciPy nor trimesh: nothing here may import more than numpy.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..cache.manifest import SPACES, WORLD_SPACE
 from ..errors import InputError
 from ..scene.folder import SceneFolder
 from ..scene.json_fields import to_json
@@ -25,7 +29,10 @@ class BakeOptions:
     fps: frames a second, above 0 and up to 1000.
     quality: name of a preset in ``presets/qualities``.
     arch: ``cpu``, ``cuda``, ``vulkan`` or ``metal``; what is not there falls back to ``cpu`` with a notice.
-    seed: of the particle sampling.
+    seed: of the particles' places, 0 or more; 0 is the even lattice, every other moves each a little its own way.
+    space: what samples are in, ``world`` (metres) or ``mesh`` (the coordinates of the object's mesh file, so that an
+        object that stands by its matrix goes on standing by it).
+    points: whether all particles of what flows (sand, fluid, snow) get caches of their own.
     """
 
     frames: int = 48
@@ -33,12 +40,18 @@ class BakeOptions:
     quality: str = "standard"
     arch: str = "cpu"
     seed: int = 0
+    space: str = WORLD_SPACE
+    points: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 100_000:
             raise InputError(f"frames is {self.frames}: give 1 to 100000")
         if not 0 < self.fps <= 1000:
             raise InputError(f"fps is {self.fps}: give frames a second above 0 and up to 1000")
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}: give a whole number, 0 or more")
+        if self.space not in SPACES:
+            raise InputError(f"space is {self.space!r}: choose one of {', '.join(SPACES)}")
 
 
 def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
@@ -62,9 +75,18 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
         "gravity_track": to_json(scene.gravity_track),
         "contacts": to_json(scene.contacts),
         "effects": to_json(scene.effects),
-        "options": to_json(options),
+        "options": _said(options),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _said(options: BakeOptions) -> dict[str, Any]:
+    """The options without those that came later and are at their defaults, so that older bakes stay up to date."""
+    fields: dict[str, Any] = to_json(options)
+    for name in ("space", "points"):
+        if fields[name] == getattr(BakeOptions, name):
+            del fields[name]
+    return fields
 
 
 def geometry_hash(folder: SceneFolder) -> str:

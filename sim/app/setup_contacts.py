@@ -12,20 +12,24 @@ import itertools
 import math
 
 from ..mpm.contacts import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
-from ..scene.model import Contact, Scene, SceneObject
+from ..scene.model import Contact, Ground, Scene, SceneObject
 
 HOLDS = ("separate", "slip", "sticky")
 """Modes by how much they hold; of two surfaces the stronger one counts."""
 
 
 def contact_table(scene: Scene) -> ContactTable:
-    """The contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is."""
+    """The contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is.
+
+    Where there is no ground, as made of what a new scene's ground is.
+    """
+    usual = scene.ground or Ground()
     ground = SurfaceContact(
-        friction=scene.ground.friction,
-        static_friction=scene.ground.static_friction,
-        restitution=scene.ground.restitution,
+        friction=usual.friction, static_friction=usual.static_friction, restitution=usual.restitution
     )
-    surfaces = {GROUND_NAME: ground, **{item.name: surface(item, ground) for item in scene.objects}}
+    surfaces = {item.name: surface(item, ground) for item in scene.objects}
+    if scene.ground is not None:
+        surfaces = {GROUND_NAME: ground, **surfaces}
     named = {frozenset(contact.between): contact for contact in scene.contacts}
     table = ContactTable(default=ground)
     for a, b in itertools.combinations(surfaces, 2):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import InputError
-from ..mpm.estimate import PARTICLE_BYTES, available_memory, require_memory
+from ..mpm.estimate import SAMPLING_BYTES, available_memory, require_memory
 from ..mpm.options import SolverOptions
 from ..mpm.placement import centred
 from ..scene.meshes import ObjectMesh
@@ -58,7 +58,7 @@ def _refuse_absurd(names: Sequence[str], meshes: Sequence[ObjectMesh], quality: 
             f"object {names[small]} ({lengths[small]:.2g} m) asks for, are too fine for object {names[large]} "
             f"({lengths[large]:.2g} m); choose a coarser quality, make one of them a collider, or check their sizes"
         )
-    require_memory(int(count * PARTICLE_BYTES), int(count), available_memory())
+    require_memory(int(count * SAMPLING_BYTES), int(count), available_memory())
 
 
 def _place(meshes: Sequence[ObjectMesh], cell: float, quality: Quality, arch: str) -> tuple[SolverOptions, Similarity]:

@@ -39,6 +39,9 @@ from .shell import SHELL_CELLS, keep_shell
 JUMP = 1e-3
 """Share of its size by which a collider's motion may begin off the place of its mesh."""
 
+JITTER = 0.2
+"""Share of the particle spacing by which a seed other than 0 moves each particle off the lattice along each axis."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedWorld:
@@ -94,8 +97,9 @@ def prepare_world(folder: SceneFolder, meshes: Sequence[ObjectMesh], options: Ba
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):
         warnings += surface_warnings(_surface(mesh), item.name, cell)
-    for i in moving:
-        require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
+    if scene.ground is not None:
+        for i in moving:
+            require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
     bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
     warnings += overlap_warnings(bodies, spacing, cell)
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
@@ -141,7 +145,7 @@ def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed
             "out; role 'collider' with motion holds or leads a rigid thing"
         )
     try:
-        sample = sample_interior(mesh.vertices, mesh.faces, spacing, seed=seed)
+        sample = sample_interior(mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed)
         if not item.fill:
             thickness = SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness
             sample = keep_shell(sample, mesh, thickness, spacing)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +11,9 @@ from numpy.typing import NDArray
 
 from ..events import StageProgress
 from ..mpm.world import World
-from ..scene.folder import SceneFolder
-from ..scene.meshes import ObjectMesh
-from .bake_inputs import BakeOptions
 from .collider_motion import moves, vertices_at
 from .engine_material import engine_material
-from .setup_world import PreparedWorld, cost_text, prepare_world
+from .setup_world import PreparedWorld, cost_text
 
 __all__ = ["ENGINE_NAME", "Simulation", "build_world", "engine_material"]
 
@@ -59,7 +55,7 @@ class Simulation:
         return vertices_at(self.prepared.setup.colliders[index], self.world.time)
 
     def metrics(self) -> dict[str, Any]:
-        """Of the present state: energies in J, momentum in kg m/s, gap to the ground in m (below 0 under it)."""
+        """Of now: energies in J, momentum in kg m/s, gap to the ground in m (below 0 under it, None without)."""
         energy = self.world.energy()
         bodies = range(len(self.world.bodies))
         return {
@@ -69,19 +65,16 @@ class Simulation:
             "elastic_j": energy.elastic,
             "potential_j": energy.potential,
             "momentum": [float(c) for c in self.world.linear_momentum()],
-            "ground_gap_m": min(self.world.ground_gap(i) for i in bodies),
+            "ground_gap_m": None if self.world.setup.ground is None else min(map(self.world.ground_gap, bodies)),
             "outside": sum(self.world.particles_outside(i) for i in bodies),
         }
 
 
-def build_world(
-    folder: SceneFolder, meshes: Sequence[ObjectMesh], options: BakeOptions, progress: StageProgress
-) -> Simulation:
-    """The scene's world, ready to run, after saying what it will cost and what is odd about it.
+def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> Simulation:
+    """The prepared world, ready to run on ``arch``, after saying what it will cost and what is odd about it.
 
-    Raises InputError as ``setup_world.prepare_world`` does, and for a bake that would take too long or too much memory.
+    Raises InputError for a bake that would take too long or too much memory.
     """
-    prepared = prepare_world(folder, meshes, options)
     for warning in prepared.warnings:
         progress.notice(warning)
     prepared.require_affordable()
@@ -97,10 +90,10 @@ def build_world(
         similarity=prepared.similarity,
         options=prepared.solver,
     )
-    if world.arch != options.arch:
+    if world.arch != arch:
         prepared = prepared.on(world.arch)
         prepared.require_affordable()
-        progress.notice(f"{options.arch} is not available here; simulating on {world.arch}, {cost_text(prepared)}")
+        progress.notice(f"{arch} is not available here; simulating on {world.arch}, {cost_text(prepared)}")
     bodies = prepared.setup.bodies
     return Simulation(
         world=world,

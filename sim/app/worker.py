@@ -7,6 +7,7 @@ go to standard output as JSON lines; SIGTERM, or the parent's death, cancels.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -25,6 +26,17 @@ from .bake import BakeOptions, bake
 from .bake_inputs import inputs_hash
 
 JOB_FORMAT = "physgen-job/1"
+UNHEARD_S = 0.5
+"""A bake that was asked to stop looks up within a tenth of a second. What has not by then is compiling kernels or
+preparing the scene: nothing of that is kept anyway, so the process ends as it stands, as after a crash."""
+
+RUNNING_UNHEARD_S = 3.0
+"""The same once frames are made: of millions of particles, or on a busy machine, a launch takes longer, and there is
+something to keep."""
+
+RUNNING_LOOKS = 50
+"""A bake that has looked up so often is making frames."""
+
 LAST_GRACE_S = 15.0
 """Longer than the asker waits before it kills (process.py), for when there is no asker any more."""
 MODULE = __name__ if __name__ != "__main__" else f"{__package__}.worker"
@@ -65,37 +77,76 @@ def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
     return {"event": "done", "stage": "bake", "out": job.out, "frames": manifest.frames_done}
 
 
-def _end_at_last(cancelled: IsCancelled) -> None:
-    """End the process when it was asked to stop and has not: a single time step can take longer than anyone waits."""
-    while not cancelled():
-        time.sleep(0.5)
-    time.sleep(LAST_GRACE_S)
+class _Wish:
+    """Whether this process is to stop, and whether its work has heard of it."""
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+        self.heard = threading.Event()
+        self.looks = 0
+        self._parent = os.getppid()
+
+    def listen(self) -> None:
+        """Take the signals that ask to stop, at once: Python's handlers wait until the main thread's present call into
+        NumPy or SciPy is over, which can take seconds. The main thread calls this."""
+        read, write = os.pipe()
+        if os.name != "nt":
+            os.set_blocking(write, False)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGTERM)):
+            signal.signal(number, lambda *_: self.asked.set())
+        threading.Thread(target=self._await_signal, args=(read,), daemon=True).start()
+
+    def _await_signal(self, pipe: int) -> None:
+        os.read(pipe, 1)
+        self.asked.set()
+
+    def pending(self) -> bool:
+        """Somebody has asked, or nobody is left who could."""
+        return self.asked.is_set() or os.getppid() != self._parent
+
+    def cancelled(self) -> bool:
+        """The same, asked by the work itself, which then stops in good order."""
+        self.looks += 1
+        if self.pending():
+            self.heard.set()
+        return self.heard.is_set()
+
+
+def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
+    """End the process when it was asked to stop and does not."""
+    while not wish.pending():
+        time.sleep(0.05)
+    if not wish.heard.wait(UNHEARD_S if wish.looks < RUNNING_LOOKS else RUNNING_UNHEARD_S):
+        with contextlib.suppress(OSError):
+            emit(_error(Cancelled("bake cancelled in the middle of a long step; run it again to continue")))
+    else:
+        time.sleep(LAST_GRACE_S)
     os._exit(Cancelled.exit_code)
+
+
+def _error(error: PhysGenError) -> Event:
+    return {"event": "error", "kind": type(error).__name__, "message": str(error)}
 
 
 def main(arguments: list[str]) -> int:
     """Entry of the process; the exit code of docs/cli.md."""
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGTERM)):
-        signal.signal(number, lambda *_: stop.set())
+    wish = _Wish()
+    wish.listen()
     # Libraries print to standard output; events get a descriptor of their own.
     events: TextIO = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)
-    parent = os.getppid()
 
     def emit(event: Event) -> None:
         events.write(json.dumps(event, ensure_ascii=False) + "\n")
 
-    def cancelled() -> bool:
-        return stop.is_set() or os.getppid() != parent
-
-    threading.Thread(target=_end_at_last, args=(cancelled,), daemon=True).start()
+    threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
     try:
         if len(arguments) != 1:
             raise InputError(f"worker: expected one job file, found {len(arguments)} arguments")
-        emit(run_job(Path(arguments[0]), emit, cancelled))
+        emit(run_job(Path(arguments[0]), emit, wish.cancelled))
     except PhysGenError as error:
-        emit({"event": "error", "kind": type(error).__name__, "message": str(error)})
+        emit(_error(error))
         return error.exit_code
     return 0
 

@@ -15,14 +15,44 @@ FORMAT = "physgen-bake/1"
 MANIFEST_FILE = "manifest.json"
 STATES = ("running", "complete", "cancelled")
 
+CHECKPOINT_FILE = "checkpoints/state.npz"
+"""The engine's state to go on from, replaced now and then while a bake runs, gone when it is complete."""
+
+METRICS_FILE = "metrics.json"
+
+WORLD_SPACE, MESH_SPACE = "world", "mesh"
+SPACES = (WORLD_SPACE, MESH_SPACE)
+"""What samples are in: world metres, or the coordinates of the object's mesh file."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BakedObject:
-    """One object's cache: ``file`` is the PC2 relative to the bake folder, ``vertices`` its count."""
+    """One object's caches, files relative to the bake folder.
+
+    file: PC2 of the mesh's vertices, of which there are ``vertices``.
+    space: of all samples, one of ``SPACES``.
+    points_file: PC2 of all particles, of which there are ``points``; None and 0 where they were not asked for or the
+        object does not flow.
+    """
 
     name: str
     file: str
     vertices: int
+    space: str = WORLD_SPACE
+    points_file: str | None = None
+    points: int = 0
+
+    def __post_init__(self) -> None:
+        if self.space not in SPACES:
+            raise InputError(f"object {self.name}: space is {self.space!r}: choose one of {', '.join(SPACES)}")
+        if (self.points_file is None) != (self.points == 0):
+            raise InputError(f"object {self.name}: {self.points} points in {self.points_file!r}; bake again")
+
+    @property
+    def files(self) -> dict[str, int]:
+        """Its PC2 files, and how many points a sample of each has."""
+        mesh = {self.file: self.vertices}
+        return mesh if self.points_file is None else {**mesh, self.points_file: self.points}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +61,7 @@ class BakeManifest:
 
     inputs_hash: SHA-256 over everything that the motion depends on (sim/app/bake.py: inputs_hash).
     fps, frame_start, frames: frame ``frame_start + i`` is sample ``i`` at ``i / fps`` seconds.
-    frames_done: samples that every cache holds.
+    frames_done: samples that every cache holds; while a bake runs, at least so many.
     particles: simulated particles of all objects together.
     geometry_hash: SHA-256 over the objects' meshes and where they stand (sim/app/bake_inputs.py: geometry_hash), by
         which a bake of another scene is told; empty when not known.
@@ -48,6 +78,11 @@ class BakeManifest:
     particles: int
     objects: tuple[BakedObject, ...]
     geometry_hash: str = ""
+
+    @property
+    def files(self) -> dict[str, int]:
+        """All PC2 files, and how many points a sample of each has."""
+        return {name: count for item in self.objects for name, count in item.files.items()}
 
     def __post_init__(self) -> None:
         if self.state not in STATES:
@@ -67,8 +102,8 @@ def load_manifest(folder: Path) -> BakeManifest:
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise InputError(f"{path}: not of format {FORMAT!r}; bake again with this version")
     manifest = parse(BakeManifest, data, str(path))
-    for item in manifest.objects:
-        inside(folder, item.file)
+    for name in manifest.files:
+        inside(folder, name)
     return manifest
 
 

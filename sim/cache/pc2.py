@@ -27,7 +27,9 @@ MAX_VERTICES = 50_000_000
 
 
 class Pc2Reader:
-    """A cache on disk, memory-mapped: opening costs nothing and samples are read when asked for.
+    """A cache on disk: opening reads the header, samples are read when asked for.
+
+    Not memory-mapped, because a bake may cut the file short meanwhile, which would end the process that looks.
 
     Raises InputError when the file is missing, not PC2, or shorter than its header says.
     """
@@ -57,17 +59,21 @@ class Pc2Reader:
         self.sample_count: int = samples
         self.start_frame: float = start
         self.sample_rate: float = rate
-        self._data: NDArray[np.float32] | None = None
-        if samples:
-            self._data = np.memmap(path, dtype="<f4", mode="r", offset=_HEADER.size, shape=(samples, vertices, 3))
 
     def sample(self, index: int) -> NDArray[np.float32]:
         """Vertex positions (V, 3) of sample ``index`` from 0; InputError outside the cache."""
-        if self._data is None or not 0 <= index < self.sample_count:
+        if not 0 <= index < self.sample_count:
             raise InputError(
                 f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames"
             )
-        sample = np.array(self._data[index])
+        count = 3 * self.vertex_count
+        try:
+            numbers = np.fromfile(self.path, dtype="<f4", count=count, offset=_HEADER.size + 4 * index * count)
+        except OSError as error:
+            raise InputError(f"{self.path}: {error.strerror or error}; bake again") from None
+        if len(numbers) < count:
+            raise InputError(f"{self.path}: was cut off meanwhile at sample {index}; wait for the bake, or bake again")
+        sample: NDArray[np.float32] = numbers.reshape(-1, 3).astype(np.float32, copy=False)
         if not np.isfinite(sample).all():
             raise InputError(f"{self.path}: sample {index} has positions that are not finite; bake again")
         return sample
@@ -91,8 +97,9 @@ class Pc2Writer:
             if existing.vertex_count != vertex_count or existing.sample_count < keep:
                 raise InputError(f"{path}: does not hold the {keep} samples of {vertex_count} vertices to go on from")
         self._file = path.open("r+b" if keep else "w+b")
-        self._file.truncate(_HEADER.size + keep * vertex_count * 12)
+        # The header first: whoever looks, or goes on after a kill between the two, never misses what it promises.
         self._write_header()
+        self._file.truncate(_HEADER.size + keep * vertex_count * 12)
 
     def append(self, positions: NDArray[np.floating]) -> None:
         """Write one sample of (V, 3) world positions in metres; they must be finite."""

@@ -11,6 +11,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from ..events import IsCancelled
 from . import layout, meeting, runtime, sorting
 from .launch import Launcher
 from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
@@ -44,6 +45,10 @@ LEAST_STEP = 1e-10
 LEAST_BLOCKS = 64
 GROWTH = 1.3
 """Room for more blocks than there are, so that the arrays are not made anew at every sort."""
+
+
+class Stopped(Exception):
+    """The caller wants no more; the worlds are left between two times."""
 
 
 class Diverged(Exception):
@@ -420,9 +425,10 @@ class Engine:
         step = np.minimum(control[:, layout.LONGEST_STEP], wave)
         return np.asarray(np.minimum(step, scale * self.cfl_velocity / np.maximum(fastest, 1e-30)))
 
-    def advance(self, durations: Array, *, longest_step: Array) -> None:
+    def advance(self, durations: Array, *, longest_step: Array, stop: IsCancelled) -> None:
         """Advance every world by its duration (W,) in s, 0 to let it be, in substeps of at most ``longest_step`` (W,).
 
+        stop: asked before every launch. Raises Stopped when it says yes: only ``restore`` makes sense after that.
         Raises Diverged when a world goes wrong and shorter steps do not help. All worlds are then as they were when
         they were last sorted, ELAPSED s after the call.
         """
@@ -446,7 +452,11 @@ class Engine:
                     launcher, arguments = self._launcher(), self._arguments()
                     self._running[0] = self.world_count
                     while self._running[0] > 0:
+                        if stop():
+                            raise Stopped
                         launcher.launch(arguments)
+                elif stop():
+                    raise Stopped
                 else:
                     self._advance_solids()
                 after = self.control()

@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, SimulationError
+from ..errors import Cancelled, InputError, SimulationError
+from ..events import IsCancelled, never
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import layout, packing, runtime
 from .checks import check_start
-from .engine import MOST_RETRIES, Diverged, Engine
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped
 from .fitting import FittedGradients
 from .options import SolverOptions
 from .setup import WorldSetup
@@ -62,6 +63,7 @@ class Group:
         self._offsets = np.concatenate([[0], np.cumsum(counts)])
         self._started = np.zeros(len(counts), dtype=bool)
         self._times = np.zeros(len(self.setups))
+        self._between = False
         self._solids = self._new_solids()
         self._engine = self._new_engine()
         self._host: State | None = None
@@ -111,14 +113,16 @@ class Group:
         """Stretches of substeps that were taken again with shorter steps because they had gone wrong."""
         return self._engine.retries
 
-    def advance(self, duration: float) -> None:
+    def advance(self, duration: float, stop: IsCancelled = never) -> None:
         """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
 
-        Raises SimulationError that names the body when a world goes wrong and shorter substeps do not help.
+        Raises Cancelled when ``stop`` says so, SimulationError that names the body when a world goes wrong and shorter
+        substeps do not help.
         """
         if not (math.isfinite(duration) and duration >= 0):
             raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
         self._check_generation()
+        self._check_whole()
         end = self._times[0] + duration
         while (self._times < end - INSTANT).any():
             stops = np.array([self._next_stop(place, end) for place in self._places])
@@ -133,7 +137,10 @@ class Group:
             longest = [self._longest_step(place) for place in self._places]
             self._host = None
             try:
-                self._engine.advance(stops - self._times, longest_step=np.array(longest))
+                self._engine.advance(stops - self._times, longest_step=np.array(longest), stop=stop)
+            except Stopped:
+                self._between = True
+                raise Cancelled("the simulation was stopped in the middle of a step") from None
             except Diverged as failure:
                 self._times = self._times + self._engine.control()[:, layout.ELAPSED]
                 raise self._lost(failure) from None
@@ -248,6 +255,11 @@ class Group:
             f"lower the solver option cfl_elastic ({self.options.cfl_elastic:g})"
         )
 
+    def _check_whole(self) -> None:
+        """Raise SimulationError for a state that is of no time, because ``advance`` was stopped."""
+        if self._between:
+            raise SimulationError("the world was stopped in the middle of a step: restore a checkpoint to go on")
+
     def _check_generation(self) -> None:
         if self._generation != runtime.generation():
             raise SimulationError(
@@ -260,6 +272,7 @@ class Group:
     def state(self) -> State:
         """The engine's state; kept until the next advance."""
         self._check_generation()
+        self._check_whole()
         if self._host is None:
             self._host = self._engine.state()
         return self._host
@@ -267,6 +280,7 @@ class Group:
     def pose(self, world: int, name: str) -> SolidPose:
         """Where the rigid body or collider ``name`` of world ``world`` is and how it moves."""
         self._check_generation()
+        self._check_whole()
         if (world, name) not in self._poses:
             self._poses[(world, name)] = self._solids.pose(world, name)
         return self._poses[(world, name)]
@@ -337,5 +351,6 @@ class Group:
             self._solids.restore(solids)
         self._engine = self._new_engine()
         self._engine.restore(checkpoint)
+        self._between = False
         self._host = None
         self._poses = {}

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..events import IsCancelled, never
 from ..scene.units import Similarity
 from .bodies import BodyParticles, Vector
 from .colliders import Collider
@@ -85,12 +86,14 @@ class World(WorldView):
         """Stretches of substeps that were taken again with shorter steps because they had gone wrong."""
         return self._worlds.retries
 
-    def advance(self, duration: float) -> None:
+    def advance(self, duration: float, stop: IsCancelled = never) -> None:
         """Advance by exactly ``duration`` seconds, in substeps that are stable.
 
+        stop: asked between launches of a few substeps, so it must be cheap; asking changes nothing. When it says yes,
+        Cancelled is raised, and the state is of no time: nothing but ``restore`` works then.
         Raises SimulationError that names the body when the world goes wrong and shorter substeps do not help.
         """
-        self._worlds.advance(duration)
+        self._worlds.advance(duration, stop)
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Everything needed to continue, as arrays for ``numpy.savez``; a restored world continues with equal bytes."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..events import IsCancelled, never
 from ..scene.units import Similarity
 from . import packing
 from .group import Group
@@ -104,16 +105,18 @@ class Worlds:
         """Simulated time in s of world ``world``."""
         return self[world].time
 
-    def advance(self, duration: float) -> None:
+    def advance(self, duration: float, stop: IsCancelled = never) -> None:
         """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
 
+        stop: asked between launches of a few substeps, so it must be cheap; asking changes nothing. When it says yes,
+        Cancelled is raised, and the state is of no time: nothing but ``restore`` works then.
         Raises SimulationError that names the body when a world goes wrong and shorter substeps do not help; the others
         are then at their own ``time``, before or at the end.
         """
         if not (math.isfinite(duration) and duration >= 0):
             raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
         for group in self._groups:
-            group.advance(duration)
+            group.advance(duration, stop)
 
     def checkpoint(self) -> State:
         """Everything needed to continue, as arrays for ``numpy.savez``; a restored run continues with equal bytes."""

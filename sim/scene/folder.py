@@ -10,7 +10,7 @@ from typing import Any
 from ..atomic import write_json
 from ..errors import InputError
 from .json_fields import parse, read_json, to_json
-from .model import FORMAT, Scene
+from .model import FORMAT, Ground, Scene
 
 SCENE_FILE = "scene.json"
 
@@ -102,8 +102,27 @@ def save_scene(root: Path, scene: Scene) -> SceneFolder:
     return SceneFolder(root=root, scene=scene)
 
 
+def require_photo(folder: SceneFolder) -> tuple[str, str, Ground]:
+    """Names of the photo and its background, and the ground in it: what is needed to show anything in the photo.
+
+    Raises InputError, with what to do instead, for a scene without a photo or without a ground.
+    """
+    scene = folder.scene
+    if scene.photo is None or scene.background is None:
+        raise InputError(
+            f"{folder.root}: this scene has no photo to render into; render it in Blender, with the bake attached to "
+            "its objects, or reconstruct a scene from a photo (physgen reconstruct)"
+        )
+    if scene.ground is None:
+        raise InputError(
+            f"{folder.root}: this scene has no ground, which the photo's shadows fall on; give it a ground again, "
+            "below all objects if it should not hold them"
+        )
+    return scene.photo, scene.background, scene.ground
+
+
 def referenced_files(scene: Scene) -> list[str]:
-    """Names of all files that ``scene`` needs, photo first."""
+    """Names of all files that ``scene`` needs, photo first if there is one."""
     names = [name for name in (scene.photo, scene.background) if name is not None]
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None

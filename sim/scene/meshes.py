@@ -20,21 +20,28 @@ MAX_MESH_BYTES = 512 * 2**20
 
 @dataclass(frozen=True)
 class ObjectMesh:
-    """A triangle mesh. vertices: (V, 3) world metres; faces: (T, 3) vertex indices, counter-clockwise from outside."""
+    """A triangle mesh.
+
+    vertices: (V, 3) world metres.
+    faces: (T, 3) vertex indices, counter-clockwise from outside in the world, also where it is mirrored there.
+    in_file: (V, 3) the vertices as the mesh file has them.
+    """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
+    in_file: NDArray[np.float64]
 
 
 def load_object_mesh(folder: SceneFolder, item: SceneObject) -> ObjectMesh:
     """The mesh of ``item`` in world metres. Raises InputError as ``read_mesh`` does."""
     mesh = read_mesh(folder.file(item.mesh))
     matrix = np.asarray(item.world_from_mesh)
-    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    in_file = np.asarray(mesh.vertices, dtype=np.float64)
+    vertices = in_file @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, dtype=np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1].copy()
-    return ObjectMesh(vertices=vertices, faces=faces)
+    return ObjectMesh(vertices=vertices, faces=faces, in_file=in_file)
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:

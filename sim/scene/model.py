@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scene: what stands in the photo, where, of what matter, under which light.
+"""The scene: what stands in the photo (if there is one), where, of what matter, under which light.
 
 Metres, kilograms, seconds; the world is right-handed with +Z up. A reconstructed scene has its origin on the
 ground, X to the right of the camera and Y away from it. All data here are immutable.
@@ -48,7 +48,7 @@ FORMAT = "physgen-scene/1"
 class Camera:
     """Pinhole camera without distortion, OpenCV axes (x right, y down, z forward).
 
-    width, height: pixels of ``photo.png``.
+    width, height: pixels of the photo.
     fx, fy, cx, cy: pixels; the centre of the top left pixel is (0.5, 0.5).
     world_from_camera: 4x4 rigid transform, metres.
     """
@@ -212,6 +212,8 @@ class Light:
 class Scene:
     """A whole scene. File names are relative to the scene folder.
 
+    ground: None for no floor at all; ``contacts`` cannot name it then.
+    photo, background: None, both, for a scene without a photo: it can be baked, and not rendered into anything.
     gravity: m/s²; gravity_track: keyframes of it, in its place; none: steady.
     contacts: how pairs meet where it does not follow from the two surfaces.
     """
@@ -230,6 +232,12 @@ class Scene:
 
     def __post_init__(self) -> None:
         require(len(self.objects) > 0, "objects", (), "a scene needs at least one object")
+        require(
+            (self.photo is None) == (self.background is None),
+            "photo, background",
+            (self.photo, self.background),
+            "give both files, or null for both: a scene without a photo",
+        )
         require(
             finite(*self.gravity) and math.hypot(*self.gravity) <= 1e4,
             "gravity",
@@ -259,15 +267,16 @@ class Scene:
         self._check_contacts()
 
     def _check_contacts(self) -> None:
-        known = [o.name for o in self.objects]
+        known = [o.name for o in self.objects] + ([GROUND] if self.ground is not None else [])
         pairs = set()
         for i, contact in enumerate(self.contacts):
             for name in contact.between:
+                missing = "no ground" if name == GROUND else f"no object {name!r}"
                 require(
-                    name == GROUND or name in known,
+                    name in known,
                     f"contacts[{i}].between",
                     list(contact.between),
-                    f"there is no object {name!r}; choose two of {', '.join([*known, GROUND])}",
+                    f"there is {missing}; choose two of {', '.join(known)}",
                 )
             pair = frozenset(contact.between)
             require(pair not in pairs, f"contacts[{i}].between", list(contact.between), "name every pair once")

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .checks import finite, require, require_range
 from .control import Box, Keys, Motion, Vector, require_rising, require_surface
@@ -16,6 +17,9 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]
 ROLES = ("dynamic", "collider")
 IDENTITY4: Matrix4 = tuple(tuple(1.0 if i == j else 0.0 for j in range(4)) for i in range(4))  # type: ignore[misc]
 
+LEAST_ANGLE = 1e-6
+"""Volume of a unit cube under ``world_from_mesh`` over that of a brick with its edges; below, it is flat."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SceneObject:
@@ -23,7 +27,8 @@ class SceneObject:
 
     name: letters, digits, ``_``, ``-`` and spaces; it names the object's files.
     mesh, mask, shadow: files relative to the scene folder; mask and shadow may be None.
-    world_from_mesh: 4x4 similarity from the mesh file's own coordinates to world metres.
+    world_from_mesh: 4x4 affine map from the mesh file's own coordinates to world metres: any that can be undone, also
+        with another scale along each axis, sheared or mirrored.
     size_m: largest extent in metres.
     role: ``dynamic`` moves, ``collider`` stays where it is or goes where ``motion`` takes it, and others hit it.
     fill: matter through the whole inside (True), or only within ``shell_thickness`` m of the surface (False; None takes
@@ -32,7 +37,8 @@ class SceneObject:
     occlusion_order: 0 is frontmost.
     roughness: of the surface, 0 (polished) to 1 (coarse); gives its friction where ``friction`` is None.
     friction, static_friction: Coulomb's coefficients of the surface, 0 to 10; restitution: 0 to 1; contact_mode: one of
-        ``CONTACT_MODES``. None takes the ground's. docs/file-formats.md says how those of two surfaces combine.
+        ``CONTACT_MODES``. None takes the ground's, or those of ``Ground()`` where there is no ground.
+        docs/file-formats.md says how those of two surfaces combine.
     motion: of a collider; None stands still.
 
     Of dynamic objects only:
@@ -90,10 +96,10 @@ class SceneObject:
         require(finite(*self.spin), f"object {self.name}: spin", self.spin, "give three finite numbers in rad/s")
         matrix = np.asarray(self.world_from_mesh, dtype=float)
         require(
-            matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and abs(float(np.linalg.det(matrix))) > 1e-18,
+            matrix.shape == (4, 4) and _invertible(matrix),
             f"object {self.name}: world_from_mesh",
-            matrix.shape,
-            "give a finite, invertible 4x4 matrix",
+            matrix.tolist(),
+            "give a finite, invertible 4x4 matrix whose last row is 0 0 0 1: no axis may be scaled to nothing",
         )
         self._check_control()
 
@@ -114,3 +120,11 @@ class SceneObject:
             return
         for name in ("start_time", "acceleration", "velocity_keys", "pins", "goal_stiffness"):
             require(not getattr(self, name), f"{where}: {name}", "given", "only an object of role 'dynamic' has one")
+
+
+def _invertible(matrix: NDArray[np.float64]) -> bool:
+    """Whether the 4x4 ``matrix`` is affine and flattens no body, whatever unit the mesh is in."""
+    if not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        return False
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    return bool((scales > 0).all() and abs(np.linalg.det(matrix[:3, :3] / scales)) > LEAST_ANGLE)

@@ -55,7 +55,7 @@ def without_physics(scene: Scene, friction: float) -> Scene:
     return dataclasses.replace(
         scene,
         objects=tuple(SceneObject(**shape) for shape in shapes),
-        ground=Ground(point=scene.ground.point, normal=scene.ground.normal, friction=friction),
+        ground=scene.ground and Ground(point=scene.ground.point, normal=scene.ground.normal, friction=friction),
         gravity=Scene.gravity,
         gravity_track=(),
         contacts=(),
@@ -72,6 +72,8 @@ def _apply(data: dict[str, Any], text: str) -> None:
         _apply_to_object(objects[name], field, _value(value), text)
     elif name == GROUND:
         _known(field, GROUND_FIELDS, text)
+        if data["ground"] is None:
+            raise InputError(f"--set {text}: the scene has no ground; give it one in scene.json first")
         data["ground"][field] = _value(value)
     elif name == WHOLE:
         _known(field, SCENE_FIELDS, text)

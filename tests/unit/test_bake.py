@@ -143,6 +143,24 @@ def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
     assert not (tmp_path / "bake" / ".lock").exists()
 
 
+@pytest.mark.parametrize("until", ["sampling", "about"])
+def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until):
+    """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and is in no later bake's way."""
+    folder = ball_scene()
+    job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
+    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    command = [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "TI_OFFLINE_CACHE": "0"})
+    events = []
+    for line in process.stdout:
+        events.append(json.loads(line))
+        if until in events[-1].get("message", "") and events[-1]["event"] != "error":
+            process.terminate()
+    assert process.wait() == 130
+    assert (events[-1]["event"], events[-1]["kind"]) == ("error", "Cancelled")
+    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+
+
 def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
     folder = ball_scene()
     asked = iter([False] * 14 + [True])

@@ -12,6 +12,7 @@ import pytest
 from physgen.batch.cli import build_parser, main
 from physgen.sim.app.bake_inputs import BakeOptions
 from physgen.sim.app.worker import MODULE, BakeJob, job_to_json
+from physgen.sim.cache.folder import disk_use
 from physgen.sim.cache.manifest import load_manifest
 from physgen.sim.scene.folder import load_scene
 
@@ -154,8 +155,12 @@ def test_stages_one_by_one(tmp_path, photo):
     heavy = ["--preset", "hard", "--set", "ball.density=700", "--frames", "4", "--quality", "preview", "--json"]
     code, events, errors = physgen("bake", scene, "--estimate", *heavy)
     assert code == 0, errors
-    cost = events[-1]["estimate"]
-    assert cost["particles"] == first.particles and cost["substeps"] > 0 and cost["bytes"] > 2**20
+    cost = events[-1]
+    assert cost["event"] == "done" and cost["particles"] == first.particles and cost["substeps"] > 0
+    assert cost["seconds"] > 0 and cost["memory_bytes"] > 2**20 and isinstance(cost["warnings"], list)
+    # Nothing that a bake of four frames leaves is larger than what was said.
+    assert cost["disk_bytes"] >= disk_use(bake)
+    assert physgen("estimate", scene, *heavy)[1][-1] == cost
     assert (scene / "scene.json").read_bytes() == said
     code, events, errors = physgen("bake", scene, "--estimate", "--set", "ball.velocity=0,0,1e7")
     assert code == 3 and "hours" in errors and "velocity" in errors

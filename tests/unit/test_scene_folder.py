@@ -13,7 +13,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.contacts import GROUND_NAME, MODES
-from physgen.sim.scene.folder import SCENE_FILE, inside, load_scene, parse_scene, save_scene, scene_to_json
+from physgen.sim.scene.folder import (
+    SCENE_FILE,
+    SceneFolder,
+    inside,
+    load_scene,
+    parse_scene,
+    referenced_files,
+    require_photo,
+    save_scene,
+    scene_to_json,
+)
 from physgen.sim.scene.json_fields import read_json
 from physgen.sim.scene.materials import PRESET_FOLDER, load_preset, preset_names
 from physgen.sim.scene.model import (
@@ -33,6 +43,7 @@ from physgen.sim.scene.model import (
     Scene,
     SceneObject,
 )
+from physgen.sim.scene.overrides import apply_overrides, without_physics
 from physgen.sim.scene.vertex_tracks import load_vertex_track
 
 positive = st.floats(0.01, 1e4, allow_nan=False)
@@ -392,3 +403,55 @@ def test_presets_are_the_papers():
     assert all(load_preset(name).preset == name for name in preset_names())
     with pytest.raises(InputError, match="choose one of"):
         load_preset("unobtainium")
+
+
+def test_a_scene_may_have_neither_photo_nor_ground(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "cup.glb").write_bytes(b"")
+    item = SceneObject(name="cup", mesh="meshes/cup.glb", size_m=0.1)
+    scene = a_scene(objects=(item,), photo=None, background=None, ground=None)
+    save_scene(tmp_path, scene)
+    folder = load_scene(tmp_path)
+    assert folder.scene == scene and referenced_files(scene) == ["meshes/cup.glb"]
+    with pytest.raises(InputError, match="no photo to render into; render it in Blender"):
+        require_photo(folder)
+    with pytest.raises(InputError, match="no ground"):
+        require_photo(SceneFolder(root=tmp_path, scene=a_scene(ground=None)))
+    assert require_photo(SceneFolder(root=tmp_path, scene=a_scene())) == ("photo.png", "background.png", Ground())
+    with pytest.raises(InputError, match="null for both"):
+        a_scene(photo=None)
+
+
+def test_what_is_not_there_has_no_contacts():
+    pair = Contact(between=("cup", GROUND), friction=0.2)
+    assert a_scene(contacts=(pair,)).contacts == (pair,)
+    with pytest.raises(InputError, match="there is no ground; choose two of cup"):
+        a_scene(contacts=(pair,), ground=None)
+    with pytest.raises(InputError, match="the scene has no ground"):
+        apply_overrides(a_scene(ground=None), ["ground.friction=0.2"])
+    assert without_physics(a_scene(ground=None), 0.3).ground is None
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1.0, 1e5])
+def test_any_matrix_that_can_be_undone_places_a_mesh(scale):
+    def placed(matrix):
+        return SceneObject(name="cup", mesh="cup.glb", size_m=0.1, world_from_mesh=matrix)
+
+    rows = np.eye(4)
+    rows[:3] *= scale
+    for change in (
+        np.eye(3),
+        np.diag([1.0, 1e-3, 30.0]),
+        np.diag([-1.0, 1.0, 1.0]),
+        [[1, 0.9, 0], [0, 1, 0], [0, 0, 1]],
+    ):
+        matrix = rows.copy()
+        matrix[:3, :3] = matrix[:3, :3] @ change
+        placed(tuple(map(tuple, matrix.tolist())))
+    flat = rows.copy()
+    flat[2, 2] = 0.0
+    tilted = rows.copy()
+    tilted[3, 0] = 0.5
+    for matrix in (flat, tilted, np.full((4, 4), np.nan)):
+        with pytest.raises(InputError, match=r"object cup: world_from_mesh.*invertible"):
+            placed(tuple(map(tuple, matrix.tolist())))

@@ -128,6 +128,10 @@ def _density(item: SceneObject) -> float:
 
 def believed_ground(scene: Scene, objects: Sequence[SceneObject]) -> Ground:
     """The ground as the first of ``objects`` meets it: a capture has one friction and one restitution for all."""
+    if scene.ground is None:
+        raise InputError(
+            "the scene has no ground, which a capture needs: give it one, below all objects if none hits it"
+        )
     contact = contact_table(scene).between(objects[0].name, GROUND_NAME)
     return Ground(
         point=scene.ground.point,

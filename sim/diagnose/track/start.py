@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...scene.folder import SceneFolder
+from ...scene.folder import SceneFolder, require_photo
 from ..capture import Camera
 from .beliefs import SceneBody
 from .corners import find_corners
@@ -47,13 +47,13 @@ class ScenePhoto:
 
 
 def load_scene_photo(folder: SceneFolder, camera: Camera, bodies: Sequence[SceneBody]) -> ScenePhoto:
-    """Raises InputError when the photo or a mask is not an image."""
+    """Raises InputError when there is no photo, or it or a mask is not an image."""
     size = (camera.width, camera.height)
     masks: list[Mask | None] = []
     for body in bodies:
         name = body.source.mask
         masks.append(None if name is None else _picture(folder, name, size) > 127)
-    return ScenePhoto(grey=_picture(folder, folder.scene.photo, size), masks=tuple(masks))
+    return ScenePhoto(grey=_picture(folder, require_photo(folder)[0], size), masks=tuple(masks))
 
 
 def _picture(folder: SceneFolder, name: str, size: tuple[int, int]) -> NDArray[np.uint8]:

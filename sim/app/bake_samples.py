@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""What a bake writes at each frame: the vertices of every object, and the particles of those that flow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cache.manifest import MESH_SPACE, BakedObject
+from ..mpm.materials import FLUID, SAND, SNOW, RigidMaterial
+from ..scene.folder import SceneFolder
+from ..scene.meshes import ObjectMesh
+from ..skinning.binding import bind, deform
+from .bake_inputs import BakeOptions
+from .setup_world import PreparedWorld
+
+if TYPE_CHECKING:
+    from .simulation import Simulation
+
+Array = NDArray[np.float64]
+
+GRANULAR = frozenset({SAND, FLUID, SNOW})
+"""Laws whose matter is shown by its particles as well: its skin tears or covers what it should not."""
+
+
+def baked_objects(
+    folder: SceneFolder, meshes: Sequence[ObjectMesh], prepared: PreparedWorld, options: BakeOptions
+) -> tuple[BakedObject, ...]:
+    """The caches that a bake of the scene has, one entry an object."""
+    return tuple(
+        _baked_object(item.name, len(mesh.vertices), _points(prepared, slot) if options.points else 0, options.space)
+        for slot, (item, mesh) in enumerate(zip(folder.scene.objects, meshes, strict=True))
+    )
+
+
+def _baked_object(name: str, vertices: int, points: int, space: str) -> BakedObject:
+    points_file = f"{name}.points.pc2" if points else None
+    return BakedObject(
+        name=name, file=f"{name}.pc2", vertices=vertices, space=space, points_file=points_file, points=points
+    )
+
+
+def _points(prepared: PreparedWorld, slot: int) -> int:
+    """Particles of object ``slot`` if it is, or becomes, of one of the ``GRANULAR`` laws, else 0."""
+    index = prepared.body_of_object[slot]
+    if index is None:
+        return 0
+    body = prepared.setup.bodies[index]
+    if isinstance(body.material, RigidMaterial):
+        return 0
+    return body.count if any(m.law in GRANULAR for m in (body.material, *body.materials)) else 0
+
+
+class ObjectSampler:
+    """Samples of object number ``slot`` of the scene, as ``baked`` says, at the present time of ``simulation``."""
+
+    def __init__(
+        self, slot: int, baked: BakedObject, mesh: ObjectMesh, world_from_mesh: Array, simulation: Simulation
+    ) -> None:
+        self._slot = slot
+        self._baked = baked
+        self._mesh = mesh
+        self._simulation = simulation
+        self._body = simulation.body_of_object[slot]
+        self._rest = simulation.rest_positions[slot]
+        self._binding = None if self._rest is None else bind(mesh.vertices, self._rest)
+        self._mesh_from_world = np.linalg.inv(world_from_mesh) if baked.space == MESH_SPACE else None
+
+    def samples(self, index: int) -> dict[str, Array]:
+        """By file name what is appended as sample ``index``, (V, 3) or (N, 3) in the space of the bake.
+
+        Sample 0 is the scene at rest to the last bit, so that it renders as the photo: the mesh's own vertices.
+        """
+        if index == 0:
+            found = {self._baked.file: self._mesh.vertices if self._mesh_from_world is None else self._mesh.in_file}
+        else:
+            found = {self._baked.file: self._placed(self._vertices())}
+        if self._baked.points_file is not None:
+            assert self._body is not None and self._rest is not None
+            points = self._rest if index == 0 else self._simulation.world.positions(self._body)
+            found[self._baked.points_file] = self._placed(points)
+        return found
+
+    def _vertices(self) -> Array:
+        if self._binding is None or self._body is None:
+            moved = self._simulation.collider_vertices(self._slot)
+            return self._mesh.vertices if moved is None else moved
+        world = self._simulation.world
+        return deform(self._binding, world.positions(self._body), world.deformation_gradients(self._body))
+
+    def _placed(self, points: Array) -> Array:
+        """World ``points`` (N, 3) in the space of the bake."""
+        matrix = self._mesh_from_world
+        return points if matrix is None else points @ matrix[:3, :3].T + matrix[:3, 3]
