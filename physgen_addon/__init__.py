@@ -18,6 +18,10 @@ MODULES = (
     "operators.capture",
     "operators.diagnose",
     "operators.effect",
+    "operators.bake",
+    "operators.cache",
+    "operators.share",
+    "handlers",
     "panels.diagnose",
 )
 """All that Blender must know, in the order in which it must learn it; each has CLASSES, some a ``register`` too."""
