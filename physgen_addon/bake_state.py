@@ -229,7 +229,8 @@ def _look(scene: bpy.types.Scene) -> BakeState:
         return BakeState("baking", done, manifest.frames, message="Another process is baking this")
     else:
         status = "baked" if manifest.state == "complete" and done == manifest.frames else "paused"
-    return BakeState(status, done, manifest.frames, message=" ".join([*troubles, obstacle or MESSAGES[status]]).strip())
+    said = [text for text in (*troubles, obstacle or MESSAGES[status]) if text]
+    return BakeState(status, done, manifest.frames, message=". ".join(said))
 
 
 def shows(scene: bpy.types.Scene, folder: Path) -> bool:

@@ -62,7 +62,7 @@ class _ExportOperator:
 
 
 class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
-    """Write the baked animation as Alembic: bodies and surfaces as meshes, grains as vertices. Blender waits meanwhile"""
+    """Write the baked animation as Alembic: bodies, surfaces, and grains as vertices. Blender waits meanwhile"""
 
     bl_idname = "physgen.export_alembic"
     bl_label = "Export Alembic"
@@ -82,7 +82,7 @@ class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
 
 
 class PHYSGEN_OT_export_usd(_ExportOperator, bpy.types.Operator):
-    """Write the baked animation as USD: bodies and surfaces as meshes, grains as vertices. Blender waits meanwhile"""
+    """Write the baked animation as USD: bodies, surfaces, and grains as vertices. Blender waits meanwhile"""
 
     bl_idname = "physgen.export_usd"
     bl_label = "Export USD"

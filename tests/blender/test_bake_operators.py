@@ -311,7 +311,7 @@ class Live(Bake):
 
 
 def test_a_bake_is_played_stopped_killed_and_goes_on(tmp_path):
-    found = a_scene(frames=40, law="fixed_corotated")
+    found = a_scene(frames=24, law="fixed_corotated")
     save(tmp_path)
     live = Live()
     job = live.begin(bpy.context)
@@ -343,7 +343,7 @@ def test_a_bake_is_played_stopped_killed_and_goes_on(tmp_path):
     assert result == {"CANCELLED"} and again.said[-1][0] == "ERROR"
     stopped = bake_state.state(scene())
     assert stopped.status == "paused" and "ended with code" in stopped.message
-    assert 3 < stopped.frames_done < 40 and corner(START + 3)[2] < corner(START)[2]
+    assert 3 < stopped.frames_done < 24 and corner(START + 3)[2] < corner(START)[2]
     # Another Blender finds it as it was left.
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
@@ -361,4 +361,4 @@ def test_a_bake_is_played_stopped_killed_and_goes_on(tmp_path):
         time.sleep(0.05)
     assert result == {"CANCELLED"} and "its scene is gone" in last.said[-1][1]
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert status() == "baked" and bake_state.state(scene()).frames_done == 40
+    assert status() == "baked" and bake_state.state(scene()).frames_done == 24
