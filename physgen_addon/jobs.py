@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import bpy
 
@@ -28,12 +28,19 @@ STEP_S = 0.1
 class Job:
     """One piece of work, anywhere: in Blender's interface, in a script, in a test.
 
-    title: what a person calls it. stage, message, fraction (0 to 1, or None while it cannot be told), eta_s: how it
-    stands, as of the last ``step``. notices: what a person should know.
+    title: what a person calls it. stage, message, done and total (of the stage's units), fraction (0 to 1, or None
+    while it cannot be told), eta_s: how it stands, as of the last ``step``. notices: what a person should know.
+    details: what the work has told of itself by ``{"event": "detail", …}``. operator, scene: who runs it, and for the
+    scene of which ``session_uid``. longest_tick_s: how long it has held the main thread at most.
     """
 
-    def __init__(self, title: str, work: Work) -> None:
+    def __init__(self, title: str, work: Work, *, operator: str = "", scene: int = 0) -> None:
         self.title = title
+        self.operator, self.scene = operator, scene
+        self.done: int | None = None
+        self.total: int | None = None
+        self.details: dict[str, Any] = {}
+        self.longest_tick_s = 0.0
         self.stage, self.message = "", "starting"
         self.fraction: float | None = None
         self.eta_s: float | None = None
@@ -50,10 +57,20 @@ class Job:
         """Begin; returns at once."""
         self._thread.start()
 
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether it was asked to stop."""
+        return self._stop.is_set()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its thread has ended."""
+        return not self._thread.is_alive()
+
     def cancel(self) -> None:
         """Ask the work to stop; ``step`` says when it has. Its child process is killed if it does not obey."""
         self._stop.set()
-        self.message = "cancelling"
+        self.message = "stopping"
 
     def abandon(self) -> None:
         """Cancel, and wait just long enough that the child process has been told; nobody will ask for the result."""
@@ -91,6 +108,8 @@ class Job:
     def _take(self, event: Event) -> None:
         if event.get("event") == "notice":
             self.notices.append(str(event.get("message")))
+        if event.get("event") == "detail":
+            self.details.update(event)
         if event.get("event") != "progress":
             return
         total, done = event.get("total"), event.get("done")
@@ -99,11 +118,14 @@ class Job:
             self.message = str(event.get("message") or "")
         self.eta_s = event.get("eta_s")
         if isinstance(total, int | float) and isinstance(done, int | float) and total > 0:
+            self.done, self.total = int(done), int(total)
             self.fraction = min(max(done / total, 0.0), 1.0)
 
 
 _running: list[Job] = []
 """At most one; a list, so that it can be emptied. It ends with Blender and is no part of any file."""
+_stopping: list[Job] = []
+"""Cancelled and not yet ended: the interface does not wait until a worker has put things in order."""
 
 
 def running() -> Job | None:
@@ -111,14 +133,31 @@ def running() -> Job | None:
     return _running[0] if _running else None
 
 
+def stopping() -> list[Job]:
+    """Jobs that were cancelled and whose workers still put things in order; for whoever needs their folders."""
+    _stopping[:] = [job for job in _stopping if not job.has_ended]
+    return list(_stopping)
+
+
+def wait_for(others: list[Job], on_event: OnEvent, cancelled: IsCancelled) -> None:
+    """Wait, in a job's thread, until ``others`` have ended. Raises Cancelled when asked to stop."""
+    while any(not job.has_ended for job in others):
+        on_event({"event": "progress", "message": "waiting for the run before to put things in order"})
+        if cancelled():
+            raise Cancelled("cancelled while waiting for the run before")
+        time.sleep(STEP_S)
+
+
 class JobOperator:
     """Mixin for operators that run a job: live with a modal timer (INVOKE_DEFAULT), blocking from scripts.
 
-    A subclass gives ``request`` (check the input, build the work, call nothing) and ``finished`` (show the result).
+    A subclass gives ``request`` (check the input, build the work, call nothing) and ``finished`` (show the result), and
+    may give ``progressed`` and ``stopped``.
     Nothing of bpy's data is kept while it runs, because undo or another file may free it; the scene is found again
-    by its name.
+    by its ``session_uid``, which undo and renaming keep.
     """
 
+    bl_idname: str
     job_title: ClassVar[str] = "Job"
 
     def request(self, context: bpy.types.Context) -> Work:
@@ -128,6 +167,12 @@ class JobOperator:
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show the result in ``scene``; the sentence to report. May raise PhysGenError."""
         raise NotImplementedError
+
+    def progressed(self, scene: bpy.types.Scene, job: Job) -> None:
+        """Called in the main thread at every look; has a few milliseconds. May raise PhysGenError, which is noted."""
+
+    def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
+        """Called when it was cancelled or failed."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -140,69 +185,112 @@ class JobOperator:
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Blocking, for scripts and background mode."""
         try:
-            job = Job(self.job_title, self.request(context))
-            job.start()
-            job.wait()
+            self.begin(context)
         except PhysGenError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return self._end(job, context.scene)
+        try:
+            while (result := self.tick()) is None:
+                time.sleep(STEP_S)
+        finally:
+            if self._job in _running:
+                # Ctrl-C.
+                _running.remove(self._job)
+                self._job.abandon()
+        return result
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Live: Blender stays usable."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
-            work = self.request(context)
+            self.begin(context)
         except PhysGenError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self._job = Job(self.job_title, work)
-        self._scene_name = context.scene.name
         self._timer = context.window_manager.event_timer_add(STEP_S, window=context.window)
         context.window_manager.modal_handler_add(self)
-        _running.append(self._job)
-        self._job.start()
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Look for news at every tick; every other event is somebody else's."""
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        ended = self._job.step()
+        result = self.tick()
         redraw(context)
-        if not ended:
+        if result is None:
             return {"PASS_THROUGH"}
-        self._release(context)
-        scene = bpy.data.scenes.get(self._scene_name)
+        context.window_manager.event_timer_remove(self._timer)
+        return result
+
+    def tick(self) -> set[str] | None:
+        """One look at the job, as the modal timer does it: None while it goes on, else the operator's result."""
+        began, job = time.perf_counter(), self._job
+        ended, scene = job.step(), scene_of(job)
+        if scene is not None and not ended:
+            self._progress(scene)
+        job.longest_tick_s = max(job.longest_tick_s, time.perf_counter() - began)
+        if not ended and not job.is_cancelled:
+            return None
+        if job in _running:
+            _running.remove(job)
         if scene is None:
-            self.report({"WARNING"}, f"{self.job_title} has ended, but scene {self._scene_name!r} is gone")
+            self.report({"WARNING"}, f"{self.job_title} has ended and its scene is gone; what was done is kept")
             return {"CANCELLED"}
-        return self._end(self._job, scene)
+        if not ended:
+            # The worker has a few seconds to put things in order; nobody has to watch.
+            _stopping.append(job)
+            self._fail(scene, Cancelled(f"{self.job_title} was stopped; what is done is kept"))
+            return {"CANCELLED"}
+        return self._end(scene)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator itself: another file is loaded, or it quits."""
         self._job.abandon()
-        self._release(context)
-
-    def _release(self, context: bpy.types.Context) -> None:
         context.window_manager.event_timer_remove(self._timer)
         if self._job in _running:
             _running.remove(self._job)
+        if not self._job.has_ended:
+            _stopping.append(self._job)
 
-    def _end(self, job: Job, scene: bpy.types.Scene) -> set[str]:
+    def begin(self, context: bpy.types.Context) -> Job:
+        """Start the job; ``tick`` until it returns something. Raises InputError when something is missing."""
+        self._job = Job(
+            self.job_title, self.request(context), operator=type(self).bl_idname, scene=context.scene.session_uid
+        )
+        self._noted: set[str] = set()
+        self._job.start()
+        _running.append(self._job)
+        return self._job
+
+    def _progress(self, scene: bpy.types.Scene) -> None:
         try:
-            sentence = self.finished(scene, job.result())
-        except Cancelled as error:
-            self.report({"WARNING"}, str(error))
-            return {"CANCELLED"}
+            self.progressed(scene, self._job)
         except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
+            # What cannot be shown now may be once it is complete; said once.
+            if str(error) not in self._noted:
+                self._noted.add(str(error))
+                self.report({"WARNING"}, str(error))
+
+    def _fail(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
+        self.report({"WARNING" if isinstance(error, Cancelled) else "ERROR"}, str(error))
+        self.stopped(scene, error)
+
+    def _end(self, scene: bpy.types.Scene) -> set[str]:
+        try:
+            sentence = self.finished(scene, self._job.result())
+        except PhysGenError as error:
+            self._fail(scene, error)
             return {"CANCELLED"}
-        for notice in job.notices[-3:]:
+        for notice in self._job.notices[-3:]:
             self.report({"INFO"}, notice)
         self.report({"INFO"}, sentence)
         return {"FINISHED"}
+
+
+def scene_of(job: Job) -> bpy.types.Scene | None:
+    """The scene that ``job`` was started in; None when it is gone."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == job.scene), None)
 
 
 class PHYSGEN_OT_cancel_job(bpy.types.Operator):

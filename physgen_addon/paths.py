@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import uuid
 from pathlib import Path
 
 import bpy
@@ -42,3 +45,87 @@ def _unfinished(folder: Path) -> bool:
         return load_manifest(folder).state != "complete"
     except InputError:
         return False
+
+
+def file_name(name: str) -> str:
+    """``name`` as every file system takes it; two names that differ stay different."""
+    plain = re.sub(r"[^\w .-]", "_", name).strip(" .") or "_"
+    if plain == name and name.lower() not in _RESERVED:
+        return name
+    return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
+
+
+_RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(1, 10))}
+"""What Windows keeps for itself."""
+
+
+def is_unsaved_cache(scene: bpy.types.Scene) -> bool:
+    """Whether the scene's bakes wait in a temporary folder, because ``//`` means nothing before the file is saved."""
+    return not bpy.data.filepath and scene.physgen.simulation.cache.strip().startswith("//")
+
+
+_unsaved_key = [uuid.uuid4().hex[:12]]
+"""Of the file that is open; also kept here, because undo takes back what a scene remembers."""
+
+
+def unsaved_key() -> str:
+    """What tells the bakes of this unsaved file from those of others."""
+    return _unsaved_key[0]
+
+
+def new_unsaved_key() -> None:
+    """Another file is open."""
+    _unsaved_key[0] = uuid.uuid4().hex[:12]
+
+
+def unsaved_root() -> Path:
+    """Where bakes of unsaved files wait. Beside Blender's temporary folder, which is deleted when Blender ends."""
+    return Path(bpy.app.tempdir).resolve().parent / "physgen_unsaved"
+
+
+def scene_cache(scene: bpy.types.Scene) -> Path:
+    """Folder of all bakes of ``scene``, absolute; it need not exist. InputError when no cache folder is named."""
+    simulation = scene.physgen.simulation
+    if is_unsaved_cache(scene):
+        return unsaved_root() / (simulation.unsaved or _unsaved_key[0]) / file_name(scene.name)
+    return require_folder(simulation.cache, "Cache") / file_name(scene.name)
+
+
+def scene_cache_beside(scene: bpy.types.Scene, blend: Path) -> Path:
+    """``scene_cache`` as it will be once the file is saved as ``blend``."""
+    cache = scene.physgen.simulation.cache.strip()
+    root = blend.parent / cache[2:].replace("\\", "/") if cache.startswith("//") else require_folder(cache, "Cache")
+    return Path(os.path.normpath(root)) / file_name(scene.name)
+
+
+def require_writable(folder: Path) -> None:
+    """Make ``folder``. Raises InputError where nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be made ({error.strerror or error}); choose another Cache folder, or save the file "
+            "where you may write"
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{folder}: cannot be written; choose another Cache folder")
+
+
+def stored(path: Path, blend: Path | None = None) -> str:
+    """``path`` as the file remembers it: from ``//`` with forward slashes, absolute before the file is saved.
+
+    blend: where the file is about to be saved, if not where it is now.
+    """
+    folder = blend.parent if blend else Path(bpy.data.filepath).parent if bpy.data.filepath else None
+    if folder is None:
+        return str(path)
+    try:
+        return "//" + os.path.relpath(path, folder).replace("\\", "/")
+    except ValueError:
+        # Another drive of Windows.
+        return str(path)
+
+
+def absolute(path: str) -> Path:
+    """What ``stored`` gave, as an absolute path."""
+    return Path(os.path.normpath(bpy.path.abspath(path)))

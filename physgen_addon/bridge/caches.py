@@ -95,3 +95,31 @@ def attach(item: bpy.types.Object, cache: Pc2Reader, first_frame: int) -> bpy.ty
     modifier.interpolation = "LINEAR"
     modifier.frame_start = first_frame
     return modifier
+
+
+def attach_as_first(item: bpy.types.Object, cache: Pc2Reader, path: str, first_frame: int) -> bpy.types.Modifier:
+    """``attach`` for objects that have modifiers of their own: these work on what is played.
+
+    path: of the cache as the file is to remember it, such as ``//cache/cube.pc2``. What is so already is left alone, so
+    that nothing is evaluated again.
+    """
+    require_fit(cache, len(item.data.vertices), item.name)
+    modifier = item.modifiers.get(MODIFIER)
+    if modifier is None:
+        modifier = item.modifiers.new(MODIFIER, "MESH_CACHE")
+    index = item.modifiers.find(MODIFIER)
+    if index > 0:
+        item.modifiers.move(index, 0)
+        modifier = item.modifiers[0]
+    wanted = {"cache_format": "PC2", "filepath": path, "interpolation": "LINEAR", "frame_start": float(first_frame)}
+    for name, value in wanted.items():
+        if getattr(modifier, name) != value:
+            setattr(modifier, name, value)
+    return modifier
+
+
+def detach(item: bpy.types.Object) -> None:
+    """Take the cache off ``item``."""
+    modifier = item.modifiers.get(MODIFIER)
+    if modifier is not None:
+        item.modifiers.remove(modifier)

@@ -39,7 +39,7 @@ def set_input(modifier: bpy.types.Modifier, name: str, value: Any) -> None:
     raise KeyError(name)
 
 
-class _Tree:
+class Tree:
     """A node group under construction: short names for what its nodes are made of."""
 
     def __init__(self, name: str, inputs: dict[str, tuple[str, Any]]) -> None:
@@ -70,18 +70,23 @@ class _Tree:
         return next(s for s in self.node(kind, *values, **settings).outputs if s.enabled)
 
     def attribute(self, name: Any, kind: str) -> Socket:
+        """A named attribute of the geometry."""
         return self.out("GeometryNodeInputNamedAttribute", name, data_type=kind)
 
     def math(self, operation: str, *values: Any) -> Socket:
+        """A number from numbers."""
         return self.out("ShaderNodeMath", *values, operation=operation)
 
     def compare(self, operation: str, *values: Any) -> Socket:
+        """A truth from two numbers."""
         return self.out("FunctionNodeCompare", *values, operation=operation, data_type="FLOAT")
 
     def both(self, operation: str, a: Any, b: Any) -> Socket:
+        """A truth from two truths."""
         return self.out("FunctionNodeBooleanMath", a, b, operation=operation)
 
     def finish(self, geometry: Socket) -> bpy.types.NodeTree:
+        """The group, with ``geometry`` as its result."""
         output = self.group.nodes.new("NodeGroupOutput")
         self.group.links.new(geometry, output.inputs[0])
         for index, node in enumerate(self.group.nodes):
@@ -94,7 +99,7 @@ def points_group() -> bpy.types.NodeTree:
     found = bpy.data.node_groups.get(POINTS)
     if found is not None:
         return found
-    tree = _Tree(
+    tree = Tree(
         POINTS,
         {
             "Radius": ("Float", 0.003),
@@ -133,7 +138,7 @@ def body_group() -> bpy.types.NodeTree:
     found = bpy.data.node_groups.get(BODY)
     if found is not None:
         return found
-    tree = _Tree(
+    tree = Tree(
         BODY,
         {
             "Samples": ("Object", None),
@@ -185,7 +190,7 @@ def body_group() -> bpy.types.NodeTree:
     return tree.finish(tree.out("GeometryNodeSwitch", known, None, body, input_type="GEOMETRY"))
 
 
-def _sample(tree: _Tree, samples: Socket, value: Socket, index: Socket, kind: str) -> Socket:
+def _sample(tree: Tree, samples: Socket, value: Socket, index: Socket, kind: str) -> Socket:
     return tree.out("GeometryNodeSampleIndex", samples, value, index, data_type=kind, domain="POINT", clamp=True)
 
 

@@ -98,3 +98,11 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, identifier: str, value
         getattr(modifier.properties.inputs, identifier).value = value
     else:
         modifier[identifier] = value
+
+
+def set_resolution(node: bpy.types.Node, mode: str) -> None:
+    """How a volume node is given its resolution: ``Grid``, ``Size`` or ``Amount``; a menu input from 5.0 on."""
+    if hasattr(node, "resolution_mode"):
+        node.resolution_mode = {"Grid": "GRID", "Size": "VOXEL_SIZE", "Amount": "VOXEL_AMOUNT"}[mode]
+    else:
+        node.inputs["Resolution Mode"].default_value = mode

@@ -63,6 +63,7 @@ class PHYSGEN_PG_body(bpy.types.PropertyGroup):
 
     enabled: BoolProperty(name="In Simulation", description="Let the object take part in the simulation")
     source: StringProperty(description="Name of the object in the scene folder that it was imported from")
+    cache: StringProperty(description="Name of the object in its bakes, so that it can be renamed")
     role: EnumProperty(
         name="Role",
         description="What the object does",

@@ -200,6 +200,9 @@ class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
     bake: StringProperty(
         name="Bake", description="Folder of the bake that is shown; empty: none", subtype="DIR_PATH", options=RELATIVE
     )
+    unsaved: StringProperty(description="Where bakes wait until the file is saved")
+    estimate: StringProperty(description="What the bake was estimated to cost")
+    estimate_of: StringProperty(description="Fingerprint of the scene that was estimated")
 
 
 class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
