@@ -17,7 +17,7 @@ import numpy as np
 import physgen
 from physgen.physgen_addon import bake_record, bake_state, paths
 from physgen.physgen_addon.bake_record import BakeRecord, Look
-from physgen.physgen_addon.bridge.export import fingerprint
+from physgen.physgen_addon.bridge.fingerprint import fingerprint
 from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 

@@ -183,13 +183,3 @@ def disk_bytes(cache: Path) -> int:
         except OSError:
             continue
     return total
-
-
-def size_text(size: int) -> str:
-    """Such as ``12.3 MB``."""
-    value, unit = float(size), "B"
-    for unit in ("B", "kB", "MB", "GB"):
-        if value < 1000 or unit == "GB":
-            break
-        value /= 1000
-    return f"{value:.3g} {unit}"

@@ -18,7 +18,7 @@ from ..sim.errors import InputError
 from . import bake_record, jobs, paths
 from .bake_record import BakeRecord
 from .bridge import playback
-from .bridge.export import fingerprint
+from .bridge.fingerprint import fingerprint
 from .props.body import bodies
 
 BAKE_OPERATOR = "physgen.bake"

@@ -15,6 +15,7 @@ from mathutils import Matrix, Vector
 
 from . import gizmo_maths as maths
 from .bridge.export_units import metres_per_unit
+from .views import redraw
 
 SHOW_ARROWS = "physgen_show_arrows"
 """Name of the switch, a property of the window manager."""
@@ -136,7 +137,7 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
             value = (tip - base) / self._length(context, item)
             setattr(item.physgen, self.key, value)
             self._say(context, value)
-            _redraw(None, context)
+            redraw("VIEW_3D")
         return {"RUNNING_MODAL"}
 
     def exit(self, context: bpy.types.Context, cancel: bool) -> None:
@@ -231,11 +232,8 @@ def _matrix(place: np.ndarray, turn: np.ndarray, size: list[float]) -> Matrix:
     return Matrix(result.tolist())
 
 
-def _redraw(self: Any, context: bpy.types.Context) -> None:
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+def _on_switch(self: bpy.types.WindowManager, context: bpy.types.Context) -> None:
+    redraw("VIEW_3D")
 
 
 CLASSES = (PHYSGEN_GT_arrow, PHYSGEN_GGT_arrows)
@@ -248,7 +246,7 @@ def register() -> None:
         description="Show velocity and spin of the active object as arrows whose tips can be dragged",
         default=True,
         options={"SKIP_SAVE"},
-        update=_redraw,
+        update=_on_switch,
     )
     setattr(bpy.types.WindowManager, SHOW_ARROWS, switch)
 

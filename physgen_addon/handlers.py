@@ -13,9 +13,10 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from . import bake_state, changes, jobs, paths, unsaved
+from . import bake_state, changes, paths, unsaved
 from .bake_record import BAKES
 from .bridge import caches
+from .views import redraw
 
 TICK_S = 0.5
 REST_S = 0.3
@@ -54,7 +55,7 @@ def _look_at(scene: bpy.types.Scene) -> None:
         return
     before, now = bake_state.last_seen(scene), bake_state.refresh(scene)
     if now != before:
-        jobs.redraw(bpy.context)
+        redraw("VIEW_3D", "UI")
     if now.status == "baking" or bake_state.is_stopping(scene):
         bake_state.mark_progress(scene)
 

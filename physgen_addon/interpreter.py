@@ -13,6 +13,7 @@ import importlib.util
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -100,12 +101,17 @@ def install_command(python: Path | None = None, installs: bool = False) -> str:
     python: it gets what it lacks, or, where pip may not install into it, a virtual environment is made with it in the
     home folder; None for one made with the newest Python that will do.
     """
-    wanted = " ".join(f'"{requirement}"' for requirement in REQUIREMENTS.values())
+    wanted = " ".join(_quoted(requirement) for requirement in REQUIREMENTS.values())
     if python is not None and installs:
-        return f'"{python}" -m pip install {wanted}'
+        return f"{_quoted(python)} -m pip install {wanted}"
     newest = f"py -{_dotted(NEWEST)}" if os.name == "nt" else f"python{_dotted(NEWEST)}"
-    start = newest if python is None else f'"{python}"'
-    return f'{start} -m venv "{home_folder()}" && "{_home_python()}" -m pip install {wanted}'
+    start = newest if python is None else _quoted(python)
+    return f"{start} -m venv {_quoted(home_folder())} && {_quoted(_home_python())} -m pip install {wanted}"
+
+
+def _quoted(word: str | Path) -> str:
+    """``word`` as the terminal takes it for one: a shell would also look for $ and ` between double quotes."""
+    return f'"{word}"' if os.name == "nt" else shlex.quote(str(word))
 
 
 def home_folder() -> Path:

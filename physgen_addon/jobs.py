@@ -17,6 +17,7 @@ import bpy
 
 from ..sim.errors import Cancelled, PhysGenError
 from ..sim.events import Event, IsCancelled, OnEvent
+from .views import redraw
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """What a job does: called in a thread, without bpy; passes events on and returns the final one or raises."""
@@ -217,7 +218,9 @@ class JobOperator:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         result = self.tick()
-        redraw(context)
+        # Sidebars show the progress, some of them in image editors.
+        redraw("VIEW_3D", "UI")
+        redraw("IMAGE_EDITOR", "UI")
         if result is None:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)
@@ -312,20 +315,6 @@ class PHYSGEN_OT_cancel_job(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def draw_job(layout: bpy.types.UILayout) -> None:
-    """Progress and Cancel of the running job; nothing when there is none."""
-    job = running()
-    if job is None:
-        return
-    column = layout.column(align=True)
-    row = column.row(align=True)
-    row.scale_y = 1.4
-    row.progress(factor=job.fraction or 0.0, text=progress_text(job))
-    row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
-    if job.message:
-        column.label(text=job.message)
-
-
 def progress_text(job: Job) -> str:
     """Such as ``Diagnose: fits 40 %, 12 s left``; seconds so far while the share is not known."""
     text = f"{job.title}: {job.stage}" if job.stage else job.title
@@ -333,16 +322,6 @@ def progress_text(job: Job) -> str:
         return f"{text}, {time.monotonic() - job.started:.0f} s"
     text += f" {100 * job.fraction:.0f} %"
     return text if job.eta_s is None else f"{text}, {job.eta_s:.0f} s left"
-
-
-def redraw(context: bpy.types.Context) -> None:
-    """Redraw the sidebars, so that progress is seen."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                for region in area.regions:
-                    if region.type == "UI":
-                        region.tag_redraw()
 
 
 CLASSES = (PHYSGEN_OT_cancel_job,)

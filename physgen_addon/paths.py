@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import stat
 import uuid
 from pathlib import Path
 
@@ -64,6 +65,7 @@ def is_unsaved_cache(scene: bpy.types.Scene) -> bool:
     return not bpy.data.filepath and scene.physgen.simulation.cache.strip().startswith("//")
 
 
+_KEY = re.compile("[0-9a-f]{12}")
 _unsaved_key = [uuid.uuid4().hex[:12]]
 """Of the file that is open; also kept here, because undo takes back what a scene remembers."""
 
@@ -79,15 +81,41 @@ def new_unsaved_key() -> None:
 
 
 def unsaved_root() -> Path:
-    """Where bakes of unsaved files wait. Beside Blender's temporary folder, which is deleted when Blender ends."""
-    return Path(bpy.app.tempdir).resolve().parent / "physgen_unsaved"
+    """Where bakes of unsaved files wait. Beside Blender's temporary folder, which is deleted when Blender ends.
+
+    Everybody may write there, so it is the user's own: ``make_unsaved_root``.
+    """
+    user = f"-{os.getuid()}" if hasattr(os, "getuid") else ""
+    return Path(bpy.app.tempdir).resolve().parent / f"physgen_unsaved{user}"
+
+
+def make_unsaved_root() -> None:
+    """Make ``unsaved_root`` for nobody but this user. Raises InputError where somebody else has put something there."""
+    root = unsaved_root()
+    try:
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = root.lstat()
+        if not stat.S_ISDIR(found.st_mode) or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
+            raise InputError(f"{root}: is somebody else's, so no bake is kept there; save the file first")
+        root.chmod(0o700)
+    except OSError as error:
+        raise InputError(f"{root}: cannot be made ({error.strerror or error}); save the file first") from error
+
+
+def unsaved_cache(scene: bpy.types.Scene, key: str) -> Path | None:
+    """Where bakes of ``scene`` waited under ``key``; None for a key that this extension has not made.
+
+    A .blend keeps the key, so it may come from anybody, and what is there is deleted once it is copied.
+    """
+    return unsaved_root() / key / file_name(scene.name) if _KEY.fullmatch(key) else None
 
 
 def scene_cache(scene: bpy.types.Scene) -> Path:
     """Folder of all bakes of ``scene``, absolute; it need not exist. InputError when no cache folder is named."""
     simulation = scene.physgen.simulation
     if is_unsaved_cache(scene):
-        return unsaved_root() / (simulation.unsaved or _unsaved_key[0]) / file_name(scene.name)
+        kept = unsaved_cache(scene, simulation.unsaved)
+        return kept or unsaved_root() / _unsaved_key[0] / file_name(scene.name)
     return require_folder(simulation.cache, "Cache") / file_name(scene.name)
 
 

@@ -66,10 +66,10 @@ def after_save(path: str) -> None:
 
 def settle(scene: bpy.types.Scene) -> None:
     """Bring beside the saved file what waited while a bake ran. The file has to be saved once more then."""
-    key = scene.physgen.simulation.unsaved
-    if not key or not bpy.data.filepath:
+    old = paths.unsaved_cache(scene, scene.physgen.simulation.unsaved)
+    if old is None or not bpy.data.filepath:
         return
-    old, new = paths.unsaved_root() / key / paths.file_name(scene.name), paths.scene_cache(scene)
+    new = paths.scene_cache(scene)
     if old.is_dir() and _copy(scene, old, new):
         playback.repoint(scene, old, new)
         scene.physgen.simulation.unsaved = ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The window's 3D viewports; there are none in background mode."""
+"""Blender's editors: what they show, and that they show it anew. In background mode there are none."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import functools
 import bpy
 from mathutils import Vector
 
+TAB = "PhysGen"
+"""Category of the sidebars' tab."""
 WIDE_PX = 800
 """Width from which an image editor has room for its sidebar."""
 
@@ -17,6 +19,20 @@ def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
     """The 3D viewports of the window."""
     areas = context.window.screen.areas if context.window is not None else ()
     return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
+
+
+def redraw(area_type: str, *region_types: str) -> None:
+    """Draw anew all editors of that type in all windows; with ``region_types`` these parts of them only."""
+    for manager in bpy.data.window_managers:
+        for window in manager.windows:
+            for area in window.screen.areas:
+                if area.type != area_type:
+                    continue
+                if not region_types:
+                    area.tag_redraw()
+                for region in area.regions:
+                    if region.type in region_types:
+                        region.tag_redraw()
 
 
 def turn_to(context: bpy.types.Context, low: Vector, high: Vector) -> None:
@@ -56,7 +72,7 @@ def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
                 bpy.ops.view3d.view_center_camera()
 
 
-def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
+def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
     """Show ``image`` and the sidebar's ``tab`` in an image editor; if there is none, beside the 3D viewport."""
     if context.window is None:
         return
@@ -71,6 +87,26 @@ def show_image(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> 
     area.spaces.active.show_region_ui = True
     # Once the editor has got its size, and the sidebar its tabs.
     bpy.app.timers.register(functools.partial(_settle, image.name, tab), first_interval=0.5)
+
+
+def show_result(context: bpy.types.Context, image: bpy.types.Image) -> None:
+    """Show ``image`` in an image editor; in a window of its own where none is open.
+
+    Where the preferences keep rendered pictures in the interface (Render In: Keep User Interface), none is opened.
+    """
+    if bpy.app.background or context.window is None:
+        return
+    screens = [window.screen for window in context.window_manager.windows]
+    areas = [area for screen in screens for area in screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        if context.preferences.view.render_display_type == "NONE":
+            return
+        before = set(context.window_manager.windows)
+        bpy.ops.wm.window_new()
+        areas = [window.screen.areas[0] for window in context.window_manager.windows if window not in before]
+    for area in areas[:1]:
+        area.type = "IMAGE_EDITOR"
+        area.spaces.active.image = image
 
 
 def _settle(name: str, tab: str) -> None:

@@ -30,9 +30,6 @@ from .export_objects import physics, sand
 from .export_pins import PinBoxes
 from .export_refusals import OWN, require_evaluated, require_placed, require_simulable, require_still_settings
 from .export_units import clock, metres_per_unit, placed
-from .fingerprint import fingerprint
-
-__all__ = ["export_names", "export_scene", "fingerprint"]
 
 SUNK = 0.25
 """Share of its size by which an object may reach into the ground; finer is the simulation's to judge."""

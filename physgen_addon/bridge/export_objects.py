@@ -9,7 +9,7 @@ import bpy
 
 from ...sim.errors import InputError
 from ...sim.scene.model import Effect, Material
-from ..props.body import get_material
+from ..props.material import get_material
 from .export_units import Clock, decimal, scaled
 
 CANNOT_CRUMBLE = ("rigid", "fluid")

@@ -17,7 +17,8 @@ from ...sim.effects.registry import effect
 from ...sim.scene.control import Box, Keys, Motion
 from ...sim.scene.matter import Material
 from ...sim.scene.model import Ground, Scene, SceneObject
-from ..props.body import CUSTOM, get_material, set_material
+from ..props import presets
+from ..props.material import is_modified, set_material
 from . import compat
 
 MAX_GRAVITY = 200.0
@@ -112,12 +113,10 @@ def _fill_body(
 
 
 def _fill_material(target: bpy.types.PropertyGroup, material: Material) -> None:
-    presets = target.bl_rna.properties["preset"].enum_items
-    target.preset = material.preset if material.preset in presets else CUSTOM
-    usual = get_material(target)
     set_material(target, material)
-    if target.preset != CUSTOM and get_material(target) != usual:
-        target.preset = CUSTOM
+    target.preset_name = material.preset
+    if presets.find(material.preset) is None or is_modified(target):
+        target.preset_name = presets.CUSTOM
 
 
 def _fill_surface(body: bpy.types.PropertyGroup, source: SceneObject, ground: Ground) -> None:

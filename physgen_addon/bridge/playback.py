@@ -14,7 +14,7 @@ from .. import paths
 from ..bake_record import GRAINS, MESH, SURFACE, BakeRecord, Look, manifest_of, playable, spacing
 from ..props.body import bodies
 from . import caches, points
-from .export import export_names
+from .export_names import export_names
 
 GRANULAR = ("sand", "snow")
 
@@ -133,11 +133,10 @@ def repoint(scene: bpy.types.Scene, old: Path, new: Path, blend: Path | None = N
 def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObject, record: BakeRecord) -> None:
     look, file = record.look(baked.name), record.path / baked.file
     caches.attach_as_first(item, Pc2Reader(file), paths.stored(file), record.frame_start)
-    particles = getattr(baked, "points_file", None)
-    if look.shape == MESH or particles is None:
+    if look.shape == MESH or baked.points_file is None:
         _hide_points(scene, item, baked.name)
         return
-    file = record.path / particles
+    file = record.path / baked.points_file
     points.show(
         scene,
         item,

@@ -13,13 +13,17 @@ from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
 from .. import bake_record, bake_state, jobs, paths, unsaved
-from ..bake_record import BakeRecord, read_record, size_text, write_record
+from ..bake_record import BakeRecord, read_record, write_record
 from ..bridge import playback
-from ..bridge.export import export_names, export_scene, fingerprint
+from ..bridge.export import export_scene
+from ..bridge.export_names import export_names
+from ..bridge.export_units import clock
+from ..bridge.fingerprint import fingerprint
 from ..interpreter import cli_command, find_python
 from ..jobs import Job, JobOperator, Work
 from ..props.body import bodies
 from ..props.preferences import python
+from ..text import duration, storage
 
 
 def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
@@ -34,14 +38,16 @@ def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
         raise InputError(
             f"End is frame {settings.frame_end} and Start {settings.frame_start}; let End come after Start"
         )
-    if paths.is_unsaved_cache(scene) and not settings.unsaved:
-        settings.unsaved = paths.unsaved_key()
+    if paths.is_unsaved_cache(scene):
+        paths.make_unsaved_root()
+        settings.unsaved = settings.unsaved or paths.unsaved_key()
     root = paths.scene_cache(scene) / "scene"
     paths.require_writable(root)
     export_scene(scene, root)
+    times = clock(scene)
     options = BakeOptions(
-        frames=settings.frame_end - settings.frame_start + 1,
-        fps=scene.render.fps / scene.render.fps_base,
+        frames=len(times.frames),
+        fps=times.fps,
         quality=settings.quality,
         arch=settings.device,
         seed=settings.seed,
@@ -210,17 +216,10 @@ class PHYSGEN_OT_estimate_bake(JobOperator, bpy.types.Operator):
 def estimate_text(cost: Event) -> str:
     """The answer of ``physgen estimate`` in a sentence."""
     return (
-        f"About {duration_text(float(cost['seconds']))} and {size_text(int(cost['memory_bytes']))} of memory, "
-        f"{size_text(int(cost['disk_bytes']))} on the disk: {cost['particles']} particles, "
+        f"About {duration(float(cost['seconds']))} and {storage(int(cost['memory_bytes']))} of memory, "
+        f"{storage(int(cost['disk_bytes']))} on the disk: {cost['particles']} particles, "
         f"{cost['substeps']} time steps"
     )
-
-
-def duration_text(seconds: float) -> str:
-    """Such as ``12 s``, ``3 min``, ``2.5 h``."""
-    if seconds < 100:
-        return f"{max(seconds, 1.0):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 CLASSES = (PHYSGEN_OT_bake, PHYSGEN_OT_pause_bake, PHYSGEN_OT_estimate_bake)

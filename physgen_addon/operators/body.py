@@ -6,6 +6,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ..props.body import bodies, is_body
+from ..text import count
 
 PIN_MARK = "physgen_pin"
 """Custom property of the empties that "Add Pin" made, so that only those are deleted with their pin."""
@@ -76,7 +77,7 @@ class PHYSGEN_OT_add_bodies(_OfSelected, bpy.types.Operator):
         added = _add(self, context, None)
         if not added:
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{len(added)} {'object is' if len(added) == 1 else 'objects are'} in the simulation")
+        self.report({"INFO"}, f"{count(len(added), 'object')} {'is' if len(added) == 1 else 'are'} in the simulation")
         return {"FINISHED"}
 
 

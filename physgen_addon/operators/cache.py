@@ -10,8 +10,9 @@ import bpy
 from ...sim.cache.folder import free_bake
 from ...sim.errors import InputError, PhysGenError
 from .. import bake_record, bake_state, paths
-from ..bake_record import size_text
 from ..bridge import playback
+from ..bridge.fingerprint import fingerprint
+from ..text import count, storage
 
 
 def used_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
@@ -69,7 +70,7 @@ class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
             return {"CANCELLED"}
         bake_state.set_trouble(scene, "")
         bake_state.observe(scene)
-        words = f"its files stay, because they are not this scene's alone: {folder}" if kept else size_text(freed)
+        words = f"its files stay, because they are not this scene's alone: {folder}" if kept else storage(freed)
         self.report({"INFO"}, f"The bake is out of the scene; {words}")
         return {"FINISHED"}
 
@@ -82,20 +83,20 @@ class PHYSGEN_OT_free_old_bakes(_CacheOperator, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """One after the other; what cannot be deleted is named, the rest is deleted all the same."""
-        scene, freed, count, troubles = context.scene, 0, 0, []
+        scene, freed, deleted, troubles = context.scene, 0, 0, []
         for cache in bake_state.caches_of(scene):
             for record in bake_record.records(cache):
                 if bake_state.shows(scene, record.path) or used_elsewhere(scene, record.path):
                     continue
                 try:
                     freed += delete(record.path)
-                    count += 1
+                    deleted += 1
                 except InputError as error:
                     troubles.append(str(error))
         bake_state.observe(scene)
         for trouble in troubles:
             self.report({"WARNING"}, trouble)
-        self.report({"INFO"}, f"{count} bakes deleted; {size_text(freed)}")
+        self.report({"INFO"}, f"{count(deleted, 'bake')} deleted; {storage(freed)}")
         return {"FINISHED"}
 
 
@@ -144,7 +145,7 @@ def relink(scene: bpy.types.Scene, chosen: Path) -> None:
         if name and bake_record.manifest_of(folder) is not None:
             _play(scene, folder)
             return
-    current = bake_state.fingerprint(scene)
+    current = fingerprint(scene)
     for cache in (chosen, chosen.parent, *sorted(chosen.glob("*")), *sorted(chosen.glob("*/*"))):
         found = bake_record.matching(cache, current) if cache.is_dir() else None
         if found is not None:

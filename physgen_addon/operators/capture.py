@@ -16,6 +16,7 @@ from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..paths import folder_beside, require_folder
 from ..props import report as report_props
 from ..props.diagnose import apply_view
+from ..text import count
 from ..views import look_through_camera, turn_to, viewports
 
 
@@ -122,8 +123,7 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
         turn_to(context, *capture_view.bounds(state.root, state.trial))
         if capture.camera is not None:
             look_through_camera(context)
-        count = len(capture.trials)
-        self.report({"INFO"}, f"{count} {'trial' if count == 1 else 'trials'} of {capture.root.name} loaded")
+        self.report({"INFO"}, f"{count(len(capture.trials), 'trial')} of {capture.root.name} loaded")
         return {"FINISHED"}
 
 

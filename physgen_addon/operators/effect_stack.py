@@ -3,13 +3,13 @@
 
 import bpy
 
-from ...sim.effects.registry import Parameter, effect, effects
+from ...sim.effects.registry import Parameter, effect
 from ..props.body import is_body
-from ..props.report import readable
+from ..props.scene import EFFECT_ITEMS
+from ..text import paragraph, readable
 
-STACK_ITEMS = [(name, readable(name), item.summary) for name, item in effects().items() if item.kind != "observation"]
-"""What can act on a scene; effects of the kind "observation" concern who looks."""
-SECTION_TITLES = {"Equation": "Equation", "Bodies": "Acts on", "Twice": "Several of them", "Source": "Source"}
+SECTIONS = (("Equation", "Equation"), ("Bodies", "Acts on"), ("Twice", "Several"), ("Source", "Source"))
+"""Of what the registry says of an effect: the section, and what it is called here."""
 
 
 def chosen_effect(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
@@ -31,7 +31,7 @@ class PHYSGEN_OT_add_stack_effect(bpy.types.Operator):
     bl_label = "Add Effect"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    effect: bpy.props.EnumProperty(name="Effect", items=STACK_ITEMS, options={"SKIP_SAVE"})
+    effect: bpy.props.EnumProperty(name="Effect", items=EFFECT_ITEMS, options={"SKIP_SAVE"})
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -141,7 +141,7 @@ class PHYSGEN_OT_explain_effect(bpy.types.Operator):
     bl_label = "About the Effect"
     bl_options = {"INTERNAL"}  # noqa: RUF012
 
-    effect: bpy.props.EnumProperty(name="Effect", items=STACK_ITEMS, options={"SKIP_SAVE"})
+    effect: bpy.props.EnumProperty(name="Effect", items=EFFECT_ITEMS, options={"SKIP_SAVE"})
     parameter: bpy.props.StringProperty(name="Parameter", options={"SKIP_SAVE"})
 
     @classmethod
@@ -161,17 +161,10 @@ class PHYSGEN_OT_explain_effect(bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         """One paragraph a section."""
-        from ..panels.text import paragraph
-
         item = effect(self.effect)
         self.layout.label(text=readable(item.name), icon="INFO")
         paragraph(self.layout, item.summary, 66)
-        for title, heading in (
-            ("Equation", "Equation"),
-            ("Bodies", "Acts on"),
-            ("Twice", "Several"),
-            ("Source", "Source"),
-        ):
+        for title, heading in SECTIONS:
             paragraph(self.layout, f"{heading}: {item.section(title)}", 66)
         for parameter in item.parameters:
             paragraph(self.layout, f"{readable(parameter.name)}: {explain(parameter)}", 66)

@@ -20,6 +20,7 @@ from ..jobs import JobOperator, Work
 from ..paths import folder_beside, require_folder
 from ..props.body import bodies
 from ..props.preferences import python
+from ..text import count
 from ..views import show_photo
 
 SKIP = {"SKIP_SAVE"}
@@ -38,7 +39,7 @@ def show_scene(scene: bpy.types.Scene, root: Path, *, hide_others: bool = True) 
     found = bodies(scene)
     _choose(scene, [item for item in found if item.name in collection.all_objects])
     show_photo(bpy.context, scene)
-    text = f"{len(found)} {'object' if len(found) == 1 else 'objects'} imported"
+    text = f"{count(len(found), 'object')} imported"
     if visible:
         text += f"; {', '.join(item.name for item in visible[:3])}{' …' if len(visible) > 3 else ''} hidden"
     return ". ".join([text, *import_notes(collection)])
@@ -54,7 +55,6 @@ def _choose(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> None:
     for item in layer.objects:
         item.select_set(item == items[0])
     layer.objects.active = items[0]
-    scene.physgen.body_index = 0
 
 
 class PHYSGEN_OT_import_scene(bpy.types.Operator):

@@ -6,8 +6,10 @@ import bpy
 from ...sim.errors import PhysGenError
 from ...sim.scene.materials import delete_preset, save_preset
 from ..props import presets
-from ..props.body import get_material, is_body, set_material
+from ..props.body import is_body
+from ..props.material import get_material, set_material
 from ..props.presets import CUSTOM
+from ..text import count
 
 
 class _OfMaterial:
@@ -130,7 +132,7 @@ class PHYSGEN_OT_copy_material(_OfMaterial, bpy.types.Operator):
         for item in others:
             set_material(item.physgen.material, material)
             item.physgen.material.preset_name = source.preset_name
-        self.report({"INFO"}, f"Material copied to {len(others)} {'object' if len(others) == 1 else 'objects'}")
+        self.report({"INFO"}, f"Material copied to {count(len(others), 'object')}")
         return {"FINISHED"}
 
 

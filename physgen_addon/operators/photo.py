@@ -8,10 +8,7 @@ from bpy.props import StringProperty
 
 from ...sim.errors import InputError, PhysGenError
 from ..bridge.photo_image import SUFFIXES, load_photo_image
-from ..views import show_image
-
-TAB = "PhysGen"
-"""Category of the sidebars' tab."""
+from ..views import TAB, show_beside
 
 
 def set_photo(scene: bpy.types.Scene, path: Path) -> None:
@@ -46,7 +43,7 @@ class PHYSGEN_OT_open_photo(bpy.types.Operator):
         except PhysGenError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        show_image(context, context.scene.physgen_photo.image, TAB)
+        show_beside(context, context.scene.physgen_photo.image, TAB)
         return {"FINISHED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

@@ -95,14 +95,6 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
 
         return work
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """The image editor shows the progress too."""
-        if event.type == "TIMER":
-            for area in context.window.screen.areas:
-                if area.type == "IMAGE_EDITOR":
-                    area.tag_redraw()
-        return super().modal(context, event)
-
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Open the scene folder."""
         return show_scene(scene, Path(str(final["scene"])))

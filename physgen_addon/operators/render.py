@@ -2,11 +2,9 @@
 """Render the bake into the photo: ``batch/render.py`` in a Blender of its own, so that this one stays usable."""
 
 import importlib.util
-import json
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -20,6 +18,7 @@ from ...sim.scene.folder import SCENE_FILE
 from ..jobs import JobOperator, Work
 from ..paths import require_folder
 from ..props.body import bodies
+from ..views import show_result
 
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
 NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
@@ -33,15 +32,17 @@ def missing_modules() -> list[str]:
     return [title for module, title in NEEDED.items() if importlib.util.find_spec(module) is None]
 
 
-def render_command(*arguments: str) -> Sequence[str]:
-    """The command that runs ``batch/render.py``: this Python where it has bpy as a module, else this Blender."""
-    arguments = (*arguments, "--json")
+def render_command() -> list[str]:
+    """The command that runs ``batch/render.py``, to be followed by its arguments.
+
+    It is this Python where that has bpy as a module, else this Blender.
+    """
     if not bpy.app.binary_path:
-        return [sys.executable, str(SCRIPT), *arguments]
+        return [sys.executable, str(SCRIPT)]
     # A factory start-up does not load extensions, so it would not find their wheels.
-    paths = f"import sys; sys.path += [p for p in {json.dumps([p for p in sys.path if p])} if p not in sys.path]"
+    paths = f"import sys; sys.path += [p for p in {[p for p in sys.path if p]!r} if p not in sys.path]"
     blender = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
-    return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--", *arguments]
+    return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--"]
 
 
 def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
@@ -51,7 +52,7 @@ def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
         body = item.physgen
         if body.source:
             # A duplicate is not in the photo; what comes first by name is what was imported.
-            names.setdefault(body.source, getattr(body, "cache", "") or item.name)
+            names.setdefault(body.source, body.cache or item.name)
     return names
 
 
@@ -60,28 +61,6 @@ def _output_folder(scene: bpy.types.Scene) -> Path:
     if path.startswith("//") and not bpy.data.filepath:
         raise InputError(f"Output is {path!r}, beside a file that is not saved yet: save it, or choose a folder")
     return require_folder(path, "Output")
-
-
-def _show_image(context: bpy.types.Context, path: Path) -> None:
-    """Show the picture at ``path`` in an image editor; in a window of its own where none is open.
-
-    Where the preferences keep rendered pictures in the interface (Render In: Keep User Interface), none is opened.
-    """
-    image = bpy.data.images.load(str(path), check_existing=True)
-    image.reload()
-    if bpy.app.background or context.window is None:
-        return
-    screens = [window.screen for window in context.window_manager.windows]
-    areas = [area for screen in screens for area in screen.areas if area.type == "IMAGE_EDITOR"]
-    if not areas:
-        if context.preferences.view.render_display_type == "NONE":
-            return
-        before = set(context.window_manager.windows)
-        bpy.ops.wm.window_new()
-        areas = [window.screen.areas[0] for window in context.window_manager.windows if window not in before]
-    for area in areas[:1]:
-        area.type = "IMAGE_EDITOR"
-        area.spaces.active.image = image
 
 
 class _Render(JobOperator):
@@ -115,9 +94,10 @@ class _Render(JobOperator):
         names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)
         arguments = ["--out", str(out), "--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}"]
-        arguments += ["--parent", str(os.getpid()), *choices]
+        arguments += ["--parent", str(os.getpid()), "--json", *choices]
         if rendering.samples:
             arguments += ["--samples", str(rendering.samples)]
+        start = render_command()
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             if strangers:
@@ -128,7 +108,7 @@ class _Render(JobOperator):
                 if (baked_scene / SCENE_FILE).is_file():
                     rendered = Path(scratch) / "bake"
                     place_bake(photo, baked_scene, bake, rendered, names, on_event)
-                command = render_command(str(photo), "--bake", str(rendered), *arguments)
+                command = [*start, str(photo), "--bake", str(rendered), *arguments]
                 # Which frames were asked for is not in the result.
                 return {**run_stage(command, on_event, cancelled, failure=RenderError), "out": str(out)}
 
@@ -162,7 +142,9 @@ class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
         if not path.is_file():
             raise RenderError(f"{path}: is not there, although rendering has ended; render again")
         scene.physgen.rendering.result = str(path)
-        _show_image(bpy.context, path)
+        image = bpy.data.images.load(str(path), check_existing=True)
+        image.reload()
+        show_result(bpy.context, image)
         return f"rendered {path}"
 
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import bpy
 
+from .. import text
 from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
-from ..jobs import draw_job, running
+from ..jobs import running
 from ..operators.capture import (
     PHYSGEN_OT_clear_capture,
     PHYSGEN_OT_follow,
@@ -19,8 +20,7 @@ from ..operators.capture import (
 )
 from ..operators.diagnose import PHYSGEN_OT_diagnose
 from ..operators.effect import PHYSGEN_OT_add_effect, PHYSGEN_OT_clear_overlay, PHYSGEN_OT_show_overlay
-from ..props.report import readable
-from . import text
+from .job import draw_job
 from .sidebar import DIAGNOSE, Sidebar
 
 TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "Found"}
@@ -44,7 +44,7 @@ class PHYSGEN_UL_effects(bpy.types.UIList):
     ) -> None:
         """Name on the left, a bar with the probability on the right."""
         split = layout.split(factor=0.52)
-        split.label(text=readable(item.name))
+        split.label(text=text.readable(item.name))
         split.progress(factor=item.probability, text=f"{100 * item.probability:.0f} %")
 
 
@@ -160,7 +160,7 @@ def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, state:
     box = layout.box()
     text.sentences(box, context, state.summary)
     if state.alternatives:
-        names = ", ".join(readable(name).lower() for name in state.alternatives.split(", "))
+        names = ", ".join(text.readable(name).lower() for name in state.alternatives.split(", "))
         text.sentences(box, context, f"The data cannot tell it from {names}.", icon="QUESTION")
     box.operator(PHYSGEN_OT_open_report.bl_idname, icon="URL")
 
@@ -171,7 +171,7 @@ def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
     column = layout.box().column(align=True)
     for item in effect.parameters:
         split = column.split(factor=0.45)
-        split.label(text=readable(item.name))
+        split.label(text=text.readable(item.name))
         split.label(text=text.number(item.value, item.unit))
         if math.isfinite(item.low) and math.isfinite(item.high):
             split = column.split(factor=0.45)

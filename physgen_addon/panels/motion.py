@@ -9,8 +9,9 @@ from typing import Any
 import bpy
 from mathutils import Vector
 
+from .. import text
 from ..operators.body import PHYSGEN_OT_add_pin, PHYSGEN_OT_clear_motion, PHYSGEN_OT_remove_pin
-from . import text
+from .preview import draw_arrows
 from .sidebar import MOTION, Sidebar, active_body, is_in, settings
 
 
@@ -66,6 +67,7 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split.label(text=f"rad/s: {turns:.3g} turns a second")
         column.prop(body, "start_frame")
         column.operator(PHYSGEN_OT_clear_motion.bl_idname, icon="X")
+        draw_arrows(layout, context)
 
 
 class PHYSGEN_PT_pins(Sidebar, bpy.types.Panel):

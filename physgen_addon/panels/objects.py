@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from .. import text
 from ..operators.body import PHYSGEN_OT_add_bodies, PHYSGEN_OT_remove_body, PHYSGEN_OT_select_bodies
 from ..operators.material import (
     PHYSGEN_OT_copy_material,
@@ -17,8 +18,7 @@ from ..operators.material import (
 from ..props import presets
 from ..props.body import bodies, is_body
 from ..props.material import LAW_FIELDS, is_modified
-from . import text
-from .sidebar import OBJECTS, Sidebar, active_body, settings
+from .sidebar import OBJECTS, Sidebar, active_body, draw_static_friction_note, settings
 
 ROLE_ICONS = {"dynamic": "PHYSICS", "collider": "MOD_PHYSICS"}
 UNITS = {
@@ -57,13 +57,13 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
     def filter_items(self, context: bpy.types.Context, data: Any, prop: str) -> tuple[list[int], list[int]]:
         """Bodies whose name fits the filter, by name."""
         items = getattr(data, prop)
-        helper = bpy.types.UI_UL_list
+        names = bpy.types.UI_UL_list
         if self.filter_name:
-            flags = helper.filter_items_by_name(self.filter_name, self.bitflag_filter_item, items, "name")
+            flags = names.filter_items_by_name(self.filter_name, self.bitflag_filter_item, items, "name")
         else:
             flags = [self.bitflag_filter_item] * len(items)
         flags = [flag if is_body(item) else 0 for flag, item in zip(flags, items, strict=True)]
-        return flags, helper.sort_items_by_name(items, "name")
+        return flags, names.sort_items_by_name(items, "name")
 
 
 class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
@@ -224,9 +224,7 @@ class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
             return
         for name in SURFACE:
             column.prop(body, name)
-        if body.static_friction < body.friction:
-            words = f"Static friction counts as {body.friction:.3g}: it is never below the sliding one."
-            text.sentences(column, context, words, icon="INFO")
+        draw_static_friction_note(column, context, body)
 
 
 CLASSES = (PHYSGEN_UL_bodies, PHYSGEN_PT_objects, PHYSGEN_PT_material, PHYSGEN_PT_inside, PHYSGEN_PT_surface)

@@ -8,11 +8,12 @@ from typing import Any
 import bpy
 
 from ...sim.errors import PhysGenError
-from ..jobs import draw_job
+from .. import text
 from ..operators.draw_box import PHYSGEN_OT_draw_box
-from ..operators.photo import TAB, PHYSGEN_OT_open_photo, PHYSGEN_OT_remove_box, PHYSGEN_OT_use_image
+from ..operators.photo import PHYSGEN_OT_open_photo, PHYSGEN_OT_remove_box, PHYSGEN_OT_use_image
 from ..operators.reconstruct import PHYSGEN_OT_reconstruct, scene_folder
-from . import text
+from ..views import TAB
+from .job import draw_job
 
 
 class PHYSGEN_UL_boxes(bpy.types.UIList):

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import bpy
 
+from .. import text
 from ..gizmos import SHOW_ARROWS
 from ..operators.preview import PHYSGEN_OT_toggle_preview
 from ..preview import live
-from . import text
 
 WORDS = {
     "starting": ("Starting the worker", "TIME"),

@@ -8,12 +8,15 @@ from typing import Any
 
 import bpy
 
-from ..jobs import draw_job, running
+from .. import text
+from ..jobs import running
 from ..operators.render import PHYSGEN_OT_render_still, PHYSGEN_OT_render_video, missing_modules
-from . import text
-from .sidebar import RENDER, Sidebar, button, exists
+from ..operators.share import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_usd, PHYSGEN_OT_make_independent
+from .job import draw_job
+from .sidebar import RENDER, Sidebar
 
-OUT = ("physgen.export_alembic", "physgen.export_usd", "physgen.make_independent")
+RESULTS = (".png", ".mp4")
+"""What rendering makes."""
 
 
 class PHYSGEN_PT_render(Sidebar, bpy.types.Panel):
@@ -71,7 +74,8 @@ def _draw_result(layout: bpy.types.UILayout, context: bpy.types.Context, renderi
     if not rendering.result:
         return
     path = Path(bpy.path.abspath(rendering.result))
-    if not path.is_file():
+    # A .blend from somebody else may name anything here, and Open hands it to the operating system.
+    if path.suffix not in RESULTS or not path.is_file():
         return
     row = layout.row(align=True)
     row.label(text=path.name, icon="CHECKMARK")
@@ -103,20 +107,15 @@ class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
     bl_label = "Export"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """There is a way out in this build."""
-        return any(exists(operator) for operator in OUT)
-
     def draw(self, context: bpy.types.Context) -> None:
         """A button each."""
         layout = self.layout
         if not context.scene.physgen.simulation.bake:
             text.sentences(layout, context, "Bake first (see Simulate); then the motion can go elsewhere.", icon="INFO")
         row = layout.row(align=True)
-        button(row, OUT[0], text="Alembic", icon="EXPORT")
-        button(row, OUT[1], text="USD", icon="EXPORT")
-        button(layout, OUT[2], text="Make Independent", icon="UNLINKED")
+        row.operator(PHYSGEN_OT_export_alembic.bl_idname, text="Alembic", icon="EXPORT")
+        row.operator(PHYSGEN_OT_export_usd.bl_idname, text="USD", icon="EXPORT")
+        layout.operator(PHYSGEN_OT_make_independent.bl_idname, text="Make Independent", icon="UNLINKED")
         text.sentences(layout, context, "Independent: the file plays and renders without PhysGen.")
 
 

@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import bpy
 
+from .. import text
 from ..operators.body import PHYSGEN_OT_add_bodies
+from ..operators.import_scene import PHYSGEN_OT_import_scene
+from ..operators.photo import PHYSGEN_OT_open_photo
 from ..props.body import bodies
-from . import text
-from .sidebar import SCENE, Sidebar, button
-
-if importlib.util.find_spec(f"{__package__}.photo") is None:
-    photo = None
-else:
-    from . import photo
+from . import photo
+from .sidebar import SCENE, Sidebar
 
 
 class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
@@ -32,33 +29,32 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
         if state.folder:
             _draw_folder(layout, context, state)
             return
-        if photo is not None and context.scene.physgen_photo.image is not None:
+        if context.scene.physgen_photo.image is not None:
             photo.draw_photo(layout, context)
             return
-        count = len(bodies(context.scene))
-        if count == 0:
+        found = bodies(context.scene)
+        if not found:
             _draw_beginning(layout, context)
             return
-        what = "1 object" if count == 1 else f"{count} objects"
+        what = text.count(len(found), "object")
         text.sentences(layout, context, f"{what} in the simulation, without a photo.", icon="CHECKMARK")
         row = layout.row(align=True)
-        button(row, "physgen.open_photo", text="Open Photo", icon="IMAGE_DATA")
-        button(row, "physgen.import_scene", text="Import", icon="IMPORT")
+        row.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo", icon="IMAGE_DATA")
+        row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import", icon="IMPORT")
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     text.sentences(layout, context, "Three ways to begin:")
     for title, operator, label, icon in (
-        ("A photo: draw a box around each object in it", "physgen.open_photo", "Open Photo", "IMAGE_DATA"),
-        ("A scene folder that was made before", "physgen.import_scene", "Import Scene Folder", "IMPORT"),
-        ("The meshes that are selected", PHYSGEN_OT_add_bodies.bl_idname, "Simulate Selected", "MESH_MONKEY"),
+        ("A photo: draw a box around each object in it", PHYSGEN_OT_open_photo, "Open Photo", "IMAGE_DATA"),
+        ("A scene folder that was made before", PHYSGEN_OT_import_scene, "Import Scene Folder", "IMPORT"),
+        ("The meshes that are selected", PHYSGEN_OT_add_bodies, "Simulate Selected", "MESH_MONKEY"),
     ):
         box = layout.box()
         text.sentences(box, context, title)
         row = box.row()
         row.scale_y = 1.3
-        if button(row, operator, text=label, icon=icon) is None:
-            row.label(text="Not in this build")
+        row.operator(operator.bl_idname, text=label, icon=icon)
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
@@ -73,14 +69,12 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
         text.sentences(
             layout, context, "This folder is not there: choose where it is now, or import it again.", icon="ERROR"
         )
-    count = len(bodies(context.scene))
-    what = "1 object" if count == 1 else f"{count} objects"
-    text.sentences(layout, context, f"{what} in the simulation.")
+    text.sentences(layout, context, f"{text.count(len(bodies(context.scene)), 'object')} in the simulation.")
     row = layout.row(align=True)
     row.operator("view3d.view_camera", text="Look Through Camera", icon="VIEW_CAMERA")
     if state.photo_root is not None:
         row.prop(state.photo_root, "hide_viewport", text="")
-    button(layout, "physgen.import_scene", text="Import Another", icon="IMPORT")
+    layout.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import Another", icon="IMPORT")
 
 
 CLASSES = (PHYSGEN_PT_scene,)

@@ -3,38 +3,27 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import bpy
 
+from .. import bake_state, text
 from ..props.body import is_body
-from . import text
+from ..views import TAB
 
 SCENE, OBJECTS, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(7)
 """``bl_order``: the order of work."""
-
-if importlib.util.find_spec(f"{__package__.rpartition('.')[0]}.bake_state") is None:
-    bake_state = None
-else:
-    from .. import bake_state
 
 
 class Sidebar:
     """Mixin: a panel of the 3D viewport's sidebar."""
 
-    bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", "PhysGen"
-
-
-def state(scene: bpy.types.Scene) -> Any:
-    """How the scene's bake stands (``bake_state.BakeState``); None where this build cannot bake."""
-    return None if bake_state is None else bake_state.state(scene)
+    bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", TAB
 
 
 def is_baking(scene: bpy.types.Scene) -> bool:
     """Whether what a bake depends on must not change now."""
-    found = state(scene)
-    return found is not None and found.status == "baking"
+    return bake_state.state(scene).status == "baking"
 
 
 def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: bool = False) -> bpy.types.UILayout:
@@ -51,14 +40,11 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
     return column
 
 
-def exists(operator: str) -> bool:
-    """Whether the operator ``physgen.NAME`` is there."""
-    return hasattr(bpy.types, f"PHYSGEN_OT_{operator.partition('.')[2]}")
-
-
-def button(layout: bpy.types.UILayout, operator: str, **options: Any) -> bpy.types.OperatorProperties | None:
-    """The operator's button; nothing where this build lacks the operator."""
-    return layout.operator(operator, **options) if exists(operator) else None
+def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Context, surface: Any) -> None:
+    """Where ``surface`` (a body or the world) has less static than sliding friction: what counts then."""
+    if surface.static_friction < surface.friction:
+        words = f"Static friction counts as {surface.friction:.3g}: it is never below the sliding one."
+        text.sentences(layout, context, words, icon="INFO")
 
 
 def active_body(context: bpy.types.Context) -> bpy.types.Object | None:

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
-from ..jobs import progress_text, running
+from .. import text
+from ..bake_state import BakeState, state
+from ..jobs import PHYSGEN_OT_cancel_job, running
+from ..operators.bake import PHYSGEN_OT_bake, PHYSGEN_OT_estimate_bake, PHYSGEN_OT_pause_bake
+from ..operators.cache import PHYSGEN_OT_free_bake, PHYSGEN_OT_free_old_bakes, PHYSGEN_OT_relink_caches
 from ..operators.world import PHYSGEN_OT_frames_from_scene
 from ..props.body import bodies
-from . import text
-from .sidebar import SIMULATE, Sidebar, button, exists, is_baking, settings, state
+from .job import draw_progress
+from .preview import draw_preview
+from .sidebar import SIMULATE, Sidebar, is_baking, settings
 
 
 class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
@@ -37,13 +40,11 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         trouble = _trouble(scene)
         if trouble and not is_baking(scene):
             text.sentences(layout, context, trouble, icon="INFO")
-        if not exists("physgen.bake"):
-            text.sentences(layout, context, "This build cannot bake.", icon="ERROR")
-            return
         _draw_bake(layout, context, state(scene), ready=not trouble)
+        draw_preview(layout, context)
 
 
-def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulation: Any) -> None:
+def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulation: bpy.types.PropertyGroup) -> None:
     frames = simulation.frame_end - simulation.frame_start + 1
     rate = context.scene.render.fps / context.scene.render.fps_base
     if frames < 2:
@@ -59,17 +60,17 @@ def _trouble(scene: bpy.types.Scene) -> str:
     return ""
 
 
-def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Any, *, ready: bool) -> None:
-    status = found.status if found is not None else "none"
-    if status == "baking":
-        if running() is None:
+def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState, *, ready: bool) -> None:
+    if found.status == "baking":
+        job = running()
+        if job is None:
             # Another Blender, or one that was killed, whose bake goes on.
             text.sentences(layout, context, found.message, icon="INFO")
             return
-        _draw_progress(layout)
+        draw_progress(layout, job)
         row = layout.row(align=True)
-        button(row, "physgen.pause_bake", text="Pause", icon="PAUSE")
-        button(row, "physgen.cancel_job", text="Cancel", icon="CANCEL")
+        row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="Pause", icon="PAUSE")
+        row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="Cancel", icon="CANCEL")
         return
     other = running()
     if other is not None:
@@ -79,51 +80,37 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: An
     row = layout.row(align=True)
     row.scale_y = 1.4
     row.enabled = ready
-    button(row, "physgen.bake", text=labels.get(status, "Bake"), icon=icons.get(status, "FILE_REFRESH"))
-    _draw_status(layout, context, found, status)
+    label, icon = labels.get(found.status, "Bake"), icons.get(found.status, "FILE_REFRESH")
+    row.operator(PHYSGEN_OT_bake.bl_idname, text=label, icon=icon)
+    _draw_status(layout, context, found)
     estimate = layout.row(align=True)
     estimate.enabled = ready
-    button(estimate, "physgen.estimate_bake", text="Estimate Time and Memory", icon="SORTTIME")
-    if found is not None and found.estimate_text:
+    estimate.operator(PHYSGEN_OT_estimate_bake.bl_idname, text="Estimate Time and Memory", icon="SORTTIME")
+    if found.estimate_text:
         text.sentences(layout, context, found.estimate_text)
 
 
-def _draw_progress(layout: bpy.types.UILayout) -> None:
-    job = running()
-    if job is None:
-        return
-    column = layout.column(align=True)
-    row = column.row()
-    row.scale_y = 1.4
-    row.progress(factor=job.fraction or 0.0, text=progress_text(job))
-    if job.message:
-        column.label(text=job.message)
-
-
-def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: Any, status: str) -> None:
+def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState) -> None:
     """What is there, in a box, with what can be done about it."""
-    if status == "none":
-        text.sentences(
-            layout, context, text.brief(found.message) if found is not None and found.message else "Not baked yet."
-        )
+    if found.status == "none":
+        text.sentences(layout, context, text.brief(found.message))
         return
     words, icon = {
         "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
         "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
         "stale": (f"{found.frames_done} frames are baked and still play", "ERROR"),
-        "missing": (text.brief(found.message) or "The bake's files are not there", "ERROR"),
-    }[status]
+        "missing": (text.brief(found.message), "ERROR"),
+    }[found.status]
     box = layout.box()
     text.sentences(box, context, words, icon=icon)
-    message = found.message or ("Out of date: something has changed since." if status == "stale" else "")
-    if message and status != "missing":
-        text.sentences(box, context, text.brief(message))
+    if found.message and found.status != "missing":
+        text.sentences(box, context, text.brief(found.message))
     row = box.row(align=True)
-    if status == "missing":
-        button(row, "physgen.relink_caches", text="Find It", icon="FILE_FOLDER")
+    if found.status == "missing":
+        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find It", icon="FILE_FOLDER")
         return
     row.label(text=f"{text.storage(found.disk_bytes)} on disk")
-    button(row, "physgen.free_bake", text="Free", icon="TRASH")
+    row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
 
 
 class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
@@ -143,8 +130,8 @@ class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
             text.sentences(column, context, words, icon="INFO")
         column.prop(simulation, "seed")
         row = layout.row(align=True)
-        button(row, "physgen.relink_caches", text="Find Lost", icon="FILE_FOLDER")
-        button(row, "physgen.free_old_bakes", text="Free Old", icon="TRASH")
+        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find Lost", icon="FILE_FOLDER")
+        row.operator(PHYSGEN_OT_free_old_bakes.bl_idname, text="Free Old", icon="TRASH")
 
 
 CLASSES = (PHYSGEN_PT_simulate, PHYSGEN_PT_cache)

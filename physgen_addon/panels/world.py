@@ -9,9 +9,9 @@ from typing import Any
 import bpy
 
 from ...sim.effects.registry import KINDS, Parameter, effect, effects
+from .. import text
 from ..operators.body import PHYSGEN_OT_add_colliders, PHYSGEN_OT_remove_body
 from ..operators.effect_stack import (
-    STACK_ITEMS,
     PHYSGEN_OT_add_effect_targets,
     PHYSGEN_OT_add_stack_effect,
     PHYSGEN_OT_explain_effect,
@@ -22,9 +22,8 @@ from ..operators.effect_stack import (
 )
 from ..operators.world import PHYSGEN_OT_ground_below
 from ..props.body import bodies, is_body
-from ..props.report import readable
-from . import text
-from .sidebar import WORLD, Sidebar, is_in, settings
+from ..props.scene import EFFECT_ITEMS
+from .sidebar import WORLD, Sidebar, draw_static_friction_note, is_in, settings
 
 KIND_ICONS = {"force": "FORCE_WIND", "contact": "MOD_PHYSICS", "material": "MATERIAL", "mass": "PIVOT_CURSOR"}
 
@@ -77,9 +76,7 @@ class PHYSGEN_PT_ground(_Part, bpy.types.Panel):
             text.sentences(column, context, "The plane is deleted: choose another, or clear the field.", icon="ERROR")
         column.prop(world, "friction")
         column.prop(world, "static_friction")
-        if world.static_friction < world.friction:
-            words = f"Static friction counts as {world.friction:.3g}: it is never below the sliding one."
-            text.sentences(column, context, words, icon="INFO")
+        draw_static_friction_note(column, context, world)
         column.prop(world, "restitution")
 
 
@@ -119,7 +116,7 @@ class PHYSGEN_UL_effect_stack(bpy.types.UIList):
         """Name, on how many objects, on or off."""
         row = layout.row()
         row.active = item.enabled
-        row.label(text=readable(item.effect), icon=KIND_ICONS[effect(item.effect).kind])
+        row.label(text=text.readable(item.effect), icon=KIND_ICONS[effect(item.effect).kind])
         if item.targets:
             row.label(text=f"{len(item.targets)} obj.")
         row.prop(item, "enabled", text="")
@@ -132,7 +129,7 @@ class PHYSGEN_MT_add_effect(bpy.types.Menu):
 
     def draw(self, context: bpy.types.Context) -> None:
         """One heading a kind."""
-        names = {name for name, _, _ in STACK_ITEMS}
+        names = {name for name, _, _ in EFFECT_ITEMS}
         for kind in KINDS:
             of_kind = [name for name, item in effects().items() if item.kind == kind and name in names]
             if not of_kind:
@@ -141,7 +138,7 @@ class PHYSGEN_MT_add_effect(bpy.types.Menu):
                 self.layout.separator()
             self.layout.label(text=kind.capitalize(), icon=KIND_ICONS[kind])
             for name in of_kind:
-                self.layout.operator(PHYSGEN_OT_add_stack_effect.bl_idname, text=readable(name)).effect = name
+                self.layout.operator(PHYSGEN_OT_add_stack_effect.bl_idname, text=text.readable(name)).effect = name
 
 
 class PHYSGEN_PT_effects(_Part, bpy.types.Panel):
@@ -175,7 +172,7 @@ def _draw_entry(layout: bpy.types.UILayout, context: bpy.types.Context, entry: A
     box = layout.box().column()
     box.active = entry.enabled
     row = box.row()
-    row.label(text=readable(item.name))
+    row.label(text=text.readable(item.name))
     row.operator(PHYSGEN_OT_explain_effect.bl_idname, text="", icon="QUESTION", emboss=False).effect = item.name
     text.sentences(box, context, item.summary)
     known = {parameter.name: parameter for parameter in item.parameters}
@@ -200,7 +197,7 @@ def _stem(name: str) -> str:
 
 def _draw_parameter(layout: bpy.types.UILayout, name: str, parameter: Parameter, number: Any, *, first: bool) -> None:
     stem = _stem(parameter.name)
-    title = readable(stem).replace(" per mass", " / mass")
+    title = text.readable(stem).replace(" per mass", " / mass")
     if stem != parameter.name:
         title = f"{title} {parameter.name[-1].upper()}" if first else parameter.name[-1].upper()
     row = layout.row(align=True)

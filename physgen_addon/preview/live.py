@@ -13,6 +13,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from ..views import redraw
 from .session import Session
 
 STEP_S = 0.04
@@ -55,7 +56,7 @@ def stop() -> None:
         old.stop()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
-    _redraw(("WINDOW", "UI"))
+    redraw("VIEW_3D", "WINDOW", "UI")
 
 
 def _tick() -> float | None:
@@ -65,19 +66,9 @@ def _tick() -> float | None:
     before = time.perf_counter()
     said = (current.state, current.message)
     if current.step():
-        _redraw(("WINDOW", "UI") if (current.state, current.message) != said else ("WINDOW",))
+        redraw("VIEW_3D", *(("WINDOW", "UI") if (current.state, current.message) != said else ("WINDOW",)))
     longest_step_s[0] = max(longest_step_s[0], time.perf_counter() - before)
     return STEP_S
-
-
-def _redraw(kinds: tuple[str, ...]) -> None:
-    for manager in bpy.data.window_managers:
-        for window in manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    for region in area.regions:
-                        if region.type in kinds:
-                            region.tag_redraw()
 
 
 @persistent

@@ -18,10 +18,7 @@ from bpy.props import (
 )
 from mathutils import Vector
 
-from .material import PHYSGEN_PG_material, get_material, set_material
-from .presets import CUSTOM
-
-__all__ = ["CLASSES", "CUSTOM", "bodies", "get_material", "is_body", "set_material"]
+from .material import PHYSGEN_PG_material
 
 
 def _is_empty(self: "PHYSGEN_PG_pin", item: bpy.types.Object) -> bool:

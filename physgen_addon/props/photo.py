@@ -14,24 +14,22 @@ from bpy.props import (
     StringProperty,
 )
 
-RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+from ..views import redraw
+from .scene import RELATIVE
 
 
-def redraw_boxes(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    """Let the image editors show the boxes as they are now."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "IMAGE_EDITOR":
-                area.tag_redraw()
+def _on_box(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    # The image editors draw the boxes.
+    redraw("IMAGE_EDITOR")
 
 
 class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
     """A box around an object, in pixels of the upright photo from its top left corner; ``name`` is the object's."""
 
-    x0: IntProperty(name="Left", description="Left border in pixels", min=0, subtype="PIXEL", update=redraw_boxes)
-    y0: IntProperty(name="Top", description="Upper border in pixels", min=0, subtype="PIXEL", update=redraw_boxes)
-    x1: IntProperty(name="Right", description="Right border in pixels", min=0, subtype="PIXEL", update=redraw_boxes)
-    y1: IntProperty(name="Bottom", description="Lower border in pixels", min=0, subtype="PIXEL", update=redraw_boxes)
+    x0: IntProperty(name="Left", description="Left border in pixels", min=0, subtype="PIXEL", update=_on_box)
+    y0: IntProperty(name="Top", description="Upper border in pixels", min=0, subtype="PIXEL", update=_on_box)
+    x1: IntProperty(name="Right", description="Right border in pixels", min=0, subtype="PIXEL", update=_on_box)
+    y1: IntProperty(name="Bottom", description="Lower border in pixels", min=0, subtype="PIXEL", update=_on_box)
     size_m: FloatProperty(
         name="Size",
         description=(
@@ -55,7 +53,7 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
     height: IntProperty()
     """Pixels of the upright photo; what is shown may be smaller."""
     boxes: CollectionProperty(type=PHYSGEN_PG_photo_box)
-    box_index: IntProperty(name="Box", description="The chosen box", update=redraw_boxes)
+    box_index: IntProperty(name="Box", description="The chosen box", update=_on_box)
     use_pitch: BoolProperty(
         name="Camera Pitch", description="Say how far the camera looked down; off: estimated from the photo"
     )

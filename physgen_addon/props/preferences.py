@@ -3,8 +3,9 @@
 
 import bpy
 
+from .. import text
 from ..interpreter import TERMINAL, home_folder
-from ..panels import text
+from ..views import redraw
 
 ADDON = __package__.removesuffix(".physgen_addon.props")
 """Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` where it is installed."""
@@ -69,10 +70,7 @@ def show_check(context: bpy.types.Context, answer: str, sentence: str, command: 
     if own is None:
         return
     own.check, own.check_text, own.check_command = answer, sentence, command
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "PREFERENCES":
-                area.tag_redraw()
+    redraw("PREFERENCES")
 
 
 CLASSES = (PHYSGEN_AP_preferences,)

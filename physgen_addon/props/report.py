@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ..text import readable
 from .diagnose import NOT_KNOWN
 
 if TYPE_CHECKING:
@@ -52,11 +53,6 @@ def clear(state: PHYSGEN_PG_diagnose) -> None:
     state.warnings.clear()
     state.effect_index = 0
     state.has_report = False
-
-
-def readable(name: str) -> str:
-    """``air_drag`` as ``Air drag``."""
-    return name.replace("_", " ").capitalize()
 
 
 def _fill_effect(line: Any, item: Mapping[str, Any]) -> None:

@@ -19,17 +19,14 @@ from bpy.props import (
 )
 
 from ...sim.effects.registry import Parameter, effect, effects
+from ..text import readable
 from .body import is_body
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-def _effect_items() -> list[tuple[str, str, str]]:
-    return [
-        (name, name.replace("_", " ").capitalize(), item.summary)
-        for name, item in effects().items()
-        if item.kind != "observation"
-    ]
+EFFECT_ITEMS = [(name, readable(name), item.summary) for name, item in effects().items() if item.kind != "observation"]
+"""What can act on a scene; effects of the kind "observation" concern who looks."""
 
 
 def _on_effect(self: "PHYSGEN_PG_effect_entry", context: bpy.types.Context) -> None:
@@ -106,7 +103,7 @@ class PHYSGEN_PG_effect_entry(bpy.types.PropertyGroup):
     """An entry of the effect stack."""
 
     enabled: BoolProperty(name="On", description="Let the effect act", default=True)
-    effect: EnumProperty(name="Effect", description="What acts", items=_effect_items(), update=_on_effect)
+    effect: EnumProperty(name="Effect", description="What acts", items=EFFECT_ITEMS, update=_on_effect)
     parameters: CollectionProperty(type=PHYSGEN_PG_number)
     targets: CollectionProperty(type=PHYSGEN_PG_target)
     """Empty: all that it can act on."""

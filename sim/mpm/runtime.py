@@ -9,7 +9,6 @@ import logging
 from typing import Any
 
 import taichi as ti
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from ..errors import InputError
 from .options import SolverOptions
@@ -63,19 +62,37 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
 
 def _start(arguments: dict[str, object]) -> None:
     """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
-    ASTTransformerContext.get_pos_info = _position
+    _leave_source_lines_out()
     with contextlib.redirect_stdout(io.StringIO()) as said:
         ti.init(**arguments)
     logger.debug("%s", said.getvalue().strip())
 
 
-def _position(context: Any, node: Any) -> str:
-    """Where ``node`` of a kernel stands, for Taichi's error messages.
+def _leave_source_lines_out() -> None:
+    """Let Taichi say in which line a node of a kernel stands, without drawing that line.
 
-    Taichi draws the source line with it, for each of 40 000 nodes at every start: a quarter of the time that kernels
-    from its cache take to get ready.
+    It draws it for each of 40 000 nodes at every start, for messages that are hardly ever needed: a quarter of the time
+    that kernels from its cache take to get ready. The text is in its messages alone, neither in what is compiled nor in
+    the keys of its cache. Nothing of this is a promise of Taichi's: where a version has no such function, or its
+    arguments look different, all stays as that version has it.
     """
-    return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n'
+    try:
+        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    except ImportError:
+        return
+    drawn = getattr(ASTTransformerContext, "get_pos_info", None)
+    if drawn is None or getattr(drawn, "leaves_lines_out", False):
+        return
+
+    def named(context: Any, node: Any) -> str:
+        try:
+            line, kernel = node.lineno + context.lineno_offset, context.func.func.__name__
+            return f'File "{context.file}", line {line}, in {kernel}:\n'
+        except (AttributeError, TypeError):
+            return str(drawn(context, node))
+
+    named.leaves_lines_out = True  # type: ignore[attr-defined]
+    ASTTransformerContext.get_pos_info = named
 
 
 def generation() -> int:

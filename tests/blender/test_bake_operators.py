@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import stat
 import time
 from pathlib import Path
 
@@ -13,11 +14,12 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen  # noqa: E402
 from mathutils import Matrix  # noqa: E402
-from physgen.physgen_addon import bake_record, bake_state, jobs, paths  # noqa: E402
+from physgen.physgen_addon import bake_record, bake_state, jobs, paths, unsaved  # noqa: E402
 from physgen.physgen_addon.bridge import caches, playback  # noqa: E402
 from physgen.physgen_addon.operators.bake import Bake  # noqa: E402
 from physgen.sim.cache.manifest import load_manifest  # noqa: E402
 from physgen.sim.cache.pc2 import Pc2Reader  # noqa: E402
+from physgen.sim.errors import InputError  # noqa: E402
 
 FRAMES = 5
 START = 3
@@ -200,6 +202,33 @@ def test_bakes_of_an_unsaved_file_wait_and_come_along_when_it_is_saved(baked, tm
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "first save" / "scene.blend"))
     assert bpy.data.objects["Cube"].modifiers[0].filepath.startswith("//physgen_cache/")
     assert status() == "baked" and corner(START + 4)[2] < 0.24
+
+
+@pytest.mark.parametrize("key", ["../../elsewhere", "{elsewhere}", "0123456789ab/.."])
+def test_a_file_from_somebody_else_cannot_say_what_is_moved_and_deleted(file, tmp_path, key):
+    victim = tmp_path / "elsewhere" / scene().name
+    victim.mkdir(parents=True)
+    scene().physgen.simulation.unsaved = key.format(elsewhere=tmp_path / "elsewhere")
+    assert paths.unsaved_cache(scene(), scene().physgen.simulation.unsaved) is None
+    unsaved.settle(scene())
+    assert victim.is_dir()
+
+
+def test_bakes_of_unsaved_files_are_nobody_elses():
+    root = paths.unsaved_root()
+    root.mkdir(parents=True, exist_ok=True)
+    root.chmod(0o777)
+    paths.make_unsaved_root()
+    assert stat.S_IMODE(root.stat().st_mode) == 0o700
+    target = root.with_name("aside")
+    root.rename(target)
+    try:
+        root.symlink_to(target)
+        with pytest.raises(InputError, match="somebody else's"):
+            paths.make_unsaved_root()
+        root.unlink()
+    finally:
+        target.rename(root)
 
 
 def test_a_mesh_that_has_changed_says_so_and_loses_its_cache(file):

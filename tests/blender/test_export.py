@@ -14,7 +14,9 @@ import physgen  # noqa: E402
 from mathutils import Matrix  # noqa: E402
 from physgen.physgen_addon.bridge import camera as bridge_camera  # noqa: E402
 from physgen.physgen_addon.bridge import compat  # noqa: E402
-from physgen.physgen_addon.bridge.export import export_names, export_scene, fingerprint  # noqa: E402
+from physgen.physgen_addon.bridge.export import export_scene  # noqa: E402
+from physgen.physgen_addon.bridge.export_names import export_names  # noqa: E402
+from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
 from physgen.sim.app.bake_inputs import BakeOptions, inputs_hash  # noqa: E402
 from physgen.sim.app.collider_motion import vertices_at  # noqa: E402
 from physgen.sim.app.setup_world import prepare_world  # noqa: E402

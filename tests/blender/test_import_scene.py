@@ -19,7 +19,7 @@ from physgen.physgen_addon.bridge.photo_image import load_photo_image  # noqa: E
 from physgen.physgen_addon.operators.draw_box import add_box  # noqa: E402
 from physgen.physgen_addon.operators.photo import set_photo  # noqa: E402
 from physgen.physgen_addon.operators.reconstruct import arguments, scene_folder  # noqa: E402
-from physgen.physgen_addon.props.body import get_material  # noqa: E402
+from physgen.physgen_addon.props.material import get_material  # noqa: E402
 from physgen.sim.errors import InputError  # noqa: E402
 from physgen.sim.scene.folder import SceneFolder, load_scene, save_scene  # noqa: E402
 from physgen.sim.scene.materials import load_preset  # noqa: E402

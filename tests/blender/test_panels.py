@@ -10,14 +10,17 @@ bpy = pytest.importorskip("bpy")
 import physgen  # noqa: E402
 from mathutils import Vector  # noqa: E402
 from physgen import physgen_addon  # noqa: E402
+from physgen.physgen_addon import text  # noqa: E402
 from physgen.physgen_addon.operators import render  # noqa: E402
-from physgen.physgen_addon.operators.effect_stack import STACK_ITEMS  # noqa: E402
-from physgen.physgen_addon.panels import text  # noqa: E402
 from physgen.physgen_addon.panels.sidebar import is_in  # noqa: E402
 from physgen.physgen_addon.props import presets  # noqa: E402
-from physgen.physgen_addon.props.body import bodies, get_material  # noqa: E402
-from physgen.physgen_addon.props.material import LAW_FIELDS, is_modified  # noqa: E402
-from physgen.physgen_addon.props.scene import effect_values  # noqa: E402
+from physgen.physgen_addon.props.body import bodies  # noqa: E402
+from physgen.physgen_addon.props.material import (  # noqa: E402
+    LAW_FIELDS,
+    get_material,
+    is_modified,
+)
+from physgen.physgen_addon.props.scene import EFFECT_ITEMS, effect_values  # noqa: E402
 from physgen.sim.effects.registry import effect  # noqa: E402
 from physgen.sim.scene.matter import LAWS  # noqa: E402
 
@@ -391,7 +394,7 @@ def test_pins_that_lost_their_box():
 
 def test_every_effect_can_be_added_and_means_what_the_registry_says():
     world = bpy.context.scene.physgen.world
-    for name, _, _ in STACK_ITEMS:
+    for name, _, _ in EFFECT_ITEMS:
         assert bpy.ops.physgen.add_stack_effect(effect=name) == {"FINISHED"}
         entry = world.effects[world.effect_index]
         assert effect_values(entry) == effect(name).defaults
@@ -524,6 +527,6 @@ def test_what_cannot_be_rendered_says_why(world, bake, tmp_path, monkeypatch):
 
 
 def test_the_command_is_of_this_blender():
-    command = render.render_command("a b", "--bake", "c")
-    assert command[1:] == [str(render.SCRIPT), "a b", "--bake", "c", "--json"] and Path(command[0]).is_file()
+    command = render.render_command()
+    assert command[1:] == [str(render.SCRIPT)] and Path(command[0]).is_file()
     assert render.SCRIPT.is_file()

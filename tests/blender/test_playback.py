@@ -10,7 +10,7 @@ import physgen  # noqa: E402
 from physgen.physgen_addon import bake_record, bake_state, paths  # noqa: E402
 from physgen.physgen_addon.bake_record import BakeRecord, Look  # noqa: E402
 from physgen.physgen_addon.bridge import caches, compat, playback, points  # noqa: E402
-from physgen.physgen_addon.bridge.export import fingerprint  # noqa: E402
+from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
 from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest  # noqa: E402
 from physgen.sim.cache.pc2 import Pc2Writer  # noqa: E402
 

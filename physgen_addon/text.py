@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sentences and numbers in a panel: Blender's labels neither wrap nor round."""
+"""Sentences and numbers for people: Blender's labels neither wrap nor round."""
 
 from __future__ import annotations
 
@@ -36,6 +36,16 @@ def paragraph(layout: bpy.types.UILayout, text: str, room: int) -> None:
         column.label(text=line)
 
 
+def readable(name: str) -> str:
+    """``air_drag`` as ``Air drag``."""
+    return name.replace("_", " ").capitalize()
+
+
+def count(number: int, what: str) -> str:
+    """``1 object``, ``2 objects``."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def pressure(pascals: float) -> str:
     """Such as ``25 kPa`` or ``70 GPa``."""
     for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
@@ -44,12 +54,19 @@ def pressure(pascals: float) -> str:
     return f"{pascals:.3g} Pa"
 
 
-def storage(count: int) -> str:
+def storage(size: int) -> str:
     """Bytes, such as ``12 MB``."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count} bytes"
+    for unit, unit_size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= unit_size:
+            return f"{size / unit_size:.3g} {unit}"
+    return f"{size} bytes"
+
+
+def duration(seconds: float) -> str:
+    """Such as ``12 s``, ``3 min``, ``2.5 h``."""
+    if seconds < 100:
+        return f"{max(seconds, 1.0):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def length(metres: float) -> str:
