@@ -9,7 +9,6 @@ which frame on. Written without bpy, in the job's thread.
 from __future__ import annotations
 
 import dataclasses
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.atomic import write_json
-from ..sim.cache.lock import LOCK_FILE, process_alive
 from ..sim.cache.manifest import BakeManifest, load_manifest
 from ..sim.cache.pc2 import Pc2Reader
 from ..sim.errors import InputError
@@ -144,11 +142,15 @@ def manifest_of(folder: Path) -> BakeManifest | None:
         return None
 
 
-def playable(folder: Path, manifest: BakeManifest) -> int:
-    """Samples that every cache holds. The caches' headers say it, also when the worker was killed."""
-    if manifest.state == "complete":
-        return manifest.frames_done
+def playable(folder: Path) -> int:
+    """Samples that every cache of the bake ``folder`` holds; 0 where there is no bake.
+
+    The caches' headers say it, also when the worker was killed.
+    """
     try:
+        manifest = load_manifest(folder)
+        if manifest.state == "complete":
+            return manifest.frames_done
         return min((Pc2Reader(folder / item.file).sample_count for item in manifest.objects), default=0)
     except InputError:
         return 0
@@ -157,21 +159,7 @@ def playable(folder: Path, manifest: BakeManifest) -> int:
 def matching(cache: Path, fingerprint: str) -> BakeRecord | None:
     """The bake in ``cache`` of the scene with that fingerprint: the one that got furthest."""
     found = [item for item in records(cache) if fingerprint and fingerprint in item.fingerprints]
-
-    def progress(record: BakeRecord) -> int:
-        manifest = manifest_of(record.path)
-        return 0 if manifest is None else playable(record.path, manifest)
-
-    return max(found, key=progress, default=None)
-
-
-def is_being_written(folder: Path) -> bool:
-    """Whether a living process of this machine writes the bake ``folder``."""
-    try:
-        owner = read_json(folder / LOCK_FILE)
-        return process_alive(int(owner["pid"])) and int(owner["pid"]) != os.getpid()
-    except (InputError, KeyError, TypeError, ValueError):
-        return False
+    return max(found, key=lambda record: playable(record.path), default=None)
 
 
 def disk_bytes(cache: Path) -> int:

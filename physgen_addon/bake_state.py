@@ -14,6 +14,7 @@ from pathlib import Path
 
 import bpy
 
+from ..sim.cache.lock import is_written
 from ..sim.errors import InputError
 from . import bake_record, jobs, paths
 from .bake_record import BakeRecord
@@ -121,11 +122,12 @@ def is_stopping(scene: bpy.types.Scene) -> bool:
 def shown_record(scene: bpy.types.Scene) -> BakeRecord | None:
     """The record of the bake that ``scene`` shows; None when there is none, or its files are gone."""
     path = scene.physgen.simulation.bake
-    if not path:
-        return None
-    folder = paths.absolute(path)
-    if bake_record.manifest_of(folder) is None:
-        return None
+    folder = paths.absolute(path) if path else None
+    return None if folder is None or bake_record.manifest_of(folder) is None else record_of(scene, folder)
+
+
+def record_of(scene: bpy.types.Scene, folder: Path) -> BakeRecord:
+    """The record of the bake ``folder``; where it is gone, what would do for ``scene``."""
     return bake_record.read_record(folder) or BakeRecord(
         folder=str(folder), frame_start=scene.physgen.simulation.frame_start
     )
@@ -199,8 +201,7 @@ def _show_matching(scene: bpy.types.Scene) -> None:
         return
     for cache in caches_of(scene):
         found = bake_record.matching(cache, current)
-        manifest = bake_record.manifest_of(found.path) if found is not None else None
-        if found is not None and manifest is not None and bake_record.playable(found.path, manifest):
+        if found is not None and bake_record.playable(found.path):
             playback.show(scene, found)
             return
     if shown is not None:
@@ -221,11 +222,11 @@ def _look(scene: bpy.types.Scene) -> BakeState:
     if manifest is None or shown is None:
         status = "missing" if simulation.bake else "none"
         return BakeState(status, 0, frames, message=obstacle or MESSAGES[status])
-    done = bake_record.playable(shown.path, manifest)
+    done = bake_record.playable(shown.path)
     troubles = playback.misfits(scene, shown)
     if current not in shown.fingerprints:
         status = "stale"
-    elif bake_record.is_being_written(shown.path) and not is_stopping(scene):
+    elif is_written(shown.path) and not is_stopping(scene):
         return BakeState("baking", done, manifest.frames, message="Another process is baking this")
     else:
         status = "baked" if manifest.state == "complete" and done == manifest.frames else "paused"

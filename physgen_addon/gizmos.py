@@ -14,6 +14,7 @@ from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from . import gizmo_maths as maths
+from .bridge.bounds import box_corners
 from .bridge.export_units import metres_per_unit
 from .views import redraw
 
@@ -60,7 +61,7 @@ def _sides() -> list[tuple[tuple[float, float], tuple[float, float]]]:
 
 def box_of(item: bpy.types.Object) -> tuple[np.ndarray, float, float]:
     """Of ``item`` in the world: middle (3,) of its bounding box, its largest extent, height of its highest corner."""
-    corners = np.array([item.matrix_world @ Vector(corner) for corner in item.bound_box])
+    corners = box_corners(item)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return 0.5 * (low + high), max(float((high - low).max()), 1e-9), float(high[2])
 

@@ -14,6 +14,7 @@ import bpy
 
 from ..sim.cache.manifest import load_manifest
 from ..sim.errors import InputError
+from ..sim.scene.names import DEVICES
 
 
 def require_folder(path: str, what: str) -> Path:
@@ -51,13 +52,9 @@ def _unfinished(folder: Path) -> bool:
 def file_name(name: str) -> str:
     """``name`` as every file system takes it; two names that differ stay different."""
     plain = re.sub(r"[^\w .-]", "_", name).strip(" .") or "_"
-    if plain == name and name.lower() not in _RESERVED:
+    if plain == name and name.lower() not in DEVICES:
         return name
     return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
-
-
-_RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(1, 10))}
-"""What Windows keeps for itself."""
 
 
 def is_unsaved_cache(scene: bpy.types.Scene) -> bool:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 from mathutils import Matrix
+from numpy.typing import NDArray
 
 from ...sim.scene.model import Camera
 
@@ -16,6 +17,15 @@ CLIP_NEAR_M, CLIP_FAR_M = 1e-3, 1e4
 def render_size(camera: Camera, scale: float) -> tuple[int, int]:
     """Width and height in pixels of the camera's image times ``scale``."""
     return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+
+
+def photo_uv(camera: Camera, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Texture coordinates (V, 2), the origin at the bottom left, of ``vertices`` (V, 3) that wear the photo.
+
+    It is projected along the camera's rays.
+    """
+    pixels = camera.project(vertices)
+    return np.nan_to_num(np.stack([pixels[:, 0] / camera.width, 1.0 - pixels[:, 1] / camera.height], axis=1))
 
 
 def add_camera(scene: bpy.types.Scene, camera: Camera, size: tuple[int, int]) -> bpy.types.Object:

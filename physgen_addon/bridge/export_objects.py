@@ -10,7 +10,8 @@ import bpy
 from ...sim.errors import InputError
 from ...sim.scene.model import Effect, Material
 from ..props.material import get_material
-from .export_units import Clock, decimal, scaled
+from ..typed import decimal
+from .export_units import Clock, scaled
 
 CANNOT_CRUMBLE = ("rigid", "fluid")
 """Laws of matter that no sand comes of."""

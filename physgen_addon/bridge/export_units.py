@@ -19,6 +19,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ..typed import decimal
 
 Vector = tuple[float, float, float]
 
@@ -27,11 +28,6 @@ def metres_per_unit(scene: bpy.types.Scene) -> float:
     """Length of a Blender unit of ``scene`` in metres."""
     units = scene.unit_settings
     return 1.0 if units.system == "NONE" else decimal(units.scale_length)
-
-
-def decimal(value: float) -> float:
-    """The number that was typed: Blender keeps 32 bits, where 0.4 is 0.4000000059604645."""
-    return float(f"{value:.7g}")
 
 
 def scaled(values: Iterable[float], factor: float = 1.0) -> Vector:

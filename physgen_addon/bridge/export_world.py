@@ -11,10 +11,12 @@ import numpy as np
 from ...sim.effects.registry import effect
 from ...sim.errors import InputError
 from ...sim.scene.model import Camera, Effect, Ground, Keys
+from ..props.scene import effect_values
+from ..typed import decimal
 from .animation import channels, why_it_moves
 from .export_motion import keys
 from .export_refusals import require_evaluated, require_placed
-from .export_units import Clock, Vector, decimal, placed, scaled
+from .export_units import Clock, Vector, placed, scaled
 
 DEFAULT_FOCAL = 1.4
 """Focal length over the image's width of the camera of a scene that has none: Blender's 50 mm."""
@@ -95,10 +97,8 @@ def effects(scene: bpy.types.Scene, names: Mapping[str, str]) -> list[Effect]:
             continue
         where = f"effect {number} ({entry.effect})"
         kind = effect(entry.effect)
-        given = {item.name: decimal(item.value) for item in entry.parameters}
-        values = {parameter.name: parameter.default for parameter in kind.parameters} | given
         try:
-            checked = kind.checked(values)
+            checked = kind.checked(effect_values(entry))
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         targets = tuple(_target(scene, target.item, names, where) for target in entry.targets)

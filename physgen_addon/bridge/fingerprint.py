@@ -19,7 +19,7 @@ from mathutils import Matrix
 
 from ...sim.errors import InputError
 from ..props.body import bodies
-from .animation import TRANSFORM, Channel, channels, curves, drivers
+from .animation import PLACING, TRANSFORM, Channel, channels, curves, drivers
 from .export_meshes import read_corners, read_points
 from .export_names import export_names
 from .export_objects import physics, sand
@@ -119,8 +119,7 @@ class _Digest:
         self._seen.add(item.as_pointer())
         animated = channels(item)
         self._add(item.type, item.rotation_mode, item.empty_display_size, item.parent_type, item.parent_bone)
-        placing = (*TRANSFORM, *(f"delta_{name}" for name in TRANSFORM if name != "rotation_axis_angle"))
-        self._channels(item, placing, animated)
+        self._channels(item, PLACING, animated)
         self._animation(item)
         for constraint in item.constraints:
             self._struct(constraint, animated, f'constraints["{constraint.name}"]')

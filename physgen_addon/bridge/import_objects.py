@@ -17,6 +17,7 @@ from ...sim.scene.folder import SceneFolder
 from ...sim.scene.glb import TexturedMesh
 from ...sim.scene.model import SceneObject
 from . import compat
+from .camera import photo_uv
 from .import_view import Made, load_picture
 
 UV = "photo"
@@ -78,10 +79,7 @@ def _appearance(
         if not image.size[0] or not image.size[1]:
             raise InputError(f"object {source.name}: the picture in {source.mesh} is not readable; export it again")
         return mesh.uv, image
-    camera = folder.scene.camera
-    pixels = camera.project(vertices)
-    uv = np.stack([pixels[:, 0] / camera.width, 1.0 - pixels[:, 1] / camera.height], axis=1)
-    return np.nan_to_num(uv), load_picture(made, folder.file(folder.scene.photo))
+    return photo_uv(folder.scene.camera, vertices), load_picture(made, folder.file(folder.scene.photo))
 
 
 def _material(made: Made, name: str, picture: bpy.types.Image) -> bpy.types.Material:

@@ -20,6 +20,7 @@ from ...sim.scene.model import Ground, Scene, SceneObject
 from ..props import presets
 from ..props.material import is_modified, set_material
 from . import compat
+from .bounds import box_corners
 
 MAX_GRAVITY = 200.0
 """Strongest gravity that Blender keeps, along each axis, m/s²."""
@@ -153,7 +154,7 @@ def _animate_collider(item: bpy.types.Object, motion: Motion, first: int, rate: 
     if motion.pivot is not None:
         pivot = Vector(motion.pivot)
     else:
-        corners = np.array([item.matrix_world @ Vector(corner) for corner in item.bound_box])
+        corners = box_corners(item)
         pivot = Vector(((corners.min(axis=0) + corners.max(axis=0)) / 2).tolist())
     times = {key.time_s for key in (*motion.translations, *motion.rotations)}
     if len(motion.rotations) > 1:

@@ -11,20 +11,21 @@ from typing import TypeVar
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.model import Camera
 from . import compat
+from .bounds import box_corners
 from .camera import add_camera
 from .environment import LUMINANCE, environment_irradiance
 from .regions import plane_axes
+from .sun import new_sun
 
 MARK = "physgen_import"
 """Custom property of what an import has made, so that nothing else is removed with it."""
-MIN_SUN_COSINE = 0.05
 REACH = 12.0
 """Half the ground's width over the extent of all objects."""
 KEPT = (bpy.types.Mesh, bpy.types.Material, bpy.types.Image, bpy.types.Light, bpy.types.Camera, bpy.types.World)
@@ -84,7 +85,7 @@ def build(made: Made, collection: bpy.types.Collection, folder: SceneFolder, ite
     if light.sun_direction is not None and light.sun_strength > 0:
         sun = _add_sun(made, folder, light.sun_strength * irradiance, colour / irradiance)
         collection.objects.link(sun)
-    corners = np.array([item.matrix_world @ Vector(corner) for item in items for corner in item.bound_box])
+    corners = np.concatenate([box_corners(item) for item in items])
     ground = _ground(made, scene.ground.unit_normal, np.asarray(scene.ground.point, dtype=float), corners)
     collection.objects.link(ground)
     return View(ground=ground, world=world, photo=photo, background=background)
@@ -173,18 +174,13 @@ def _fill_world(made: Made, world: bpy.types.World, folder: SceneFolder) -> NDAr
 def _add_sun(
     made: Made, folder: SceneFolder, ground_irradiance: float, colour: NDArray[np.floating]
 ) -> bpy.types.Object:
-    light = folder.scene.light
-    direction = np.asarray(light.sun_direction)
-    data = made.add(bpy.data.lights.new("sun", "SUN"))
-    # Blender's strength is the irradiance of a surface that faces the sun; the colour is the sky's (see light.py).
-    data.energy = ground_irradiance / max(float(direction @ folder.scene.ground.unit_normal), MIN_SUN_COSINE)
-    data.color = colour.tolist()
-    data.angle = light.sun_angle
-    item = made.add(bpy.data.objects.new("sun", data))
-    turn = Vector(direction.tolist()).to_track_quat("Z", "Y").to_matrix().to_4x4()
+    data, turn = new_sun(folder.scene.light, folder.scene.ground.unit_normal, ground_irradiance, colour)
+    item = made.add(bpy.data.objects.new("sun", made.add(data)))
     # Where a sun stands does not matter: behind the camera its line is out of the picture.
     camera = folder.scene.camera
-    item.matrix_world = Matrix.Translation((2 * camera.position - _target(camera, folder)).tolist()) @ turn
+    item.matrix_world = (
+        Matrix.Translation((2 * camera.position - _target(camera, folder)).tolist()) @ turn.to_matrix().to_4x4()
+    )
     return item
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Vector
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
@@ -16,9 +15,7 @@ from ...sim.scene.folder import SceneFolder
 from . import compat
 from .environment import LUMINANCE, environment_irradiance
 from .exr import read_layers
-
-MIN_SUN_COSINE = 0.05
-"""A sun lower than 3° over the ground would need an unbounded strength to light it as much as the scene says."""
+from .sun import new_sun
 
 
 def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
@@ -56,26 +53,12 @@ def add_light(scenes: list[bpy.types.Scene], folder: SceneFolder) -> float:
     total = irradiance
     if light.sun_direction is not None and light.sun_strength > 0:
         total += light.sun_strength * irradiance
-        _add_sun(scenes, folder, light.sun_strength * irradiance, colour / (colour @ LUMINANCE))
+        data, turn = new_sun(light, normal, light.sun_strength * irradiance, colour / (colour @ LUMINANCE))
+        sun = bpy.data.objects.new("sun", data)
+        sun.rotation_euler = turn.to_euler()
+        for scene in scenes:
+            scene.collection.objects.link(sun)
     return total
-
-
-def _add_sun(
-    scenes: list[bpy.types.Scene], folder: SceneFolder, ground_irradiance: float, colour: NDArray[np.floating]
-) -> None:
-    light, normal = folder.scene.light, np.asarray(folder.scene.ground.normal)
-    direction = np.asarray(light.sun_direction)
-    data = bpy.data.lights.new("sun", "SUN")
-    # Blender's strength is the irradiance of a surface that faces the sun.
-    data.energy = ground_irradiance / max(float(direction @ normal), MIN_SUN_COSINE)
-    # The photo's white balance has made the whole light white; a sun of another colour than the sky's light would
-    # tint the shadows.
-    data.color = colour.tolist()
-    data.angle = light.sun_angle
-    item = bpy.data.objects.new("sun", data)
-    item.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
-    for scene in scenes:
-        scene.collection.objects.link(item)
 
 
 def _read_environment(path: Path) -> NDArray[np.float32]:

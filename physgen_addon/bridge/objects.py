@@ -21,6 +21,7 @@ from ...sim.scene.folder import SceneFolder
 from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
 from ...sim.scene.model import SceneObject
 from . import compat
+from .camera import photo_uv
 
 REST_LIGHT = "rest_light"
 """Colour attribute at the vertices: L₀ + k, radiance of a white surface at rest plus the ambient term."""
@@ -84,11 +85,8 @@ def _appearance(
     uv, image = getattr(visual, "uv", None), _base_colour(visual)
     if uv is not None and image is not None and len(uv) == len(mesh.vertices) and np.isfinite(uv).all():
         return np.asarray(uv, dtype=np.float64), _load_image(source.name, image.convert("RGB"))
-    camera = folder.scene.camera
-    pixels = camera.project(mesh.vertices)
-    uv = np.stack([pixels[:, 0] / camera.width, 1.0 - pixels[:, 1] / camera.height], axis=1)
     with Image.open(folder.file(folder.scene.photo)) as photo:
-        return np.nan_to_num(uv), _load_image(source.name, photo.convert("RGB"))
+        return photo_uv(folder.scene.camera, mesh.vertices), _load_image(source.name, photo.convert("RGB"))
 
 
 def _base_colour(visual: trimesh.visual.base.Visuals) -> Image.Image | None:

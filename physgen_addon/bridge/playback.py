@@ -54,7 +54,7 @@ def show(scene: bpy.types.Scene, record: BakeRecord) -> list[str]:
     Raises InputError when the folder holds no bake that can be played.
     """
     manifest = manifest_of(record.path)
-    if manifest is None or playable(record.path, manifest) < 1:
+    if manifest is None or playable(record.path) < 1:
         raise InputError(f"{record.path}: holds no frame that can be played; bake again")
     troubles, items = [], bound(scene)
     for baked in manifest.objects:

@@ -9,7 +9,7 @@ import bpy
 
 from ...sim.app.bake_inputs import BakeOptions, inputs_hash
 from ...sim.app.process import run_stage
-from ...sim.errors import InputError, PhysGenError
+from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
 from .. import bake_record, bake_state, jobs, paths, unsaved
@@ -120,8 +120,8 @@ class Bake(JobOperator):
         path = Path(folder)
         # Undo may have taken it out again.
         if not self._shown or not bake_state.shows(scene, path):
-            record, manifest = read_record(path), bake_record.manifest_of(path)
-            if record is None or manifest is None or not bake_record.playable(path, manifest):
+            record = read_record(path)
+            if record is None or not bake_record.playable(path):
                 return
             playback.show(scene, record)
         self._refresh_held_frame(scene, done)
@@ -153,7 +153,7 @@ class Bake(JobOperator):
 
     def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
         """Frames that are there stay playable."""
-        bake_state.set_trouble(scene, "" if type(error).__name__ == "Cancelled" else str(error))
+        bake_state.set_trouble(scene, "" if isinstance(error, Cancelled) else str(error))
         unsaved.settle(scene)
         bake_state.refresh(scene)
 

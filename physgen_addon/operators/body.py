@@ -2,9 +2,9 @@
 """Objects into the simulation and out of it; how they begin; what holds them."""
 
 import bpy
-import numpy as np
 from mathutils import Matrix, Vector
 
+from ..bridge.bounds import rest_bounds
 from ..props.body import bodies, is_body
 from ..text import count
 
@@ -14,15 +14,6 @@ UPPER_PART = 0.25
 """Share of the object's height that a new pin holds."""
 _MARGIN = 0.02
 """Of the object's size; a pin reaches so far beyond its surface."""
-
-
-def rest_bounds(item: bpy.types.Object) -> tuple[Vector, Vector]:
-    """Lowest and highest corner in the world of the mesh as it is before its modifiers, a bake's among them."""
-    places = np.zeros((max(len(item.data.vertices), 1), 3), dtype=np.float32)
-    item.data.vertices.foreach_get("co", places[: len(item.data.vertices)].ravel())
-    matrix = np.asarray(item.matrix_world)
-    world = places @ matrix[:3, :3].T + matrix[:3, 3]
-    return Vector(world.min(axis=0)), Vector(world.max(axis=0))
 
 
 def _unfit(item: bpy.types.Object) -> str | None:
@@ -136,7 +127,9 @@ class PHYSGEN_OT_select_bodies(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class _OfBody:
+class OfBody:
+    """Mixin: an operator on the active object, which takes part."""
+
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
@@ -148,7 +141,7 @@ class _OfBody:
         return True
 
 
-class PHYSGEN_OT_clear_motion(_OfBody, bpy.types.Operator):
+class PHYSGEN_OT_clear_motion(OfBody, bpy.types.Operator):
     """Let the object begin at rest with the simulation: no velocity, no spin, no start frame"""
 
     bl_idname = "physgen.clear_motion"
@@ -161,7 +154,7 @@ class PHYSGEN_OT_clear_motion(_OfBody, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PHYSGEN_OT_add_pin(_OfBody, bpy.types.Operator):
+class PHYSGEN_OT_add_pin(OfBody, bpy.types.Operator):
     """Hold the upper part of the object: adds a box around it that you can move, scale and animate"""
 
     bl_idname = "physgen.add_pin"
@@ -188,7 +181,7 @@ class PHYSGEN_OT_add_pin(_OfBody, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PHYSGEN_OT_remove_pin(_OfBody, bpy.types.Operator):
+class PHYSGEN_OT_remove_pin(OfBody, bpy.types.Operator):
     """Let go of what the chosen pin holds; its box is deleted if "Add Pin" made it and nobody else uses it"""
 
     bl_idname = "physgen.remove_pin"

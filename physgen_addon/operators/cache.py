@@ -143,23 +143,16 @@ def relink(scene: bpy.types.Scene, chosen: Path) -> None:
     ]
     for folder in candidates:
         if name and bake_record.manifest_of(folder) is not None:
-            _play(scene, folder)
+            playback.show(scene, bake_state.record_of(scene, folder))
             return
     current = fingerprint(scene)
     for cache in (chosen, chosen.parent, *sorted(chosen.glob("*")), *sorted(chosen.glob("*/*"))):
         found = bake_record.matching(cache, current) if cache.is_dir() else None
         if found is not None:
-            _play(scene, found.path)
+            playback.show(scene, found)
             return
     what = f"the bake {name!r}" if name else "a bake of this scene"
     raise InputError(f"{chosen}: {what} is not in there; choose the folder with the caches, or bake again")
-
-
-def _play(scene: bpy.types.Scene, folder: Path) -> None:
-    record = bake_record.read_record(folder) or bake_record.BakeRecord(
-        folder=str(folder), frame_start=scene.physgen.simulation.frame_start
-    )
-    playback.show(scene, record)
 
 
 CLASSES = (PHYSGEN_OT_free_bake, PHYSGEN_OT_free_old_bakes, PHYSGEN_OT_relink_caches)

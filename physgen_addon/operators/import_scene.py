@@ -95,17 +95,7 @@ class PHYSGEN_OT_import_scene(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
 
-class PHYSGEN_OT_import_physgen3d(JobOperator, bpy.types.Operator):
-    """Turn an output folder of PhysGen3D into a scene folder beside it, and open that"""
-
-    bl_idname = "physgen.import_physgen3d"
-    bl_label = "Import PhysGen3D Output"
-    bl_options = {"UNDO"}  # noqa: RUF012
-    job_title = "Import"
-
-    directory: StringProperty(
-        name="Folder", description="With transform.json, meshes, mask and inpaint", subtype="DIR_PATH", options=SKIP
-    )
+class _OfPhysgen3d:
     size_m: FloatProperty(
         name="Size of the First Object",
         description="Its largest extent, which sets the scale of the scene; PhysGen3D does not know it",
@@ -115,6 +105,19 @@ class PHYSGEN_OT_import_physgen3d(JobOperator, bpy.types.Operator):
         soft_min=0.01,
         soft_max=10.0,
         unit="LENGTH",
+    )
+
+
+class PHYSGEN_OT_import_physgen3d(_OfPhysgen3d, JobOperator, bpy.types.Operator):
+    """Turn an output folder of PhysGen3D into a scene folder beside it, and open that"""
+
+    bl_idname = "physgen.import_physgen3d"
+    bl_label = "Import PhysGen3D Output"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Import"
+
+    directory: StringProperty(
+        name="Folder", description="With transform.json, meshes, mask and inpaint", subtype="DIR_PATH", options=SKIP
     )
 
     def request(self, context: bpy.types.Context) -> Work:
@@ -134,7 +137,7 @@ class PHYSGEN_OT_import_physgen3d(JobOperator, bpy.types.Operator):
         return show_scene(scene, Path(str(final["scene"])))
 
 
-class PHYSGEN_OT_choose_physgen3d(bpy.types.Operator):
+class PHYSGEN_OT_choose_physgen3d(_OfPhysgen3d, bpy.types.Operator):
     """Choose an output folder of PhysGen3D and open it"""
 
     bl_idname = "physgen.choose_physgen3d"
@@ -142,16 +145,6 @@ class PHYSGEN_OT_choose_physgen3d(bpy.types.Operator):
 
     directory: StringProperty(subtype="DIR_PATH", options=SKIP)
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})
-    size_m: FloatProperty(
-        name="Size of the First Object",
-        description="Its largest extent, which sets the scale of the scene; PhysGen3D does not know it",
-        default=0.15,
-        min=1e-4,
-        max=1e3,
-        soft_min=0.01,
-        soft_max=10.0,
-        unit="LENGTH",
-    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

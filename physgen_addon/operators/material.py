@@ -10,21 +10,10 @@ from ..props.body import is_body
 from ..props.material import get_material, set_material
 from ..props.presets import CUSTOM
 from ..text import count
+from .body import OfBody
 
 
-class _OfMaterial:
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """The active object has one."""
-        if not is_body(context.active_object):
-            cls.poll_message_set("The active object is not in the simulation")
-            return False
-        return True
-
-
-class PHYSGEN_OT_save_preset(_OfMaterial, bpy.types.Operator):
+class PHYSGEN_OT_save_preset(OfBody, bpy.types.Operator):
     """Keep these numbers under a name, for all your files"""
 
     bl_idname = "physgen.save_preset"
@@ -87,7 +76,7 @@ class PHYSGEN_OT_delete_preset(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PHYSGEN_OT_reset_preset(_OfMaterial, bpy.types.Operator):
+class PHYSGEN_OT_reset_preset(OfBody, bpy.types.Operator):
     """Go back to the preset's numbers"""
 
     bl_idname = "physgen.reset_preset"
@@ -104,7 +93,7 @@ class PHYSGEN_OT_reset_preset(_OfMaterial, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PHYSGEN_OT_copy_material(_OfMaterial, bpy.types.Operator):
+class PHYSGEN_OT_copy_material(OfBody, bpy.types.Operator):
     """Give all selected objects of the simulation the active one's material"""
 
     bl_idname = "physgen.copy_material"

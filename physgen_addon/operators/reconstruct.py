@@ -11,6 +11,7 @@ import bpy
 from ...sim.app.process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.names import fitting_names
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
 from ..paths import folder_beside, require_folder
@@ -41,7 +42,8 @@ def arguments(state: bpy.types.PropertyGroup) -> list[str]:
         raise InputError("there is no box; draw one around each object that is to move")
     # The command takes sizes from the first box on, so boxes with one go first.
     boxes = sorted(state.boxes, key=lambda box: box.size_m <= 0)
-    names = _names([box.name for box in boxes])
+    # A name that begins with a dash would be taken for an option.
+    names = fitting_names([box.name.strip(" -") for box in boxes])
     for box in boxes:
         if box.x1 - box.x0 < LEAST_PX or box.y1 - box.y0 < LEAST_PX:
             raise InputError(f"box {box.name}: is {box.x1 - box.x0} x {box.y1 - box.y0} pixels; draw it larger")
@@ -52,18 +54,6 @@ def arguments(state: bpy.types.PropertyGroup) -> list[str]:
         found += ["--size", *sizes]
     if state.use_pitch:
         found += ["--pitch", f"{math.degrees(state.pitch):.7g}"]
-    return found
-
-
-def _names(names: list[str]) -> list[str]:
-    """Names as a scene may have them, each once."""
-    found: list[str] = []
-    for name in names:
-        plain = "".join(c if c.isalnum() or c in "_- " else "_" for c in name).strip(" -")[:56] or "object"
-        candidate, number = plain, 2
-        while candidate.casefold() in {other.casefold() for other in found}:
-            candidate, number = f"{plain}_{number}", number + 1
-        found.append(candidate)
     return found
 
 

@@ -104,8 +104,7 @@ class PHYSGEN_OT_export_usd(_ExportOperator, bpy.types.Operator):
 def baked_range(scene: bpy.types.Scene) -> tuple[int, int]:
     """First and last frame that can be played. Raises InputError when there is none."""
     record = bake_state.shown_record(scene)
-    manifest = bake_record.manifest_of(record.path) if record is not None else None
-    done = bake_record.playable(record.path, manifest) if record is not None and manifest is not None else 0
+    done = bake_record.playable(record.path) if record is not None else 0
     if record is None or done < 1:
         raise InputError("no frame of the bake can be played; bake again, or relink its files")
     return record.frame_start, record.frame_start + done - 1

@@ -3,8 +3,8 @@
 
 import bpy
 
+from ..bridge.bounds import rest_bounds
 from ..props.body import bodies
-from .body import rest_bounds
 
 
 class PHYSGEN_OT_ground_below(bpy.types.Operator):

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 
-from ...sim.app.process import child_environment
+from ...sim.app.process import parse_event, read_errors, start_process
 from ...sim.errors import PhysGenError
 from ...sim.events import Event
 
@@ -79,33 +78,23 @@ class Client:
             self._at_end()
 
     def _serve(self, command: list[str]) -> None:
-        flags = 0x08000000 if os.name == "nt" else 0  # no console window
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=child_environment(),
-            start_new_session=os.name != "nt",
-            creationflags=flags,
-        )
+        process = start_process(command, stdin=subprocess.PIPE)
         tail: deque[str] = deque(maxlen=10)
-        helpers = [
+        threads = [
             threading.Thread(target=self._write, args=(process,), daemon=True),
-            threading.Thread(target=_read_errors, args=(process, tail), daemon=True),
+            threading.Thread(target=read_errors, args=(process, tail), daemon=True),
         ]
-        for helper in helpers:
-            helper.start()
+        for thread in threads:
+            thread.start()
         assert process.stdout is not None
         for line in process.stdout:
-            with contextlib.suppress(ValueError):
-                event = json.loads(line)
-                if isinstance(event, dict) and "event" in event:
-                    self._events.put(event)
+            event = parse_event(line)
+            if event is not None:
+                self._events.put(event)
         code = process.wait()
         self._requests.put(None)
-        for helper in helpers:
-            helper.join(1.0)
+        for thread in threads:
+            thread.join(1.0)
         words = "" if self._stopped.is_set() else "\n".join(tail).strip() or f"the worker ended with code {code}"
         self._events.put({"event": "ended", "message": words})
 
@@ -121,9 +110,3 @@ class Client:
             process.wait(STOP_GRACE_S)
         except subprocess.TimeoutExpired:
             process.kill()
-
-
-def _read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
-    assert process.stderr is not None
-    for line in process.stderr:
-        tail.append(line.decode("utf-8", "replace").rstrip())

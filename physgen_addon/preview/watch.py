@@ -15,9 +15,10 @@ from ..bridge.animation import channels
 from ..bridge.export_meshes import read_points
 from ..bridge.export_names import export_names
 from ..bridge.export_objects import physics
-from ..bridge.export_units import clock, decimal, metres_per_unit
+from ..bridge.export_units import clock, metres_per_unit
 from ..bridge.export_world import effects, gravity
 from ..props.body import bodies
+from ..typed import decimal
 
 UNSET = ("friction", "static_friction", "restitution", "contact_mode", "shell_thickness")
 """Fields of an object that are left out where the artist has not set them."""

@@ -19,6 +19,7 @@ from bpy.props import (
 from mathutils import Vector
 
 from .material import PHYSGEN_PG_material
+from .surface import Surface
 
 
 def _is_empty(self: "PHYSGEN_PG_pin", item: bpy.types.Object) -> bool:
@@ -39,12 +40,6 @@ class PHYSGEN_PG_pin(bpy.types.PropertyGroup):
     )
 
 
-def _on_friction(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
-    # Only upwards and only from here, so that the two can be set in any order.
-    if self.static_friction < self.friction:
-        self.static_friction = self.friction
-
-
 def _get_speed(self: "PHYSGEN_PG_body") -> float:
     return Vector(self.velocity).length
 
@@ -55,7 +50,7 @@ def _set_speed(self: "PHYSGEN_PG_body", speed: float) -> None:
     self.velocity = direction * speed
 
 
-class PHYSGEN_PG_body(bpy.types.PropertyGroup):
+class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     """An object's part in the simulation; ``Object.physgen``."""
 
     enabled: BoolProperty(name="In Simulation", description="Let the object take part in the simulation")
@@ -88,30 +83,6 @@ class PHYSGEN_PG_body(bpy.types.PropertyGroup):
 
     own_surface: BoolProperty(
         name="Own Surface", description="Friction and bounce of its own; off: the same as the ground's"
-    )
-    friction: FloatProperty(
-        name="Friction",
-        description="Coulomb's coefficient while sliding: ice 0.03, wood on wood 0.4, rubber 1",
-        default=0.4,
-        min=0.0,
-        max=10.0,
-        soft_max=1.5,
-        update=_on_friction,
-    )
-    static_friction: FloatProperty(
-        name="Static Friction",
-        description="Coulomb's coefficient before it slides; never below the sliding one",
-        default=0.4,
-        min=0.0,
-        max=10.0,
-        soft_max=1.5,
-    )
-    restitution: FloatProperty(
-        name="Bounce",
-        description="Speed after over speed before an impact of rigid objects",
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
     )
     contact_mode: EnumProperty(
         name="Contact",

@@ -11,6 +11,7 @@ import bpy
 from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, StringProperty
 
 from ...sim.scene.matter import Material
+from ..typed import decimal
 from . import presets
 from .presets import CUSTOM
 
@@ -82,9 +83,9 @@ def set_material(target: "PHYSGEN_PG_material", material: Material) -> None:
 
 def get_material(source: "PHYSGEN_PG_material") -> Material:
     """The matter as the simulation takes it. Raises InputError for a number out of range."""
-    values = {name: _number(getattr(source, name)) for name in NUMBERS if name != "fibre_axis"}
-    values["fibre_axis"] = tuple(_number(number) for number in source.fibre_axis)
-    return Material(preset=source.preset, **values)
+    values = {name: decimal(getattr(source, name)) for name in NUMBERS if name not in ("law", "fibre_axis")}
+    axis = tuple(decimal(number) for number in source.fibre_axis)
+    return Material(preset=source.preset, law=source.law, fibre_axis=axis, **values)
 
 
 def is_modified(source: "PHYSGEN_PG_material") -> bool:
@@ -98,11 +99,6 @@ def _same(mine: object, theirs: object) -> bool:
         return all(_same(a, b) for a, b in zip(mine, theirs, strict=True))  # type: ignore[call-overload]
     # Blender keeps 32 bits.
     return math.isclose(mine, theirs, rel_tol=1e-6) if isinstance(theirs, float) else mine == theirs  # type: ignore[arg-type]
-
-
-def _number(value: float | str) -> float | str:
-    """Blender keeps 32 bits: 0.4 comes back as 0.4000000059604645."""
-    return float(f"{value:.7g}") if isinstance(value, float) else value
 
 
 class PHYSGEN_PG_material(bpy.types.PropertyGroup):

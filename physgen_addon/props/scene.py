@@ -20,7 +20,9 @@ from bpy.props import (
 
 from ...sim.effects.registry import Parameter, effect, effects
 from ..text import readable
+from ..typed import decimal
 from .body import is_body
+from .surface import Surface
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -89,7 +91,7 @@ class PHYSGEN_PG_number(bpy.types.PropertyGroup):
 
 def effect_values(entry: "PHYSGEN_PG_effect_entry") -> dict[str, float]:
     """The parameters of ``entry`` as the registry takes them: complete, in range, 0.4 as 0.4."""
-    given = {number.name: float(f"{number.value:.7g}") for number in entry.parameters}
+    given = {number.name: decimal(number.value) for number in entry.parameters}
     return {p.name: _clamped(given.get(p.name, p.default), p) for p in effect(entry.effect).parameters}
 
 
@@ -109,13 +111,7 @@ class PHYSGEN_PG_effect_entry(bpy.types.PropertyGroup):
     """Empty: all that it can act on."""
 
 
-def _on_friction(self: "PHYSGEN_PG_world", context: bpy.types.Context) -> None:
-    # Only upwards and only from here, so that the two can be set in any order.
-    if self.static_friction < self.friction:
-        self.static_friction = self.friction
-
-
-class PHYSGEN_PG_world(bpy.types.PropertyGroup):
+class PHYSGEN_PG_world(Surface, bpy.types.PropertyGroup):
     """Ground and effects. Gravity is Blender's own (``Scene.gravity``)."""
 
     use_ground: BoolProperty(name="Ground", description="A floor without end", default=True)
@@ -129,30 +125,6 @@ class PHYSGEN_PG_world(bpy.types.PropertyGroup):
     )
     ground_normal: FloatVectorProperty(
         name="Up", description="The side on which objects stand", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
-    )
-    friction: FloatProperty(
-        name="Friction",
-        description="Coulomb's coefficient while sliding: ice 0.03, wood on wood 0.4, rubber 1",
-        default=0.4,
-        min=0.0,
-        max=10.0,
-        soft_max=1.5,
-        update=_on_friction,
-    )
-    static_friction: FloatProperty(
-        name="Static Friction",
-        description="Coulomb's coefficient before it slides; never below the sliding one",
-        default=0.4,
-        min=0.0,
-        max=10.0,
-        soft_max=1.5,
-    )
-    restitution: FloatProperty(
-        name="Bounce",
-        description="Speed after over speed before an impact of rigid objects",
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
     )
     effects: CollectionProperty(type=PHYSGEN_PG_effect_entry)
     effect_index: IntProperty(name="Effect")

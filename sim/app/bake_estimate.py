@@ -62,7 +62,7 @@ def estimate_bake(folder: SceneFolder, options: BakeOptions) -> PreparedWorld:
 
 
 def bake_cost(folder: SceneFolder, options: BakeOptions) -> BakeCost:
-    """What a bake of ``folder`` will take. Raises InputError as ``estimate_bake`` does."""
+    """What a bake of ``folder`` will take, disk included. Raises InputError as ``estimate_bake`` does."""
     meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
     prepared = prepare_world(folder, meshes, options)
     objects = baked_objects(folder, meshes, prepared, options)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-GRANULAR = frozenset({SAND, FLUID, SNOW})
+AS_PARTICLES = frozenset({SAND, FLUID, SNOW})
 """Laws whose matter is shown by its particles as well: its skin tears or covers what it should not."""
 
 
@@ -44,14 +44,14 @@ def _baked_object(name: str, vertices: int, points: int, space: str) -> BakedObj
 
 
 def _points(prepared: PreparedWorld, slot: int) -> int:
-    """Particles of object ``slot`` if it is, or becomes, of one of the ``GRANULAR`` laws, else 0."""
+    """Particles of object ``slot`` if it is, or becomes, of one of the ``AS_PARTICLES`` laws, else 0."""
     index = prepared.body_of_object[slot]
     if index is None:
         return 0
     body = prepared.setup.bodies[index]
     if isinstance(body.material, RigidMaterial):
         return 0
-    return body.count if any(m.law in GRANULAR for m in (body.material, *body.materials)) else 0
+    return body.count if any(m.law in AS_PARTICLES for m in (body.material, *body.materials)) else 0
 
 
 class ObjectSampler:

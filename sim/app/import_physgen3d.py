@@ -23,6 +23,7 @@ from ..scene.materials import load_preset
 from ..scene.matter import Material
 from ..scene.meshes import read_mesh
 from ..scene.model import Camera, Matrix4, Scene, SceneObject
+from ..scene.names import fitting_names
 from ..scene.physgen3d import Physgen3dFolder, Physgen3dObject, read_physgen3d
 
 DEFAULT_SIZE_M = 0.15
@@ -80,7 +81,7 @@ def import_physgen3d(root: Path, out: Path, *, size_m: float | None = None, on_e
             (folder / sub).mkdir()
         Image.fromarray(photo).save(folder / "photo.png")
         Image.fromarray(background).save(folder / "background.png")
-        names = _names([item.source.name for item in placed])
+        names = fitting_names([item.source.name for item in placed])
         objects = tuple(
             _write_object(folder, name, item, world, metres, placed) for name, item in zip(names, placed, strict=True)
         )
@@ -173,15 +174,3 @@ def _sized(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     if picture.size != (width, height):
         picture = picture.resize((width, height), Image.Resampling.BILINEAR)
     return np.array(picture, dtype=np.uint8)
-
-
-def _names(names: list[str]) -> list[str]:
-    """Names as a scene may have them, each once."""
-    found: list[str] = []
-    for name in names:
-        plain = "".join(c if c.isalnum() or c in "_- " else "_" for c in name).strip()[:56] or "object"
-        candidate, number = plain, 2
-        while candidate.casefold() in {other.casefold() for other in found}:
-            candidate, number = f"{plain}_{number}", number + 1
-        found.append(candidate)
-    return found

@@ -55,6 +55,22 @@ def own_command(
     return [python, str(_LAUNCHER), *options, module, *arguments]
 
 
+def start_process(command: Sequence[str], *, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
+    """Start ``command`` with pipes for what it says, in a session of its own.
+
+    Ctrl-C then reaches this process alone, which asks the other to stop in good order.
+    """
+    return subprocess.Popen(
+        list(command),
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=child_environment(),
+        start_new_session=os.name != "nt",
+        creationflags=0x00000200 | NO_WINDOW if os.name == "nt" else 0,  # a process group of its own
+    )
+
+
 def run_stage(
     command: Sequence[str],
     on_event: OnEvent,
@@ -94,22 +110,12 @@ def _run_once(
     command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
 ) -> tuple[Event | None, int, deque[str]]:
     """The final event of ``command`` if it gave one, its exit code and the last lines of its chatter."""
-    flags = 0x00000200 | NO_WINDOW if os.name == "nt" else 0  # a process group of its own
-    # Own session: Ctrl-C reaches this process alone, which then asks the stage to stop in good order.
-    process = subprocess.Popen(
-        list(command),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=child_environment(),
-        start_new_session=os.name != "nt",
-        creationflags=flags,
-    )
+    process = start_process(command)
     lines: Queue[bytes | None] = Queue()
     tail: deque[str] = deque(maxlen=30)
     readers = [
         threading.Thread(target=_read_events, args=(process, lines), daemon=True),
-        threading.Thread(target=_read_errors, args=(process, tail), daemon=True),
+        threading.Thread(target=read_errors, args=(process, tail), daemon=True),
     ]
     for reader in readers:
         reader.start()
@@ -147,7 +153,7 @@ def _relay(
             if final is None and asked_at is not None:
                 raise Cancelled("cancelled while starting; run it again to continue")
             return final
-        event = _parse_event(line)
+        event = parse_event(line)
         if event is None:
             tail.append(line.decode("utf-8", "replace").rstrip())
         elif event["event"] in ("done", "error"):
@@ -156,7 +162,7 @@ def _relay(
             on_event(event)
 
 
-def _parse_event(line: bytes) -> Event | None:
+def parse_event(line: bytes) -> Event | None:
     """The event on ``line``, or None for the chatter of a library."""
     try:
         value = json.loads(line)
@@ -172,7 +178,8 @@ def _read_events(process: subprocess.Popen[bytes], lines: Queue[bytes | None]) -
     lines.put(None)
 
 
-def _read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
+def read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
+    """Keep the last lines that ``process`` writes to standard error in ``tail``; a thread's work, until it ends."""
     assert process.stderr is not None
     for line in process.stderr:
         tail.append(line.decode("utf-8", "replace").rstrip())

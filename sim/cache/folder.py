@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bake folders as things on a disk: what they take, which there are, and getting rid of one.
+"""Bake folders as things on a disk: what they take, and getting rid of one.
 
 Only what a manifest lists is ever counted or deleted, so that nothing that somebody else put there is lost.
 """
@@ -7,16 +7,12 @@ Only what a manifest lists is ever counted or deleted, so that nothing that some
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
 from .lock import LOCK_FILE, folder_lock, process_alive
 from .manifest import CHECKPOINT_FILE, MANIFEST_FILE, METRICS_FILE, BakeManifest, load_manifest
-
-MOST_FOLDERS = 100_000
-"""Folders that are looked into for bakes; more are no cache of ours."""
 
 _PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-\d+\.(?:json|npz)")
 _LOCK_LEFTOVER = re.compile(re.escape(LOCK_FILE) + r"-(?:dead-)?(\d+)-[0-9a-f]{8}")
@@ -92,22 +88,3 @@ def remove_leftovers(folder: Path) -> None:
             lock = _LOCK_LEFTOVER.fullmatch(path.name)
             if _PARTIAL.fullmatch(path.name) or (lock and not process_alive(int(lock[1]))):
                 path.unlink(missing_ok=True)
-
-
-def scan_bakes(folder: Path) -> list[tuple[Path, BakeManifest]]:
-    """All bakes below ``folder`` with their manifests, sorted by path; links are not followed.
-
-    A folder whose manifest cannot be read is none, and one that is not there holds none.
-    """
-    found = []
-    for number, (root, folders, files) in enumerate(os.walk(folder)):
-        if number >= MOST_FOLDERS:
-            break
-        if MANIFEST_FILE not in files:
-            continue
-        try:
-            found.append((Path(root), load_manifest(Path(root))))
-        except InputError:
-            continue
-        folders.clear()
-    return sorted(found, key=lambda item: item[0])

@@ -35,6 +35,16 @@ def folder_lock(folder: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
+def is_written(folder: Path) -> bool:
+    """Whether another living process of this machine holds ``folder``."""
+    try:
+        owner = json.loads((folder / LOCK_FILE).read_bytes())
+        pid, host = int(owner["pid"]), str(owner["host"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return host == socket.gethostname() and pid != os.getpid() and process_alive(pid)
+
+
 def _acquire(path: Path) -> None:
     """Put a whole lock at ``path``: written beside it and linked, so that no one ever reads half of it."""
     mine = path.with_name(f"{LOCK_FILE}-{os.getpid()}-{uuid.uuid4().hex[:8]}")

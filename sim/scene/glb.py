@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .meshes import MAX_MESH_BYTES, read_mesh
 
-MAX_GLB_BYTES = 512 * 2**20
 MAX_JSON_BYTES = 16 * 2**20
 MAX_NODES = 10_000
 PICTURES = ("image/png", "image/jpeg")
@@ -59,13 +59,6 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
         found = _read_glb(path)
         if found is not None:
             return found
-    try:
-        from .meshes import read_mesh
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{path}: only GLB files with one mesh can be read without {error.name}; install the extension with its "
-            "wheels, or export the mesh as such a file"
-        ) from None
     mesh = read_mesh(path)
     return TexturedMesh(vertices=np.asarray(mesh.vertices, dtype=np.float64), faces=np.asarray(mesh.faces))
 
@@ -74,8 +67,8 @@ def _read_glb(path: Path) -> TexturedMesh | None:
     """None where it is a GLB that this reader does not cover."""
     try:
         size = path.stat().st_size
-        if size > MAX_GLB_BYTES:
-            raise InputError(f"{path}: {size >> 20} MiB is more than the {MAX_GLB_BYTES >> 20} MiB a mesh may have")
+        if size > MAX_MESH_BYTES:
+            raise InputError(f"{path}: {size >> 20} MiB is more than the {MAX_MESH_BYTES >> 20} MiB a mesh may have")
         content = path.read_bytes()
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such mesh; restore it or reconstruct the scene again") from None

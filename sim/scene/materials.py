@@ -14,14 +14,15 @@ from ..atomic import replacing
 from ..errors import InputError
 from .json_fields import parse
 from .matter import Material
+from .names import DEVICES
 
 PRESET_FOLDER = Path(__file__).resolve().parents[2] / "presets" / "materials"
 MAX_PRESET_BYTES = 64 * 2**10
 MAX_PRESETS = 500
 """More files in a folder of presets are not read."""
 
-_RESERVED = {"con", "prn", "aux", "nul", "custom", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
-"""``custom`` stands for no preset; Windows gives no file the other names."""
+_RESERVED = DEVICES | {"custom"}
+"""``custom`` stands for no preset."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

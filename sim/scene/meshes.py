@@ -57,7 +57,9 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     try:
         import trimesh
     except ModuleNotFoundError as error:
-        raise InputError(f"{path}: cannot be read without the Python package {error.name}; install it") from None
+        raise InputError(
+            f"{path}: cannot be read without the Python package {error.name}; install it, or give a GLB with one mesh"
+        ) from None
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: mesh files are {', '.join(MESH_SUFFIXES)}, not {path.suffix or 'without suffix'!r}")
     try:

@@ -9,8 +9,7 @@ import textwrap
 
 import numpy as np
 import pytest
-from physgen.sim.cache import folder as module
-from physgen.sim.cache.folder import disk_use, free_bake, remove_leftovers, scan_bakes
+from physgen.sim.cache.folder import disk_use, free_bake, remove_leftovers
 from physgen.sim.cache.lock import folder_lock
 from physgen.sim.cache.manifest import BakedObject, BakeManifest, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
@@ -148,17 +147,6 @@ def test_what_cannot_be_deleted_is_named_and_can_be_freed_later(tmp_path):
     assert not bake.exists()
 
 
-def test_bakes_are_found_below_a_folder(tmp_path):
-    cache = tmp_path / "cache"
-    first, second = a_bake(cache / "Scene" / "bakes" / "aa"), a_bake(cache / "Scene" / "bakes" / "bb", frames=7)
-    (cache / "Scene" / "bakes" / "cc").mkdir()
-    (cache / "Scene" / "bakes" / "cc" / "manifest.json").write_text("garbage")
-    (cache / "loop").symlink_to(cache)
-    assert [(path, manifest.frames) for path, manifest in scan_bakes(cache)] == [(first, 3), (second, 7)]
-    assert scan_bakes(first) == [(first, load_manifest(first))]
-    assert scan_bakes(tmp_path / "nothing") == []
-
-
 def test_half_written_files_of_killed_runs_are_cleared_away(tmp_path):
     bake = a_bake(tmp_path / "bake")
     gone = subprocess.Popen([sys.executable, "-c", "pass"])
@@ -188,10 +176,3 @@ def test_a_reader_survives_a_cache_that_is_cut_short_meanwhile(tmp_path):
     assert reader.sample(0).max() == 0.0
     with pytest.raises(InputError, match="cut off"):
         reader.sample(2)
-
-
-def test_looking_for_bakes_gives_up_in_a_tree_that_is_no_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MOST_FOLDERS", 5)
-    for index in range(10):
-        a_bake(tmp_path / f"{index}")
-    assert len(scan_bakes(tmp_path)) == 4
