@@ -11,8 +11,6 @@ from typing import TextIO
 
 from ..sim.events import Event
 
-STAGES = ("reconstruct", "bake", "render", "encode")
-
 
 class Terminal:
     """Shows events. One line that renews itself on a terminal, a line now and then in a log, JSON for machines."""

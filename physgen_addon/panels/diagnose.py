@@ -25,8 +25,6 @@ from .sidebar import DIAGNOSE, Sidebar
 
 TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "Found"}
 ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_04"}
-SURE = 0.005
-"""Effects less probable than this are summed up in the list's last words rather than shown as 0 %."""
 
 
 class PHYSGEN_UL_effects(bpy.types.UIList):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -67,10 +66,10 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     row.enabled = not lacking
     row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
     row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
-    _draw_result(layout, context, rendering)
+    _draw_result(layout, rendering)
 
 
-def _draw_result(layout: bpy.types.UILayout, context: bpy.types.Context, rendering: Any) -> None:
+def _draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup) -> None:
     if not rendering.result:
         return
     path = Path(bpy.path.abspath(rendering.result))

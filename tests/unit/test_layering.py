@@ -13,7 +13,15 @@ from physgen.sim.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians", "sim/diagnose/rigid", "sim/diagnose/soft")
-FORBIDDEN = {"sim": ("physgen_addon", "batch"), "physgen_addon/bridge": ("batch",)}
+INTERFACE = ("operators", "panels", "preview", "jobs", "handlers", "gizmos", "bake_state", "unsaved", "changes")
+UPWARD = {
+    "props": INTERFACE,
+    "bridge": INTERFACE,
+    "preview": ("operators", "panels", "jobs", "handlers", "gizmos", "bake_state"),
+    "operators": ("panels", "handlers", "gizmos"),
+    "panels": ("handlers", "bridge.export", "bridge.import_scene", "bridge.objects", "bridge.renderer"),
+}
+"""Folder of the add-on → what of the add-on it must not import. Panels are drawn all the time, so nothing heavy."""
 
 
 def sources(folder):
@@ -44,6 +52,18 @@ def test_sim_needs_no_blender_and_never_looks_upward(path):
 @pytest.mark.parametrize("path", sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_the_addon_never_imports_taichi_or_batch(path):
     assert not [n for n in imports(path) if n.split(".")[0] in ("taichi", "batch")]
+
+
+@pytest.mark.parametrize("folder", UPWARD)
+def test_no_folder_of_the_addon_looks_upward(folder):
+    found = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sources(f"physgen_addon/{folder}")
+        for name in imports(path)
+        for upper in UPWARD[folder]
+        if f"{name}.".startswith(f"physgen_addon.{upper}.")
+    }
+    assert not found
 
 
 @pytest.mark.parametrize("path", sources("sim") + sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from ...app.setup_contacts import contact_table
 from ...errors import InputError
 from ...mpm.contacts import GROUND_NAME
@@ -167,8 +165,3 @@ def belief_warnings(scene: Scene, chosen: Sequence[int]) -> list[str]:
     if left:
         warnings.append(f"not tracked: {', '.join(left)}; what hits them is a cause that a diagnosis cannot know")
     return warnings
-
-
-def middle_offsets(bodies: Sequence[SceneBody]) -> Array:
-    """World places (N, 3) of the rest frames' origins, metres."""
-    return np.array([body.middle for body in bodies])

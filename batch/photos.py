@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``import``, ``render``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..sim.app.import_physgen3d import import_physgen3d
+from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
+from ..sim.events import IsCancelled
+from ..sim.reconstruct.pipeline import object_names
+from ..sim.scene.overrides import check_overrides
+from . import pipeline
+from .arguments import (
+    add_bake_options,
+    add_photo,
+    add_physics,
+    add_render_options,
+    bake_options,
+    object_requests,
+    physics,
+    reconstruct_options,
+    render_request,
+)
+from .terminal import Terminal
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen run``."""
+    add_photo(parser)
+    add_physics(parser)
+    add_bake_options(parser)
+    add_render_options(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="VIDEO.mp4", help="the video")
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="keeps scene, bake and frames (default: beside the video)"
+    )
+
+
+def add_reconstruct(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen reconstruct``."""
+    add_photo(parser)
+    add_physics(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+
+
+def add_import(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen import``."""
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="with transform.json, meshes, mask and inpaint")
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+    scale = "largest extent of the first object; sets the scale of the scene (default 0.15)"
+    parser.add_argument("--size", type=float, metavar="METRES", help=scale)
+
+
+def add_render(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen render``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    parser.add_argument("--bake", type=Path, required=True, metavar="BAKE")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
+    parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all)")
+    parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    add_render_options(parser)
+
+
+def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen run``; the exit code."""
+    pipeline.check_render(render_request(options), options.out)
+    request = pipeline.RunRequest(
+        photo=options.photo,
+        objects=object_requests(options),
+        video=options.out,
+        work=options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work"),
+        presets=tuple(options.preset),
+        velocities=tuple(options.velocity),
+        spins=tuple(options.spin),
+        overrides=tuple(options.overrides),
+        reconstruct=reconstruct_options(options),
+        bake=bake_options(options),
+        render=render_request(options),
+    )
+    pipeline.run(request, terminal, cancelled)
+    terminal(
+        {"event": "done", "video": str(request.video), "scene": str(request.work / "scene"), "work": str(request.work)}
+    )
+    terminal.line(f"video: {request.video}\nscene: {request.work / 'scene'}")
+    return 0
+
+
+def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen reconstruct``; the exit code."""
+    requests, settings = object_requests(options), reconstruct_options(options)
+    require_physics(len(requests), options.preset, options.velocity, options.spin)
+    check_overrides(object_names(requests), options.overrides)
+    reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
+    set_all_physics(options.out, **physics(options), friction=settings.friction)
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen import``; the exit code."""
+    import_physgen3d(options.folder, options.out, size_m=options.size, on_event=terminal)
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def run_render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen render``; the exit code."""
+    request = render_request(options, options.frames)
+    terminal(
+        pipeline.render_stage(
+            options.scene, options.bake, options.out, request, terminal, cancelled, video=options.video
+        )
+    )
+    terminal.line(f"frames: {options.out}" + (f"\nvideo: {options.video}" if options.video else ""))
+    return 0
