@@ -3,12 +3,14 @@
 
 ``bakes/NAME.json`` beside ``bakes/NAME/``, ``physgen-blender-bake/1``: `fingerprints` of the scenes that this bake is
 of, `frame_start` (Blender's frame of sample 0), `looks[]`: what is shown of each object (`name` in the bake) and from
-which frame on. Written without bpy, in the job's thread.
+which frame on; `files`, the .blend files that showed it when they were saved, from the bake folder. Written without
+bpy, in the job's thread.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +29,8 @@ PROBES, NEIGHBOURS = 16, 9
 LONE = 0.01
 """Spacing, m, of a particle without neighbours."""
 MESH, GRAINS, SURFACE = "mesh", "grains", "surface"
+LAST_FRAME = 1_048_574
+"""Blender's; numbers beyond it are not ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,12 @@ class Look:
     from_frame: int = 0
     spacing: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self.shape not in (MESH, GRAINS, SURFACE):
+            raise InputError(f"{self.name}: shape is {self.shape!r}: choose {MESH}, {GRAINS} or {SURFACE}")
+        if abs(self.from_frame) > LAST_FRAME or not 0.0 <= self.spacing < 1e9:
+            raise InputError(f"{self.name}: frame {self.from_frame}, spacing {self.spacing}: bake again")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRecord:
@@ -53,6 +63,11 @@ class BakeRecord:
     fingerprints: tuple[str, ...] = ()
     frame_start: int = 1
     looks: tuple[Look, ...] = ()
+    files: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if abs(self.frame_start) > LAST_FRAME:
+            raise InputError(f"frame_start is {self.frame_start}: bake again")
 
     @property
     def path(self) -> Path:
@@ -74,9 +89,33 @@ def write_record(record: BakeRecord) -> None:
     before = read_record(record.path)
     known = before.fingerprints if before is not None else ()
     kept = tuple(item for item in known if item not in record.fingerprints)
-    data = to_json(dataclasses.replace(record, fingerprints=(*kept[-19:], *record.fingerprints)))
+    files = before.files if before is not None else ()
+    _write(dataclasses.replace(record, fingerprints=(*kept[-19:], *record.fingerprints), files=files))
+
+
+def _write(record: BakeRecord) -> None:
+    data = to_json(record)
     del data["folder"]
     write_json(record_file(record.path), {"format": FORMAT, **data})
+
+
+def note_file(record: BakeRecord, blend: Path, shown: bool) -> None:
+    """Remember whether the file ``blend`` shows the bake. Raises InputError when it cannot be written."""
+    try:
+        name = os.path.relpath(blend, record.path).replace("\\", "/")
+    except ValueError:
+        # Another drive of Windows.
+        name = str(blend)
+    others = tuple(item for item in record.files if item != name)
+    files = (*others[-99:], name) if shown else others
+    if files != record.files:
+        _write(dataclasses.replace(record, files=files))
+
+
+def other_files(record: BakeRecord, blend: Path | None) -> list[Path]:
+    """Files other than ``blend`` that showed the bake when they were saved, and are still there."""
+    found = [Path(os.path.normpath(record.path / name)) for name in record.files]
+    return [path for path in found if path != blend and path.is_file()]
 
 
 def read_record(folder: Path) -> BakeRecord | None:
@@ -148,12 +187,28 @@ def playable(folder: Path) -> int:
     The caches' headers say it, also when the worker was killed.
     """
     try:
-        manifest = load_manifest(folder)
-        if manifest.state == "complete":
-            return manifest.frames_done
-        return min((Pc2Reader(folder / item.file).sample_count for item in manifest.objects), default=0)
+        files = load_manifest(folder).files
+        return min((_sound(folder / name, count).sample_count for name, count in files.items()), default=0)
     except InputError:
         return 0
+
+
+def damage(folder: Path, manifest: BakeManifest) -> str:
+    """What is wrong with the caches of a bake, of which Blender itself tells the console only; empty: nothing."""
+    try:
+        found = [_sound(folder / name, count).sample_count for name, count in manifest.files.items()]
+    except InputError as error:
+        return str(error)
+    if manifest.state == "complete" and min(found, default=0) < manifest.frames:
+        return f"{folder}: {min(found, default=0)} of {manifest.frames} frames are there; bake again"
+    return ""
+
+
+def _sound(path: Path, count: int) -> Pc2Reader:
+    cache = Pc2Reader(path)
+    if cache.vertex_count != count:
+        raise InputError(f"{path}: has {cache.vertex_count} vertices instead of {count}; bake again")
+    return cache
 
 
 def matching(cache: Path, fingerprint: str) -> BakeRecord | None:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import bpy
 
-from ..sim.cache.lock import is_written
+from ..sim.cache.lock import LOCK_FILE, is_written
+from ..sim.cache.manifest import MANIFEST_FILE, load_manifest
 from ..sim.errors import InputError
 from . import bake_record, jobs, paths
 from .bake_record import BakeRecord
@@ -29,6 +30,7 @@ MESSAGES = {
     "paused": "Stopped before the end. Bake again to go on",
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
     "missing": "The bake's files are not where they were. Relink them, or bake again",
+    "damaged": "Files of the bake are gone or damaged. Bake again, or find an undamaged copy",
 }
 
 
@@ -37,16 +39,27 @@ class BakeState:
     """How it stands with a scene's bake.
 
     status: ``none``, ``baking``, ``paused`` (there is more to bake), ``baked``, ``stale`` (of the scene as it was) or
-    ``missing`` (its files are gone). frames_done of frames can be played. disk_bytes: of all bakes of the scene.
-    message: what a person should know. estimate_text: what baking will cost; empty when that is not known.
+    ``missing`` (its files are gone or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the
+    scene. trouble: what went wrong; advice: how it stands and what to do. estimate_text: what baking will cost; empty
+    when that is not known.
     """
 
     status: str = "none"
     frames_done: int = 0
     frames: int = 0
     disk_bytes: int = 0
-    message: str = ""
+    trouble: str = ""
+    advice: str = ""
     estimate_text: str = ""
+
+    @property
+    def message(self) -> str:
+        """All that a person should know."""
+        return _sentences(self.trouble, self.advice)
+
+
+def _sentences(*parts: str) -> str:
+    return ". ".join(part.rstrip(" .") for part in parts if part)
 
 
 _known: dict[int, BakeState] = {}
@@ -63,7 +76,14 @@ def state(scene: bpy.types.Scene) -> BakeState:
     """How it stands. Costs microseconds in Blender's interface, where a timer keeps it up to date."""
     known = _known.get(scene.session_uid)
     # Timers never fire in the background, and without an interface nobody is in a hurry.
-    return observe(scene) if known is None or bpy.app.background else known
+    if known is not None and not bpy.app.background:
+        return known
+    waits = is_dirty(scene)
+    found = observe(scene)
+    if waits:
+        # A panel that is drawn first must not keep the timer from showing the bake that it will find.
+        _dirty.add(scene.session_uid)
+    return found
 
 
 def last_seen(scene: bpy.types.Scene) -> BakeState | None:
@@ -163,10 +183,10 @@ def refresh(scene: bpy.types.Scene) -> BakeState:
 
 def observe(scene: bpy.types.Scene) -> BakeState:
     """Say how it stands, and remember it; changes nothing."""
-    found = _look(scene) if concerns(scene) else BakeState(message=MESSAGES["none"])
+    found = _look(scene) if concerns(scene) else BakeState(advice=MESSAGES["none"])
     trouble = _troubles.get(scene.session_uid, "")
     if trouble and found.status != "baking":
-        found = replace(found, message=f"{trouble}. {found.message}".rstrip(" .") if found.message else trouble)
+        found = replace(found, trouble=_sentences(trouble, found.trouble))
     simulation = scene.physgen.simulation
     found = replace(
         found,
@@ -217,21 +237,37 @@ def _look(scene: bpy.types.Scene) -> BakeState:
     job = bake_job(scene)
     if job is not None:
         changed = job.details.get("fingerprint") not in (None, current)
-        message = "Changed since the bake began; bake again afterwards" if changed else job.message
-        return BakeState("baking", job.done or 0, job.total or frames, message=message)
+        words = "Changed since the bake began; bake again afterwards" if changed else job.message
+        return BakeState("baking", job.done or 0, job.total or frames, advice=words)
     if manifest is None or shown is None:
         status = "missing" if simulation.bake else "none"
-        return BakeState(status, 0, frames, message=obstacle or MESSAGES[status])
+        return BakeState(status, 0, frames, trouble=obstacle or _unreadable(scene), advice=MESSAGES[status])
     done = bake_record.playable(shown.path)
+    damage = bake_record.damage(shown.path, manifest)
     troubles = playback.misfits(scene, shown)
+    if damage:
+        return BakeState("missing", 0, manifest.frames, trouble=damage, advice=MESSAGES["damaged"])
     if current not in shown.fingerprints:
         status = "stale"
     elif is_written(shown.path) and not is_stopping(scene):
-        return BakeState("baking", done, manifest.frames, message="Another process is baking this")
+        words = f"Another process is baking this. If none is, delete {shown.path / LOCK_FILE}"
+        return BakeState("baking", done, manifest.frames, advice=words)
     else:
         status = "baked" if manifest.state == "complete" and done == manifest.frames else "paused"
-    said = [text for text in (*troubles, obstacle or MESSAGES[status]) if text]
-    return BakeState(status, done, manifest.frames, message=". ".join(said))
+    return BakeState(status, done, manifest.frames, trouble=_sentences(*troubles, obstacle), advice=MESSAGES[status])
+
+
+def _unreadable(scene: bpy.types.Scene) -> str:
+    """Why the bake that ``scene`` shows cannot be read, where it is still there."""
+    path = scene.physgen.simulation.bake
+    folder = paths.absolute(path) if path else None
+    if folder is None or not (folder / MANIFEST_FILE).exists():
+        return ""
+    try:
+        load_manifest(folder)
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def shows(scene: bpy.types.Scene, folder: Path) -> bool:

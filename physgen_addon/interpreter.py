@@ -8,6 +8,7 @@ else the environment that ``install_command`` makes in the home folder.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import json
@@ -15,10 +16,13 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 from ..sim.app.process import NO_WINDOW, child_environment, own_command
 from ..sim.app.requirements import MODULE, NEWEST, OLDEST, REQUIREMENTS
@@ -28,6 +32,8 @@ VARIABLE = "PHYSGEN_PYTHON"
 TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
 """Where commands are typed: Windows' other one, PowerShell, knows no ``&&``."""
 _TIMEOUT_S = 60.0
+_MOST_BYTES = 2**20
+"""Of an answer; what says more is no Python."""
 
 
 class NoPython(InputError):
@@ -165,33 +171,77 @@ class _Unfit(Exception):
 @functools.lru_cache(maxsize=8)
 def _checked(python: str, packages: str) -> str:
     """The version of an interpreter that can simulate; raises _Unfit. What is good is kept, it is asked before jobs."""
+    code, said, complaints = _asked(own_command(MODULE, python=python, packages=packages))
+    lines = said.strip().splitlines()
+    if code != 0 or not lines:
+        words = complaints.strip().splitlines()
+        raise _Unfit(words[-1][:300] if words else f"it ended with code {code} when Taichi was loaded")
     try:
-        done = subprocess.run(
-            own_command(MODULE, python=python, packages=packages),
+        answer = json.loads(lines[-1])
+        version, trouble = str(answer["python"]), str(answer["trouble"] or "")
+        number = tuple(int(part) for part in version.split(".")[:2])
+        missing, installs = [str(item) for item in answer["missing"]], bool(answer["installs"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise _Unfit(f"it answered {lines[-1][:80]!r}") from None
+    if missing and number > NEWEST:
+        raise _Unfit(f"Python {version} is too new: {_dotted(OLDEST)} to {_dotted(NEWEST)} are needed")
+    if missing:
+        names = ", ".join(re.split("[<>=]", requirement)[0] for requirement in missing)
+        raise _Unfit(f"it lacks {names}", lacks=True, installs=installs)
+    if trouble:
+        raise _Unfit(trouble)
+    return version
+
+
+def _asked(command: Sequence[str]) -> tuple[int, str, str]:
+    """Exit code, output and complaints of ``command``; _Unfit where it cannot be started or has no end.
+
+    Neither a program that prints for ever nor one that leaves children behind keeps this waiting.
+    """
+    try:
+        process = subprocess.Popen(
+            command,
             stdin=subprocess.DEVNULL,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             env=child_environment(),
-            timeout=_TIMEOUT_S,
+            start_new_session=os.name != "nt",
             creationflags=NO_WINDOW,
         )
     except OSError as error:
         raise _Unfit(str(error.strerror or error)) from None
+    said = [b"", b""]
+
+    def read(index: int, stream: IO[bytes]) -> None:
+        said[index] = stream.read(_MOST_BYTES)
+        if len(said[index]) == _MOST_BYTES:
+            _kill(process)
+
+    readers = [
+        threading.Thread(target=read, args=(index, stream), daemon=True)
+        for index, stream in enumerate((process.stdout, process.stderr))
+    ]
+    for reader in readers:
+        reader.start()
+    try:
+        code = process.wait(_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         raise _Unfit(f"it did not answer within {_TIMEOUT_S:g} s") from None
-    lines = done.stdout.decode("utf-8", "replace").strip().splitlines()
-    if done.returncode != 0 or not lines:
-        words = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        raise _Unfit(words[-1] if words else f"it ended with code {done.returncode} when Taichi was loaded")
-    try:
-        answer = json.loads(lines[-1])
-        version, missing = str(answer["python"]), list(answer["missing"])
-    except (ValueError, TypeError, KeyError):
-        raise _Unfit(f"it answered {lines[-1][:80]!r}") from None
-    if missing and tuple(int(n) for n in version.split(".")[:2]) > NEWEST:
-        raise _Unfit(f"Python {version} is too new: {_dotted(OLDEST)} to {_dotted(NEWEST)} are needed")
-    if missing:
-        names = ", ".join(re.split("[<>=]", requirement)[0] for requirement in missing)
-        raise _Unfit(f"it lacks {names}", lacks=True, installs=bool(answer["installs"]))
-    if answer["trouble"]:
-        raise _Unfit(str(answer["trouble"]))
-    return version
+    finally:
+        _kill(process)
+        process.wait()
+    for reader in readers:
+        reader.join(1.0)
+    if any(len(text) == _MOST_BYTES for text in said):
+        raise _Unfit("it is no Python: it prints without end")
+    out, complaints = (text.decode("utf-8", "replace") for text in said)
+    return code, out, complaints
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """With all that it has started."""
+    with contextlib.suppress(OSError):
+        if os.name == "nt":
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGKILL)

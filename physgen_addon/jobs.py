@@ -7,6 +7,7 @@ their events on; nothing but the main thread touches bpy.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -15,12 +16,14 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..sim.errors import Cancelled, PhysGenError
+from ..sim.errors import Cancelled, PhysGenError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from .views import redraw
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """What a job does: called in a thread, without bpy; passes events on and returns the final one or raises."""
+
+_LOG = logging.getLogger(__name__)
 
 STEP_S = 0.1
 """How often a live job looks for news."""
@@ -51,7 +54,7 @@ class Job:
         self._events: SimpleQueue[Event] = SimpleQueue()
         self._stop = threading.Event()
         self._final: Event | None = None
-        self._error: BaseException | None = None
+        self._error: PhysGenError | None = None
         self._thread = threading.Thread(target=self._run, name=f"physgen {title}", daemon=True)
 
     def start(self) -> None:
@@ -103,8 +106,12 @@ class Job:
     def _run(self) -> None:
         try:
             self._final = self._work(self._events.put, self._stop.is_set)
-        except BaseException as error:
+        except PhysGenError as error:
             self._error = error
+        except BaseException as error:
+            # A fault of ours must not leave the interface with a job that never ends.
+            _LOG.exception("%s", self.title)
+            self._error = SimulationError(f"{self.title} has failed ({type(error).__name__}: {error}); see the console")
 
     def _take(self, event: Event) -> None:
         if event.get("event") == "notice":
@@ -229,6 +236,9 @@ class JobOperator:
     def tick(self) -> set[str] | None:
         """One look at the job, as the modal timer does it: None while it goes on, else the operator's result."""
         began, job = time.perf_counter(), self._job
+        if job not in _running:
+            # The extension was disabled.
+            return {"CANCELLED"}
         ended, scene = job.step(), scene_of(job)
         if scene is not None and not ended:
             self._progress(scene)

@@ -6,12 +6,14 @@ A scene's paths are its own affair, because Blender keeps only those of modifier
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 
 import bpy
 
-from . import bake_state, paths
+from ..sim.errors import InputError
+from . import bake_record, bake_state, paths
 from .bridge import playback
 
 _moved: dict[int, tuple[Path, Path]] = {}
@@ -62,6 +64,20 @@ def after_save(path: str) -> None:
             playback.repoint(scene, new, old)
             if shown is not None:
                 scene.physgen.simulation.bake = paths.stored(shown)
+    _note_file(Path(path))
+
+
+def _note_file(blend: Path) -> None:
+    """Let the bakes know that the saved file ``blend`` shows them, so that no other file beside it deletes them."""
+    if not blend.is_file():
+        return
+    for scene in bpy.data.scenes:
+        for cache in bake_state.caches_of(scene):
+            for record in bake_record.records(cache):
+                shown = any(bake_state.shows(other, record.path) for other in bpy.data.scenes)
+                # A cache that cannot be written cannot be deleted either.
+                with contextlib.suppress(InputError):
+                    bake_record.note_file(record, blend, shown)
 
 
 def settle(scene: bpy.types.Scene) -> None:

@@ -45,6 +45,9 @@ SMOOTHING_GROUPS = ("Smooth by Angle", "Auto Smooth")
 THINNEST = 1e-6
 """Smallest scale of an object over its largest."""
 
+FARTHEST = 1e9
+"""m; nothing of a size is left there in 32 bits."""
+
 
 def foreign_modifiers(item: bpy.types.Object) -> list[bpy.types.Modifier]:
     """The modifiers of ``item`` that act in the viewport and are not PhysGen's own."""
@@ -109,6 +112,9 @@ def require_placed(matrix: np.ndarray, name: str) -> None:
     """Raise InputError where ``matrix`` (4, 4) flattens object ``name`` or is not finite."""
     if not np.isfinite(matrix).all():
         raise InputError(f"object {name!r}: its place is not finite: reset its location, rotation and scale")
+    away = float(np.abs(matrix[:3, 3]).max())
+    if away > FARTHEST:
+        raise InputError(f"object {name!r}: is {away:.3g} m away from the origin: move it nearer")
     sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if not sizes[-1] > THINNEST * sizes[0]:
         raise InputError(f"object {name!r}: its scale makes it flat or vanish: give it a scale above 0 on every axis")

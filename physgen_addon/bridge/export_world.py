@@ -8,10 +8,9 @@ from collections.abc import Mapping
 import bpy
 import numpy as np
 
-from ...sim.effects.registry import effect
 from ...sim.errors import InputError
 from ...sim.scene.model import Camera, Effect, Ground, Keys
-from ..props.scene import effect_values
+from ..props.scene import effect_values, known_effect
 from ..typed import decimal
 from .animation import channels, why_it_moves
 from .export_motion import keys
@@ -96,7 +95,9 @@ def effects(scene: bpy.types.Scene, names: Mapping[str, str]) -> list[Effect]:
         if not entry.enabled:
             continue
         where = f"effect {number} ({entry.effect})"
-        kind = effect(entry.effect)
+        kind = known_effect(entry)
+        if kind is None:
+            raise InputError(f"effect {number}: this version does not know it: remove it from the stack")
         try:
             checked = kind.checked(effect_values(entry))
         except InputError as error:

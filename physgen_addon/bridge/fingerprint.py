@@ -23,7 +23,7 @@ from .animation import PLACING, TRANSFORM, Channel, channels, curves, drivers
 from .export_meshes import read_corners, read_points
 from .export_names import export_names
 from .export_objects import physics, sand
-from .export_refusals import foreign_modifiers
+from .export_refusals import foreign_modifiers, is_smoothing
 from .export_units import clock, metres_per_unit
 from .export_world import effects
 
@@ -69,7 +69,7 @@ class _Digest:
         self.hash = hashlib.sha256()
         self._scene = scene
         self._unit = metres_per_unit(scene)
-        self._seen: set[int] = set()
+        self._seen: set[tuple[int, bool]] = set()
 
     def _add(self, *values: Any) -> None:
         self.hash.update(repr(values).encode())
@@ -105,18 +105,22 @@ class _Digest:
         scene = self._scene
         self._add(item.name)
         self._add_checked(lambda: _plain(physics(item, self._unit, clock(scene))), lambda: sand(item, "", clock(scene)))
-        self._seen.discard(item.as_pointer())
-        self._object(item, shape=True)
-        if item.physgen.role == "dynamic":
+        self._seen.discard((item.as_pointer(), True))
+        dynamic = item.physgen.role == "dynamic"
+        self._object(item, shape=True, as_seen=not dynamic)
+        if dynamic:
             for pin in item.physgen.pins:
                 self._object(pin.box, shape=True)
 
-    def _object(self, item: bpy.types.Object | None, shape: bool) -> None:
-        """Where ``item`` is and goes, and with ``shape`` what it looks like, by its settings."""
-        if item is None or item.as_pointer() in self._seen:
+    def _object(self, item: bpy.types.Object | None, shape: bool, as_seen: bool = True) -> None:
+        """Where ``item`` is and goes, and with ``shape`` what it looks like, by its settings.
+
+        as_seen: also its modifiers that leave its shape about as it is, which a simulated mesh is without.
+        """
+        if item is None or (item.as_pointer(), as_seen) in self._seen:
             self._add(None if item is None else item.name)
             return
-        self._seen.add(item.as_pointer())
+        self._seen.add((item.as_pointer(), as_seen))
         animated = channels(item)
         self._add(item.type, item.rotation_mode, item.empty_display_size, item.parent_type, item.parent_bone)
         self._channels(item, PLACING, animated)
@@ -127,12 +131,12 @@ class _Digest:
             self._add(tuple(map(tuple, item.matrix_parent_inverse)))
             self._object(item.parent, shape=item.parent_type != "OBJECT")
         if shape:
-            self._shape(item)
+            self._shape(item, as_seen)
 
-    def _shape(self, item: bpy.types.Object) -> None:
+    def _shape(self, item: bpy.types.Object, as_seen: bool) -> None:
         data = item.data
-        if data is not None and data.as_pointer() not in self._seen:
-            self._seen.add(data.as_pointer())
+        if data is not None and (data.as_pointer(), True) not in self._seen:
+            self._seen.add((data.as_pointer(), True))
             self._animation(data)
             if item.type == "MESH":
                 self._mesh(data)
@@ -152,6 +156,8 @@ class _Digest:
             for constraint in bone.constraints:
                 self._struct(constraint, animated, f'{path}constraints["{constraint.name}"]')
         for modifier in foreign_modifiers(item) if item.type in ("MESH", "CURVE", "LATTICE") else ():
+            if not as_seen and is_smoothing(modifier):
+                continue
             path = f'modifiers["{modifier.name}"]'
             self._add(modifier.name)
             self._struct(modifier, animated, path)
@@ -233,8 +239,8 @@ class _Digest:
                 if not any(key in path for path in animated):
                     self._value(modifier[key])
         tree = modifier.node_group
-        if tree is not None and tree.as_pointer() not in self._seen:
-            self._seen.add(tree.as_pointer())
+        if tree is not None and (tree.as_pointer(), True) not in self._seen:
+            self._seen.add((tree.as_pointer(), True))
             self._add([(link.from_socket.path_from_id(), link.to_socket.path_from_id()) for link in tree.links])
             for node in tree.nodes:
                 self._struct(node)

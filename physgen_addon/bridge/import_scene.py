@@ -102,6 +102,10 @@ def remove_import(scene: bpy.types.Scene, collection: bpy.types.Collection) -> N
 
 def _read(root: Path) -> _Read:
     folder = load_scene(root)
+    if folder.scene.photo is None:
+        raise InputError(
+            f"{root}: is a scene without a photo, as a bake in Blender leaves it; open the .blend that it comes from"
+        )
     for entry in folder.scene.effects:
         known = effect(entry.name)
         try:

@@ -78,7 +78,8 @@ def _cache_modifiers() -> list[bpy.types.Modifier]:
     return [
         item.modifiers[caches.MODIFIER]
         for item in bpy.data.objects
-        if item.type == "MESH" and caches.MODIFIER in item.modifiers
+        # What is linked is its own file's, and its paths are from there.
+        if item.type == "MESH" and item.library is None and caches.MODIFIER in item.modifiers
     ]
 
 

@@ -99,7 +99,27 @@ def misfits(scene: bpy.types.Scene, record: BakeRecord) -> list[str]:
             troubles.append(
                 f"{item.name} has {len(item.data.vertices)} vertices and its bake {baked.vertices}; bake again"
             )
+        else:
+            troubles += _obstacles(item, record.path / baked.file, record.frame_start)
     return troubles
+
+
+def _obstacles(item: bpy.types.Object, file: Path, first_frame: int) -> list[str]:
+    """Why ``item`` does not show the cache ``file``, which fits it, from ``first_frame`` on, or not it alone."""
+    modifier = item.modifiers.get(caches.MODIFIER)
+    if modifier is None:
+        return [f"{item.name} has lost its modifier {caches.MODIFIER!r} and does not play; bake again"]
+    if not (modifier.show_viewport and modifier.show_render):
+        return [f"{item.name}: its modifier {caches.MODIFIER!r} is switched off in the viewport or for renders"]
+    if (paths.absolute(modifier.filepath), modifier.frame_start) != (file, first_frame):
+        return [f"{item.name} plays another bake, as objects do that scenes share; bake again to play this scene's"]
+    before = item.modifiers[: item.modifiers.find(caches.MODIFIER)]
+    return [
+        f"{item.name}: modifier {other.name!r} comes before the bake, which no longer fits then; "
+        f"move it below {caches.MODIFIER!r}"
+        for other in before
+        if other.show_viewport or other.show_render
+    ]
 
 
 def detach_misfits(scene: bpy.types.Scene, record: BakeRecord) -> None:

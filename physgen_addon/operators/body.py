@@ -5,6 +5,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ..bridge.bounds import rest_bounds
+from ..chosen import active, selected
 from ..props.body import bodies, is_body
 from ..text import count
 
@@ -30,7 +31,7 @@ def _unfit(item: bpy.types.Object) -> str | None:
 def _add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | None) -> list[bpy.types.Object]:
     """Make what is selected a body; what cannot be is reported. ``role`` None leaves that of the object."""
     added = []
-    for item in context.selected_objects:
+    for item in selected(context):
         trouble = _unfit(item)
         if trouble is not None:
             operator.report({"WARNING"}, trouble)
@@ -52,9 +53,9 @@ class _OfSelected:
         """Something is selected, in Object Mode."""
         if context.mode != "OBJECT":
             cls.poll_message_set("Leave Edit Mode first")
-        elif not context.selected_objects:
+        elif not selected(context):
             cls.poll_message_set("Select an object in the viewport first")
-        return context.mode == "OBJECT" and bool(context.selected_objects)
+        return context.mode == "OBJECT" and bool(selected(context))
 
 
 class PHYSGEN_OT_add_bodies(_OfSelected, bpy.types.Operator):
@@ -94,7 +95,7 @@ class PHYSGEN_OT_remove_body(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Disable it."""
-        item = context.scene.objects.get(self.name) if self.name else context.active_object
+        item = context.scene.objects.get(self.name) if self.name else active(context)
         if not is_body(item):
             self.report({"WARNING"}, "The active object is not in the simulation: choose one in the list")
             return {"CANCELLED"}
@@ -135,7 +136,7 @@ class OfBody:
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """The active object takes part."""
-        if not is_body(context.active_object):
+        if not is_body(active(context)):
             cls.poll_message_set("The active object is not in the simulation")
             return False
         return True
@@ -150,7 +151,7 @@ class PHYSGEN_OT_clear_motion(OfBody, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Back to the defaults."""
         for name in ("velocity", "spin", "start_frame"):
-            context.active_object.physgen.property_unset(name)
+            active(context).physgen.property_unset(name)
         return {"FINISHED"}
 
 
@@ -162,7 +163,7 @@ class PHYSGEN_OT_add_pin(OfBody, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """A cube empty, parented to the object so that it goes where the object is put."""
-        item = context.active_object
+        item = active(context)
         low, high = rest_bounds(item)
         margin = _MARGIN * max(high - low)
         box_low = Vector((low.x, low.y, high.z - UPPER_PART * (high.z - low.z))) - Vector((margin, margin, 0))
@@ -189,7 +190,7 @@ class PHYSGEN_OT_remove_pin(OfBody, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove the entry, and the box where it is ours."""
-        body = context.active_object.physgen
+        body = active(context).physgen
         if not 0 <= body.pin_index < len(body.pins):
             self.report({"WARNING"}, "There is no pin to remove")
             return {"CANCELLED"}

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import bpy
@@ -16,7 +17,11 @@ from ..text import count, storage
 
 
 def used_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
-    """Whether another scene of this file plays the bake ``folder``, or it lies outside this scene's own cache."""
+    """Whether another scene or file plays the bake ``folder``, or it lies outside this scene's own cache."""
+    record = bake_record.read_record(folder)
+    blend = Path(bpy.data.filepath) if bpy.data.filepath else None
+    if record is not None and bake_record.other_files(record, blend):
+        return True
     if any(bake_state.shows(other, folder) for other in bpy.data.scenes if other != scene):
         return True
     return not folder.is_relative_to(paths.scene_cache(scene))
@@ -25,7 +30,11 @@ def used_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
 def delete(folder: Path) -> int:
     """Delete the bake ``folder`` and its record; bytes freed. Raises InputError where that cannot be done."""
     freed = free_bake(folder)
-    bake_record.record_file(folder).unlink(missing_ok=True)
+    record = bake_record.record_file(folder)
+    try:
+        record.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{record}: cannot be deleted ({error.strerror or error}); delete it by hand") from error
     return freed
 
 
@@ -65,6 +74,8 @@ class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
             playback.hide(scene)
             freed = 0 if kept or bake_record.manifest_of(folder) is None else delete(folder)
         except PhysGenError as error:
+            with contextlib.suppress(PhysGenError):
+                playback.show(scene, bake_state.record_of(scene, folder))
             bake_state.observe(scene)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -138,11 +149,10 @@ def relink(scene: bpy.types.Scene, chosen: Path) -> None:
     name = paths.absolute(shown).name if shown else ""
     depths = ("", bake_record.BAKES, f"*/{bake_record.BAKES}", f"*/*/{bake_record.BAKES}")
     candidates = [chosen] if chosen.name == name else []
-    candidates += [
-        path for depth in depths for path in sorted(chosen.glob(f"{depth}/{name}" if depth else name or "."))
-    ]
+    if name:
+        candidates += [path / name for depth in depths for path in (sorted(chosen.glob(depth)) if depth else [chosen])]
     for folder in candidates:
-        if name and bake_record.manifest_of(folder) is not None:
+        if bake_record.manifest_of(folder) is not None:
             playback.show(scene, bake_state.record_of(scene, folder))
             return
     current = fingerprint(scene)

@@ -4,6 +4,7 @@
 import bpy
 
 from ...sim.effects.registry import Parameter, effect
+from ..chosen import selected
 from ..props.body import is_body
 from ..props.scene import EFFECT_ITEMS
 from ..text import paragraph, readable
@@ -102,7 +103,7 @@ class PHYSGEN_OT_add_effect_targets(_OfStack, bpy.types.Operator):
         """An entry is chosen, and so is an object that moves."""
         if not super().poll(context):
             return False
-        if not any(is_body(item) and item.physgen.role == "dynamic" for item in context.selected_objects):
+        if not any(is_body(item) and item.physgen.role == "dynamic" for item in selected(context)):
             cls.poll_message_set("Select an object of the simulation that moves")
             return False
         return True
@@ -111,7 +112,7 @@ class PHYSGEN_OT_add_effect_targets(_OfStack, bpy.types.Operator):
         """Add those that are not there yet."""
         entry = chosen_effect(context.scene)
         known = {target.item for target in entry.targets}
-        for item in context.selected_objects:
+        for item in selected(context):
             if is_body(item) and item.physgen.role == "dynamic" and item not in known:
                 entry.targets.add().item = item
         return {"FINISHED"}

@@ -158,7 +158,13 @@ class PHYSGEN_OT_choose_physgen3d(_OfPhysgen3d, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start the job: an operator that a file browser runs cannot go on beside Blender itself."""
-        bpy.ops.physgen.import_physgen3d("INVOKE_DEFAULT", directory=self.directory, size_m=self.size_m)
+        mode = "EXEC_DEFAULT" if context.window is None else "INVOKE_DEFAULT"
+        try:
+            bpy.ops.physgen.import_physgen3d(mode, directory=self.directory, size_m=self.size_m)
+        except RuntimeError as error:
+            # What the other one has reported as an error.
+            self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 

@@ -5,6 +5,7 @@ import bpy
 
 from ...sim.errors import PhysGenError
 from ...sim.scene.materials import delete_preset, save_preset
+from ..chosen import active, selected
 from ..props import presets
 from ..props.body import is_body
 from ..props.material import get_material, set_material
@@ -25,8 +26,8 @@ class PHYSGEN_OT_save_preset(OfBody, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask for the name; that of a preset of one's own is suggested, so that it can be changed."""
-        chosen = context.active_object.physgen.material.preset_name
-        self.name = self.name or (chosen if chosen in presets.own_presets().good else context.active_object.name)
+        chosen = active(context).physgen.material.preset_name
+        self.name = self.name or (chosen if chosen in presets.own_presets().good else active(context).name)
         return context.window_manager.invoke_props_dialog(self)
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -37,7 +38,7 @@ class PHYSGEN_OT_save_preset(OfBody, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Write it, and let the object use it."""
-        material, name = context.active_object.physgen.material, self.name.strip()
+        material, name = active(context).physgen.material, self.name.strip()
         try:
             path = save_preset(presets.own_folder(create=True), name, get_material(material))
         except PhysGenError as error:
@@ -84,7 +85,7 @@ class PHYSGEN_OT_reset_preset(OfBody, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Set them all."""
-        material = context.active_object.physgen.material
+        material = active(context).physgen.material
         preset = presets.find(material.preset_name)
         if preset is None:
             self.report({"WARNING"}, f"There is no preset {material.preset_name!r} here: choose another")
@@ -104,15 +105,15 @@ class PHYSGEN_OT_copy_material(OfBody, bpy.types.Operator):
         """There is another one."""
         if not super().poll(context):
             return False
-        if not any(is_body(o) and o != context.active_object for o in context.selected_objects):
+        if not any(is_body(o) and o != active(context) for o in selected(context)):
             cls.poll_message_set("Select more objects of the simulation; the active one's material is copied")
             return False
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Numbers and the preset's name."""
-        source = context.active_object.physgen.material
-        others = [o for o in context.selected_objects if is_body(o) and o != context.active_object and o.is_editable]
+        source = active(context).physgen.material
+        others = [o for o in selected(context) if is_body(o) and o != active(context) and o.is_editable]
         try:
             material = get_material(source)
         except PhysGenError as error:

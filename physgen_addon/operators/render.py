@@ -110,7 +110,7 @@ class _Render(JobOperator):
                     place_bake(photo, baked_scene, bake, rendered, names, on_event)
                 command = [*start, str(photo), "--bake", str(rendered), *arguments]
                 # Which frames were asked for is not in the result.
-                return {**run_stage(command, on_event, cancelled, failure=RenderError), "out": str(out)}
+                return {**run_stage(command, on_event, cancelled, failure=RenderError, restarts=1), "out": str(out)}
 
         return work
 

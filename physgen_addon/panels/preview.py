@@ -30,8 +30,9 @@ def draw_preview(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     )
     if session is None:
         return
-    if session.scene_name != context.scene.name:
-        column.label(text=f"On in scene {session.scene_name}", icon="INFO")
+    scene = session.scene()
+    if scene is not None and scene != context.scene:
+        column.label(text=f"On in scene {scene.name}", icon="INFO")
         return
     if session.state == "error":
         text.sentences(column, context, session.message, icon="ERROR")

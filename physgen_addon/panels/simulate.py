@@ -92,23 +92,30 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
 
 def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState) -> None:
     """What is there, in a box, with what can be done about it."""
+    trouble, advice = text.brief(found.trouble), text.brief(found.advice)
     if found.status == "none":
-        text.sentences(layout, context, text.brief(found.message))
+        if trouble:
+            text.sentences(layout, context, trouble, icon="ERROR")
+        text.sentences(layout, context, advice)
+        return
+    box = layout.box()
+    if trouble:
+        text.sentences(box, context, trouble, icon="ERROR")
+    if found.status == "missing":
+        text.sentences(box, context, advice, icon="ERROR")
+        row = box.row(align=True)
+        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find It", icon="FILE_FOLDER")
+        row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
         return
     words, icon = {
         "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
         "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
         "stale": (f"{found.frames_done} frames are baked and still play", "ERROR"),
-        "missing": (text.brief(found.message), "ERROR"),
     }[found.status]
-    box = layout.box()
     text.sentences(box, context, words, icon=icon)
-    if found.message and found.status != "missing":
-        text.sentences(box, context, text.brief(found.message))
+    if advice:
+        text.sentences(box, context, advice)
     row = box.row(align=True)
-    if found.status == "missing":
-        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find It", icon="FILE_FOLDER")
-        return
     row.label(text=f"{text.storage(found.disk_bytes)} on disk")
     row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from ...sim.effects.registry import KINDS, Parameter, effect, effects
+from ...sim.effects.registry import KINDS, Parameter, effects
 from .. import text
 from ..operators.body import PHYSGEN_OT_add_colliders, PHYSGEN_OT_remove_body
 from ..operators.effect_stack import (
@@ -22,7 +22,7 @@ from ..operators.effect_stack import (
 )
 from ..operators.world import PHYSGEN_OT_ground_below
 from ..props.body import bodies, is_body
-from ..props.scene import EFFECT_ITEMS
+from ..props.scene import EFFECT_ITEMS, known_effect
 from .sidebar import WORLD, Sidebar, draw_static_friction_note, is_in, settings
 
 KIND_ICONS = {"force": "FORCE_WIND", "contact": "MOD_PHYSICS", "material": "MATERIAL", "mass": "PIVOT_CURSOR"}
@@ -116,7 +116,11 @@ class PHYSGEN_UL_effect_stack(bpy.types.UIList):
         """Name, on how many objects, on or off."""
         row = layout.row()
         row.active = item.enabled
-        row.label(text=text.readable(item.effect), icon=KIND_ICONS[effect(item.effect).kind])
+        kind = known_effect(item)
+        if kind is None:
+            row.label(text="Unknown effect", icon="ERROR")
+        else:
+            row.label(text=text.readable(item.effect), icon=KIND_ICONS[kind.kind])
         if item.targets:
             row.label(text=f"{len(item.targets)} obj.")
         row.prop(item, "enabled", text="")
@@ -129,7 +133,7 @@ class PHYSGEN_MT_add_effect(bpy.types.Menu):
 
     def draw(self, context: bpy.types.Context) -> None:
         """One heading a kind."""
-        names = {name for name, _, _ in EFFECT_ITEMS}
+        names = {name for name, *_ in EFFECT_ITEMS}
         for kind in KINDS:
             of_kind = [name for name, item in effects().items() if item.kind == kind and name in names]
             if not of_kind:
@@ -168,7 +172,11 @@ class PHYSGEN_PT_effects(_Part, bpy.types.Panel):
 
 
 def _draw_entry(layout: bpy.types.UILayout, context: bpy.types.Context, entry: Any) -> None:
-    item = effect(entry.effect)
+    item = known_effect(entry)
+    if item is None:
+        words = "Another version of PhysGen stored this effect, and this one does not know it: remove it."
+        text.sentences(layout, context, words, icon="ERROR")
+        return
     box = layout.box().column()
     box.active = entry.enabled
     row = box.row()
@@ -183,7 +191,7 @@ def _draw_entry(layout: bpy.types.UILayout, context: bpy.types.Context, entry: A
         for index, (parameter, number) in enumerate(group):
             _draw_parameter(column, item.name, parameter, number, first=index == 0)
     if item.name == "sandy":
-        start = next(number.value for parameter, number in lines if parameter.name == "start")
+        start = next((number.value for parameter, number in lines if parameter.name == "start"), 0.0)
         simulation, render = context.scene.physgen.simulation, context.scene.render
         frame = simulation.frame_start + start * render.fps / render.fps_base
         text.sentences(box, context, f"That is frame {frame:.0f}.")

@@ -32,7 +32,7 @@ class Drawing:
 
     def _draw(self) -> None:
         session, clip = self._session, self._session.clip
-        if clip is None or clip.done == 0 or bpy.context.scene.name != session.scene_name:
+        if clip is None or clip.done == 0 or bpy.context.scene.session_uid != session.scene_uid:
             return
         if clip is not self._clip:
             self._clip, self._batches = clip, {}

@@ -34,7 +34,7 @@ def session() -> Session | None:
 def start(scene: bpy.types.Scene, command: Callable[[Path], Sequence[str]]) -> Session:
     """Switch the preview of ``scene`` on; another one is switched off."""
     stop()
-    new = Session(scene.name, command)
+    new = Session(scene.session_uid, command)
     _sessions.append(new)
     longest_step_s[0] = 0.0
     new.start()

@@ -32,12 +32,13 @@ class Session:
     """The live preview of one scene.
 
     command: gives the command line of a worker whose runs go into a folder; called in a thread.
-    scene_name: looked up at every step, because undo and another file replace the scene. state: ``starting``,
-    ``compiling``, ``running``, ``playing`` or ``error``; message: what a person should know; clip: what is shown.
+    scene_uid: its ``session_uid``, looked up at every step, because undo and another file replace the scene.
+    state: ``starting``, ``compiling``, ``running``, ``playing`` or ``error``; message: what a person should know;
+    clip: what is shown.
     """
 
-    def __init__(self, scene_name: str, command: Callable[[Path], Sequence[str]]) -> None:
-        self.scene_name = scene_name
+    def __init__(self, scene_uid: int, command: Callable[[Path], Sequence[str]]) -> None:
+        self.scene_uid = scene_uid
         self.state, self.message = "starting", ""
         self.notices: list[str] = []
         self.clip: Clip | None = None
@@ -80,7 +81,7 @@ class Session:
         """
         now = time.monotonic() if now is None else now
         before = (self.clip, self.frame, self.state, self.message)
-        scene = bpy.data.scenes.get(self.scene_name)
+        scene = self.scene()
         if scene is None:
             self._fail("the scene is gone; switch the preview off")
         elif not self._ended:
@@ -93,6 +94,10 @@ class Session:
         if self.clip is not None:
             self.frame = self.clip.frame_at(now)
         return (self.clip, self.frame, self.state, self.message) != before
+
+    def scene(self) -> bpy.types.Scene | None:
+        """The scene, also renamed; None when it is gone."""
+        return next((item for item in bpy.data.scenes if item.session_uid == self.scene_uid), None)
 
     def _follow(self, scene: bpy.types.Scene, now: float) -> None:
         """Ask for a run when a number or a shape is no more what it was at the last request."""

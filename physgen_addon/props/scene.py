@@ -5,6 +5,7 @@ Blender reads the classes' annotations as properties, so they must not be postpo
 """
 
 import math
+import zlib
 
 import bpy
 from bpy.props import (
@@ -18,7 +19,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...sim.effects.registry import Parameter, effect, effects
+from ...sim.effects.registry import Effect, Parameter, effect, effects
 from ..text import readable
 from ..typed import decimal
 from .body import is_body
@@ -27,13 +28,24 @@ from .surface import Surface
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-EFFECT_ITEMS = [(name, readable(name), item.summary) for name, item in effects().items() if item.kind != "observation"]
+EFFECT_ITEMS = [
+    # Blender stores the number: it must stay that effect's when the registry grows.
+    (name, readable(name), item.summary, zlib.crc32(name.encode()) & 0x7FFFFFFF)
+    for name, item in effects().items()
+    if item.kind != "observation"
+]
 """What can act on a scene; effects of the kind "observation" concern who looks."""
+
+
+def known_effect(entry: "PHYSGEN_PG_effect_entry") -> Effect | None:
+    """The effect of ``entry``; None where the file is of a version that had another one."""
+    return effects().get(entry.effect)
 
 
 def _on_effect(self: "PHYSGEN_PG_effect_entry", context: bpy.types.Context) -> None:
     self.parameters.clear()
-    for parameter in effect(self.effect).parameters:
+    kind = known_effect(self)
+    for parameter in kind.parameters if kind is not None else ():
         item = self.parameters.add()
         item.name, item.value = parameter.name, parameter.default
 
@@ -42,7 +54,8 @@ def parameter_of(number: "PHYSGEN_PG_number") -> Parameter | None:
     """What the registry says of ``number``; None while it has no name, or one of an older registry."""
     # A property group does not know its owner, but where it is.
     owner = number.id_data.path_resolve(number.path_from_id().rpartition(".parameters")[0])
-    return next((p for p in effect(owner.effect).parameters if p.name == number.name), None)
+    kind = known_effect(owner)
+    return None if kind is None else next((p for p in kind.parameters if p.name == number.name), None)
 
 
 def _clamped(value: float, parameter: Parameter) -> float:

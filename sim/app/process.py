@@ -25,6 +25,9 @@ from ..events import Event, IsCancelled, OnEvent
 CANCEL_GRACE_S = 10.0
 """How long a stage may take to put things in order before it is killed."""
 
+MOST_LINE_BYTES = 2**20
+"""Longer lines are cut: none of ours comes near it."""
+
 _ERRORS: dict[str, type[PhysGenError]] = {e.__name__: e for e in (InputError, SimulationError, RenderError, Cancelled)}
 _STRIPPED = ("PYTHON", "LD_", "DYLD_")
 _KEPT = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
@@ -58,17 +61,23 @@ def own_command(
 def start_process(command: Sequence[str], *, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
     """Start ``command`` with pipes for what it says, in a session of its own.
 
-    Ctrl-C then reaches this process alone, which asks the other to stop in good order.
+    Ctrl-C then reaches this process alone, which asks the other to stop in good order. Raises InputError when it cannot
+    be started, as an interpreter that was deleted meanwhile.
     """
-    return subprocess.Popen(
-        list(command),
-        stdin=stdin,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=child_environment(),
-        start_new_session=os.name != "nt",
-        creationflags=0x00000200 | NO_WINDOW if os.name == "nt" else 0,  # a process group of its own
-    )
+    try:
+        return subprocess.Popen(
+            list(command),
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=child_environment(),
+            start_new_session=os.name != "nt",
+            creationflags=0x00000200 | NO_WINDOW if os.name == "nt" else 0,  # a process group of its own
+        )
+    except OSError as error:
+        raise InputError(
+            f"{command[0]}: cannot be started ({error.strerror or error}); put it back, or choose another interpreter"
+        ) from error
 
 
 def run_stage(
@@ -96,7 +105,7 @@ def run_stage(
         raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
     if code != 0 or final is None:
         words = "\n".join(tail).strip() or "it said nothing"
-        raise failure(f"the process ended with code {code}: {words}")
+        raise failure(f"{_how_it_ended(code)}: {words}")
     return final
 
 
@@ -106,12 +115,21 @@ def _crashed(code: int) -> bool:
     return -code in faults or (os.name == "nt" and code & 0xF0000000 == 0xC0000000)
 
 
+def _how_it_ended(code: int) -> str:
+    """Beginning of a sentence about a process with this exit code."""
+    text = f"the process ended with code {code}"
+    if code == -getattr(signal, "SIGKILL", 0):
+        return f"{text} (it was killed, as the system does where memory runs out)"
+    return f"{text} (it crashed)" if _crashed(code) else text
+
+
 def _run_once(
     command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
 ) -> tuple[Event | None, int, deque[str]]:
     """The final event of ``command`` if it gave one, its exit code and the last lines of its chatter."""
     process = start_process(command)
-    lines: Queue[bytes | None] = Queue()
+    # Bounded, so that whatever prints without end fills no memory, but waits.
+    lines: Queue[bytes | None] = Queue(maxsize=256)
     tail: deque[str] = deque(maxlen=30)
     readers = [
         threading.Thread(target=_read_events, args=(process, lines), daemon=True),
@@ -166,14 +184,14 @@ def parse_event(line: bytes) -> Event | None:
     """The event on ``line``, or None for the chatter of a library."""
     try:
         value = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return value if isinstance(value, dict) and "event" in value else None
 
 
 def _read_events(process: subprocess.Popen[bytes], lines: Queue[bytes | None]) -> None:
     assert process.stdout is not None
-    for line in process.stdout:
+    while line := process.stdout.readline(MOST_LINE_BYTES):
         lines.put(line)
     lines.put(None)
 
@@ -181,7 +199,7 @@ def _read_events(process: subprocess.Popen[bytes], lines: Queue[bytes | None]) -
 def read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
     """Keep the last lines that ``process`` writes to standard error in ``tail``; a thread's work, until it ends."""
     assert process.stderr is not None
-    for line in process.stderr:
+    while line := process.stderr.readline(MOST_LINE_BYTES):
         tail.append(line.decode("utf-8", "replace").rstrip())
 
 

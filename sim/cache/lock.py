@@ -40,7 +40,7 @@ def is_written(folder: Path) -> bool:
     try:
         owner = json.loads((folder / LOCK_FILE).read_bytes())
         pid, host = int(owner["pid"]), str(owner["host"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return False
     return host == socket.gethostname() and pid != os.getpid() and process_alive(pid)
 
@@ -83,7 +83,7 @@ def _drop_if_dead(path: Path) -> None:
         pid, host = int(owner["pid"]), str(owner["host"])
     except FileNotFoundError:
         return
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         pid, host = 0, socket.gethostname()
     if host != socket.gethostname():
         raise InputError(f"{path.parent}: in use by process {pid} on {host}; if that run is gone, delete {path}")
@@ -114,7 +114,8 @@ def process_alive(pid: int) -> bool:
         return bool(handle)
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
+        # No system has numbers as large as those that cannot even be asked for.
         return False
     except PermissionError:
         return True

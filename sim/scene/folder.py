@@ -36,7 +36,12 @@ def inside(root: Path, name: str) -> Path:
     if not name or "\\" in name or "\0" in name or ":" in name or pure.is_absolute() or ".." in pure.parts:
         raise InputError(f"file name {name!r}: must be relative to {root}, with forward slashes and without '..'")
     path = root / pure
-    if not path.resolve().is_relative_to(root.resolve()):
+    try:
+        inside_root = path.resolve().is_relative_to(root.resolve())
+    except (OSError, ValueError, RuntimeError) as error:
+        # Half a character, links in a circle.
+        raise InputError(f"file name {name!r}: no file can be called that ({error})") from None
+    if not inside_root:
         raise InputError(f"file name {name!r}: leads out of {root}")
     return path
 

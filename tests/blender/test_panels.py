@@ -394,7 +394,7 @@ def test_pins_that_lost_their_box():
 
 def test_every_effect_can_be_added_and_means_what_the_registry_says():
     world = bpy.context.scene.physgen.world
-    for name, _, _ in EFFECT_ITEMS:
+    for name, *_ in EFFECT_ITEMS:
         assert bpy.ops.physgen.add_stack_effect(effect=name) == {"FINISHED"}
         entry = world.effects[world.effect_index]
         assert effect_values(entry) == effect(name).defaults

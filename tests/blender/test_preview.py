@@ -57,7 +57,7 @@ def test_frames_arrive_a_changed_number_runs_again_and_stop_leaves_nothing():
     scene = bpy.context.scene
     scene.physgen.simulation.frame_end = 8
     scene.use_gravity = False
-    session = Session(scene.name, command)
+    session = Session(scene.session_uid, command)
     session.start()
     step_until(session, lambda: session.state in ("playing", "error"))
     assert session.message == "" and session.clip.done == 8
@@ -83,7 +83,7 @@ def test_frames_arrive_a_changed_number_runs_again_and_stop_leaves_nothing():
 def test_what_cannot_be_simulated_is_said_and_mending_it_goes_on():
     ball = add_body()
     ball.scale.z = 0.0
-    session = Session(bpy.context.scene.name, command)
+    session = Session(bpy.context.scene.session_uid, command)
     session.step(0.0)
     assert session.state == "error" and "Ball" in session.message
     ball.scale.z = 1.0
@@ -99,7 +99,7 @@ def test_a_worker_that_cannot_start_is_an_error_and_no_hang():
         raise InputError("no Python that can simulate")
 
     add_body()
-    session = Session(bpy.context.scene.name, broken)
+    session = Session(bpy.context.scene.session_uid, broken)
     session.start()
     step_until(session, lambda: session.state == "error")
     assert "no Python" in session.message
@@ -109,7 +109,8 @@ def test_a_worker_that_cannot_start_is_an_error_and_no_hang():
 
 def test_a_worker_that_dies_says_its_last_words():
     add_body()
-    session = Session(bpy.context.scene.name, lambda runs: [sys.executable, "-c", "raise SystemExit('out of luck')"])
+    dying = [sys.executable, "-c", "raise SystemExit('out of luck')"]
+    session = Session(bpy.context.scene.session_uid, lambda runs: dying)
     session.start()
     step_until(session, lambda: session.state == "error")
     assert "out of luck" in session.message
@@ -122,7 +123,9 @@ def test_the_operator_needs_a_body_and_toggles():
     add_body()
     assert bpy.ops.physgen.toggle_preview() == {"FINISHED"}
     session = live.session()
-    assert session is not None and session.scene_name == bpy.context.scene.name
+    assert session is not None and session.scene() == bpy.context.scene
+    bpy.context.scene.name = "renamed"
+    assert session.scene() == bpy.context.scene
     assert bpy.ops.physgen.toggle_preview() == {"FINISHED"}
     assert live.session() is None
     assert session.join(WAIT_S)
