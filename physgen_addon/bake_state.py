@@ -27,9 +27,9 @@ BAKE_OPERATOR = "physgen.bake"
 MESSAGES = {
     "none": "Nothing is baked yet",
     "baked": "",
-    "paused": "Stopped before the end. Bake again to go on",
+    "paused": "Stopped before the end. Resume goes on from there",
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
-    "missing": "The bake's files are not where they were. Relink them, or bake again",
+    "missing": "The bake is not where it was. Find its folder, or bake again",
     "damaged": "Files of the bake are gone or damaged. Bake again, or find an undamaged copy",
 }
 
@@ -197,6 +197,9 @@ def observe(scene: bpy.types.Scene) -> BakeState:
     )
     _known[scene.session_uid] = found
     _dirty.discard(scene.session_uid)
+    if found.status == "baking":
+        # It will change by itself: a worker that was killed leaves a child, which ends a moment later.
+        mark_progress(scene)
     return found
 
 

@@ -13,7 +13,7 @@ def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str,
     """``text`` on as many lines as the sidebar's width asks for."""
     scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
     width = context.region.width if context.region is not None else 300
-    room = max(int((width - (60 if icon == "NONE" else 85) * scale) / (5.6 * scale)), 16)
+    room = max(int((width - (70 if icon == "NONE" else 95) * scale) / (5.8 * scale)), 16)
     column = layout.column(align=True)
     column.scale_y = 0.8
     for index, line in enumerate(textwrap.wrap(text.replace(" %", "\N{NO-BREAK SPACE}%"), room)):

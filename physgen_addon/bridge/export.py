@@ -23,7 +23,7 @@ from ...sim.scene.model import Ground, Scene, SceneObject
 from ..props.body import bodies
 from . import export_world
 from .export_colliders import Collider
-from .export_meshes import Triangles, read_triangles, require_sound, write_mesh
+from .export_meshes import Triangles, closed, read_triangles, require_sound, write_mesh
 from .export_motion import depsgraph, modifiers_off, sample
 from .export_names import export_names
 from .export_objects import physics, sand
@@ -140,7 +140,7 @@ class _Export:
         """The mesh of ``item`` and its file, which objects with the same mesh share."""
         key = item.data.as_pointer()
         if key not in self._files:
-            mesh = read_triangles(item.data)
+            mesh = closed(read_triangles(item.data))
             require_sound(mesh, item.name)
             file = f"meshes/{self._names[item.name]}.ply"
             write_mesh(self._root / file, mesh.points, mesh.faces)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...sim.atomic import replacing
 from ...sim.errors import InputError
+from .export_holes import caps
 
 Points = NDArray[np.float32]
 Indices = NDArray[np.int32]
@@ -105,10 +106,24 @@ def require_sound(mesh: Triangles, name: str) -> None:
         )
 
 
+def closed(mesh: Triangles) -> Triangles:
+    """``mesh`` with its small holes closed; itself where it has none, or larger ones."""
+    if not (mesh.edges % 2 == 1).any() or not np.isfinite(mesh.points).all():
+        return mesh
+    faces = _joined(mesh.points, mesh.faces)
+    if not _open_edges(faces)[0]:
+        return mesh
+    added = caps(mesh.points, faces)
+    faces = np.concatenate([faces, added])
+    # All or nothing: what is still open is refused as it came.
+    return mesh if _open_edges(faces)[0] else Triangles(points=mesh.points, faces=faces, edges=np.array([2]))
+
+
 def _joined(points: Points, faces: Indices) -> Indices:
     """``faces`` (T, 3) with vertices in the same place taken as one, without those that then name one twice."""
     bits = np.ascontiguousarray(points + np.float32(0.0)).view(np.dtype((np.void, 12))).ravel()
-    joined = np.unique(bits, return_inverse=True)[1].reshape(-1)[faces]
+    _, first, number = np.unique(bits, return_index=True, return_inverse=True)
+    joined = first[number.reshape(-1)][faces]
     distinct = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
     return np.asarray(joined[distinct], dtype=np.int32)
 

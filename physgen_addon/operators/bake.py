@@ -111,6 +111,14 @@ class Bake(JobOperator):
 
         return work
 
+    def begin(self, context: bpy.types.Context) -> Job:
+        """As any job; what cannot be baked is also said in the panel, because reports vanish."""
+        try:
+            return super().begin(context)
+        except PhysGenError as error:
+            bake_state.set_trouble(context.scene, str(error))
+            raise
+
     def progressed(self, scene: bpy.types.Scene, job: Job) -> None:
         """Attach the caches as soon as there is a frame; afterwards Blender reads what is appended by itself."""
         bake_state.mark_progress(scene)

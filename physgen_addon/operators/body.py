@@ -5,6 +5,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ..bridge.bounds import rest_bounds
+from ..bridge.export import SUNK
 from ..chosen import active, selected
 from ..props.body import bodies, is_body
 from ..text import count
@@ -45,6 +46,15 @@ def _add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | N
     return added
 
 
+def _is_sunk(item: bpy.types.Object, world: bpy.types.PropertyGroup) -> bool:
+    """Whether dynamic ``item`` reaches clearly below the plane that the fields of ``world`` give."""
+    if item.physgen.role != "dynamic" or not world.use_ground or world.ground_object is not None:
+        return False
+    corners = [item.matrix_world @ Vector(corner) - Vector(world.ground_point) for corner in item.bound_box]
+    heights = [corner.dot(Vector(world.ground_normal).normalized()) for corner in corners]
+    return min(heights) < -SUNK * max(item.dimensions)
+
+
 class _OfSelected:
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
@@ -70,6 +80,11 @@ class PHYSGEN_OT_add_bodies(_OfSelected, bpy.types.Operator):
         if not added:
             return {"CANCELLED"}
         self.report({"INFO"}, f"{count(len(added), 'object')} {'is' if len(added) == 1 else 'are'} in the simulation")
+        sunk = [item.name for item in added if _is_sunk(item, context.scene.physgen.world)]
+        if sunk:
+            # Blender's own first cube is one of them; said now rather than when it is to be baked.
+            words = f"{', '.join(sunk)}: below the ground. Lift it (G Z), or World > Ground > Put Below the Objects"
+            self.report({"WARNING"}, words)
         return {"FINISHED"}
 
 

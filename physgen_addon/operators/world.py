@@ -47,4 +47,19 @@ class PHYSGEN_OT_frames_from_scene(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (PHYSGEN_OT_ground_below, PHYSGEN_OT_frames_from_scene)
+class PHYSGEN_OT_play_bake_only(bpy.types.Operator):
+    """Let the scene's frame range be that of the simulation, so that playback begins again where the bake ends"""
+
+    bl_idname = "physgen.play_bake_only"
+    bl_label = "Play Only the Bake"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """The simulation's start and end."""
+        scene = context.scene
+        simulation = scene.physgen.simulation
+        scene.frame_start, scene.frame_end = simulation.frame_start, simulation.frame_end
+        return {"FINISHED"}
+
+
+CLASSES = (PHYSGEN_OT_ground_below, PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only)

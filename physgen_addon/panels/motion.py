@@ -11,6 +11,7 @@ from mathutils import Vector
 
 from .. import text
 from ..operators.body import PHYSGEN_OT_add_pin, PHYSGEN_OT_clear_motion, PHYSGEN_OT_remove_pin
+from ..props.body import bodies
 from .preview import draw_arrows
 from .sidebar import MOTION, Sidebar, active_body, is_in, settings
 
@@ -44,6 +45,11 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
     bl_label = "Motion"
     bl_order = MOTION
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is something that could move."""
+        return bool(bodies(context.scene))
+
     def draw(self, context: bpy.types.Context) -> None:
         """Velocity, spin, start."""
         layout, item = self.layout, active_body(context)
@@ -55,7 +61,7 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             return
         body = item.physgen
         text.sentences(layout, context, f"{item.name} at the start:")
-        column = settings(layout, context, why=True)
+        column = settings(layout, context)
         column.prop(body, "velocity")
         column.prop(body, "speed")
         column.prop(body, "spin")
@@ -64,10 +70,13 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split = column.split(factor=0.4)
             split.label(text="")
             split.active = False
-            split.label(text=f"rad/s: {turns:.3g} turns a second")
+            split.label(text=f"{turns:.2g} turns/s")
         column.prop(body, "start_frame")
-        column.operator(PHYSGEN_OT_clear_motion.bl_idname, icon="X")
-        draw_arrows(layout, context)
+        row = layout.row(align=True)
+        draw_arrows(row, context)
+        cleared = row.row(align=True)
+        cleared.enabled = column.enabled
+        cleared.operator(PHYSGEN_OT_clear_motion.bl_idname, text="", icon="LOOP_BACK")
 
 
 class PHYSGEN_PT_pins(Sidebar, bpy.types.Panel):

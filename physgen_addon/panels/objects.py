@@ -73,18 +73,19 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
     bl_label = "Objects"
     bl_order = OBJECTS
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There are some; until then the Scene panel says how to begin."""
+        return bool(bodies(context.scene))
+
     def draw(self, context: bpy.types.Context) -> None:
         """The list; the role of the active object."""
         layout, scene = self.layout, context.scene
-        if not bodies(scene):
-            text.sentences(layout, context, "Nothing is simulated yet. Select a mesh and add it.")
-            layout.operator(PHYSGEN_OT_add_bodies.bl_idname, icon="ADD")
-            return
         editing = context.mode != "OBJECT"
         row = layout.row()
         names = row.column()
         names.enabled = not editing
-        names.template_list("PHYSGEN_UL_bodies", "", scene, "objects", scene.physgen, "body_index", rows=4)
+        names.template_list("PHYSGEN_UL_bodies", "", scene, "objects", scene.physgen, "body_index", rows=3)
         side = settings(row, context)
         side.use_property_split = False
         side = side.column(align=True)
@@ -102,6 +103,8 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
             return
         column = settings(layout, context, why=True)
         column.row().prop(item.physgen, "role", expand=True)
+        if item.physgen.role == "dynamic":
+            _draw_preset(column, context, item.physgen.material)
         if item.physgen.role == "collider":
             text.sentences(layout, context, "Others hit it. It stays where it is, or goes where its keyframes lead.")
 
@@ -117,16 +120,16 @@ class _Part(Sidebar):
 
 
 class PHYSGEN_PT_material(_Part, bpy.types.Panel):
-    """What the object is made of"""
+    """The numbers of what the object is made of"""
 
     bl_label = "Material"
     bl_order = 0
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Preset, behaviour, and the numbers that count for it."""
+        """Behaviour, and the numbers that count for it."""
         material = active_body(context).physgen.material
         column = settings(self.layout, context)
-        _draw_preset(column, context, material)
         column.prop(material, "law")
         _number(column, material, "density", "kg/m³")
         for name in LAW_FIELDS[material.law]:
@@ -182,6 +185,7 @@ class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
 
     bl_label = "Filling"
     bl_order = 1
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
         """Solid, wall, sand."""
@@ -193,13 +197,11 @@ class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
             if body.shell_thickness == 0:
                 text.sentences(column, context, "0: the thinnest wall that the quality resolves.")
         law = body.material.law
-        sand = column.column()
-        sand.enabled = law not in ("rigid", "sand", "fluid")
-        sand.prop(body, "sandy")
-        if body.sandy and sand.enabled:
-            sand.prop(body, "sandy_frame")
-        if law == "rigid":
-            text.sentences(column, context, "A rigid object cannot turn to sand: choose an elastic material.")
+        # Only what deforms can fall apart.
+        if law not in ("rigid", "sand", "fluid"):
+            column.prop(body, "sandy")
+            if body.sandy:
+                column.prop(body, "sandy_frame")
 
 
 class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
@@ -208,6 +210,7 @@ class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
     bl_parent_id = "PHYSGEN_PT_objects"
     bl_label = "Surface"
     bl_order = 2
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

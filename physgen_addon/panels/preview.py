@@ -9,6 +9,10 @@ from .. import text
 from ..gizmos import SHOW_ARROWS
 from ..operators.preview import PHYSGEN_OT_toggle_preview
 from ..preview import live
+from .sidebar import draw_trouble
+
+NOTICE = 120
+"""Characters of a notice."""
 
 WORDS = {
     "starting": ("Starting the worker", "TIME"),
@@ -35,12 +39,15 @@ def draw_preview(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         column.label(text=f"On in scene {scene.name}", icon="INFO")
         return
     if session.state == "error":
-        text.sentences(column, context, session.message, icon="ERROR")
+        draw_trouble(column, context, session.message, icon="ERROR")
         return
     words, icon = WORDS[session.state]
     column.label(text=f"{words}: {session.message}" if session.message else words, icon=icon)
-    for notice in session.notices[:3]:
-        text.sentences(column, context, notice, icon="INFO")
+    # What is said of each mesh would push the Bake button out of sight; a bake says all of it.
+    for notice in session.notices[:1]:
+        text.sentences(column, context, text.brief(notice, NOTICE), icon="INFO")
+    if len(session.notices) > 1:
+        column.label(text=f"and {len(session.notices) - 1} more; a bake says them all", icon="BLANK1")
 
 
 def draw_arrows(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

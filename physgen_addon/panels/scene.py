@@ -44,17 +44,18 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    text.sentences(layout, context, "Three ways to begin:")
+    text.sentences(layout, context, "Things that fall, bounce, squash and flow. Begin with one of these:")
     for title, operator, label, icon in (
-        ("A photo: draw a box around each object in it", PHYSGEN_OT_open_photo, "Open Photo", "IMAGE_DATA"),
+        ("Meshes: select some in the viewport", PHYSGEN_OT_add_bodies, "Simulate Selected", "PHYSICS"),
+        ("A photo: draw a box around each thing in it", PHYSGEN_OT_open_photo, "Open Photo", "IMAGE_DATA"),
         ("A scene folder that was made before", PHYSGEN_OT_import_scene, "Import Scene Folder", "IMPORT"),
-        ("The meshes that are selected", PHYSGEN_OT_add_bodies, "Simulate Selected", "MESH_MONKEY"),
     ):
         box = layout.box()
         text.sentences(box, context, title)
         row = box.row()
         row.scale_y = 1.3
         row.operator(operator.bl_idname, text=label, icon=icon)
+    text.sentences(layout, context, "Then choose materials and velocities here, and press Bake (see Simulate).")
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:

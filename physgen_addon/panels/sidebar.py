@@ -8,11 +8,16 @@ from typing import Any
 import bpy
 
 from .. import bake_state, text
+from ..interpreter import TERMINAL
 from ..props.body import is_body
+from ..props.preferences import PHYSGEN_AP_preferences
 from ..views import TAB
 
 SCENE, OBJECTS, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(7)
 """``bl_order``: the order of work."""
+
+COMMAND = f" In {TERMINAL}:"
+"""What precedes the command that installs what a Python lacks (``interpreter``)."""
 
 
 class Sidebar:
@@ -45,6 +50,15 @@ def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Con
     if surface.static_friction < surface.friction:
         words = f"Static friction counts as {surface.friction:.3g}: it is never below the sliding one."
         text.sentences(layout, context, words, icon="INFO")
+
+
+def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message: str, *, icon: str = "NONE") -> None:
+    """What went wrong; where the Python is to blame, the way to the preferences instead of a long command."""
+    words, command, _ = message.partition(COMMAND)
+    text.sentences(layout, context, text.brief(words), icon=icon)
+    if command:
+        button = layout.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
+        button.module = PHYSGEN_AP_preferences.bl_idname
 
 
 def active_body(context: bpy.types.Context) -> bpy.types.Object | None:

@@ -10,11 +10,11 @@ from ..bake_state import BakeState, state
 from ..jobs import PHYSGEN_OT_cancel_job, running
 from ..operators.bake import PHYSGEN_OT_bake, PHYSGEN_OT_estimate_bake, PHYSGEN_OT_pause_bake
 from ..operators.cache import PHYSGEN_OT_free_bake, PHYSGEN_OT_free_old_bakes, PHYSGEN_OT_relink_caches
-from ..operators.world import PHYSGEN_OT_frames_from_scene
+from ..operators.world import PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only
 from ..props.body import bodies
 from .job import draw_progress
 from .preview import draw_preview
-from .sidebar import SIMULATE, Sidebar, is_baking, settings
+from .sidebar import SIMULATE, Sidebar, draw_trouble, is_baking, settings
 
 
 class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
@@ -28,7 +28,7 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         """Settings, estimate, the buttons, how the bake stands."""
         layout, scene = self.layout, context.scene
         simulation = scene.physgen.simulation
-        column = settings(layout, context, why=True)
+        column = settings(layout, context)
         column.prop(simulation, "quality")
         frames = column.column(align=True)
         row = frames.row(align=True)
@@ -37,11 +37,12 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         frames.prop(simulation, "frame_end", text="To")
         column.prop(simulation, "device")
         _draw_length(layout, context, simulation)
-        trouble = _trouble(scene)
-        if trouble and not is_baking(scene):
-            text.sentences(layout, context, trouble, icon="INFO")
-        _draw_bake(layout, context, state(scene), ready=not trouble)
-        draw_preview(layout, context)
+        lacking = _lacking(scene)
+        if not lacking:
+            draw_preview(layout, context)
+        elif not is_baking(scene):
+            text.sentences(layout, context, lacking, icon="INFO")
+        _draw_bake(layout, context, state(scene), ready=not lacking)
 
 
 def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulation: bpy.types.PropertyGroup) -> None:
@@ -50,13 +51,18 @@ def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulat
     if frames < 2:
         text.sentences(layout, context, "The last frame must come after the first.", icon="ERROR")
         return
-    text.sentences(layout, context, f"{frames} frames, {frames / rate:.3g} s at {rate:.4g} frames a second")
+    text.sentences(layout, context, f"{frames} frames: {frames / rate:.2g} s at {rate:.4g} fps")
 
 
-def _trouble(scene: bpy.types.Scene) -> str:
+def _lacking(scene: bpy.types.Scene) -> str:
     """Why nothing can be baked yet; empty when it can."""
-    if not any(item.physgen.role == "dynamic" for item in bodies(scene)):
-        return "Nothing moves yet: add an object to the simulation (see Objects)."
+    found = bodies(scene)
+    if found and all(item.physgen.role == "collider" for item in found):
+        return "Nothing moves yet: give an object the role Moves (see Objects)."
+    if not found and scene.physgen_photo.image is not None:
+        return "Nothing moves yet: draw boxes and reconstruct the photo (see Scene)."
+    if not found:
+        return "Nothing moves yet: select a mesh, then Simulate Selected (see Scene)."
     return ""
 
 
@@ -82,6 +88,8 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
     row.enabled = ready
     label, icon = labels.get(found.status, "Bake"), icons.get(found.status, "FILE_REFRESH")
     row.operator(PHYSGEN_OT_bake.bl_idname, text=label, icon=icon)
+    if not ready and found.status == "none":
+        return
     _draw_status(layout, context, found)
     estimate = layout.row(align=True)
     estimate.enabled = ready
@@ -92,15 +100,15 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
 
 def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState) -> None:
     """What is there, in a box, with what can be done about it."""
-    trouble, advice = text.brief(found.trouble), text.brief(found.advice)
+    advice = text.brief(found.advice)
     if found.status == "none":
-        if trouble:
-            text.sentences(layout, context, trouble, icon="ERROR")
+        if found.trouble:
+            draw_trouble(layout, context, found.trouble, icon="ERROR")
         text.sentences(layout, context, advice)
         return
     box = layout.box()
-    if trouble:
-        text.sentences(box, context, trouble, icon="ERROR")
+    if found.trouble:
+        draw_trouble(box, context, found.trouble, icon="ERROR")
     if found.status == "missing":
         text.sentences(box, context, advice, icon="ERROR")
         row = box.row(align=True)
@@ -115,6 +123,11 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     text.sentences(box, context, words, icon=icon)
     if advice:
         text.sentences(box, context, advice)
+    last = context.scene.physgen.simulation.frame_end
+    if found.status == "baked" and context.scene.frame_end > last:
+        column = box.column(align=True)
+        text.sentences(column, context, f"Playback goes on to frame {context.scene.frame_end}, at rest.")
+        column.operator(PHYSGEN_OT_play_bake_only.bl_idname, text=f"End Playback at {last}", icon="PREVIEW_RANGE")
     row = box.row(align=True)
     row.label(text=f"{text.storage(found.disk_bytes)} on disk")
     row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")

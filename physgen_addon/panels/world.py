@@ -39,7 +39,7 @@ class PHYSGEN_PT_world(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Gravity, which is the scene's own."""
         scene = context.scene
-        column = settings(self.layout, context, why=True)
+        column = settings(self.layout, context)
         column.prop(scene, "use_gravity", text="Use Gravity")
         vector = column.column()
         vector.active = scene.use_gravity

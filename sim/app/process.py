@@ -103,7 +103,8 @@ def run_stage(
         on_event({"event": "notice", "message": f"the process crashed (code {code}); it goes on where it was"})
     if final is not None and final.get("event") == "error":
         raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
-    if code != 0 or final is None:
+    # Asked to stop when its work was done already, a process may die of that before it has ended by itself.
+    if final is None or (code != 0 and not cancelled()):
         words = "\n".join(tail).strip() or "it said nothing"
         raise failure(f"{_how_it_ended(code)}: {words}")
     return final

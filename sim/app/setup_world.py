@@ -246,7 +246,7 @@ def cost_text(prepared: PreparedWorld) -> str:
     return (
         f"about {_duration(cost.seconds)} of computing and {cost.bytes / 2**20:.0f} MiB: {prepared.particle_count} "
         f"particles, {cost.substeps} time steps of {prepared.stable_step * 1e6:.0f} µs, cells of "
-        f"{prepared.solver.cell_size(prepared.similarity) * 1000:.2g} mm"
+        f"{prepared.solver.cell_size(prepared.similarity) * 1000:.3g} mm"
     )
 
 

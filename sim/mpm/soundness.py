@@ -85,7 +85,7 @@ def check_surface(surface: Surface, *, name: str, cell_size: float | None = None
         if share > THIN_SHARE:
             said.append(
                 f"{name}: {100 * share:.0f} % of the surface is thinner than a grid cell of {cell_size:g} m; contact "
-                "there is inexact: thicken it or use a finer grid (solver option grid)"
+                "there is inexact: thicken it or bake with a finer quality"
             )
     return tuple(said)
 

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import stat
 import time
 from pathlib import Path
@@ -107,6 +108,18 @@ def test_a_bake_plays_what_is_in_its_cache(file):
         assert corner(START + index) == pytest.approx(cache.sample(index)[0])
     assert corner(START)[2] == pytest.approx(0.25) and corner(START + FRAMES - 1)[2] < 0.24
     assert load_manifest(folder).objects[0].space == "mesh"
+
+
+def test_a_bake_of_another_process_is_looked_at_until_it_ends(file):
+    folder = paths.absolute(scene().physgen.simulation.bake)
+    # The process above this one lives as long as it does.
+    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
+    assert bake_state.observe(scene()).status == "baking"
+    # Nobody tells when it ends, so the timer has to look again.
+    assert bake_state.is_dirty(scene())
+    (folder / ".lock").unlink()
+    assert bake_state.observe(scene()).status == "baked"
+    assert not bake_state.is_dirty(scene())
 
 
 def test_baking_again_does_nothing_twice(file):

@@ -174,6 +174,20 @@ def test_the_simulation_refuses_what_the_export_refuses_and_takes_what_it_takes(
     prepared(exported(scene, tmp_path)[0])
 
 
+def test_small_holes_are_closed_for_the_simulation_alone(scene, tmp_path):
+    bpy.ops.mesh.primitive_monkey_add(location=(0, 0, 2))
+    head = bpy.context.object
+    head.physgen.enabled = True
+    count = len(head.data.vertices), len(head.data.polygons)
+    folder, objects = exported(scene, tmp_path)
+    mesh = load_object_mesh(folder, objects[head.name])
+    assert len(mesh.vertices) == count[0]
+    assert (len(head.data.vertices), len(head.data.polygons)) == count
+    sides = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
+    prepared(folder)
+
+
 @pytest.mark.parametrize("scale", [(0, 0, 0), (1, 1, 0)])
 def test_no_scale_may_vanish(scene, tmp_path, scale):
     add().scale = scale

@@ -315,6 +315,7 @@ def test_the_operator_takes_the_file_the_folder_and_nothing_else(copy, tmp_path)
     assert bpy.ops.physgen.import_scene(filepath=str(copy.root / "scene.json")) == {"FINISHED"}
     # It would stand in the picture; what is added later is part of it.
     assert cube.hide_viewport and cube.hide_render
+    assert bpy.context.view_layer.objects.active.physgen.enabled
     cube.hide_viewport = cube.hide_render = False
     assert bpy.ops.physgen.import_scene(filepath=str(copy.root)) == {"FINISHED"}
     assert not cube.hide_viewport

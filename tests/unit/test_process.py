@@ -70,6 +70,18 @@ def test_a_stage_that_was_killed_is_not_started_again(tmp_path):
     assert (tmp_path / "starts").stat().st_size == 1
 
 
+def test_a_stage_that_was_done_when_it_was_asked_to_stop_is_done():
+    code = """
+        import time
+        print('{"event": "progress", "stage": "s"}\\n{"event": "done", "value": 7}', flush=True)
+        time.sleep(60)
+    """
+    events = []
+    assert run_stage(stage(code), events.append, lambda: bool(events))["value"] == 7
+    with pytest.raises(RenderError, match="code 3"):
+        run_stage(stage("""print('{"event": "done"}'); raise SystemExit(3)"""), print, bool, failure=RenderError)
+
+
 def test_a_deaf_stage_is_killed(monkeypatch):
     monkeypatch.setattr(process, "CANCEL_GRACE_S", 0.5)
     pids = []
