@@ -23,6 +23,9 @@ GRAINS_GROUP, SURFACE_GROUP, UNTIL_GROUP = "PhysGen grains", "PhysGen surface", 
 RADIUS, FROM, MATERIAL, BARE = "Radius", "From Frame", "Material", "Bare Vertices"
 GRAIN = 0.55
 """Radius of a grain over the particles' spacing: neighbours just touch."""
+STRAY, SMALLEST, LARGEST = 0.6, 0.75, 1.15
+"""Of the grains, over their radius: how far each may lie off its particle along each axis, and how small and large they
+are. Particles begin on a lattice, whose rows would still be seen in a heap."""
 SURFACE, VOXEL, SHRINK, BLUR = 1.1, 0.6, 0.7, 2
 """Of the surface, over the particles' spacing: radius of the balls that grow together, which leave no hole between
 neighbours then; size of its voxels; how far it is drawn in afterwards, so that it ends where the matter does. And how
@@ -136,7 +139,13 @@ def _grains_group() -> bpy.types.NodeTree:
         return found
     inputs = {RADIUS: ("Float", 0.01), FROM: ("Int", 1), MATERIAL: ("Material", None), BARE: ("Bool", False)}
     tree = Tree(GRAINS_GROUP, inputs)
-    grains = tree.out("GeometryNodeMeshToPoints", tree.inputs["Geometry"], None, None, tree.inputs[RADIUS])
+    radius = tree.inputs[RADIUS]
+    reach = tree.math("MULTIPLY", radius, STRAY)
+    stray = tree.out("FunctionNodeRandomValue", tree.math("MULTIPLY", reach, -1.0), reach, data_type="FLOAT_VECTOR")
+    size = tree.out("FunctionNodeRandomValue", SMALLEST, LARGEST, data_type="FLOAT")
+    size = tree.math("MULTIPLY", radius, size)
+    place = tree.out("ShaderNodeVectorMath", tree.out("GeometryNodeInputPosition"), stray, operation="ADD")
+    grains = tree.out("GeometryNodeMeshToPoints", tree.inputs["Geometry"], None, place, size)
     coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[MATERIAL])
     shown = _switch(tree, tree.inputs[BARE], coloured, tree.inputs["Geometry"])
     return tree.finish(_switch(tree, _from_frame(tree), None, shown))

@@ -169,7 +169,9 @@ def test_a_file_with_a_bake_plays_without_the_extension(a_bake):
         bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
         name = next(item.name for item in bpy.data.objects if points.POINTS_OF in item)
         last, _ = evaluated(START + FRAMES - 1, name)
-        assert len(last) == len(lattice()) and last[:, 0].mean() == pytest.approx(2 * 0.3 * (FRAMES - 1), abs=1e-4)
+        # Grains stray evenly up to 16.5 mm: five times the standard error of the mean of all of them.
+        off = 5 * points.STRAY * points.GRAIN * 0.05 / np.sqrt(3 * len(lattice()))
+        assert len(last) == len(lattice()) and last[:, 0].mean() == pytest.approx(2 * 0.3 * (FRAMES - 1), abs=off)
     finally:
         physgen.register()
 
