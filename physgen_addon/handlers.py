@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from . import bake_state, changes, paths, unsaved
+from . import bake_state, changes, folders, paths, unsaved
 from .bake_record import BAKES
 from .bridge import caches
 from .views import redraw
@@ -122,11 +122,13 @@ def _before_save(path: str = "", *_: Any) -> None:
     # Empty for the start-up file.
     if path:
         unsaved.before_save(path)
+        folders.before_save(path)
 
 
 @persistent
 def _after_save(path: str = "", *_: Any) -> None:
     if path:
+        folders.after_save(path)
         unsaved.after_save(path)
         bake_state.mark_dirty()
 

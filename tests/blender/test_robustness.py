@@ -453,3 +453,20 @@ def test_a_fault_of_ours_is_reported_and_ends_the_job(caplog):
         time.sleep(0.05)
     assert result == {"CANCELLED"} and jobs.running() is None
     assert "has failed (KeyError: 'nothing')" in live.said[-1][1] and "KeyError" in caplog.text
+
+
+@pytest.mark.parametrize("copy", [False, True])
+def test_folders_that_a_scene_names_are_found_from_a_file_saved_elsewhere(tmp_path, copy):
+    (tmp_path / "shots").mkdir()
+    (tmp_path / "other").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots" / "a.blend"))
+    scene().physgen.folder = "//scène 1/"
+    scene().physgen_diagnose.capture = "//throw"
+    second = tmp_path / "other" / "b.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(second), copy=copy)
+    if copy:
+        assert (scene().physgen.folder, scene().physgen_diagnose.capture) == ("//scène 1/", "//throw")
+        bpy.ops.wm.open_mainfile(filepath=str(second))
+    assert paths.absolute(scene().physgen.folder) == tmp_path / "shots" / "scène 1"
+    assert paths.absolute(scene().physgen_diagnose.capture) == tmp_path / "shots" / "throw"
+    assert scene().physgen.folder.startswith("//") and scene().physgen.rendering.output == "//physgen_render"

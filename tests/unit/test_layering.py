@@ -13,7 +13,18 @@ from physgen.sim.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 MAY_IMPORT_TAICHI = ("sim/mpm", "sim/gaussians", "sim/diagnose/rigid", "sim/diagnose/soft")
-INTERFACE = ("operators", "panels", "preview", "jobs", "handlers", "gizmos", "bake_state", "unsaved", "changes")
+INTERFACE = (
+    "operators",
+    "panels",
+    "preview",
+    "jobs",
+    "handlers",
+    "gizmos",
+    "bake_state",
+    "unsaved",
+    "folders",
+    "changes",
+)
 UPWARD = {
     "props": INTERFACE,
     "bridge": INTERFACE,
