@@ -141,8 +141,7 @@ def is_stopping(scene: bpy.types.Scene) -> bool:
 
 def shown_record(scene: bpy.types.Scene) -> BakeRecord | None:
     """The record of the bake that ``scene`` shows; None when there is none, or its files are gone."""
-    path = scene.physgen.simulation.bake
-    folder = paths.absolute(path) if path else None
+    folder = paths.shown_bake(scene)
     return None if folder is None or bake_record.manifest_of(folder) is None else record_of(scene, folder)
 
 
@@ -158,11 +157,9 @@ def caches_of(scene: bpy.types.Scene) -> list[Path]:
     found = []
     with contextlib.suppress(InputError):
         found.append(paths.scene_cache(scene))
-    path = scene.physgen.simulation.bake
-    if path:
-        folder = paths.absolute(path)
-        if folder.parent.name == bake_record.BAKES and folder.parent.parent not in found:
-            found.append(folder.parent.parent)
+    folder = paths.shown_bake(scene)
+    if folder is not None and folder.parent.name == bake_record.BAKES and folder.parent.parent not in found:
+        found.append(folder.parent.parent)
     return found
 
 
@@ -262,8 +259,7 @@ def _look(scene: bpy.types.Scene) -> BakeState:
 
 def _unreadable(scene: bpy.types.Scene) -> str:
     """Why the bake that ``scene`` shows cannot be read, where it is still there."""
-    path = scene.physgen.simulation.bake
-    folder = paths.absolute(path) if path else None
+    folder = paths.shown_bake(scene)
     if folder is None or not (folder / MANIFEST_FILE).exists():
         return ""
     try:
@@ -275,5 +271,4 @@ def _unreadable(scene: bpy.types.Scene) -> str:
 
 def shows(scene: bpy.types.Scene, folder: Path) -> bool:
     """Whether ``scene`` plays the bake ``folder``."""
-    path = scene.physgen.simulation.bake
-    return bool(path) and paths.absolute(path) == folder
+    return paths.shown_bake(scene) == folder

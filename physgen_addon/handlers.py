@@ -105,15 +105,15 @@ def _refresh_all() -> None:
 
 def _find_by_modifiers(scene: bpy.types.Scene) -> None:
     """In a copy of the file elsewhere Blender has kept the modifiers' paths right, and not the scene's."""
-    simulation = scene.physgen.simulation
-    if not simulation.bake or paths.absolute(simulation.bake).is_dir():
+    shown = paths.shown_bake(scene)
+    if shown is None or shown.is_dir():
         return
     for item in scene.objects:
         modifier = item.modifiers.get(caches.MODIFIER)
         if modifier is not None:
             folder = paths.absolute(modifier.filepath).parent
             if folder.is_dir() and folder.parent.name == BAKES:
-                simulation.bake = paths.stored(folder)
+                scene.physgen.simulation.bake = paths.stored(folder)
                 return
 
 

@@ -154,3 +154,9 @@ def stored(path: Path, blend: Path | None = None) -> str:
 def absolute(path: str) -> Path:
     """What ``stored`` gave, as an absolute path."""
     return Path(os.path.normpath(bpy.path.abspath(path)))
+
+
+def shown_bake(scene: bpy.types.Scene) -> Path | None:
+    """Folder of the bake that ``scene`` shows, whether it is still there or not; None: it shows none."""
+    path = scene.physgen.simulation.bake
+    return absolute(path) if path else None

@@ -32,17 +32,17 @@ def before_save(path: str) -> None:
     """Bring what waits beside the file that is about to be written, and store paths as they will be right there."""
     blend = Path(path)
     for scene in bpy.data.scenes:
-        simulation = scene.physgen.simulation
-        if simulation.bake:
-            _shown[scene.session_uid] = paths.absolute(simulation.bake)
+        shown = paths.shown_bake(scene)
+        if shown is not None:
+            _shown[scene.session_uid] = shown
         if paths.is_unsaved_cache(scene) and bake_state.bake_job(scene) is None:
             old, new = paths.scene_cache(scene), paths.scene_cache_beside(scene, blend)
             if old.is_dir() and _copy(scene, old, new):
                 playback.repoint(scene, old, new, blend)
                 _moved[scene.session_uid] = (old, new)
                 continue
-        if simulation.bake:
-            simulation.bake = paths.stored(_shown[scene.session_uid], blend)
+        if shown is not None:
+            scene.physgen.simulation.bake = paths.stored(shown, blend)
 
 
 def after_save(path: str) -> None:

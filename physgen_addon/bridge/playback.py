@@ -145,9 +145,9 @@ def repoint(scene: bpy.types.Scene, old: Path, new: Path, blend: Path | None = N
             # Absolute while the file is being saved: Blender itself makes paths of modifiers relative then.
             target = new / path.relative_to(old)
             modifier.filepath = str(target) if blend else paths.stored(target)
-    simulation = scene.physgen.simulation
-    if simulation.bake and paths.absolute(simulation.bake).is_relative_to(old):
-        simulation.bake = paths.stored(new / paths.absolute(simulation.bake).relative_to(old), blend)
+    shown = paths.shown_bake(scene)
+    if shown is not None and shown.is_relative_to(old):
+        scene.physgen.simulation.bake = paths.stored(new / shown.relative_to(old), blend)
 
 
 def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObject, record: BakeRecord) -> None:

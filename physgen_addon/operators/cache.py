@@ -13,6 +13,7 @@ from ...sim.errors import InputError, PhysGenError
 from .. import bake_record, bake_state, paths
 from ..bridge import playback
 from ..bridge.fingerprint import fingerprint
+from ..reports import reports_errors
 from ..text import count, storage
 
 
@@ -126,14 +127,11 @@ class PHYSGEN_OT_relink_caches(_CacheOperator, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Look for the bake that was shown below the folder."""
         scene = context.scene
-        try:
-            relink(scene, paths.require_folder(self.directory, "Folder"))
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        relink(scene, paths.require_folder(self.directory, "Folder"))
         bake_state.set_trouble(scene, "")
         bake_state.observe(scene)
         self.report({"INFO"}, f"The bake is {scene.physgen.simulation.bake}")
@@ -145,8 +143,8 @@ def relink(scene: bpy.types.Scene, chosen: Path) -> None:
 
     Raises InputError when none of both is there.
     """
-    shown = scene.physgen.simulation.bake
-    name = paths.absolute(shown).name if shown else ""
+    shown = paths.shown_bake(scene)
+    name = shown.name if shown is not None else ""
     depths = ("", bake_record.BAKES, f"*/{bake_record.BAKES}", f"*/*/{bake_record.BAKES}")
     candidates = [chosen] if chosen.name == name else []
     if name:

@@ -10,12 +10,13 @@ import bpy
 
 from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
 from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
-from ...sim.errors import InputError, PhysGenError
+from ...sim.errors import InputError
 from ..bridge import capture_scene, capture_view
 from ..bridge.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..paths import folder_beside, require_folder
 from ..props import report as report_props
 from ..props.diagnose import apply_view
+from ..reports import reports_errors
 from ..text import count
 from ..views import look_through_camera, turn_to, viewports
 
@@ -106,18 +107,15 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
     bl_label = "Load Capture"
     bl_options = {"UNDO"}  # noqa: RUF012
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Load and show."""
         scene = context.scene
         state = scene.physgen_diagnose
-        try:
-            folder = report_folder(state) if state.report.strip() or _found_beside(state) else None
-            if folder is not None and not (folder / REPORT_FILE).is_file():
-                folder = None
-            capture = show_capture(scene, folder)
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        folder = report_folder(state) if state.report.strip() or _found_beside(state) else None
+        if folder is not None and not (folder / REPORT_FILE).is_file():
+            folder = None
+        capture = show_capture(scene, folder)
         if folder is not None:
             state.report = str(folder)
         turn_to(context, *capture_view.bounds(state.root, state.trial))
@@ -139,13 +137,10 @@ class PHYSGEN_OT_load_diagnosis(bpy.types.Operator):
     bl_label = "Load Diagnosis"
     bl_options = {"UNDO"}  # noqa: RUF012
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Load and show."""
-        try:
-            show_capture(context.scene, report_folder(context.scene.physgen_diagnose))
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        show_capture(context.scene, report_folder(context.scene.physgen_diagnose))
         return {"FINISHED"}
 
 
@@ -178,15 +173,12 @@ class PHYSGEN_OT_open_report(bpy.types.Operator):
     bl_idname = "physgen.open_report"
     bl_label = "Open Report"
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Open report.html."""
-        try:
-            page = report_folder(context.scene.physgen_diagnose) / PAGE_FILE
-            if not page.is_file():
-                raise InputError(f"{page}: there is no such page; run the diagnosis again")
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        page = report_folder(context.scene.physgen_diagnose) / PAGE_FILE
+        if not page.is_file():
+            raise InputError(f"{page}: there is no such page; run the diagnosis again")
         webbrowser.open(page.as_uri())
         return {"FINISHED"}
 

@@ -19,6 +19,7 @@ from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
 from ..paths import bake_folder, folder_beside, require_folder
 from ..props.preferences import python
+from ..reports import reports_errors
 from ..views import turn_to
 from .capture import report_folder
 
@@ -83,13 +84,10 @@ class PHYSGEN_OT_show_overlay(bpy.types.Operator):
     bl_label = "Show Before and After"
     bl_options = {"UNDO"}  # noqa: RUF012
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Load both."""
-        try:
-            show_overlay(context.scene)
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        show_overlay(context.scene)
         return {"FINISHED"}
 
 

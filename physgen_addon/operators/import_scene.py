@@ -10,7 +10,7 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, StringProperty
 
 from ...sim.app.process import run_stage
-from ...sim.errors import InputError, PhysGenError
+from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import SCENE_FILE
 from ...sim.scene.physgen3d import read_physgen3d
@@ -20,6 +20,7 @@ from ..jobs import JobOperator, Work
 from ..paths import folder_beside, require_folder
 from ..props.body import bodies
 from ..props.preferences import python
+from ..reports import reports_errors
 from ..text import count
 from ..views import show_photo
 
@@ -74,16 +75,13 @@ class PHYSGEN_OT_import_scene(bpy.types.Operator):
         default=True,
     )
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Import and show."""
-        try:
-            if not self.filepath.strip():
-                raise InputError(f"no scene is chosen; choose the file {SCENE_FILE} of a PhysGen scene folder")
-            path = Path(bpy.path.abspath(self.filepath))
-            text = show_scene(context.scene, path, hide_others=self.hide_others)
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        if not self.filepath.strip():
+            raise InputError(f"no scene is chosen; choose the file {SCENE_FILE} of a PhysGen scene folder")
+        path = Path(bpy.path.abspath(self.filepath))
+        text = show_scene(context.scene, path, hide_others=self.hide_others)
         self.report({"INFO"}, text)
         return {"FINISHED"}
 

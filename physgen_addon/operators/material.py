@@ -3,13 +3,13 @@
 
 import bpy
 
-from ...sim.errors import PhysGenError
 from ...sim.scene.materials import delete_preset, save_preset
 from ..chosen import active, selected
 from ..props import presets
 from ..props.body import is_body
 from ..props.material import get_material, set_material
 from ..props.presets import CUSTOM
+from ..reports import reports_errors
 from ..text import count
 from .body import OfBody
 
@@ -36,14 +36,11 @@ class PHYSGEN_OT_save_preset(OfBody, bpy.types.Operator):
         if self.name.strip() in presets.own_presets().good:
             self.layout.label(text="Replaces your preset of that name", icon="INFO")
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Write it, and let the object use it."""
         material, name = active(context).physgen.material, self.name.strip()
-        try:
-            path = save_preset(presets.own_folder(create=True), name, get_material(material))
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        path = save_preset(presets.own_folder(create=True), name, get_material(material))
         presets.forget()
         material.preset_name = path.stem
         self.report({"INFO"}, f"Material preset {path.stem!r} is saved")
@@ -62,13 +59,10 @@ class PHYSGEN_OT_delete_preset(bpy.types.Operator):
         """Ask, because undo does not bring a file back."""
         return context.window_manager.invoke_confirm(self, event)
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Delete the file; what used it becomes custom."""
-        try:
-            delete_preset(presets.own_folder(), self.name)
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        delete_preset(presets.own_folder(), self.name)
         presets.forget()
         for item in bpy.data.objects:
             if item.physgen.material.preset_name == self.name and item.is_editable:
@@ -110,15 +104,12 @@ class PHYSGEN_OT_copy_material(OfBody, bpy.types.Operator):
             return False
         return True
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Numbers and the preset's name."""
         source = active(context).physgen.material
         others = [o for o in selected(context) if is_body(o) and o != active(context) and o.is_editable]
-        try:
-            material = get_material(source)
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        material = get_material(source)
         for item in others:
             set_material(item.physgen.material, material)
             item.physgen.material.preset_name = source.preset_name

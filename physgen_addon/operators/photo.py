@@ -6,8 +6,9 @@ from pathlib import Path
 import bpy
 from bpy.props import StringProperty
 
-from ...sim.errors import InputError, PhysGenError
+from ...sim.errors import InputError
 from ..bridge.photo_image import SUFFIXES, load_photo_image
+from ..reports import reports_errors
 from ..views import TAB, show_beside
 
 
@@ -34,15 +35,12 @@ class PHYSGEN_OT_open_photo(bpy.types.Operator):
     filepath: StringProperty(name="Photo", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Load and show it."""
-        try:
-            if not self.filepath.strip():
-                raise InputError("no photo is chosen; choose a JPEG, PNG, TIFF or WebP file")
-            set_photo(context.scene, Path(bpy.path.abspath(self.filepath)).resolve())
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        if not self.filepath.strip():
+            raise InputError("no photo is chosen; choose a JPEG, PNG, TIFF or WebP file")
+        set_photo(context.scene, Path(bpy.path.abspath(self.filepath)).resolve())
         show_beside(context, context.scene.physgen_photo.image, TAB)
         return {"FINISHED"}
 
@@ -70,14 +68,11 @@ class PHYSGEN_OT_use_image(bpy.types.Operator):
             return False
         return True
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Take it."""
         path = bpy.path.abspath(context.space_data.image.filepath)
-        try:
-            set_photo(context.scene, Path(path).resolve())
-        except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        set_photo(context.scene, Path(path).resolve())
         context.space_data.image = context.scene.physgen_photo.image
         return {"FINISHED"}
 

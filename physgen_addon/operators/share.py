@@ -16,7 +16,10 @@ from ..props.body import bodies
 
 
 class _ExportOperator:
-    """Asks for a file, selects what was baked, and lets Blender's own exporter write it; Blender waits meanwhile."""
+    """Asks for a file, selects what was baked, and lets Blender's own exporter write it; Blender waits meanwhile.
+
+    A subclass gives ``filename_ext``, ``format_name``, ``other_format`` (offered where this one is missing), ``write``.
+    """
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -38,7 +41,7 @@ class _ExportOperator:
         """Export the frames that are baked."""
         scene = context.scene
         try:
-            self.require_exporter()
+            self._require_exporter()
             first, last = baked_range(scene)
             path = self._target()
             with _only_baked(context, scene, first, last):
@@ -51,6 +54,14 @@ class _ExportOperator:
             return {"CANCELLED"}
         self.report({"INFO"}, f"Frames {first} to {last} are in {path}")
         return {"FINISHED"}
+
+    def _require_exporter(self) -> None:
+        """InputError when this Blender has none."""
+        if not getattr(bpy.app.build_options, self.format_name.lower()):
+            raise InputError(
+                f"this Blender was built without {self.format_name}; use an official build, or export "
+                f"{self.other_format}"
+            )
 
     def _target(self) -> Path:
         if not self.filepath.strip():
@@ -67,14 +78,10 @@ class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
     bl_idname = "physgen.export_alembic"
     bl_label = "Export Alembic"
     filename_ext = ".abc"
+    format_name, other_format = "Alembic", "USD"
 
     filepath: bpy.props.StringProperty(name="File", description="File to write", subtype="FILE_PATH")
     filter_glob: bpy.props.StringProperty(default="*.abc", options={"HIDDEN"})
-
-    def require_exporter(self) -> None:
-        """InputError when this Blender has none."""
-        if not bpy.app.build_options.alembic:
-            raise InputError("this Blender was built without Alembic; use an official build, or export USD")
 
     def write(self, path: str, first: int, last: int) -> None:
         """Call Blender."""
@@ -87,14 +94,10 @@ class PHYSGEN_OT_export_usd(_ExportOperator, bpy.types.Operator):
     bl_idname = "physgen.export_usd"
     bl_label = "Export USD"
     filename_ext = ".usdc"
+    format_name, other_format = "USD", "Alembic"
 
     filepath: bpy.props.StringProperty(name="File", description="File to write", subtype="FILE_PATH")
     filter_glob: bpy.props.StringProperty(default="*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
-
-    def require_exporter(self) -> None:
-        """InputError when this Blender has none."""
-        if not bpy.app.build_options.usd:
-            raise InputError("this Blender was built without USD; use an official build, or export Alembic")
 
     def write(self, path: str, first: int, last: int) -> None:
         """Call Blender; the frames are the scene's range."""
