@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is active and selected, also where a script runs without a window: the context lacks both there."""
+"""What is meant: the active and the selected objects, also where a script runs without a window and the context lacks
+both, and a scene that undo, renaming and other files may have replaced meanwhile."""
 
 from __future__ import annotations
 
@@ -15,3 +16,8 @@ def selected(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The selected objects."""
     found = context.selected_objects if hasattr(context, "selected_objects") else context.view_layer.objects.selected
     return list(found)
+
+
+def scene_with(uid: int) -> bpy.types.Scene | None:
+    """The scene of that ``session_uid``, which undo and renaming keep; None when it is gone."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)

@@ -18,6 +18,7 @@ import bpy
 
 from ..sim.errors import Cancelled, PhysGenError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
+from .chosen import scene_with
 from .views import redraw
 
 Work = Callable[[OnEvent, IsCancelled], Event]
@@ -239,7 +240,7 @@ class JobOperator:
         if job not in _running:
             # The extension was disabled.
             return {"CANCELLED"}
-        ended, scene = job.step(), scene_of(job)
+        ended, scene = job.step(), scene_with(job.scene)
         if scene is not None and not ended:
             self._progress(scene)
         job.longest_tick_s = max(job.longest_tick_s, time.perf_counter() - began)
@@ -299,11 +300,6 @@ class JobOperator:
             self.report({"INFO"}, notice)
         self.report({"INFO"}, sentence)
         return {"FINISHED"}
-
-
-def scene_of(job: Job) -> bpy.types.Scene | None:
-    """The scene that ``job`` was started in; None when it is gone."""
-    return next((scene for scene in bpy.data.scenes if scene.session_uid == job.scene), None)
 
 
 class PHYSGEN_OT_cancel_job(bpy.types.Operator):

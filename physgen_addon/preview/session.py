@@ -15,6 +15,7 @@ from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event
 from ..bridge.export import export_scene
 from ..bridge.export_units import clock, metres_per_unit
+from ..chosen import scene_with
 from . import watch
 from .client import Client
 from .clip import Clip
@@ -97,7 +98,7 @@ class Session:
 
     def scene(self) -> bpy.types.Scene | None:
         """The scene, also renamed; None when it is gone."""
-        return next((item for item in bpy.data.scenes if item.session_uid == self.scene_uid), None)
+        return scene_with(self.scene_uid)
 
     def _follow(self, scene: bpy.types.Scene, now: float) -> None:
         """Ask for a run when a number or a shape is no more what it was at the last request."""
@@ -113,7 +114,7 @@ class Session:
                     self._exports += 1
                     export_scene(scene, self._root / f"scene-{self._exports}")
                     shutil.rmtree(self._root / f"scene-{self._exports - 2}", ignore_errors=True)
-                    self._numbers = watch.numbers(scene)
+                    self._numbers = ()
             if self._numbers is None:
                 return
             times = clock(scene)
