@@ -15,7 +15,6 @@ from ..sim.errors import InputError
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector
-from . import pipeline
 
 
 def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
@@ -97,13 +96,6 @@ def add_sample_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", action="store_true", default=defaults.points, help=points)
 
 
-def add_render_options(parser: argparse.ArgumentParser) -> None:
-    """How frames are rendered."""
-    parser.add_argument("--engine", default="cycles", choices=["cycles"], help="render engine")
-    parser.add_argument("--samples", type=int, metavar="N", help="samples a pixel")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the photo's resolution (default 1)")
-
-
 def object_requests(options: argparse.Namespace) -> tuple[ObjectRequest, ...]:
     """What to cut out of the photo. Raises InputError for more names or sizes than boxes."""
     boxes = options.box
@@ -142,8 +134,3 @@ def bake_options(options: argparse.Namespace) -> BakeOptions:
     """Options of the bake; a verb that does not ask for some of them takes the defaults."""
     names = ("frames", "fps", "quality", "arch", "seed", "space", "points")
     return BakeOptions(**{name: getattr(options, name) for name in names if hasattr(options, name)})
-
-
-def render_request(options: argparse.Namespace, frames: str | None = None) -> pipeline.RenderRequest:
-    """How frames are rendered. frames: which; None for all."""
-    return pipeline.RenderRequest(engine=options.engine, samples=options.samples, scale=options.scale, frames=frames)

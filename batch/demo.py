@@ -12,6 +12,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..physgen_addon.bridge.options import RenderOptions
 from ..sim.app.bake_inputs import BakeOptions
 from ..sim.errors import InputError, PhysGenError
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -73,7 +74,7 @@ def request(config: DemoConfig, out: Path) -> pipeline.RunRequest:
         velocities=config.velocities,
         reconstruct=ReconstructOptions(pitch_deg=config.pitch),
         bake=BakeOptions(frames=config.frames, fps=config.fps),
-        render=pipeline.RenderRequest(samples=config.samples),
+        render=RenderOptions(samples=config.samples),
     )
 
 

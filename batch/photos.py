@@ -16,13 +16,12 @@ from .arguments import (
     add_bake_options,
     add_photo,
     add_physics,
-    add_render_options,
     bake_options,
     object_requests,
     physics,
     reconstruct_options,
-    render_request,
 )
+from .render_arguments import add_render_options, render_options
 from .terminal import Terminal
 
 
@@ -65,7 +64,7 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
-    pipeline.check_render(render_request(options), options.out)
+    pipeline.check_video(options.out)
     request = pipeline.RunRequest(
         photo=options.photo,
         objects=object_requests(options),
@@ -77,7 +76,7 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
         overrides=tuple(options.overrides),
         reconstruct=reconstruct_options(options),
         bake=bake_options(options),
-        render=render_request(options),
+        render=render_options(options),
     )
     pipeline.run(request, terminal, cancelled)
     terminal(
@@ -109,11 +108,16 @@ def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
 
 def run_render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen render``; the exit code."""
-    request = render_request(options, options.frames)
-    terminal(
-        pipeline.render_stage(
-            options.scene, options.bake, options.out, request, terminal, cancelled, video=options.video
-        )
+    done = pipeline.render_stage(
+        options.scene,
+        options.bake,
+        options.out,
+        render_options(options),
+        terminal,
+        cancelled,
+        frames=options.frames,
+        video=options.video,
     )
+    terminal(done)
     terminal.line(f"frames: {options.out}" + (f"\nvideo: {options.video}" if options.video else ""))
     return 0

@@ -24,21 +24,7 @@ from ..sim.reconstruct.pipeline import object_names
 from ..sim.scene.folder import SceneFolder, load_scene, require_photo
 from ..sim.scene.model import Vector
 from ..sim.scene.overrides import check_overrides
-
-
-@dataclass(frozen=True, kw_only=True)
-class RenderRequest:
-    """How frames are rendered.
-
-    samples: Cycles samples a pixel, None for the default.
-    scale: of the photo's resolution, above 0 to 4.
-    frames: range such as ``1-48``, ``1,5,9`` or ``1-48x2``; None for all that are baked.
-    """
-
-    engine: str = "cycles"
-    samples: int | None = None
-    scale: float = 1.0
-    frames: str | None = None
+from .render_arguments import render_arguments
 
 
 def bake_stage(
@@ -61,10 +47,8 @@ def bake_stage(
         return run_stage(own_command("sim.app.worker", str(path)), on_event, cancelled, failure=SimulationError)
 
 
-def check_render(request: RenderRequest, video: Path | None) -> None:
-    """Raise InputError for render options or a video name that cannot be used."""
-    samples = RenderOptions().samples if request.samples is None else request.samples
-    RenderOptions(engine=request.engine, scale=request.scale, samples=samples)
+def check_video(video: Path | None) -> None:
+    """Raise InputError for a video name that cannot be used."""
     if video is not None and (video.suffix.lower() != ".mp4" or video.is_dir()):
         raise InputError(f"video {video}: give a file name that ends in .mp4")
 
@@ -73,25 +57,23 @@ def render_stage(
     scene: Path,
     bake: Path,
     out: Path,
-    request: RenderRequest,
+    options: RenderOptions,
     on_event: OnEvent,
     cancelled: IsCancelled,
     *,
+    frames: str | None = None,
     video: Path | None = None,
 ) -> Event:
-    """Render frames, and ``video`` from them, in a process that holds bpy.
+    """Render ``frames`` (None for all that are baked), and ``video`` from them, in a process that holds bpy.
 
     Raises InputError, before that process starts, for a scene without a photo and for options that cannot be used.
     """
-    check_render(request, video)
+    check_video(video)
     require_photo(load_scene(scene))
     command = own_command("batch.render", str(scene.resolve()), "--bake", str(bake.resolve()))
-    command += ["--out", str(out.resolve())]
-    command += ["--engine", request.engine, "--scale", repr(request.scale), "--json", "--parent", str(os.getpid())]
-    if request.samples is not None:
-        command += ["--samples", str(request.samples)]
-    if request.frames is not None:
-        command += ["--frames", request.frames]
+    command += ["--out", str(out.resolve()), "--json", "--parent", str(os.getpid()), *render_arguments(options)]
+    if frames is not None:
+        command += ["--frames", frames]
     if video is not None:
         command += ["--video", str(video.resolve())]
     # Blender crashes now and then when a video or a process ends; whole frames are kept, so it is tried once more.
@@ -117,7 +99,7 @@ class RunRequest:
     overrides: tuple[str, ...] = ()
     reconstruct: ReconstructOptions = dataclasses.field(default_factory=ReconstructOptions)
     bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
-    render: RenderRequest = dataclasses.field(default_factory=RenderRequest)
+    render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
 
 
 def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
@@ -134,7 +116,7 @@ def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
     require_physics(len(request.objects), request.presets, request.velocities, request.spins)
     check_overrides(object_names(request.objects), request.overrides)
     load_quality(request.bake.quality)
-    check_render(request.render, request.video)
+    check_video(request.video)
     scene, bake = request.work / "scene", request.work / "bake"
     reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
     folder = set_all_physics(

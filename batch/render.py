@@ -59,12 +59,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--bake", type=Path, required=True, metavar="BAKE", help="bake folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all that are baked)")
-    parser.add_argument("--engine", default="cycles", choices=["cycles"], help="render engine")
-    parser.add_argument("--samples", type=int, metavar="N", help="rays and light samples a pixel")
-    parser.add_argument("--scale", type=float, default=1.0, metavar="F", help="of the photo's resolution (default 1)")
+    _load("batch.render_arguments").add_render_options(parser)
     parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
     parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     return parser
 
@@ -123,10 +120,8 @@ def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> i
             raise errors.RenderError(
                 f"Blender as a Python module is not usable ({error}); run `make setup`, or run this file in Blender"
             ) from error
-        frames, bridge = _load("physgen_addon.bridge.frames"), _load("physgen_addon.bridge.options")
+        frames, settings = _load("physgen_addon.bridge.frames"), _load("batch.render_arguments").render_options(options)
         folder = _load("sim.scene.folder").load_scene(options.scene)
-        changes = {} if options.samples is None else {"samples": options.samples}
-        settings = bridge.RenderOptions(engine=options.engine, scale=options.scale, threads=options.threads, **changes)
         paths = frames.render_frames(
             folder, options.bake, options.out, settings, on_event, cancelled, frames=options.frames
         )

@@ -86,7 +86,7 @@ def _make(
                     shutil.copyfile(twin, partial)
             else:
                 renderer = renderer or Renderer(scene, bake, options)
-                transfer.write_rgb(path, renderer.frame(frame.sample))
+                transfer.write_rgb(path, transfer.linear_to_bytes(renderer.frame(frame.sample).beauty))
             ledger.record(frame.number, frame.inputs)
         progress.report(len(planned))
     finally:

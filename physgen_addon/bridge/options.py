@@ -1,13 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a user chooses about rendering. Needs no bpy, so that a form can be filled in before Blender is loaded."""
+"""What a user chooses about rendering. Needs no bpy, so that a form can be filled in before Blender is loaded.
+
+Each field carries what the command line says of it; ``batch/render_arguments.py`` makes the flags of it, and an option
+is added here alone.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from ...sim.errors import InputError
 
 ENGINES = ("cycles",)
+
+
+def option(default: Any, text: str, *, metavar: str | None = None, choices: tuple[str, ...] | None = None) -> Any:
+    """A field of ``RenderOptions`` with what ``--help`` says of it."""
+    return field(default=default, metadata={"help": text, "metavar": metavar, "choices": choices})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,13 +34,13 @@ class RenderOptions:
     threads: CPU threads, 0 for all; it changes nothing in the picture.
     """
 
-    engine: str = "cycles"
-    samples: int = 16
-    scale: float = 1.0
-    light_scale: float | None = None
-    denoise: bool = True
+    engine: str = option("cycles", "render engine", choices=ENGINES)
+    samples: int = option(16, "rays and light samples a pixel", metavar="N")
+    scale: float = option(1.0, "of the photo's resolution", metavar="F")
+    light_scale: float | None = option(None, "resolution of light over the frames' (default: by size)", metavar="F")
+    denoise: bool = option(True, "denoise light where Blender can")
     seed: int = 0
-    threads: int = 0
+    threads: int = option(0, "CPU threads, 0 for all", metavar="N")
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:

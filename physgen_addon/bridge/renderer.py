@@ -10,16 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.composite import layers, rest, transfer
-from ...sim.errors import InputError
+from ...sim.composite import layers
 from ...sim.scene.folder import SceneFolder
 from . import passes, rest_light
 from .caches import Bake
 from .camera import render_size
 from .objects import COLOUR_LAYER
 from .options import RenderOptions
+from .plate import Plate
 from .regions import Box, feather, ground_depth, object_box, shadow_region
 from .scene import BlenderScene, build, remove
+from .view import View
 
 Samples = list[NDArray[np.float32]]
 
@@ -35,8 +36,7 @@ class Renderer:
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
         try:
-            self._rest = self._samples(0)
-            self._load_images()
+            self._plate = Plate(scene, self._size, self._samples(0))
             self._built = build(scene, bake, options)
             rest_light.measure(self._built, self._scratch)
             self._ground_depth = ground_depth(self._scene, self._built.light_size)
@@ -53,72 +53,24 @@ class Renderer:
             self._built = None
         self._temporary.cleanup()
 
-    def frame(self, sample: int) -> NDArray[np.uint8]:
-        """The picture (H, W, 3), 8-bit sRGB, of ``sample`` of the bake."""
+    def frame(self, sample: int) -> layers.FrameLayers:
+        """``sample`` of the bake as a picture (linear light), with what it was made of."""
+        view = View(self._scene.camera)
+        shadow = self._rest_shadow if sample == 0 else self._shadow(sample)
         ground = layers.ground_layer(
-            photo=self._photo,
-            background=self._background,
-            shadow=self._rest_shadow if sample == 0 else self._shadow(sample),
-            rest_shadow=self._rest_shadow,
-            at_rest=self._at_rest(self._samples(sample)),
-            masks=self._masks,
+            photo=view.warp(self._plate.photo),
+            background=view.warp(self._plate.background),
+            shadow=shadow,
+            rest_shadow=view.warp(self._rest_shadow),
+            at_rest=view.warp(self._plate.at_rest(self._samples(sample))),
+            masks=view.warp(self._plate.masks),
         )
-        return transfer.linear_to_bytes(layers.compose(self._objects(sample), ground))
-
-    def _load_images(self) -> None:
-        photo, background = (self._image(name) for name in (self._scene.photo, self._scene.background))
-        self._photo, self._background = photo, background
-        masks = [self._mask(item.mask) for item in self._scene.objects]
-        self._masks = np.logical_or.reduce(masks)
-        self._shares = rest.influence(
-            [mask | self._mask(item.shadow) for mask, item in zip(masks, self._scene.objects, strict=True)]
-        )
-        self._rims = [
-            rest.Rim(mask, self._masks, self._pixels(start)) for mask, start in zip(masks, self._rest, strict=True)
-        ]
-
-    def _image(self, name: str) -> transfer.Linear:
-        pixels = transfer.read_rgb(self._folder.file(name))
-        height, width = pixels.shape[:2]
-        camera = self._scene.camera
-        if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"{self._folder.file(name)}: is {width}×{height}, the camera's image is "
-                f"{camera.width}×{camera.height}; reconstruct the scene again"
-            )
-        return transfer.resized(transfer.bytes_to_linear(pixels), *self._size)
-
-    def _mask(self, name: str | None) -> NDArray[np.bool_]:
-        if name is None:
-            return np.zeros(self._size[::-1], dtype=bool)
-        mask = transfer.read_mask(self._folder.file(name))
-        camera = self._scene.camera
-        if mask.shape != (camera.height, camera.width):
-            raise InputError(
-                f"{self._folder.file(name)}: is {mask.shape[1]}×{mask.shape[0]}, the camera's image is "
-                f"{camera.width}×{camera.height}; reconstruct the scene again"
-            )
-        return np.asarray(transfer.resized(mask.astype(np.float32), *self._size) > 0.5)
+        objects = self._objects(sample)
+        beauty = layers.compose(objects, ground)
+        return layers.FrameLayers(ground=ground, shadow=shadow, objects=objects, beauty=beauty)
 
     def _samples(self, sample: int) -> Samples:
         return [cache.sample(sample) for cache in self._bake.caches]
-
-    def _pixels(self, positions: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Where world ``positions`` (V, 3) are on the frame (V, 2)."""
-        camera = self._scene.camera
-        scale = np.array([self._size[0] / camera.width, self._size[1] / camera.height])
-        return camera.project(positions)[:, :2] * scale
-
-    def _at_rest(self, now: Samples) -> NDArray[np.float32]:
-        normal = np.asarray(self._scene.ground.normal)
-        weights = []
-        for item, start, positions in zip(self._scene.objects, self._rest, now, strict=True):
-            contact = rest.contact_vertices(start, normal)
-            weights.append(rest.rest_weight(rest.contact_displacement(start, positions, contact, item.size_m)))
-        at_rest = rest.rest_map(self._shares, weights)
-        for rim, positions in zip(self._rims, now, strict=True):
-            rim.apply(at_rest, self._pixels(positions))
-        return at_rest
 
     def _objects(self, sample: int) -> layers.ObjectLayer:
         assert self._built is not None

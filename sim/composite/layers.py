@@ -40,6 +40,22 @@ class ObjectLayer:
     light: Linear
 
 
+@dataclass(frozen=True, kw_only=True)
+class FrameLayers:
+    """One frame and what it was made of, whole image size, in linear light.
+
+    ground: (H, W, 3) what is seen where no object is, also behind objects.
+    shadow: (H, W, 3) light on the ground with the objects over light without.
+    objects: the objects, their light apart from their colours.
+    beauty: (H, W, 3) the finished picture.
+    """
+
+    ground: Linear
+    shadow: Linear
+    objects: ObjectLayer
+    beauty: Linear
+
+
 def empty_layer(width: int, height: int) -> ObjectLayer:
     """No object in view."""
     return ObjectLayer(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.transfer import bytes_to_linear, read_mask, read_rgb
+from physgen.sim.composite.transfer import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.bridge import renderer as renderer_module  # noqa: E402
@@ -61,7 +61,7 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake, monkeypatc
                 renderer_module, "shadow_region", lambda _scene, _vertices, size: ShadowRegion(Box(0, 0, *size), 1e3)
             )
         renderer = Renderer(world.folder, opened, options)
-        pictures.append(renderer.frame(1).astype(int))
+        pictures.append(linear_to_bytes(renderer.frame(1).beauty).astype(int))
         renderer.close()
     difference = np.abs(pictures[0] - pictures[1])
     assert difference.mean() < 0.3
@@ -71,7 +71,7 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake, monkeypatc
 def test_out_of_view_is_the_background_alone(world, bake):
     opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.scene)
     renderer = Renderer(world.folder, opened, RenderOptions(samples=4))
-    gone = renderer.frame(1)
+    gone = linear_to_bytes(renderer.frame(1).beauty)
     renderer.close()
     mask = read_mask(world.folder.file("masks/ball.png"))
     assert np.array_equal(gone[mask], world.background[mask])
