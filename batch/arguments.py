@@ -92,8 +92,8 @@ def add_sample_options(parser: argparse.ArgumentParser) -> None:
     defaults = BakeOptions()
     space = "what the samples are in: world metres, or the coordinates of each object's mesh file"
     parser.add_argument("--space", default=defaults.space, choices=SPACES, help=f"{space} (default {defaults.space})")
-    points = "also keep the particles of what is sand, fluid or snow, or turns to sand"
-    parser.add_argument("--points", action="store_true", default=defaults.points, help=points)
+    points = "keep the particles of what is sand, fluid or snow, or turns to sand (default: on)"
+    parser.add_argument("--points", action=argparse.BooleanOptionalAction, default=defaults.points, help=points)
 
 
 def object_requests(options: argparse.Namespace) -> tuple[ObjectRequest, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...sim.app.bake_inputs import geometry_hash
-from ...sim.cache.manifest import WORLD_SPACE, BakeManifest, load_manifest
+from ...sim.cache.manifest import SURFACE, WORLD_SPACE, BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
 from ...sim.scene.folder import SceneFolder
@@ -19,12 +19,30 @@ MODIFIER = "PhysGen cache"
 
 
 @dataclass(frozen=True)
+class Flow:
+    """The particles of an object that flows.
+
+    surface: shown as the surface around them, else as a grain each. from_sample: from which sample on they are shown,
+    because the object's skin no longer holds; None: never.
+    """
+
+    cache: Pc2Reader
+    surface: bool
+    from_sample: int | None = None
+
+    def shown_at(self, sample: int) -> bool:
+        """Whether ``sample`` shows them."""
+        return self.from_sample is not None and sample >= self.from_sample
+
+
+@dataclass(frozen=True)
 class Bake:
-    """A bake that fits a scene: its caches in the order of the scene's objects."""
+    """A bake that fits a scene: caches in the order of its objects, and particles (None: without)."""
 
     folder: Path
     manifest: BakeManifest
     caches: tuple[Pc2Reader, ...]
+    flows: tuple[Flow | None, ...]
 
     @property
     def first_frame(self) -> int:
@@ -34,7 +52,12 @@ class Bake:
     @property
     def last_frame(self) -> int:
         """Number of the last frame that every cache holds."""
-        return self.manifest.frame_start + min(cache.sample_count for cache in self.caches) - 1
+        return self.manifest.frame_start + min(cache.sample_count for cache in self.every) - 1
+
+    @property
+    def every(self) -> tuple[Pc2Reader, ...]:
+        """All caches, those of particles last."""
+        return self.caches + tuple(flow.cache for flow in self.flows if flow is not None)
 
 
 def open_bake(folder: Path, scene: Scene) -> Bake:
@@ -44,15 +67,20 @@ def open_bake(folder: Path, scene: Scene) -> Bake:
     """
     manifest = load_manifest(folder)
     files = {item.name: item for item in manifest.objects}
-    caches = []
+    caches: list[Pc2Reader] = []
+    flows: list[Flow | None] = []
     for item in scene.objects:
         if item.name not in files:
             raise InputError(f"{folder}: holds no cache of object {item.name!r}; bake the scene again")
-        cache = Pc2Reader(folder / files[item.name].file)
+        baked = files[item.name]
+        caches.append(Pc2Reader(folder / baked.file))
+        particles = None if baked.points_file is None else Pc2Reader(folder / baked.points_file)
+        flows.append(None if particles is None else Flow(cache=particles, surface=baked.points_as == SURFACE))
+    bake = Bake(folder=folder, manifest=manifest, caches=tuple(caches), flows=tuple(flows))
+    for cache in bake.every:
         if cache.sample_count < 1:
             raise InputError(f"{cache.path}: holds no sample yet; let the bake run on")
-        caches.append(cache)
-    return Bake(folder=folder, manifest=manifest, caches=tuple(caches))
+    return bake
 
 
 def require_scene(bake: Bake, folder: SceneFolder) -> None:

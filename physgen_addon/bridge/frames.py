@@ -15,7 +15,7 @@ from ...sim.errors import Cancelled
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...sim.scene.folder import SceneFolder, require_photo
 from ...sim.scene.meshes import load_object_mesh
-from . import caches, compat
+from . import caches, compat, photo_particles
 from .ledger import Ledger
 from .options import RenderOptions
 from .plan import Frame, parse_range, plan_frames
@@ -49,9 +49,8 @@ def render_frames(
     numbers = parse_range(frames, opened.first_frame, opened.last_frame)
     denoised = options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
-    planned = plan_frames(
-        scene, opened.caches, numbers, first_frame=opened.first_frame, options=options, blender=blender
-    )
+    opened = photo_particles.find_tears(opened, scene)
+    planned = plan_frames(scene, opened, numbers, options=options, blender=blender)
     Ledger(out)
     with folder_lock(out):
         ledger = Ledger(out)

@@ -28,6 +28,8 @@ REST_LIGHT = "rest_light"
 COLOUR_LAYER = "texture"
 """Name of the pass that holds the photo's colours."""
 AMBIENT_NODE = "ambient"
+UV = "photo"
+"""Name of the texture coordinates."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ def add_object(collection: bpy.types.Collection, folder: SceneFolder, source: Sc
     data.from_pydata(mesh.vertices, [], mesh.faces)
     corners = np.empty(len(data.loops), dtype=np.int32)
     data.loops.foreach_get("vertex_index", corners)
-    data.uv_layers.new(name="photo").data.foreach_set("uv", uv.astype(np.float32)[corners].ravel())
+    data.uv_layers.new(name=UV).data.foreach_set("uv", uv.astype(np.float32)[corners].ravel())
     data.shade_smooth()
     attribute = data.color_attributes.new(REST_LIGHT, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", np.ones(4 * len(mesh.vertices), dtype=np.float32))

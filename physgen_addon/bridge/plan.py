@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which frames are to be made, from which inputs, and which of them are equal. Needs no bpy."""
+"""Which frames are to be made, from which inputs, and which of them are equal."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from ...sim.errors import InputError
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.json_fields import to_json
 from ...sim.version import VERSION
+from .caches import Bake
 from .options import RenderOptions
 
-RENDER_REVISION = 1
+RENDER_REVISION = 2
 """Raised with every change of rendering that changes what a frame looks like."""
 
 STILL_PX = 0.02
@@ -64,33 +65,47 @@ def parse_range(text: str | None, first: int, last: int) -> list[int]:
 
 def plan_frames(
     folder: SceneFolder,
-    caches: Sequence[Pc2Reader],
+    bake: Bake,
     numbers: Sequence[int],
     *,
-    first_frame: int,
     options: RenderOptions,
     blender: str,
 ) -> list[Frame]:
     """Hash the inputs of the frames ``numbers`` (ascending); ``blender`` names the renderer and its version."""
     base = _scene_hash(folder, options, blender)
-    still = _still_distance(folder, caches, options)
-    rest = [cache.sample(0) for cache in caches]
-    key, key_index = rest, 0
-    key_hash = rest_hash = _hash(base, rest)
+    first_frame = bake.first_frame
+    still = _still_distance(folder, bake.every, options)
+    key = rest = _pose(bake, 0)
+    key_index, key_hash = 0, _hash(base, rest)
+    rest_hash = key_hash
     frames, wanted = [], set(numbers)
     for index in range(max(numbers) - first_frame + 1 if numbers else 0):
-        now = [cache.sample(index) for cache in caches]
-        if _same(now, rest, still):
+        now = _pose(bake, index)
+        if now.same(rest, still):
             key, key_index, key_hash = rest, 0, rest_hash
-        elif not _same(now, key, still):
+        elif not now.same(key, still):
             key, key_index, key_hash = now, index, _hash(base, now)
         if first_frame + index in wanted:
             frames.append(Frame(number=first_frame + index, sample=key_index, inputs=key_hash))
     return frames
 
 
-def _same(a: Sequence[NDArray[np.float32]], b: Sequence[NDArray[np.float32]], within: float) -> bool:
-    return all(float(np.abs(x - y).max()) <= within for x, y in zip(a, b, strict=True))
+@dataclass(frozen=True)
+class _Pose:
+    """Where everything is: positions (N, 3) by cache, and which objects show their particles."""
+
+    positions: list[NDArray[np.float32]]
+    flowing: tuple[bool, ...]
+
+    def same(self, other: _Pose, within: float) -> bool:
+        """Whether nothing is farther than ``within`` metres from where it is in ``other``."""
+        pairs = zip(self.positions, other.positions, strict=True)
+        return self.flowing == other.flowing and all(float(np.abs(a - b).max()) <= within for a, b in pairs)
+
+
+def _pose(bake: Bake, sample: int) -> _Pose:
+    flowing = tuple(flow is not None and flow.shown_at(sample) for flow in bake.flows)
+    return _Pose([cache.sample(sample) for cache in bake.every], flowing)
 
 
 def _still_distance(folder: SceneFolder, caches: Sequence[Pc2Reader], options: RenderOptions) -> float:
@@ -127,8 +142,8 @@ def _file_hash(folder: SceneFolder, name: str) -> str:
     return file_hash(path)
 
 
-def _hash(base: str, samples: Sequence[NDArray[np.float32]]) -> str:
-    digest = hashlib.sha256(base.encode())
-    for sample in samples:
+def _hash(base: str, pose: _Pose) -> str:
+    digest = hashlib.sha256(f"{base} {pose.flowing}".encode())
+    for sample in pose.positions:
         digest.update(np.ascontiguousarray(sample, dtype="<f4").tobytes())
     return digest.hexdigest()

@@ -122,13 +122,14 @@ def _add_look(item: bpy.types.Object, distance: float, *, surface: bool) -> None
         set_input(modifier, MATERIAL, item.data.materials[0])
 
 
-def _from_frame(tree: Tree) -> Any:
+def begun(tree: Tree) -> Any:
     """True from the frame FROM on. Half a frame early, because subframes of motion blur belong to their frame."""
     frame = tree.node("GeometryNodeInputSceneTime").outputs["Frame"]
     return tree.compare("GREATER_EQUAL", frame, tree.math("SUBTRACT", tree.inputs[FROM], 0.5))
 
 
-def _switch(tree: Tree, when: Any, no: Any, yes: Any) -> Any:
+def switch(tree: Tree, when: Any, no: Any, yes: Any) -> Any:
+    """The geometry ``yes`` or ``no``."""
     return tree.out("GeometryNodeSwitch", when, no, yes, input_type="GEOMETRY")
 
 
@@ -139,16 +140,20 @@ def _grains_group() -> bpy.types.NodeTree:
         return found
     inputs = {RADIUS: ("Float", 0.01), FROM: ("Int", 1), MATERIAL: ("Material", None), BARE: ("Bool", False)}
     tree = Tree(GRAINS_GROUP, inputs)
-    radius = tree.inputs[RADIUS]
+    grains = grain_cloud(tree, tree.inputs["Geometry"], tree.inputs[RADIUS])
+    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[MATERIAL])
+    shown = switch(tree, tree.inputs[BARE], coloured, tree.inputs["Geometry"])
+    return tree.finish(switch(tree, begun(tree), None, shown))
+
+
+def grain_cloud(tree: Tree, geometry: Any, radius: Any) -> Any:
+    """A grain of about ``radius`` near each vertex of ``geometry``."""
     reach = tree.math("MULTIPLY", radius, STRAY)
     stray = tree.out("FunctionNodeRandomValue", tree.math("MULTIPLY", reach, -1.0), reach, data_type="FLOAT_VECTOR")
     size = tree.out("FunctionNodeRandomValue", SMALLEST, LARGEST, data_type="FLOAT")
     size = tree.math("MULTIPLY", radius, size)
     place = tree.out("ShaderNodeVectorMath", tree.out("GeometryNodeInputPosition"), stray, operation="ADD")
-    grains = tree.out("GeometryNodeMeshToPoints", tree.inputs["Geometry"], None, place, size)
-    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[MATERIAL])
-    shown = _switch(tree, tree.inputs[BARE], coloured, tree.inputs["Geometry"])
-    return tree.finish(_switch(tree, _from_frame(tree), None, shown))
+    return tree.out("GeometryNodeMeshToPoints", geometry, None, place, size)
 
 
 def _surface_group() -> bpy.types.NodeTree:
@@ -159,8 +164,14 @@ def _surface_group() -> bpy.types.NodeTree:
     tree = Tree(SURFACE_GROUP, {RADIUS: ("Float", 0.02), FROM: ("Int", 1), MATERIAL: ("Material", None)})
     radius = tree.inputs[RADIUS]
     # A switch before the costly part: frames without particles pay nothing.
-    shown = _switch(tree, _from_frame(tree), None, tree.inputs["Geometry"])
-    points = tree.out("GeometryNodeMeshToPoints", shown, None, None, radius)
+    shown = switch(tree, begun(tree), None, tree.inputs["Geometry"])
+    surface = enclosing_surface(tree, shown, radius)
+    return tree.finish(tree.out("GeometryNodeSetMaterial", surface, None, tree.inputs[MATERIAL]))
+
+
+def enclosing_surface(tree: Tree, points: Any, radius: Any) -> Any:
+    """The smooth surface of balls of ``radius`` around the vertices ``points``, drawn in to where the matter ends."""
+    points = tree.out("GeometryNodeMeshToPoints", points, None, None, radius)
     volume = tree.node("GeometryNodePointsToVolume")
     compat.set_resolution(volume, "Size")
     tree.group.links.new(points, volume.inputs["Points"])
@@ -174,8 +185,7 @@ def _surface_group() -> bpy.types.NodeTree:
     inwards = tree.node("ShaderNodeVectorMath", normal, operation="SCALE")
     tree.group.links.new(tree.math("MULTIPLY", radius, -SHRINK / SURFACE), inwards.inputs["Scale"])
     drawn_in = tree.out("GeometryNodeSetPosition", mesh.outputs[0], None, even, inwards.outputs[0])
-    smooth = tree.out("GeometryNodeSetShadeSmooth", drawn_in)
-    return tree.finish(tree.out("GeometryNodeSetMaterial", smooth, None, tree.inputs[MATERIAL]))
+    return tree.out("GeometryNodeSetShadeSmooth", drawn_in)
 
 
 def _until_group() -> bpy.types.NodeTree:
@@ -184,4 +194,4 @@ def _until_group() -> bpy.types.NodeTree:
     if found is not None:
         return found
     tree = Tree(UNTIL_GROUP, {FROM: ("Int", 1)})
-    return tree.finish(_switch(tree, _from_frame(tree), tree.inputs["Geometry"], None))
+    return tree.finish(switch(tree, begun(tree), tree.inputs["Geometry"], None))

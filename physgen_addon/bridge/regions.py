@@ -43,9 +43,17 @@ class Box(NamedTuple):
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
 
-def object_box(camera: Camera, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> Box | None:
-    """Pixels of an image of ``size`` (width, height) that objects with ``vertices`` (V, 3) cover; None out of view."""
-    return _bounds(camera, np.concatenate([np.asarray(v) for v in vertices]), size, MARGIN_PX)
+def object_box(
+    camera: Camera, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int], reach: float = 0.0
+) -> Box | None:
+    """Pixels of an image of ``size`` (width, height) that objects with ``vertices`` (V, 3) cover; None out of view.
+
+    reach: how far, in metres, something may be seen around a vertex.
+    """
+    points = np.concatenate([np.asarray(v) for v in vertices])
+    near = max(float(camera.project(points)[:, 2].min()), MIN_DEPTH_M)
+    margin = reach * max(camera.fx * size[0] / camera.width, camera.fy * size[1] / camera.height) / near
+    return _bounds(camera, points, size, MARGIN_PX + math.ceil(min(margin, max(size))))
 
 
 class ShadowRegion(NamedTuple):

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from ...sim.composite import layers
 from ...sim.scene.folder import SceneFolder
-from . import passes, rest_light
+from . import passes, photo_particles, rest_light
 from .caches import Bake
 from .camera import render_size
 from .objects import COLOUR_LAYER
 from .options import RenderOptions
 from .plate import Plate
 from .regions import Box, feather, ground_depth, object_box, shadow_region
-from .scene import BlenderScene, build, remove
+from .scene import BlenderScene, build, everything, remove
 from .view import View
 
 Samples = list[NDArray[np.float32]]
@@ -39,6 +39,7 @@ class Renderer:
             self._plate = Plate(scene, self._size, self._samples(0))
             self._built = build(scene, bake, options)
             rest_light.measure(self._built, self._scratch)
+            self._reach = self._add_particles(self._built)
             self._ground_depth = ground_depth(self._scene, self._built.light_size)
             self._open_ground = self._empty_ground()
             self._rest_shadow = self._shadow(0)
@@ -69,15 +70,33 @@ class Renderer:
         beauty = layers.compose(objects, ground)
         return layers.FrameLayers(ground=ground, shadow=shadow, objects=objects, beauty=beauty)
 
+    def _add_particles(self, built: BlenderScene) -> float:
+        """Add the particles of what flows; how far beyond their centres something of them is seen, m."""
+        before, reach = everything(), 0.0
+        for target, flow, cache in zip(built.objects, self._bake.flows, self._bake.caches, strict=True):
+            if flow is not None and flow.from_sample is not None:
+                reach = max(reach, photo_particles.add(target, flow, cache, self._bake.first_frame))
+        built.own += list(everything() - before)
+        return reach
+
     def _samples(self, sample: int) -> Samples:
         return [cache.sample(sample) for cache in self._bake.caches]
+
+    def _shown(self, sample: int) -> Samples:
+        """Where the objects are, with their particles as far as these are shown: (V + N, 3) each."""
+        shown = []
+        for vertices, flow in zip(self._samples(sample), self._bake.flows, strict=True):
+            if flow is not None and flow.shown_at(sample):
+                vertices = np.concatenate([vertices, flow.cache.sample(sample)])
+            shown.append(vertices)
+        return shown
 
     def _objects(self, sample: int) -> layers.ObjectLayer:
         assert self._built is not None
         layer = layers.empty_layer(*self._size)
-        number, positions = self._bake.first_frame + sample, self._samples(sample)
-        box = object_box(self._scene.camera, positions, self._size)
-        light_box = object_box(self._scene.camera, positions, self._built.light_size)
+        number, positions = self._bake.first_frame + sample, self._shown(sample)
+        box = object_box(self._scene.camera, positions, self._size, self._reach)
+        light_box = object_box(self._scene.camera, positions, self._built.light_size, self._reach)
         if box is None or light_box is None:
             return layer
         colours = passes.render(self._built.colour_scene, number, box, self._scratch)
@@ -105,7 +124,7 @@ class Renderer:
         assert self._built is not None
         size = self._built.light_size
         ratio = np.ones((size[1], size[0], 3), np.float32)
-        region = shadow_region(self._scene, self._samples(sample), size)
+        region = shadow_region(self._scene, self._shown(sample), size)
         if region is not None:
             box = region.box
             number = self._bake.first_frame + sample

@@ -58,13 +58,13 @@ def build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions)
     """
     require_photo(folder)
     compat.enable_cycles()
-    before = _everything()
+    before = everything()
     try:
         built = _build(folder, bake, options)
     except Exception:
-        _remove_all(_everything() - before)
+        _remove_all(everything() - before)
         raise
-    built.own = list(_everything() - before)
+    built.own = list(everything() - before)
     return built
 
 
@@ -107,9 +107,10 @@ def _build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions
     )
 
 
-def _everything() -> set[bpy.types.ID]:
+def everything() -> set[bpy.types.ID]:
+    """All data that ``build`` or what completes it can have added."""
     kinds = ("scenes", "collections", "objects", "meshes", "materials", "images", "worlds", "lights", "cameras")
-    return {item for kind in kinds for item in getattr(bpy.data, kind)}
+    return {item for kind in (*kinds, "node_groups") for item in getattr(bpy.data, kind)}
 
 
 def _remove_all(items: set[bpy.types.ID]) -> None:

@@ -61,7 +61,7 @@ def option_arguments(options: BakeOptions) -> list[str]:
     """``options`` as arguments of ``physgen``."""
     arguments = ["--frames", str(options.frames), "--fps", repr(options.fps), "--quality", options.quality]
     arguments += ["--arch", options.arch, "--seed", str(options.seed), "--space", options.space]
-    return [*arguments, "--points"] if options.points else arguments
+    return [*arguments, "--points" if options.points else "--no-points"]
 
 
 class Bake(JobOperator):

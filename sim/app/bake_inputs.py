@@ -41,7 +41,7 @@ class BakeOptions:
     arch: str = "cpu"
     seed: int = 0
     space: str = WORLD_SPACE
-    points: bool = False
+    points: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 100_000:
@@ -81,10 +81,10 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
 
 
 def _said(options: BakeOptions) -> dict[str, Any]:
-    """The options without those that came later and are at their defaults, so that older bakes stay up to date."""
+    """The options without those that came later and say what went without saying, so that older bakes stay in use."""
     fields: dict[str, Any] = to_json(options)
-    for name in ("space", "points"):
-        if fields[name] == getattr(BakeOptions, name):
+    for name, before in (("space", WORLD_SPACE), ("points", False)):
+        if fields[name] == before:
             del fields[name]
     return fields
 

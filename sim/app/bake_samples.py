@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cache.manifest import MESH_SPACE, BakedObject
-from ..mpm.materials import FLUID, SAND, SNOW, RigidMaterial
+from ..cache.manifest import GRAINS, MESH_SPACE, SURFACE, BakedObject
+from ..mpm.materials import FLUID, SAND, SNOW, FluidMaterial, RigidMaterial
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
 from ..skinning.binding import bind, deform
@@ -31,15 +31,23 @@ def baked_objects(
 ) -> tuple[BakedObject, ...]:
     """The caches that a bake of the scene has, one entry an object."""
     return tuple(
-        _baked_object(item.name, len(mesh.vertices), _points(prepared, slot) if options.points else 0, options.space)
+        _baked_object(item.name, len(mesh.vertices), prepared, slot, options)
         for slot, (item, mesh) in enumerate(zip(folder.scene.objects, meshes, strict=True))
     )
 
 
-def _baked_object(name: str, vertices: int, points: int, space: str) -> BakedObject:
-    points_file = f"{name}.points.pc2" if points else None
+def _baked_object(name: str, vertices: int, prepared: PreparedWorld, slot: int, options: BakeOptions) -> BakedObject:
+    points = _points(prepared, slot) if options.points else 0
+    index = prepared.body_of_object[slot]
+    material = None if index is None else prepared.setup.bodies[index].material
     return BakedObject(
-        name=name, file=f"{name}.pc2", vertices=vertices, space=space, points_file=points_file, points=points
+        name=name,
+        file=f"{name}.pc2",
+        vertices=vertices,
+        space=options.space,
+        points_file=f"{name}.points.pc2" if points else None,
+        points=points,
+        points_as=SURFACE if points and isinstance(material, FluidMaterial) else GRAINS,
     )
 
 

@@ -24,6 +24,9 @@ WORLD_SPACE, MESH_SPACE = "world", "mesh"
 SPACES = (WORLD_SPACE, MESH_SPACE)
 """What samples are in: world metres, or the coordinates of the object's mesh file."""
 
+GRAINS, SURFACE = "grains", "surface"
+"""What particles are shown as: each by itself, or the surface that encloses them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BakedObject:
@@ -33,6 +36,7 @@ class BakedObject:
     space: of all samples, one of ``SPACES``.
     points_file: PC2 of all particles, of which there are ``points``; None and 0 where they were not asked for or the
         object does not flow.
+    points_as: what the particles are shown as, ``grains`` or ``surface``.
     """
 
     name: str
@@ -41,8 +45,11 @@ class BakedObject:
     space: str = WORLD_SPACE
     points_file: str | None = None
     points: int = 0
+    points_as: str = GRAINS
 
     def __post_init__(self) -> None:
+        if self.points_as not in (GRAINS, SURFACE):
+            raise InputError(f"object {self.name}: points_as is {self.points_as!r}: choose {GRAINS} or {SURFACE}")
         if self.space not in SPACES:
             raise InputError(f"object {self.name}: space is {self.space!r}: choose one of {', '.join(SPACES)}")
         if (self.points_file is None) != (self.points == 0):

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Particles of a photo's objects: grains or a liquid's surface, in the photo's colours and light, where the skin tears.
+
+Until its skin tears an object is its mesh, which is the photo at rest. From then on grains show where the skin is
+gone, and a liquid is the surface around its particles. A particle keeps the colour, and the light at rest, of the skin
+that was nearest to it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...sim.cache.pc2 import Pc2Reader
+from ...sim.scene.folder import SceneFolder
+from ...sim.scene.meshes import load_object_mesh
+from ...sim.skinning.tearing import TORN_STRETCH, first_torn
+from ..bake_record import spacing
+from . import caches, points
+from .capture_nodes import Tree, set_input
+from .objects import REST_LIGHT, UV, RenderObject, get_rest_light
+
+SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen photo surface"
+REST_LENGTH = "rest_length"
+"""Attribute of the skin's edges, m."""
+BLUR = 6
+"""How often a liquid's colours are averaged with those around: each comes from one particle, and cells would show."""
+
+
+def find_tears(bake: caches.Bake, folder: SceneFolder) -> caches.Bake:
+    """``bake`` with the samples from which on particles are shown."""
+
+    def samples(cache: Pc2Reader) -> Iterator[NDArray[np.float32]]:
+        return (cache.sample(index) for index in range(cache.sample_count))
+
+    flows = []
+    for source, cache, flow in zip(folder.scene.objects, bake.caches, bake.flows, strict=True):
+        if flow is not None:
+            torn = first_torn(samples(cache), load_object_mesh(folder, source).faces)
+            flow = dataclasses.replace(flow, from_sample=torn)
+        flows.append(flow)
+    return dataclasses.replace(bake, flows=tuple(flows))
+
+
+def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: int) -> float:
+    """Let ``target``, which plays ``cache`` and whose light at rest is known, show the particles of ``flow``.
+
+    Returns how far beyond a particle's centre something of it can be seen, m.
+    """
+    assert flow.from_sample is not None
+    rest = flow.cache.sample(0)
+    distance = spacing(rest)
+    radius = distance * (points.SURFACE if flow.surface else points.GRAIN)
+    mesh = bpy.data.meshes.new(f"{target.item.name} particles")
+    mesh.vertices.add(len(rest))
+    mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(rest, dtype=np.float32).ravel())
+    _wear(mesh, target, rest)
+    mesh.materials.append(_material(target.item.data.materials[0]))
+    item = bpy.data.objects.new(mesh.name, mesh)
+    for collection in target.item.users_collection:
+        collection.objects.link(item)
+    caches.attach(item, flow.cache, first_frame)
+    look = item.modifiers.new(points.MODIFIER, "NODES")
+    look.node_group = _surface_group() if flow.surface else _grains_group()
+    set_input(look, points.RADIUS, radius)
+    set_input(look, points.FROM, first_frame + flow.from_sample)
+    set_input(look, points.MATERIAL, mesh.materials[0])
+    _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
+    # Strays lie off along each of three axes.
+    return radius * (points.LARGEST + math.sqrt(3.0) * points.STRAY)
+
+
+def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32]) -> None:
+    """Give the vertices of ``mesh`` at ``rest`` (N, 3) the picture and the light of the skin nearest to them."""
+    skin = target.item.data
+    corners = np.empty(len(skin.loops), dtype=np.int32)
+    skin.loops.foreach_get("vertex_index", corners)
+    by_corner = np.empty(2 * len(corners), dtype=np.float32)
+    skin.uv_layers[UV].data.foreach_get("uv", by_corner)
+    uv = np.zeros((len(target.mesh.vertices), 3), dtype=np.float32)
+    uv[corners, :2] = by_corner.reshape(-1, 2)
+    _, nearest = KDTree(target.mesh.vertices).query(rest)
+    for name, values in ((UV, uv), (REST_LIGHT, get_rest_light(target))):
+        attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+        attribute.data.foreach_set("vector", np.ascontiguousarray(values[nearest], dtype=np.float32).ravel())
+
+
+def _material(skin: bpy.types.Material) -> bpy.types.Material:
+    """The material of the ``skin`` for what has its texture coordinates as an attribute instead of a UV map."""
+    material = skin.copy()
+    tree = material.node_tree
+    where = tree.nodes.new("ShaderNodeAttribute")
+    where.attribute_name = UV
+    for node in tree.nodes:
+        if node.type == "TEX_IMAGE":
+            tree.links.new(where.outputs["Vector"], node.inputs["Vector"])
+    return material
+
+
+def _tear(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool) -> None:
+    """Open the skin where it is stretched, from ``from_frame`` on; or let it be ``gone`` altogether."""
+    data = target.item.data
+    ends = np.empty(2 * len(data.edges), dtype=np.int32)
+    data.edges.foreach_get("vertices", ends)
+    rest = cache.sample(0)[ends.reshape(-1, 2)]
+    attribute = data.attributes.new(REST_LENGTH, "FLOAT", "EDGE")
+    attribute.data.foreach_set("value", np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).astype(np.float32))
+    modifier = target.item.modifiers.new(SKIN, "NODES")
+    modifier.node_group = _skin_group()
+    set_input(modifier, points.FROM, from_frame)
+    set_input(modifier, "Gone", gone)
+
+
+def _skin_group() -> bpy.types.NodeTree:
+    tree = Tree(SKIN, {points.FROM: ("Int", 1), "Gone": ("Bool", False)})
+    ends = tree.node("GeometryNodeInputMeshEdgeVertices").outputs
+    length = tree.out("ShaderNodeVectorMath", ends["Position 1"], ends["Position 2"], operation="DISTANCE")
+    longest = tree.math("MULTIPLY", tree.attribute(REST_LENGTH, "FLOAT"), TORN_STRETCH)
+    torn = tree.compare("GREATER_THAN", length, longest)
+    open_skin = tree.out("GeometryNodeDeleteGeometry", tree.inputs["Geometry"], torn, domain="EDGE", mode="EDGE_FACE")
+    left = points.switch(tree, tree.inputs["Gone"], open_skin, None)
+    return tree.finish(points.switch(tree, points.begun(tree), tree.inputs["Geometry"], left))
+
+
+def _grains_group() -> bpy.types.NodeTree:
+    tree = Tree(GRAINS, _inputs())
+    grains = points.grain_cloud(tree, tree.inputs["Geometry"], tree.inputs[points.RADIUS])
+    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[points.MATERIAL])
+    return tree.finish(points.switch(tree, points.begun(tree), None, coloured))
+
+
+def _surface_group() -> bpy.types.NodeTree:
+    """The surface around the particles, with the attributes of the nearest of them."""
+    tree = Tree(SURFACE, _inputs())
+    shown = points.switch(tree, points.begun(tree), None, tree.inputs["Geometry"])
+    surface = points.enclosing_surface(tree, shown, tree.inputs[points.RADIUS])
+    nearest = tree.out("GeometryNodeSampleNearest", shown, tree.out("GeometryNodeInputPosition"), domain="POINT")
+    for name in (UV, REST_LIGHT):
+        value = tree.attribute(name, "FLOAT_VECTOR")
+        there = tree.out("GeometryNodeSampleIndex", shown, value, nearest, data_type="FLOAT_VECTOR", domain="POINT")
+        even = tree.out("GeometryNodeBlurAttribute", there, BLUR, data_type="FLOAT_VECTOR")
+        store = "GeometryNodeStoreNamedAttribute"
+        surface = tree.out(store, surface, None, name, even, data_type="FLOAT_VECTOR", domain="POINT")
+    return tree.finish(tree.out("GeometryNodeSetMaterial", surface, None, tree.inputs[points.MATERIAL]))
+
+
+def _inputs() -> dict[str, tuple[str, Any]]:
+    return {points.RADIUS: ("Float", 0.01), points.FROM: ("Int", 1), points.MATERIAL: ("Material", None)}
