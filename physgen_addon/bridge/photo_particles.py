@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...sim.cache.pc2 import Pc2Reader
+from ...sim.composite.transfer import srgb_to_linear
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.meshes import load_object_mesh
 from ...sim.skinning.tearing import TORN_STRETCH, first_torn
@@ -30,8 +31,14 @@ from .objects import REST_LIGHT, UV, RenderObject, get_rest_light
 SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen photo surface"
 REST_LENGTH = "rest_length"
 """Attribute of the skin's edges, m."""
+STEP = "Step"
+COLOUR, MIXED = "flow_colour", "flow_mixed"
+"""Attributes of particles: the picture's colour there, linear; of a liquid's surface too, and how mixed it is there."""
 BLUR = 6
-"""How often a liquid's colours are averaged with those around: each comes from one particle, and cells would show."""
+"""How often what a liquid's surface has from its particles is averaged along it: each part is of one particle."""
+MIXED_FROM, MIXED_TO = 0.7, 2.0
+"""Of a liquid, over the distance of neighbouring particles on the picture: how far the places on it that meet were
+apart before its picture gives way to the mean of its colours. Between them lies another part of the picture."""
 
 
 def find_tears(bake: caches.Bake, folder: SceneFolder) -> caches.Bake:
@@ -62,7 +69,7 @@ def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: 
     mesh.vertices.add(len(rest))
     mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(rest, dtype=np.float32).ravel())
     _wear(mesh, target, rest)
-    mesh.materials.append(_material(target.item.data.materials[0]))
+    mesh.materials.append(_material(target.item.data.materials[0], mixes=flow.surface))
     item = bpy.data.objects.new(mesh.name, mesh)
     for collection in target.item.users_collection:
         collection.objects.link(item)
@@ -70,6 +77,8 @@ def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: 
     look = item.modifiers.new(points.MODIFIER, "NODES")
     look.node_group = _surface_group() if flow.surface else _grains_group()
     set_input(look, points.RADIUS, radius)
+    if flow.surface:
+        set_input(look, STEP, _step(mesh, rest, distance))
     set_input(look, points.FROM, first_frame + flow.from_sample)
     set_input(look, points.MATERIAL, mesh.materials[0])
     _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
@@ -87,20 +96,59 @@ def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32])
     uv = np.zeros((len(target.mesh.vertices), 3), dtype=np.float32)
     uv[corners, :2] = by_corner.reshape(-1, 2)
     _, nearest = KDTree(target.mesh.vertices).query(rest)
-    for name, values in ((UV, uv), (REST_LIGHT, get_rest_light(target))):
+    for name, values in ((UV, uv), (REST_LIGHT, get_rest_light(target)), (COLOUR, _colours(target, uv))):
         attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(values[nearest], dtype=np.float32).ravel())
 
 
-def _material(skin: bpy.types.Material) -> bpy.types.Material:
-    """The material of the ``skin`` for what has its texture coordinates as an attribute instead of a UV map."""
+def _colours(target: RenderObject, uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear colours (V, 3) of the picture that ``target`` wears, at the texture coordinates ``uv`` (V, 3)."""
+    material = target.item.data.materials[0]
+    image = next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
+    width, height = image.size
+    pixels = np.empty(4 * width * height, dtype=np.float32)
+    image.pixels.foreach_get(pixels)
+    columns = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
+    rows = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
+    # The pixels of an 8-bit image are as stored: sRGB.
+    return srgb_to_linear(pixels.reshape(height, width, 4)[rows, columns, :3])
+
+
+def _step(mesh: bpy.types.Mesh, rest: NDArray[np.float32], distance: float) -> float:
+    """How far apart neighbouring particles of ``mesh`` are on the picture, in texture coordinates.
+
+    rest: (N, 3) where they are in the world, ``distance`` apart.
+    """
+    uv = np.empty(3 * len(rest), dtype=np.float32)
+    mesh.attributes[UV].data.foreach_get("vector", uv)
+    extent = np.percentile(uv.reshape(-1, 3), 98, axis=0) - np.percentile(uv.reshape(-1, 3), 2, axis=0)
+    size = np.percentile(rest, 98, axis=0) - np.percentile(rest, 2, axis=0)
+    return float(np.linalg.norm(extent) / max(float(np.linalg.norm(size)), 1e-9)) * distance
+
+
+def _material(skin: bpy.types.Material, *, mixes: bool) -> bpy.types.Material:
+    """The material of the ``skin`` for what has its texture coordinates as an attribute instead of a UV map.
+
+    mixes: it also has colours that take over where it is mixed.
+    """
     material = skin.copy()
     tree = material.node_tree
-    where = tree.nodes.new("ShaderNodeAttribute")
-    where.attribute_name = UV
-    for node in tree.nodes:
-        if node.type == "TEX_IMAGE":
-            tree.links.new(where.outputs["Vector"], node.inputs["Vector"])
+
+    def attribute(name: str, socket: str) -> bpy.types.NodeSocket:
+        node = tree.nodes.new("ShaderNodeAttribute")
+        node.attribute_name = name
+        return node.outputs[socket]
+
+    picture = next(node for node in tree.nodes if node.type == "TEX_IMAGE")
+    layer = next(node for node in tree.nodes if node.type == "OUTPUT_AOV")
+    tree.links.new(attribute(UV, "Vector"), picture.inputs["Vector"])
+    if mixes:
+        mix = tree.nodes.new("ShaderNodeMix")
+        mix.data_type = "VECTOR"
+        values = (attribute(MIXED, "Fac"), picture.outputs["Color"], attribute(COLOUR, "Vector"))
+        for value, socket in zip(values, [item for item in mix.inputs if item.enabled], strict=True):
+            tree.links.new(value, socket)
+        tree.links.new(next(item for item in mix.outputs if item.enabled), layer.inputs["Color"])
     return material
 
 
@@ -138,15 +186,22 @@ def _grains_group() -> bpy.types.NodeTree:
 
 def _surface_group() -> bpy.types.NodeTree:
     """The surface around the particles, with the attributes of the nearest of them."""
-    tree = Tree(SURFACE, _inputs())
+    tree = Tree(SURFACE, {**_inputs(), STEP: ("Float", 0.01)})
+    inputs = tree.inputs
     shown = points.switch(tree, points.begun(tree), None, tree.inputs["Geometry"])
     surface = points.enclosing_surface(tree, shown, tree.inputs[points.RADIUS])
     nearest = tree.out("GeometryNodeSampleNearest", shown, tree.out("GeometryNodeInputPosition"), domain="POINT")
-    for name in (UV, REST_LIGHT):
+    store = "GeometryNodeStoreNamedAttribute"
+    for name in (UV, REST_LIGHT, COLOUR):
         value = tree.attribute(name, "FLOAT_VECTOR")
         there = tree.out("GeometryNodeSampleIndex", shown, value, nearest, data_type="FLOAT_VECTOR", domain="POINT")
         even = tree.out("GeometryNodeBlurAttribute", there, BLUR, data_type="FLOAT_VECTOR")
-        store = "GeometryNodeStoreNamedAttribute"
+        if name == UV:
+            apart = tree.out("ShaderNodeVectorMath", there, even, operation="DISTANCE")
+            apart = tree.math("DIVIDE", apart, inputs[STEP])
+            apart = tree.out("GeometryNodeBlurAttribute", apart, BLUR, data_type="FLOAT")
+            mixed = tree.out("ShaderNodeMapRange", apart, MIXED_FROM, MIXED_TO, interpolation_type="SMOOTHSTEP")
+            surface = tree.out(store, surface, None, MIXED, mixed, data_type="FLOAT", domain="POINT")
         surface = tree.out(store, surface, None, name, even, data_type="FLOAT_VECTOR", domain="POINT")
     return tree.finish(tree.out("GeometryNodeSetMaterial", surface, None, tree.inputs[points.MATERIAL]))
 

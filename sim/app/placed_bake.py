@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cache.manifest import MESH_SPACE, WORLD_SPACE, BakedObject, BakeManifest, load_manifest, save_manifest
 from ..cache.pc2 import Pc2Reader, Pc2Writer
@@ -65,22 +66,35 @@ def _place(
 ) -> BakedObject:
     rest = load_object_mesh(folder, item).vertices
     result = BakedObject(name=item.name, file=f"{item.name}.pc2", vertices=len(rest), space=WORLD_SPACE)
-    with Pc2Writer(out / result.file, vertex_count=len(rest)) as writer:
-        if cache is None:
+    if cache is None:
+        with Pc2Writer(out / result.file, vertex_count=len(rest)) as writer:
             for _ in range(samples):
                 writer.append(rest)
-            return result
-        reader, baked, body = cache
-        if reader.vertex_count != len(rest):
-            raise InputError(
-                f"object {item.name!r}: its mesh has {reader.vertex_count} vertices and had {len(rest)} in the photo's "
-                "scene, whose picture it wears: undo the change of the mesh and bake again"
-            )
-        matrix = np.asarray(body.world_from_mesh) if baked.space == MESH_SPACE else np.eye(4)
+        return result
+    reader, baked, body = cache
+    if reader.vertex_count != len(rest):
+        raise InputError(
+            f"object {item.name!r}: its mesh has {reader.vertex_count} vertices and had {len(rest)} in the photo's "
+            "scene, whose picture it wears: undo the change of the mesh and bake again"
+        )
+    matrix = np.asarray(body.world_from_mesh) if baked.space == MESH_SPACE else np.eye(4)
+    _write_placed(reader, matrix, samples, out / result.file)
+    if np.abs(_moved(reader.sample(0), matrix) - rest).max() > MOVED * item.size_m:
+        message = f"{item.name} does not begin where the photo shows it; frames differ from the photo there"
+        on_event({"event": "notice", "stage": "render", "message": message})
+    if baked.points_file is None:
+        return result
+    points = Pc2Reader(reader.path.parent / baked.points_file)
+    file = f"{item.name}.points.pc2"
+    _write_placed(points, matrix, samples, out / file)
+    return dataclasses.replace(result, points_file=file, points=points.vertex_count, points_as=baked.points_as)
+
+
+def _write_placed(reader: Pc2Reader, matrix: NDArray[np.float64], samples: int, path: Path) -> None:
+    with Pc2Writer(path, vertex_count=reader.vertex_count) as writer:
         for index in range(samples):
-            world = reader.sample(index).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-            writer.append(world)
-            if index == 0 and np.abs(world - rest).max() > MOVED * item.size_m:
-                message = f"{item.name} does not begin where the photo shows it; frames differ from the photo there"
-                on_event({"event": "notice", "stage": "render", "message": message})
-    return result
+            writer.append(_moved(reader.sample(index), matrix))
+
+
+def _moved(sample: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    return sample.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]

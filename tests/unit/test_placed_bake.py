@@ -102,3 +102,21 @@ def test_another_mesh_or_name_is_refused(made, tmp_path):
     fine.export(photo.root / "cup.ply")
     with pytest.raises(InputError, match="8 vertices and had 42"):
         place_bake(photo.root, scene.root, bake, tmp_path / "b", {"cup": "Mug"})
+
+
+def test_particles_come_along(made, tmp_path):
+    photo, scene, bake = made
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(5, 3)) * 0.02
+    with Pc2Writer(bake / "Mug.points.pc2", vertex_count=5) as writer:
+        for index in range(3):
+            writer.append(points + np.array([0, 0, 0.1 * index]))
+    manifest = load_manifest(bake)
+    flowing = dataclasses.replace(manifest.objects[0], points_file="Mug.points.pc2", points=5, points_as="surface")
+    save_manifest(bake, dataclasses.replace(manifest, objects=(flowing,)))
+    place_bake(photo.root, scene.root, bake, tmp_path / "out", {"cup": "Mug"})
+    cup = load_manifest(tmp_path / "out").objects[0]
+    assert (cup.points_file, cup.points, cup.points_as) == ("cup.points.pc2", 5, "surface")
+    centre = np.asarray(scene.scene.objects[0].world_from_mesh)[:3, 3]
+    expected = points + centre + np.array([0, 0, 0.2])
+    np.testing.assert_allclose(Pc2Reader(tmp_path / "out" / cup.points_file).sample(2), expected, atol=1e-6)
