@@ -29,6 +29,7 @@ class RenderOptions:
     scale: width of the frames over the photo's, above 0 to 4.
     light_scale: resolution in which light is computed over the frames', above 0 to 1; outlines and colours are not
         affected. None takes half, and less for large frames, down to a quarter.
+    crop: render only where objects and shadows can be seen; off renders whole frames, which look the same.
     denoise: use OpenImageDenoise where Blender has it.
     seed: of the sampling pattern, the same for all frames, so that what stands still does not flicker.
     threads: CPU threads, 0 for all; it changes nothing in the picture.
@@ -38,6 +39,7 @@ class RenderOptions:
     samples: int = option(16, "rays and light samples a pixel", metavar="N")
     scale: float = option(1.0, "of the photo's resolution", metavar="F")
     light_scale: float | None = option(None, "resolution of light over the frames' (default: by size)", metavar="F")
+    crop: bool = option(True, "render only where something can be seen")
     denoise: bool = option(True, "denoise light where Blender can")
     seed: int = 0
     threads: int = option(0, "CPU threads, 0 for all", metavar="N")

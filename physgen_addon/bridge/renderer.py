@@ -30,7 +30,7 @@ class Renderer:
 
     def __init__(self, scene: SceneFolder, bake: Bake, options: RenderOptions) -> None:
         """Raises InputError for images, meshes or light that cannot be used, RenderError when Blender fails."""
-        self._folder, self._scene, self._bake = scene, scene.scene, bake
+        self._folder, self._scene, self._bake, self._options = scene, scene.scene, bake, options
         self._built: BlenderScene | None = None
         self._temporary = tempfile.TemporaryDirectory(prefix="physgen-render-")
         self._scratch = Path(self._temporary.name)
@@ -95,8 +95,7 @@ class Renderer:
         assert self._built is not None
         layer = layers.empty_layer(*self._size)
         number, positions = self._bake.first_frame + sample, self._shown(sample)
-        box = object_box(self._scene.camera, positions, self._size, self._reach)
-        light_box = object_box(self._scene.camera, positions, self._built.light_size, self._reach)
+        box, light_box = (self._object_box(positions, size) for size in (self._size, self._built.light_size))
         if box is None or light_box is None:
             return layer
         colours = passes.render(self._built.colour_scene, number, box, self._scratch)
@@ -107,6 +106,11 @@ class Renderer:
         light[light_box.slices] = layers.light_ratio(passes.stack(lit, "Combined"), lit["Combined.A"])
         layer.light[:] = cv2.resize(light, self._size, interpolation=cv2.INTER_LINEAR)
         return layer
+
+    def _object_box(self, positions: Samples, size: tuple[int, int]) -> Box | None:
+        if not self._options.crop:
+            return Box(0, 0, *size)
+        return object_box(self._scene.camera, positions, size, self._reach)
 
     def _empty_ground(self) -> NDArray[np.float32]:
         """Light on the ground without objects (h, w, 3), in the resolution of light."""
@@ -126,7 +130,7 @@ class Renderer:
         ratio = np.ones((size[1], size[0], 3), np.float32)
         region = shadow_region(self._scene, self._shown(sample), size)
         if region is not None:
-            box = region.box
+            box = region.box if self._options.crop else Box(0, 0, *size)
             number = self._bake.first_frame + sample
             lit = passes.stack(passes.render(self._built.shadow_scene, number, box, self._scratch), "Combined")
             empty = self._open_ground[box.slices]
