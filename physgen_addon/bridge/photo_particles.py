@@ -32,6 +32,9 @@ SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen p
 REST_LENGTH = "rest_length"
 """Attribute of the skin's edges, m."""
 STEP = "Step"
+EACH, SMALLER = 8, 0.5
+"""How many grains a particle stands for, and their size over that of one. A particle is millimetres of sand, and begins
+on a lattice that one grain each would show."""
 COLOUR, MIXED = "flow_colour", "flow_mixed"
 """Attributes of particles: the picture's colour there, linear; of a liquid's surface too, and how mixed it is there."""
 BLUR = 6
@@ -77,13 +80,12 @@ def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: 
     look = item.modifiers.new(points.MODIFIER, "NODES")
     look.node_group = _surface_group() if flow.surface else _grains_group()
     set_input(look, points.RADIUS, radius)
-    if flow.surface:
-        set_input(look, STEP, _step(mesh, rest, distance))
+    set_input(look, STEP, _step(mesh, rest, distance))
     set_input(look, points.FROM, first_frame + flow.from_sample)
     set_input(look, points.MATERIAL, mesh.materials[0])
     _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
-    # Strays lie off along each of three axes.
-    return radius * (points.LARGEST + math.sqrt(3.0) * points.STRAY)
+    # Grains stray by half the particles' distance along each of three axes.
+    return radius if flow.surface else radius * SMALLER * points.LARGEST + math.sqrt(0.75) * distance
 
 
 def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32]) -> None:
@@ -178,10 +180,33 @@ def _skin_group() -> bpy.types.NodeTree:
 
 
 def _grains_group() -> bpy.types.NodeTree:
-    tree = Tree(GRAINS, _inputs())
-    grains = points.grain_cloud(tree, tree.inputs["Geometry"], tree.inputs[points.RADIUS])
+    tree = Tree(GRAINS, {**_inputs(), STEP: ("Float", 0.01)})
+    radius, step = tree.inputs[points.RADIUS], tree.inputs[STEP]
+    # A switch before the costly part: frames without particles pay nothing.
+    shown = points.switch(tree, points.begun(tree), None, tree.inputs["Geometry"])
+    many = tree.out("GeometryNodeDuplicateElements", shown, None, EACH, domain="POINT")
+    half = tree.math("MULTIPLY", radius, 0.5 / points.GRAIN)
+    place = _strayed(tree, tree.out("GeometryNodeInputPosition"), half)
+    # Each grain takes its own piece of the picture.
+    where = _strayed(tree, tree.attribute(UV, "FLOAT_VECTOR"), tree.math("MULTIPLY", step, 0.5), seed=1)
+    store = "GeometryNodeStoreNamedAttribute"
+    many = tree.out(store, many, None, UV, where, data_type="FLOAT_VECTOR", domain="POINT")
+    size = tree.out("FunctionNodeRandomValue", points.SMALLEST, points.LARGEST, data_type="FLOAT")
+    size = tree.math("MULTIPLY", tree.math("MULTIPLY", radius, SMALLER), size)
+    grains = tree.out("GeometryNodeMeshToPoints", many, None, place, size)
     coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[points.MATERIAL])
-    return tree.finish(points.switch(tree, points.begun(tree), None, coloured))
+    return tree.finish(coloured)
+
+
+def _strayed(tree: Tree, value: Any, reach: Any, seed: int = 0) -> Any:
+    """``value`` and something random of up to ``reach`` along each axis."""
+    stray = tree.node("FunctionNodeRandomValue", data_type="FLOAT_VECTOR")
+    lowest, highest = (item for item in stray.inputs if item.enabled and item.type == "VECTOR")
+    tree.group.links.new(tree.math("MULTIPLY", reach, -1.0), lowest)
+    tree.group.links.new(reach, highest)
+    next(item for item in stray.inputs if item.name == "Seed").default_value = seed
+    moved = next(item for item in stray.outputs if item.enabled)
+    return tree.out("ShaderNodeVectorMath", value, moved, operation="ADD")
 
 
 def _surface_group() -> bpy.types.NodeTree:
