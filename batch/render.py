@@ -10,46 +10,20 @@ Exit codes: 0 done, 2 usage, 3 bad input, 5 rendering failed, 130 cancelled; com
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
-import importlib.util
-import json
-import os
-import signal
+import runpy
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn, TextIO
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def _package() -> str:
-    """Name of the package that this file belongs to; run as a plain file it has none yet, so it is loaded as physgen.
-
-    Loaded from this very tree, because another version may be installed beside it.
-    """
-    if __package__:
-        return __package__.rpartition(".")[0]
-    name = "physgen"
-    found = sys.modules.get(name)
-    if found is None or Path(str(found.__file__)).resolve().parent != ROOT:
-        spec = importlib.util.spec_from_file_location(
-            name, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
-        )
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        spec.loader.exec_module(module)
-    return name
+from typing import Any
 
 
 def _load(module: str) -> ModuleType:
-    return importlib.import_module(f"{_package()}.{module}")
+    """A module of the tree, when it is needed: what it imports in turn, Blender may lack."""
+    return importlib.import_module(f"..{module}", __package__)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -61,57 +35,16 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all that are baked)")
     _load("batch.render_arguments").add_render_options(parser)
     parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    packages = "folder of modules that Blender's Python lacks (docs/headless.md)"
+    parser.add_argument("--packages", type=Path, metavar="DIR", help=packages)
     parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
     parser.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     return parser
 
 
-@contextlib.contextmanager
-def _events_apart_from_chatter() -> Iterator[TextIO]:
-    """The real standard output, while everything that Blender's C code prints there goes to standard error."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with os.fdopen(os.dup(kept), "w", encoding="utf-8", buffering=1) as stream:
-            yield stream
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
-def _show(event: dict[str, Any], stream: TextIO, as_json: bool) -> None:
-    if as_json:
-        stream.write(json.dumps(event, ensure_ascii=False) + "\n")
-    elif event["event"] == "progress":
-        eta = event.get("eta_s")
-        left = f", about {eta:.0f} s left" if eta else ""
-        stream.write(f"{event['stage']} {event['done']}/{event['total']}{left}\n")
-    elif "message" in event:
-        stream.write(f"{event['message']}\n")
-    stream.flush()
-
-
-def _report(error: Any, as_json: bool, stream: TextIO) -> int:
-    """Say what the PhysGenError ``error`` says; the exit code it stands for."""
-    if as_json:
-        _show({"event": "error", "kind": type(error).__name__, "message": str(error)}, stream, True)
-    else:
-        sys.stderr.write(f"error: {error}\n")
-    return int(error.exit_code)
-
-
-def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> int:
-    """Render as ``options`` ask; the exit code."""
-    errors = _load("sim.errors")
-
-    def cancelled() -> bool:
-        return stop.is_set() or (options.parent is not None and os.getppid() != options.parent)
-
-    def on_event(event: dict[str, Any]) -> None:
-        _show(event, stream, options.json)
-
+def run(options: argparse.Namespace, terminal: Any, cancelled: Any) -> int:
+    """Render as ``options`` ask, with a ``batch.terminal.Terminal`` to speak to; the exit code."""
+    errors, headless = _load("sim.errors"), _load("batch.headless")
     started = time.monotonic()
     try:
         try:
@@ -120,60 +53,69 @@ def run(options: argparse.Namespace, stream: TextIO, stop: threading.Event) -> i
             raise errors.RenderError(
                 f"Blender as a Python module is not usable ({error}); run `make setup`, or run this file in Blender"
             ) from error
+        headless.start_empty()
+        found = _load("batch.modules").provide_modules(options.packages)
+        if found is not None:
+            terminal({"event": "notice", "stage": "render", "message": found})
         frames, settings = _load("physgen_addon.bridge.frames"), _load("batch.render_arguments").render_options(options)
         folder = _load("sim.scene.folder").load_scene(options.scene)
         paths = frames.render_frames(
-            folder, options.bake, options.out, settings, on_event, cancelled, frames=options.frames
+            folder, options.bake, options.out, settings, terminal, cancelled, frames=options.frames
         )
         done = {"event": "done", "frames": len(paths), "out": str(options.out)}
         if options.video is not None:
             manifest = _load("sim.cache.manifest").load_manifest(options.bake)
             ledger = _load("physgen_addon.bridge.ledger").Ledger(options.out)
             if ledger.has_video(options.video, paths, manifest.fps):
-                on_event({"event": "notice", "stage": "encode", "message": f"up to date: {options.video}"})
+                terminal({"event": "notice", "stage": "encode", "message": f"up to date: {options.video}"})
             else:
-                _load("physgen_addon.bridge.video").encode(paths, options.video, fps=manifest.fps, on_event=on_event)
+                _load("physgen_addon.bridge.video").encode(paths, options.video, fps=manifest.fps, on_event=terminal)
                 ledger.record_video(options.video, paths, manifest.fps)
             done["video"] = str(options.video)
     except errors.PhysGenError as error:
-        return _report(error, options.json, stream)
+        return _report(error, terminal)
     except OSError as error:
         # Of the temporary folder, most likely: layers and textures pass through it.
         message = f"{error.filename or tempfile.gettempdir()}: {error.strerror or error}; free space, then run again"
-        return _report(errors.RenderError(message), options.json, stream)
+        return _report(errors.RenderError(message), terminal)
     done["seconds"] = round(time.monotonic() - started, 1)
-    _show(done, stream, options.json)
-    if not options.json:
-        stream.write(f"{done['frames']} frames in {done['out']}, {done['seconds']:.0f} s\n")
+    terminal(done)
+    terminal.line(f"{done['frames']} frames in {done['out']}, {done['seconds']:.0f} s")
     return 0
+
+
+def _report(error: Any, terminal: Any) -> int:
+    """Say what the PhysGenError ``error`` says; the exit code it stands for."""
+    terminal.error(type(error).__name__, str(error))
+    return int(error.exit_code)
+
+
+def _give_up(options: argparse.Namespace, terminal: Any) -> None:
+    """Leave complete files only, when Blender cannot be waited for."""
+    for folder in {options.out, *([options.video.parent] if options.video else [])}:
+        _load("sim.atomic").remove_partials(folder)
+    _load("sim.cache.lock").let_go(options.out)
+    error = _load("sim.errors").Cancelled(
+        "cancelled within a frame; complete frames are kept, run it again to continue"
+    )
+    _report(error, terminal)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry; the exit code. Inside Blender the arguments come after ``--``."""
-    if arguments is None:
-        arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-    options = build_parser().parse_args(arguments)
-    cancelled = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: cancelled.set())
-    with _events_apart_from_chatter() as stream:
-        return run(options, stream, cancelled)
-
-
-def leave(code: int) -> NoReturn:
-    """End the process with ``code``.
-
-    Blender as a Python module crashes now and then while Python takes it down, after all work is done and said; a
-    farm would take that for a failed render. So Python does not take it down.
-    """
-    bpy: Any = sys.modules.get("bpy")
-    if bpy is not None and not bpy.app.binary_path:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    # SystemExit would leave Blender's own exit code at 0 unless it is raised at the very end of the script.
-    sys.exit(code)
+    headless, terminals = _load("batch.headless"), _load("batch.terminal")
+    options = build_parser().parse_args(headless.script_arguments(sys.argv) if arguments is None else arguments)
+    stop = headless.Stop(options.parent)
+    with headless.events_apart_from_chatter() as stream, headless.temporary_folder():
+        terminal = terminals.Terminal(as_json=options.json, out=stream)
+        stop.listen(lambda: _give_up(options, terminal))
+        return run(options, terminal, lambda: stop() or terminal.reader_gone)
 
 
 if __name__ == "__main__":
-    leave(main())
+    if __package__:
+        _load("batch.headless").leave(main)
+    else:
+        # A plain file belongs to no package: it is run once more as a module of the tree that it lies in.
+        launch = Path(__file__).resolve().parents[1] / "sim" / "app" / "launch.py"
+        runpy.run_path(str(launch))["main"](["batch.render", *sys.argv[1:]])

@@ -15,9 +15,10 @@ from ..sim.events import Event
 class Terminal:
     """Shows events. One line that renews itself on a terminal, a line now and then in a log, JSON for machines."""
 
-    def __init__(self, *, as_json: bool, expected_s: dict[str, float] | None = None) -> None:
+    def __init__(self, *, as_json: bool, expected_s: dict[str, float] | None = None, out: TextIO | None = None) -> None:
+        """expected_s: first guess for each stage; out: where lines go, standard output by default."""
         self._json = as_json
-        self._out: TextIO = sys.stdout
+        self._out: TextIO = out or sys.stdout
         self._live = not as_json and self._out.isatty()
         self._started = time.monotonic()
         # Stages that have not begun yet count with a first guess, so that the time left is of the whole job.

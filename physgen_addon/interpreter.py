@@ -54,7 +54,7 @@ def find_python(preferred: str = "") -> Path:
         if name.strip():
             python = _located(name.strip(), where)
             try:
-                _checked(str(python), _wheels_for(python))
+                _checked(str(python), wheels_for(python))
             except _Unfit as error:
                 reason = f"{python}, named {where}, cannot simulate: {error}"
                 raise NoPython(reason, install_command(python if error.lacks else None, error.installs)) from None
@@ -66,7 +66,7 @@ def _unnamed() -> Path:
     """Blender's own Python or the one in the home folder; NoPython with what is wrong with the one that comes last."""
     python = Path(sys.executable)
     try:
-        _checked(str(python), _wheels_for(python))
+        _checked(str(python), wheels_for(python))
         return python
     except _Unfit as error:
         reason = why_not(sys.version_info[:2], wheel_folder(), str(error))
@@ -80,9 +80,20 @@ def _unnamed() -> Path:
         raise NoPython(reason, install_command(_home_python() if error.lacks else None, error.lacks)) from None
 
 
+def named_python() -> Path | None:
+    """The interpreter that PHYSGEN_PYTHON names, else the one in the home folder; not asked whether it simulates.
+
+    Raises NoPython where the named one cannot be started; None where nothing is named and nothing is there.
+    """
+    name = os.environ.get(VARIABLE, "").strip()
+    if name:
+        return _located(name, f"in {VARIABLE}")
+    return _home_python() if _home_python().is_file() else None
+
+
 def python_version(python: Path) -> str:
     """Such as ``3.13.1``, of an interpreter that ``find_python`` gave."""
-    return _checked(str(python), _wheels_for(python))
+    return _checked(str(python), wheels_for(python))
 
 
 def forget() -> None:
@@ -92,7 +103,7 @@ def forget() -> None:
 
 def cli_command(python: Path, *arguments: str) -> Sequence[str]:
     """``physgen ARGUMENTS --json`` as a command of that interpreter, running this extension's own code."""
-    return own_command("batch.cli", *arguments, "--json", python=str(python), packages=_wheels_for(python))
+    return own_command("batch.cli", *arguments, "--json", python=str(python), packages=wheels_for(python))
 
 
 def wheel_folder() -> str:
@@ -131,7 +142,8 @@ def _home_python() -> Path:
 
 def why_not(version: tuple[int, int], wheels: str, trouble: str) -> str:
     """Why Blender's own Python of that version, with those wheels, does not simulate, and what to do about it."""
-    remedy = f"name a Python {_dotted(OLDEST)} to {_dotted(NEWEST)} that has its packages in PhysGen's preferences"
+    which = f"name a Python {_dotted(OLDEST)} to {_dotted(NEWEST)} that has its packages"
+    remedy = f"{which} in PhysGen's preferences, or in {VARIABLE}"
     if not OLDEST <= version <= NEWEST:
         return f"Taichi, which simulates, has no build for Blender's Python {_dotted(version)}: {remedy}"
     if not wheels:
@@ -155,7 +167,7 @@ def _located(name: str, where: str) -> Path:
     raise NoPython(f"{name}, named {where}, is no Python that can be started", install_command())
 
 
-def _wheels_for(python: Path) -> str:
+def wheels_for(python: Path) -> str:
     """The extension's wheels fit Blender's own Python and no other."""
     return wheel_folder() if python == Path(sys.executable) else ""
 

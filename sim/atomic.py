@@ -44,6 +44,13 @@ def replacing(path: Path) -> Iterator[Path]:
                 partial.unlink(missing_ok=True)
 
 
+def remove_partials(folder: Path) -> None:
+    """Remove what this process has begun to write in ``folder``, when it must end without coming back from there."""
+    for partial in folder.glob(f".*.partial-{os.getpid()}*"):
+        with contextlib.suppress(OSError):
+            partial.unlink()
+
+
 def _replace(partial: Path, path: Path) -> None:
     for pause in WINDOWS_PAUSES:
         try:

@@ -25,9 +25,10 @@ def main(arguments: "list[str]") -> None:
     """Take the options off ``arguments`` and run the module as ``__main__``."""
     if sys.version_info[:2] < OLDEST:
         sys.exit("Python {}.{} is too old: 3.11 to 3.13 are needed".format(*sys.version_info[:2]))
-    # Python has put this folder first in its search path, where it would hide other modules called process or shell.
+    # Python puts the script's folder first in its search path, where ours would hide other modules called process.
     here = Path(__file__).absolute().parent
-    sys.path[:] = [entry for entry in sys.path if Path(entry).absolute() != here]
+    hiding = (here, here.parents[1] / "batch")
+    sys.path[:] = [entry for entry in sys.path if Path(entry).absolute() not in hiding]
     while arguments and arguments[0].startswith("--"):
         option, value = arguments[:2]
         arguments = arguments[2:]

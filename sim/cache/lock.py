@@ -35,6 +35,17 @@ def folder_lock(folder: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
+def let_go(folder: Path) -> None:
+    """Give ``folder`` back if this process holds it, when it must end without leaving ``folder_lock``."""
+    path = folder / LOCK_FILE
+    try:
+        owner = json.loads(path.read_bytes())
+        if (owner["pid"], owner["host"]) == (os.getpid(), socket.gethostname()):
+            path.unlink()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return
+
+
 def is_written(folder: Path) -> bool:
     """Whether another living process of this machine holds ``folder``."""
     try:

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What ``batch/render.py``, ``bake.py``, ``reconstruct.py`` and ``diagnose.py`` share: work in a process that may be
+Blender's (docs/headless.md).
+
+Started through ``sim/app/launch.py``, so that a plain file is a module of the tree that it lies in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TextIO
+
+from ..physgen_addon.interpreter import find_python, wheels_for
+from ..sim.app import requirements
+from ..sim.app.launch import PACKAGES_VARIABLE
+from ..sim.app.process import child_environment, own_command
+from ..sim.errors import Cancelled, InputError, PhysGenError
+from .terminal import Terminal
+
+STOP_GRACE_S = 6.0
+"""How long a frame that is being rendered may take to be finished when the process is asked to stop; whoever asks for
+it waits a little longer (``sim/app/process.py``), and then kills."""
+
+ECHO_S = 1.0
+"""Signals that come so soon after the first are the same wish."""
+
+_FAULT = 1
+"""Exit code of a fault in the program itself, as Python has it."""
+
+
+def in_blender() -> bool:
+    """Whether this is Blender's own process, and not a Python that has Blender as a module."""
+    bpy: Any = sys.modules.get("bpy")
+    return bpy is not None and bool(bpy.app.binary_path)
+
+
+def script_arguments(argv: Sequence[str]) -> list[str]:
+    """The script's own of the arguments ``argv`` of the process: what follows ``--``, else all but Blender's."""
+    if "--" in argv:
+        return list(argv[argv.index("--") + 1 :])
+    return [] if in_blender() else list(argv[1:])
+
+
+@contextlib.contextmanager
+def events_apart_from_chatter() -> Iterator[TextIO]:
+    """The real standard output, while everything that Blender's C code prints there goes to standard error."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with os.fdopen(os.dup(kept), "w", encoding="utf-8", buffering=1) as stream:
+            yield stream
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Everything temporary of this process lies in one folder, so that it can go whatever the process is doing."""
+    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+        tempfile.tempdir = folder
+        try:
+            yield Path(folder)
+        finally:
+            tempfile.tempdir = None
+
+
+def start_empty() -> None:
+    """Inside Blender, put whatever file, add-ons and settings it was started with out of memory; nothing is saved.
+
+    What renders into a photo then meets no scenes, handlers or preferences but Blender's own.
+    """
+    if in_blender():
+        import bpy
+
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+class Stop:
+    """Whether this process is to stop: SIGINT and SIGTERM ask for it, and so does the end of its parent."""
+
+    def __init__(self, parent: int | None = None) -> None:
+        """parent: process that this one works for; None for nobody."""
+        self._asked, self._insisted = threading.Event(), threading.Event()
+        self._parent = parent
+
+    def __call__(self) -> bool:
+        """What the work asks itself between two steps."""
+        return self._asked.is_set() or (self._parent is not None and os.getppid() != self._parent)
+
+    def listen(self, at_last: Callable[[], None]) -> None:
+        """Take the signals; the main thread calls this.
+
+        Work that has not ended ``STOP_GRACE_S`` after it was asked to is inside a long render: ``at_last`` is called
+        then, by another thread, and the process ends as cancelled. A second signal does not wait.
+        """
+        # Python's own handlers run when the main thread comes back from Blender; the pipe is written at once.
+        reading, writing = os.pipe()
+        os.set_blocking(writing, False)
+        signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)):
+            signal.signal(number, lambda *_: self._asked.set())
+        threading.Thread(target=self._hear, args=(reading,), daemon=True).start()
+        threading.Thread(target=self._end_at_last, args=(at_last,), daemon=True).start()
+
+    def _hear(self, pipe: int) -> None:
+        heard_at: float | None = None
+        while os.read(pipe, 1):
+            now = time.monotonic()
+            self._asked.set()
+            heard_at = heard_at or now
+            # ``timeout`` and schedulers signal the process and then its group, which is one wish and not two.
+            if now - heard_at > ECHO_S:
+                self._insisted.set()
+
+    def _end_at_last(self, at_last: Callable[[], None]) -> None:
+        while not self():
+            time.sleep(0.05)
+        self._insisted.wait(STOP_GRACE_S)
+        with contextlib.suppress(OSError):
+            at_last()
+        if tempfile.tempdir is not None:
+            shutil.rmtree(tempfile.tempdir, ignore_errors=True)
+        _end(Cancelled.exit_code)
+
+
+def leave(work: Callable[[], int]) -> NoReturn:
+    """Do ``work`` and end the process with the exit code that it returns.
+
+    In Blender a script that raises SystemExit ends in whatever ``--python-exit-code`` says, or in 0; and Blender
+    crashes now and then while it is taken down, after all work is done and said, which a farm would take for a failed
+    render. So where Blender is loaded nobody takes it down.
+    """
+    try:
+        code = work()
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else _FAULT if error.code else 0
+    except Exception:
+        traceback.print_exc()
+        code = _FAULT
+    if "bpy" not in sys.modules:
+        sys.exit(code)
+    _end(code)
+
+
+def _end(code: int) -> NoReturn:
+    """End at once, with nothing of Blender's left on the disk."""
+    _remove_blenders_folder()
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdout.flush()
+    with contextlib.suppress(OSError, ValueError):
+        sys.stderr.flush()
+    os._exit(code)
+
+
+def _remove_blenders_folder() -> None:
+    bpy: Any = sys.modules.get("bpy")
+    if bpy is not None and Path(bpy.app.tempdir).name.startswith("blender_"):
+        shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
+
+
+def run_verb(verb: str, given: Sequence[str]) -> int:
+    """``physgen VERB`` with the arguments ``given``; the exit code, unless the process has become another.
+
+    Here where everything is installed, else in the Python that simulates; never in Blender's own process.
+    """
+    asks = "-h" in given or "--help" in given
+    if asks or not (in_blender() or requirements.missing()):
+        try:
+            from . import cli
+        except ModuleNotFoundError:
+            # Blender's Python lacks something; the other one knows the arguments too.
+            pass
+        else:
+            return cli.main([verb, *given])
+    # What is meant for Blender's Python does not fit another; its own is told below.
+    os.environ.pop(PACKAGES_VARIABLE, None)
+    try:
+        python = find_python()
+        _become(own_command("batch.cli", verb, *given, python=str(python), packages=wheels_for(python)))
+    except PhysGenError as error:
+        with events_apart_from_chatter() as stream:
+            Terminal(as_json="--json" in given, out=stream).error(type(error).__name__, str(error))
+        return error.exit_code
+
+
+def _become(command: Sequence[str]) -> NoReturn:
+    """Go on as ``command``: the same process for whoever waits for it, signals it or reads what it prints."""
+    _remove_blenders_folder()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    try:
+        if os.name != "nt":
+            os.execve(command[0], list(command), child_environment())  # noqa: S606
+        # Windows knows no such thing. Ctrl-C reaches both; the other one says when it has stopped.
+        signal.signal(signal.SIGINT, lambda *_: None)
+        os._exit(subprocess.call(list(command), env=child_environment()))
+    except OSError as error:
+        raise InputError(f"{command[0]}: cannot be started ({error.strerror or error}); name another Python") from error
+
+
+def main() -> int:
+    """``launch.py batch.headless VERB ARGS…``: what a plain file in this folder hands on; the exit code."""
+    return run_verb(sys.argv[1], script_arguments(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    leave(main)
