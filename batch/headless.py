@@ -87,6 +87,10 @@ def start_empty() -> None:
         import bpy
 
         bpy.ops.wm.read_factory_settings(use_empty=True)
+        # Those that are marked persistent outlive their file.
+        for name in dir(bpy.app.handlers):
+            if name.startswith(("render_", "frame_change_", "depsgraph_update_", "composite_")):
+                getattr(bpy.app.handlers, name).clear()
 
 
 class Stop:
