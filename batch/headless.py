@@ -113,7 +113,8 @@ class Stop:
         """
         # Python's own handlers run when the main thread comes back from Blender; the pipe is written at once.
         reading, writing = os.pipe()
-        os.set_blocking(writing, False)
+        if os.name != "nt":
+            os.set_blocking(writing, False)
         signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)):
             signal.signal(number, lambda *_: self._asked.set())
@@ -152,6 +153,8 @@ def leave(work: Callable[[], int]) -> NoReturn:
         code = work()
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else _FAULT if error.code else 0
+    except KeyboardInterrupt:
+        code = Cancelled.exit_code
     except Exception:
         traceback.print_exc()
         code = _FAULT
@@ -190,6 +193,8 @@ def run_verb(verb: str, given: Sequence[str]) -> int:
             pass
         else:
             return cli.main([verb, *given])
+    # Blender's own handler would only note it, and the other Python would begin.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     # What is meant for Blender's Python does not fit another; its own is told below.
     os.environ.pop(PACKAGES_VARIABLE, None)
     try:

@@ -76,7 +76,8 @@ def run(options: argparse.Namespace, terminal: Any, cancelled: Any) -> int:
         return _report(error, terminal)
     except OSError as error:
         # Of the temporary folder, most likely: layers and textures pass through it.
-        message = f"{error.filename or tempfile.gettempdir()}: {error.strerror or error}; free space, then run again"
+        where = error.filename or Path(tempfile.gettempdir()).parent
+        message = f"{where}: {error.strerror or error}; free space, then run again"
         return _report(errors.RenderError(message), terminal)
     done["seconds"] = round(time.monotonic() - started, 1)
     terminal(done)

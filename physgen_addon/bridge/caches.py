@@ -9,6 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...sim.app.bake_inputs import geometry_hash
+from ...sim.cache.lock import is_written
 from ...sim.cache.manifest import SURFACE, WORLD_SPACE, BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
@@ -58,6 +59,18 @@ class Bake:
     def every(self) -> tuple[Pc2Reader, ...]:
         """All caches, those of particles last."""
         return self.caches + tuple(flow.cache for flow in self.flows if flow is not None)
+
+    @property
+    def unfinished(self) -> str:
+        """How the rest of an incomplete bake is to be had; empty for a complete one."""
+        whole = self.manifest.frame_start + self.manifest.frames - 1
+        if self.last_frame >= whole:
+            return ""
+        if is_written(self.folder):
+            return f"the bake of {whole} frames in {self.folder} is still running: wait for it"
+        return (
+            f"the bake of {whole} frames in {self.folder} was stopped: run `physgen bake` again, it goes on from there"
+        )
 
 
 def open_bake(folder: Path, scene: Scene) -> Bake:

@@ -19,7 +19,9 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     """
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise InputError(f"{path}: not a readable image ({oiio.geterror()}); restore it or make it again")
+        # OpenEXR says the same in several lines; the last one says it best.
+        reason = (oiio.geterror().strip().splitlines() or ["no reason given"])[-1]
+        raise InputError(f"{path}: not a readable image ({reason}); restore it or make it again")
     channels: dict[str, NDArray[np.float32]] = {}
     try:
         part = 0

@@ -46,7 +46,8 @@ def render_frames(
     caches.require_scene(opened, scene)
     for source, cache in zip(scene.scene.objects, opened.caches, strict=True):
         caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
-    numbers = parse_range(frames, opened.first_frame, opened.last_frame)
+    remedy = opened.unfinished or f"bake more in {bake}, or ask for fewer"
+    numbers = parse_range(frames, opened.first_frame, opened.last_frame, remedy)
     denoised = options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
     opened = photo_particles.find_tears(opened, scene)
@@ -55,6 +56,8 @@ def render_frames(
     with folder_lock(out):
         ledger = Ledger(out)
         progress = StageProgress(on_event, "render", len(planned))
+        if frames is None and opened.unfinished:
+            progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
         if options.denoise and not denoised:
             progress.notice("this Blender has no OpenImageDenoise; raise the samples if frames are grainy")
         _make(scene, opened, planned, ledger, options, progress, cancelled)

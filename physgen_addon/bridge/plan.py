@@ -41,10 +41,10 @@ class Frame:
     inputs: str
 
 
-def parse_range(text: str | None, first: int, last: int) -> list[int]:
+def parse_range(text: str | None, first: int, last: int, remedy: str = "bake more or ask for fewer") -> list[int]:
     """Frame numbers of ``1-48``, ``1,5,9``, ``1-48x2`` or mixtures; None is ``first`` to ``last``, all there are.
 
-    Raises InputError for anything else, and for frames that are not baked.
+    Raises InputError for anything else, and for frames that are not baked, with ``remedy``.
     """
     if text is None:
         return list(range(first, last + 1))
@@ -58,7 +58,7 @@ def parse_range(text: str | None, first: int, last: int) -> list[int]:
         if stop < start:
             raise InputError(f"frames {text!r}: {start} comes after {stop}")
         if start < first or stop > last:
-            raise InputError(f"frames {text!r}: frames {first} to {last} are baked; bake more or ask for fewer")
+            raise InputError(f"frames {text!r}: frames {first} to {last} are baked; {remedy}")
         numbers.update(range(start, stop + 1, int(match[3] or 1)))
     return sorted(numbers)
 

@@ -10,6 +10,7 @@ from ..atomic import write_json
 from ..errors import InputError
 from ..scene.folder import inside
 from ..scene.json_fields import parse, read_json, to_json
+from ..version import VERSION
 
 FORMAT = "physgen-bake/1"
 MANIFEST_FILE = "manifest.json"
@@ -106,9 +107,21 @@ def load_manifest(folder: Path) -> BakeManifest:
     if not path.is_file():
         raise InputError(f"{folder}: no bake there ({MANIFEST_FILE} is missing); run `physgen bake` first")
     data = read_json(path)
-    if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
-        raise InputError(f"{path}: not of format {FORMAT!r}; bake again with this version")
-    manifest = parse(BakeManifest, data, str(path))
+    found = data.pop("format", None) if isinstance(data, dict) else None
+    if found != FORMAT:
+        remedy = "update PhysGen, or bake" if str(found).startswith("physgen-bake/") else "bake"
+        raise InputError(
+            f"{path}: format is {found!r}, this version reads {FORMAT!r}; {remedy} again with this version"
+        )
+    try:
+        manifest = parse(BakeManifest, data, str(path))
+    except InputError as error:
+        author = data.get("version")
+        if author == VERSION:
+            raise
+        raise InputError(
+            f"{error}; PhysGen {author} wrote it, this is {VERSION}: use that one, or bake again"
+        ) from None
     for name in manifest.files:
         inside(folder, name)
     return manifest

@@ -45,7 +45,10 @@ def parse(kind: type[T], value: Any, path: str) -> T:
     fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     unknown = sorted(set(value) - set(fields))
     if unknown:
-        raise InputError(f"{path}.{unknown[0]}: unknown field; known are {', '.join(fields)}")
+        raise InputError(
+            f"{path}.{unknown[0]}: unknown field; known are {', '.join(fields)}; "
+            "take it out, or update PhysGen if a newer version wrote it"
+        )
     arguments = {}
     for name, spec in fields.items():
         if name in value:
