@@ -24,7 +24,7 @@ from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
 BATCH = Path(__file__).resolve().parents[2] / "batch"
 QUICK = ["--samples", "1", "--scale", "0.25", "--threads", "1", "--json"]
 SHIFTS = [(0.01 * i, 0, 0) for i in range(6)]
-BARE = "import runpy, sys; del sys.argv[0]; sys.path.append(sys.argv.pop(0)); runpy.run_path(*sys.argv[:1], None, '__main__')"
+BARE = "import runpy, sys; sys.path += [sys.argv[1]]; del sys.argv[:2]; runpy.run_path(sys.argv[0], {}, '__main__')"
 """A Python that has only what lies in a folder, as Blender has only its own."""
 
 
