@@ -14,7 +14,7 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.version import VERSION
-from . import bakes, diagnosis, doctor, photos, pipeline
+from . import bakes, diagnosis, doctor, photos, pipeline, videos
 from .terminal import Terminal
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
@@ -46,6 +46,8 @@ def build_parser() -> argparse.ArgumentParser:
     previews = "coarse runs as they are asked for on standard input (docs/cli.md)"
     bakes.add_preview(command("preview", bakes.run_preview, previews))
     photos.add_render(command("render", photos.run_render, "scene and bake → frames, video"))
+    sheet = "frames → video or animated contact sheet"
+    videos.add_encode(command("encode", videos.run_encode, sheet))
     lack = "capture of a real motion → which effect the simulation lacks"
     diagnosis.add_diagnose(command("diagnose", diagnosis.run_diagnose, lack))
     diagnosis.add_track(command("track", diagnosis.run_track, "videos of a scene → capture folder"))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..physgen_addon.bridge.formats import require_video_name
 from ..sim.app.import_physgen3d import import_physgen3d
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
 from ..sim.events import IsCancelled
@@ -58,13 +59,13 @@ def add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bake", type=Path, required=True, metavar="BAKE")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all)")
-    parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode them: .mp4 or .webm")
     add_render_options(parser)
 
 
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
-    pipeline.check_video(options.out)
+    require_video_name(options.out)
     request = pipeline.RunRequest(
         photo=options.photo,
         objects=object_requests(options),

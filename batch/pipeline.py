@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..physgen_addon.bridge.formats import require_video_name
 from ..physgen_addon.bridge.options import RenderOptions
 from ..sim.app import worker
 from ..sim.app.bake_inputs import BakeOptions, inputs_hash
 from ..sim.app.process import own_command, run_stage
 from ..sim.app.quality import load_quality
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
-from ..sim.errors import InputError, RenderError, SimulationError
+from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.pipeline import object_names
@@ -47,12 +48,6 @@ def bake_stage(
         return run_stage(own_command("sim.app.worker", str(path)), on_event, cancelled, failure=SimulationError)
 
 
-def check_video(video: Path | None) -> None:
-    """Raise InputError for a video name that cannot be used."""
-    if video is not None and (video.suffix.lower() != ".mp4" or video.is_dir()):
-        raise InputError(f"video {video}: give a file name that ends in .mp4")
-
-
 def render_stage(
     scene: Path,
     bake: Path,
@@ -68,7 +63,8 @@ def render_stage(
 
     Raises InputError, before that process starts, for a scene without a photo and for options that cannot be used.
     """
-    check_video(video)
+    if video is not None:
+        require_video_name(video)
     require_photo(load_scene(scene))
     command = own_command("batch.render", str(scene.resolve()), "--bake", str(bake.resolve()))
     command += ["--out", str(out.resolve()), "--json", "--parent", str(os.getpid()), *render_arguments(options)]
@@ -116,7 +112,7 @@ def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
     require_physics(len(request.objects), request.presets, request.velocities, request.spins)
     check_overrides(object_names(request.objects), request.overrides)
     load_quality(request.bake.quality)
-    check_video(request.video)
+    require_video_name(request.video)
     scene, bake = request.work / "scene", request.work / "bake"
     reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
     folder = set_all_physics(

@@ -34,7 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all that are baked)")
     _load("batch.render_arguments").add_render_options(parser)
-    parser.add_argument("--video", type=Path, metavar="VIDEO.mp4", help="also encode the frames")
+    parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode them: .mp4 or .webm")
     packages = "folder of modules that Blender's Python lacks (docs/headless.md)"
     parser.add_argument("--packages", type=Path, metavar="DIR", help=packages)
     parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
@@ -65,12 +65,16 @@ def run(options: argparse.Namespace, terminal: Any, cancelled: Any) -> int:
         done = {"event": "done", "frames": len(paths), "out": str(options.out)}
         if options.video is not None:
             manifest = _load("sim.cache.manifest").load_manifest(options.bake)
-            ledger = _load("physgen_addon.bridge.ledger").Ledger(options.out)
-            if ledger.has_video(options.video, paths, manifest.fps):
+            bridge = _load("physgen_addon.bridge.ledger")
+            ledger = bridge.Ledger(options.out, suffix=paths[0].suffix, fps=manifest.fps)
+            fps = _load("physgen_addon.bridge.sequence").own_fps([int(path.stem) for path in paths], manifest.fps)
+            if ledger.has_video(options.video, paths, fps):
                 terminal({"event": "notice", "stage": "encode", "message": f"up to date: {options.video}"})
             else:
-                _load("physgen_addon.bridge.video").encode(paths, options.video, fps=manifest.fps, on_event=terminal)
-                ledger.record_video(options.video, paths, manifest.fps)
+                _load("physgen_addon.bridge.video").encode(
+                    paths, options.video, fps=fps, on_event=terminal, cancelled=cancelled
+                )
+                ledger.record_video(options.video, paths, fps)
             done["video"] = str(options.video)
     except errors.PhysGenError as error:
         return _report(error, terminal)

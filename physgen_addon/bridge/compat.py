@@ -13,6 +13,8 @@ import bpy
 from ...sim.errors import RenderError
 
 DENOISER = "OPENIMAGEDENOISE"
+OBJECT_INDEX = "Object Index.X" if bpy.app.version >= (5, 0) else "IndexOB.X"
+"""Channel of the pass that says which object a pixel shows."""
 
 
 def enable_cycles() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scene folder and bake folder → PNG frames: only what is missing, only where something can be seen."""
+"""Scene folder and bake folder → frames: only what is missing, only where something can be seen."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import bpy
 
 from ...sim.atomic import replacing
 from ...sim.cache.lock import folder_lock
-from ...sim.composite import transfer
 from ...sim.errors import Cancelled
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...sim.scene.folder import SceneFolder, require_photo
 from ...sim.scene.meshes import load_object_mesh
 from . import caches, compat, photo_particles
+from .frame_output import write_frame
+from .frame_range import parse_range
 from .ledger import Ledger
 from .options import RenderOptions
-from .plan import Frame, parse_range, plan_frames
+from .plan import Frame, plan_frames
 from .renderer import Renderer
 
 
@@ -47,14 +48,15 @@ def render_frames(
     for source, cache in zip(scene.scene.objects, opened.caches, strict=True):
         caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
     remedy = opened.unfinished or f"bake more in {bake}, or ask for fewer"
-    numbers = parse_range(frames, opened.first_frame, opened.last_frame, remedy)
+    numbers = parse_range(frames, opened.first_frame, opened.last_frame, there=f"baked; {remedy}")
     denoised = options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
     opened = photo_particles.find_tears(opened, scene)
     planned = plan_frames(scene, opened, numbers, options=options, blender=blender)
-    Ledger(out)
+    suffix, fps = options.frame_format.suffix, opened.manifest.fps
+    Ledger(out, suffix=suffix)
     with folder_lock(out):
-        ledger = Ledger(out)
+        ledger = Ledger(out, suffix=suffix, fps=fps)
         progress = StageProgress(on_event, "render", len(planned))
         if frames is None and opened.unfinished:
             progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
@@ -76,6 +78,7 @@ def _make(
     missing = [frame for frame in planned if not ledger.is_complete(frame.number, frame.inputs)]
     if len(missing) < len(planned):
         progress.notice(f"{len(planned) - len(missing)} of {len(planned)} frames are up to date")
+    names = [item.name for item in scene.scene.objects]
     renderer: Renderer | None = None
     try:
         for done, frame in enumerate(missing, start=len(planned) - len(missing)):
@@ -88,7 +91,10 @@ def _make(
                     shutil.copyfile(twin, partial)
             else:
                 renderer = renderer or Renderer(scene, bake, options)
-                transfer.write_rgb(path, transfer.linear_to_bytes(renderer.frame(frame.sample).beauty))
+                layers, data = renderer.frame(frame.sample), None
+                if options.frame_format.layered:
+                    data = renderer.data(frame.sample, after=frame.after, before=frame.before)
+                write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             ledger.record(frame.number, frame.inputs)
         progress.report(len(planned))
     finally:

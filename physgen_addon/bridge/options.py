@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...sim.errors import InputError
+from .formats import COMPRESSIONS, FRAME_KINDS, FrameFormat
 
 ENGINES = ("cycles",)
 
@@ -33,6 +34,7 @@ class RenderOptions:
     denoise: use OpenImageDenoise where Blender has it.
     seed: of the sampling pattern, the same for all frames, so that what stands still does not flicker.
     threads: CPU threads, 0 for all; it changes nothing in the picture.
+    format, bits, compression: of the frames' files, as ``formats.FrameFormat`` has them.
     """
 
     engine: str = option("cycles", "render engine", choices=ENGINES)
@@ -43,6 +45,9 @@ class RenderOptions:
     denoise: bool = option(True, "denoise light where Blender can")
     seed: int = 0
     threads: int = option(0, "CPU threads, 0 for all", metavar="N")
+    format: str = option("png", "of the frames; exr-layers has all layers in parts", choices=tuple(FRAME_KINDS))
+    bits: int | None = option(None, "a channel: PNG 8 or 16, EXR 16 or 32 (default: 8 and 16)", metavar="N")
+    compression: str = option("zip", "of EXR frames", choices=COMPRESSIONS)
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -57,6 +62,12 @@ class RenderOptions:
             raise InputError(f"threads is {self.threads}: give 0 (all) to 1024")
         if not 0 <= self.seed < 2**31:
             raise InputError(f"seed is {self.seed}: give 0 to 2147483647")
+        _ = self.frame_format
+
+    @property
+    def frame_format(self) -> FrameFormat:
+        """How frames are written. Raises InputError for what does not go together."""
+        return FrameFormat(kind=self.format, bits=self.bits, compression=self.compression)
 
     def light_scale_for(self, longest_side: int) -> float:
         """Resolution of light over that of frames whose longest side has so many pixels."""

@@ -26,7 +26,7 @@ from ...sim.skinning.tearing import TORN_STRETCH, first_torn
 from ..bake_record import spacing
 from . import caches, points
 from .capture_nodes import Tree, set_input
-from .objects import REST_LIGHT, UV, RenderObject, get_rest_light
+from .objects import COLOUR_LAYER, REST_LIGHT, UV, RenderObject, get_rest_light
 
 SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen photo surface"
 REST_LENGTH = "rest_length"
@@ -59,10 +59,13 @@ def find_tears(bake: caches.Bake, folder: SceneFolder) -> caches.Bake:
     return dataclasses.replace(bake, flows=tuple(flows))
 
 
-def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: int) -> float:
+def add(
+    target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: int, *, carried: tuple[str, ...] = ()
+) -> tuple[bpy.types.Object, float]:
     """Let ``target``, which plays ``cache`` and whose light at rest is known, show the particles of ``flow``.
 
-    Returns how far beyond a particle's centre something of it can be seen, m.
+    carried: vectors of particles that what is shown of them is to have too. Returns what holds the particles, and how
+    far beyond a particle's centre something of it can be seen, m.
     """
     assert flow.from_sample is not None
     rest = flow.cache.sample(0)
@@ -78,14 +81,15 @@ def add(target: RenderObject, flow: caches.Flow, cache: Pc2Reader, first_frame: 
         collection.objects.link(item)
     caches.attach(item, flow.cache, first_frame)
     look = item.modifiers.new(points.MODIFIER, "NODES")
-    look.node_group = _surface_group() if flow.surface else _grains_group()
+    look.node_group = _surface_group(carried) if flow.surface else _grains_group()
     set_input(look, points.RADIUS, radius)
     set_input(look, STEP, _step(mesh, rest, distance))
     set_input(look, points.FROM, first_frame + flow.from_sample)
     set_input(look, points.MATERIAL, mesh.materials[0])
     _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
     # Grains stray by half the particles' distance along each of three axes.
-    return radius if flow.surface else radius * SMALLER * points.LARGEST + math.sqrt(0.75) * distance
+    reach = radius if flow.surface else radius * SMALLER * points.LARGEST + math.sqrt(0.75) * distance
+    return item, reach
 
 
 def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32]) -> None:
@@ -142,7 +146,7 @@ def _material(skin: bpy.types.Material, *, mixes: bool) -> bpy.types.Material:
         return node.outputs[socket]
 
     picture = next(node for node in tree.nodes if node.type == "TEX_IMAGE")
-    layer = next(node for node in tree.nodes if node.type == "OUTPUT_AOV")
+    layer = next(node for node in tree.nodes if node.type == "OUTPUT_AOV" and node.aov_name == COLOUR_LAYER)
     tree.links.new(attribute(UV, "Vector"), picture.inputs["Vector"])
     if mixes:
         mix = tree.nodes.new("ShaderNodeMix")
@@ -209,15 +213,15 @@ def _strayed(tree: Tree, value: Any, reach: Any, seed: int = 0) -> Any:
     return tree.out("ShaderNodeVectorMath", value, moved, operation="ADD")
 
 
-def _surface_group() -> bpy.types.NodeTree:
-    """The surface around the particles, with the attributes of the nearest of them."""
+def _surface_group(carried: tuple[str, ...]) -> bpy.types.NodeTree:
+    """The surface around the particles, with the attributes of the nearest of them, ``carried`` ones too."""
     tree = Tree(SURFACE, {**_inputs(), STEP: ("Float", 0.01)})
     inputs = tree.inputs
     shown = points.switch(tree, points.begun(tree), None, tree.inputs["Geometry"])
     surface = points.enclosing_surface(tree, shown, tree.inputs[points.RADIUS])
     nearest = tree.out("GeometryNodeSampleNearest", shown, tree.out("GeometryNodeInputPosition"), domain="POINT")
     store = "GeometryNodeStoreNamedAttribute"
-    for name in (UV, REST_LIGHT, COLOUR):
+    for name in (UV, REST_LIGHT, COLOUR, *carried):
         value = tree.attribute(name, "FLOAT_VECTOR")
         there = tree.out("GeometryNodeSampleIndex", shown, value, nearest, data_type="FLOAT_VECTOR", domain="POINT")
         even = tree.out("GeometryNodeBlurAttribute", there, BLUR, data_type="FLOAT_VECTOR")

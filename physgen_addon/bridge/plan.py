@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 
 from ...sim.app.bake_inputs import file_hash
 from ...sim.cache.pc2 import Pc2Reader
-from ...sim.errors import InputError
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.json_fields import to_json
 from ...sim.version import VERSION
@@ -33,34 +31,15 @@ STILL_PX = 0.02
 class Frame:
     """Frame ``number`` shows ``sample`` of every cache; ``inputs`` is the hash of all that it depends on.
 
-    Frames in which nothing moved share the sample of the first of them, and so the hash.
+    Frames in which nothing moved share the sample of the first of them, and so the hash. ``after`` and ``before`` are
+    the samples of the next frame and the one before, where they count (for optical flow); else ``sample`` too.
     """
 
     number: int
     sample: int
     inputs: str
-
-
-def parse_range(text: str | None, first: int, last: int, remedy: str = "bake more or ask for fewer") -> list[int]:
-    """Frame numbers of ``1-48``, ``1,5,9``, ``1-48x2`` or mixtures; None is ``first`` to ``last``, all there are.
-
-    Raises InputError for anything else, and for frames that are not baked, with ``remedy``.
-    """
-    if text is None:
-        return list(range(first, last + 1))
-    numbers: set[int] = set()
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?:x(\d+))?)?\s*", part)
-        if match is None or match[3] == "0":
-            raise InputError(f"frames {text!r}: write 1-48, 1,5,9 or 1-48x2")
-        start = int(match[1])
-        stop = int(match[2]) if match[2] else start
-        if stop < start:
-            raise InputError(f"frames {text!r}: {start} comes after {stop}")
-        if start < first or stop > last:
-            raise InputError(f"frames {text!r}: frames {first} to {last} are baked; {remedy}")
-        numbers.update(range(start, stop + 1, int(match[3] or 1)))
-    return sorted(numbers)
+    after: int
+    before: int
 
 
 def plan_frames(
@@ -73,21 +52,38 @@ def plan_frames(
 ) -> list[Frame]:
     """Hash the inputs of the frames ``numbers`` (ascending); ``blender`` names the renderer and its version."""
     base = _scene_hash(folder, options, blender)
-    first_frame = bake.first_frame
+    flow, first_frame = options.frame_format.layered, bake.first_frame
+    last = max(numbers) - first_frame + int(flow) if numbers else -1
+    shown = _shown(folder, bake, min(last, bake.last_frame - first_frame) + 1, base=base, options=options)
+    frames = []
+    for number in numbers:
+        index = number - first_frame
+        sample, inputs = shown[index]
+        after = before = sample
+        if flow:
+            # Before the first frame and after the last nothing is known, so nothing moves.
+            following, preceding = shown[min(index + 1, len(shown) - 1)], shown[max(index - 1, 0)]
+            (after, next_inputs), (before, last_inputs) = following, preceding
+            inputs = hashlib.sha256(f"{inputs} {next_inputs} {last_inputs}".encode()).hexdigest()
+        frames.append(Frame(number=number, sample=sample, inputs=inputs, after=after, before=before))
+    return frames
+
+
+def _shown(folder: SceneFolder, bake: Bake, count: int, *, base: str, options: RenderOptions) -> list[tuple[int, str]]:
+    """For each of the first ``count`` samples the earlier one that looks the same, or itself, and the hash of that."""
     still = _still_distance(folder, bake.every, options)
     key = rest = _pose(bake, 0)
     key_index, key_hash = 0, _hash(base, rest)
     rest_hash = key_hash
-    frames, wanted = [], set(numbers)
-    for index in range(max(numbers) - first_frame + 1 if numbers else 0):
+    shown = []
+    for index in range(count):
         now = _pose(bake, index)
         if now.same(rest, still):
             key, key_index, key_hash = rest, 0, rest_hash
         elif not now.same(key, still):
             key, key_index, key_hash = now, index, _hash(base, now)
-        if first_frame + index in wanted:
-            frames.append(Frame(number=first_frame + index, sample=key_index, inputs=key_hash))
-    return frames
+        shown.append((key_index, key_hash))
+    return shown
 
 
 @dataclass(frozen=True)
@@ -128,7 +124,7 @@ def _scene_hash(folder: SceneFolder, options: RenderOptions, blender: str) -> st
     content = {
         "revision": [RENDER_REVISION, VERSION, blender],
         "camera": to_json(scene.camera),
-        "ground": [scene.ground.point, scene.ground.normal],
+        "ground": scene.ground and [scene.ground.point, scene.ground.normal],
         "light": to_json(scene.light),
         "objects": objects,
         "files": [[name, _file_hash(folder, name)] for name in files if name is not None],

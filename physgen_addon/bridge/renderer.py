@@ -15,6 +15,7 @@ from ...sim.scene.folder import SceneFolder
 from . import passes, photo_particles, rest_light
 from .caches import Bake
 from .camera import render_size
+from .data_passes import STEPS, DataLayers, DataScene
 from .objects import COLOUR_LAYER
 from .options import RenderOptions
 from .plate import Plate
@@ -32,6 +33,7 @@ class Renderer:
         """Raises InputError for images, meshes or light that cannot be used, RenderError when Blender fails."""
         self._folder, self._scene, self._bake, self._options = scene, scene.scene, bake, options
         self._built: BlenderScene | None = None
+        self._data_scene: DataScene | None = None
         self._temporary = tempfile.TemporaryDirectory(prefix="physgen-render-")
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
@@ -39,6 +41,8 @@ class Renderer:
             self._plate = Plate(scene, self._size, self._samples(0))
             self._built = build(scene, bake, options)
             rest_light.measure(self._built, self._scratch)
+            if options.frame_format.layered:
+                self._data_scene = DataScene(self._built)
             self._reach = self._add_particles(self._built)
             self._ground_depth = ground_depth(self._scene, self._built.light_size)
             self._open_ground = self._empty_ground()
@@ -73,11 +77,37 @@ class Renderer:
     def _add_particles(self, built: BlenderScene) -> float:
         """Add the particles of what flows; how far beyond their centres something of them is seen, m."""
         before, reach = everything(), 0.0
-        for target, flow, cache in zip(built.objects, self._bake.flows, self._bake.caches, strict=True):
+        carried = STEPS if self._data_scene is not None else ()
+        objects = zip(built.objects, self._bake.flows, self._bake.caches, strict=True)
+        for number, (target, flow, cache) in enumerate(objects, start=1):
             if flow is not None and flow.from_sample is not None:
-                reach = max(reach, photo_particles.add(target, flow, cache, self._bake.first_frame))
+                item, far = photo_particles.add(target, flow, cache, self._bake.first_frame, carried=carried)
+                reach = max(reach, far)
+                if self._data_scene is not None:
+                    self._data_scene.follow(item, number)
         built.own += list(everything() - before)
         return reach
+
+    def data(self, sample: int, *, after: int, before: int) -> DataLayers:
+        """Depth, object ids and flow of ``sample``, which ``after`` follows and ``before`` precedes.
+
+        Only of a renderer whose options ask for layered frames.
+        """
+        assert self._data_scene is not None
+        shown = [flow.cache for flow in self._bake.flows if flow is not None and flow.from_sample is not None]
+        steps = []
+        for cache in (*self._bake.caches, *shown):
+            now = cache.sample(sample)
+            steps.append((cache.sample(after) - now, cache.sample(before) - now))
+        camera = self._scene.camera
+        return self._data_scene.render(
+            self._bake.first_frame + sample,
+            self._object_box(self._shown(sample), self._size),
+            self._scratch,
+            scene=self._scene,
+            cameras=(camera, camera, camera),
+            steps=steps,
+        )
 
     def _samples(self, sample: int) -> Samples:
         return [cache.sample(sample) for cache in self._bake.caches]

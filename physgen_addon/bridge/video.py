@@ -1,53 +1,80 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""PNG frames → H.264 MP4 with Blender's own FFmpeg, colours unchanged."""
+"""Frames → MP4 (H.264) or WebM (VP9) with Blender's own FFmpeg, colours unchanged.
+
+Blender converts by the matrix of BT.709, to the range of television (16 to 235), and says both in the file.
+"""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
 
 import bpy
+import cv2
 import numpy as np
 from PIL import Image
 
 from ...sim.atomic import replacing
-from ...sim.errors import InputError, RenderError
-from ...sim.events import OnEvent, ignore
+from ...sim.errors import Cancelled, InputError, RenderError
+from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from . import compat
+from .formats import VIDEO_CODECS, exact_rate, require_video_name
+from .frame_file import read_picture
 
 
-def encode(frames: Sequence[Path], video: Path, *, fps: float, on_event: OnEvent = ignore) -> None:
-    """Write ``frames``, in order and of one size, as ``video`` at ``fps`` frames a second, whole or not at all.
+def encode(
+    frames: Sequence[Path],
+    video: Path,
+    *,
+    fps: float,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> None:
+    """Write ``frames`` (PNG or EXR), in order and of one size, as ``video`` at ``fps`` frames a second.
 
-    Odd widths and heights, which H.264 with subsampled colour cannot hold, gain a repeated last column or row.
-    Raises InputError for frames or a name that cannot be used, RenderError when encoding fails.
+    The suffix of ``video``, .mp4 or .webm, chooses the format. It is whole or not there.
+    Odd widths and heights, which video with subsampled colour cannot hold, gain a repeated last column or row.
+    Raises InputError for frames or a name that cannot be used, RenderError when encoding fails, Cancelled when asked
+    to stop.
     """
     if not frames:
         raise InputError(f"{video}: there are no frames to encode; render some first")
-    if video.suffix.lower() != ".mp4":
-        raise InputError(f"{video}: give the video a name that ends in .mp4")
+    require_video_name(video)
     if not bpy.app.build_options.codec_ffmpeg:
         raise RenderError(f"Blender {bpy.app.version_string} was built without FFmpeg; encode the frames otherwise")
-    total = len(frames)
-    on_event({"event": "progress", "stage": "encode", "done": 0, "total": total, "eta_s": None})
+    progress = StageProgress(on_event, "encode", len(frames))
+    progress.report(0)
     with tempfile.TemporaryDirectory(prefix="physgen-video-") as folder:
-        staged = _staged(frames, Path(folder))
+        staged = _staged(frames, Path(folder), cancelled)
         with replacing(video) as partial:
-            _encode(staged, partial.resolve(), fps)
-    on_event({"event": "progress", "stage": "encode", "done": total, "total": total, "eta_s": 0.0})
+            _encode(staged, partial.resolve(), fps, progress)
+            # Blender says nothing when the disk is full.
+            found = _count(partial)
+            if found != len(frames):
+                message = f"only {found} of {len(frames)} frames are in the file; free space, then encode again"
+                raise RenderError(f"{video}: {message}")
 
 
-def _staged(frames: Sequence[Path], folder: Path) -> list[Path]:
+def _count(video: Path) -> int:
+    """Frames that can be read from ``video``, 0 when it is no video."""
+    capture = cv2.VideoCapture(str(video))
+    try:
+        count = 0
+        while capture.grab():
+            count += 1
+        return count
+    finally:
+        capture.release()
+
+
+def _staged(frames: Sequence[Path], folder: Path, cancelled: IsCancelled) -> list[Path]:
     """The frames, consecutively numbered and of even size, in one folder."""
     staged, size = [], None
     for index, path in enumerate(frames, start=1):
-        try:
-            with Image.open(path) as image:
-                pixels = np.asarray(image.convert("RGB"))
-        except OSError as error:
-            raise InputError(f"{path}: not a readable frame ({error}); render it again") from error
+        if cancelled():
+            raise Cancelled("encoding cancelled; no video was written")
+        pixels = read_picture(path)
         size = size or pixels.shape
         if pixels.shape != size:
             raise InputError(f"{path}: is {pixels.shape[1]}×{pixels.shape[0]}, others are {size[1]}×{size[0]}")
@@ -58,16 +85,20 @@ def _staged(frames: Sequence[Path], folder: Path) -> list[Path]:
     return staged
 
 
-def _encode(frames: list[Path], video: Path, fps: float) -> None:
+def _encode(frames: list[Path], video: Path, fps: float, progress: StageProgress) -> None:
+    def written(current: bpy.types.Scene, _: object) -> None:
+        progress.report(current.frame_current)
+
     scene = bpy.data.scenes.new("PhysGen video")
     try:
         with Image.open(frames[0]) as image:
             width, height = image.size
         render = scene.render
         render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
-        rate = Fraction(fps).limit_denominator(1001)
-        base = max(1, rate.denominator)
-        render.fps, render.fps_base = (rate.numerator, float(base)) if rate.numerator <= 32767 else (round(fps), 1.0)
+        rate = exact_rate(fps)
+        # Blender takes whole frames a second up to 32767, over a base that need not be whole.
+        whole = rate.numerator if rate.numerator <= 32767 else round(fps)
+        render.fps, render.fps_base = whole, whole / rate
         render.use_sequencer, render.use_compositing, render.use_border = True, False, False
         render.use_file_extension = False
         scene.frame_start, scene.frame_end = 1, len(frames)
@@ -81,16 +112,20 @@ def _encode(frames: list[Path], video: Path, fps: float) -> None:
         for path in frames[1:]:
             strip.elements.append(path.name)
         compat.set_video(render.image_settings)
+        render.image_settings.color_mode = "RGB"
         ffmpeg = render.ffmpeg
-        ffmpeg.format, ffmpeg.codec = "MPEG4", "H264"
+        ffmpeg.format, ffmpeg.codec = VIDEO_CODECS[video.suffix.lower()]
         ffmpeg.constant_rate_factor, ffmpeg.ffmpeg_preset = "HIGH", "GOOD"
         ffmpeg.gopsize, ffmpeg.audio_codec = 12, "NONE"
         render.filepath = str(video)
         try:
+            bpy.app.handlers.render_write.append(written)
             with compat.active_scene(scene):
                 bpy.ops.render.render(animation=True, scene=scene.name)
         except RuntimeError as error:
             raise RenderError(f"{video}: Blender could not encode it: {error}") from error
+        finally:
+            bpy.app.handlers.render_write.remove(written)
         if not video.is_file() or video.stat().st_size == 0:
             raise RenderError(f"{video}: Blender wrote no video; its log has the reason")
     finally:

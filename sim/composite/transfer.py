@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from ..atomic import replacing
 from ..errors import InputError
 
 Linear = NDArray[np.float32]
@@ -64,12 +63,6 @@ def _read(path: Path, mode: str) -> NDArray[np.uint8]:
         raise InputError(
             f"{path}: not a readable image ({error}); restore it or reconstruct the scene again"
         ) from error
-
-
-def write_rgb(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write (H, W, 3) 8-bit sRGB as PNG, whole or not at all."""
-    with replacing(path) as partial:
-        Image.fromarray(pixels).save(partial, compress_level=3)
 
 
 def resized(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physgen.sim.composite.transfer import read_rgb, write_rgb
+from physgen.sim.composite.transfer import bytes_to_linear, read_rgb
 from physgen.sim.errors import Cancelled, InputError
 
 bpy = pytest.importorskip("bpy")
 import cv2  # noqa: E402
 from physgen.physgen_addon.bridge import frames as frames_module  # noqa: E402
+from physgen.physgen_addon.bridge.frame_file import Part, write_exr, write_png  # noqa: E402
+from physgen.physgen_addon.bridge.frame_range import parse_range  # noqa: E402
 from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
 from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.bridge.plan import parse_range  # noqa: E402
 from physgen.physgen_addon.bridge.video import encode  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -82,7 +83,7 @@ def test_unusable_input_is_named(world, bake, tmp_path):
         render_frames(world.folder, folder, out, QUICK)
     assert not out.exists()
     foreign = tmp_path / "holiday"
-    write_rgb(foreign / "0001.png", np.zeros((4, 4, 3), np.uint8))
+    write_png(foreign / "0001.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match="choose an empty or new folder"):
         render_frames(world.folder, bake(SHIFTS, "again"), foreign, QUICK)
 
@@ -113,16 +114,23 @@ def as_tagged(rgb):
     return np.linalg.solve(from_rgb(*weights["709"]), from_rgb(*weights["601"]) @ rgb)
 
 
-@pytest.mark.parametrize("size", [(64, 48), (65, 47)])
-def test_video_keeps_number_size_and_colours(tmp_path, size):
+@pytest.mark.parametrize(("suffix", "size"), [(".mp4", (64, 48)), (".mp4", (65, 47)), (".webm", (65, 47))])
+def test_video_keeps_number_size_and_colours(tmp_path, suffix, size):
     width, height = size
     colours = [(200, 60, 40), (40, 160, 90), (30, 60, 190), (128, 128, 128), (250, 245, 240)]
     paths = []
     for index, colour in enumerate(colours):
-        paths.append(tmp_path / f"{index + 3:04d}.png")
-        write_rgb(paths[-1], np.full((height, width, 3), colour, np.uint8))
-    encode(paths, tmp_path / "clip.mp4", fps=23.976)
-    video = cv2.VideoCapture(str(tmp_path / "clip.mp4"))
+        pixels = np.full((height, width, 3), colour, np.uint8)
+        # Frames of either kind come out in the same colours.
+        paths.append(tmp_path / f"{index + 3:04d}{'.exr' if index % 2 else '.png'}")
+        if index % 2:
+            part = Part(name="beauty", channels=("R", "G", "B"), pixels=bytes_to_linear(pixels))
+            write_exr(paths[-1], [part], fps=24.0)
+        else:
+            write_png(paths[-1], pixels)
+    clip = tmp_path / f"clip{suffix}"
+    encode(paths, clip, fps=23.976)
+    video = cv2.VideoCapture(str(clip))
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(23.976, abs=0.01)
     for colour in colours:
         there, frame = video.read()
@@ -131,7 +139,7 @@ def test_video_keeps_number_size_and_colours(tmp_path, size):
         assert np.abs(as_tagged(frame[..., ::-1].mean((0, 1))) - colour).max() < 6
     assert not video.read()[0]
     video.release()
-    assert sorted(p.name for p in tmp_path.glob("*.mp4")) == ["clip.mp4"]
+    assert [p.name for p in tmp_path.iterdir() if p not in paths] == [clip.name]
 
 
 def run_script(*arguments):
