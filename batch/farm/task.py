@@ -23,6 +23,7 @@ class Task:
     inputs: files and folders, relative to the root, whose content its result depends on.
     produces: files, relative to the root, that exist when it is done.
     slots: resources that it takes while it runs, by name: ``{"gpu": 1}``.
+    farm_folder: where its record and its log are kept, relative to the root; that of the job's results.
     """
 
     id: str
@@ -32,6 +33,7 @@ class Task:
     inputs: tuple[str, ...] = ()
     produces: tuple[str, ...] = ()
     slots: Mapping[str, int] = field(default_factory=dict)
+    farm_folder: str = ".farm"
 
 
 @dataclass(frozen=True, kw_only=True)

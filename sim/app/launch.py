@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``PYTHON launch.py [--packages DIR] [--folder DIR] MODULE ARGS…``: run a module of the tree that this file lies in.
+"""``PYTHON launch.py [--packages DIR] [--folder DIR] [--parent PID] MODULE ARGS…``: run a module of this file's tree.
 
 An installed extension is called ``bl_ext.<repository>.physgen``, and the interpreter that simulates may have no
 ``physgen``, or another version of it. Here the tree becomes the package ``physgen``, whatever else is installed, so
@@ -7,18 +7,24 @@ that the code that works is the code that asked.
 
 MODULE: from the tree's root, such as ``batch.cli``. --packages: a folder of packages that the interpreter would not
 look in, such as the extension's wheels; asked last, and inherited by what is started from here. --folder: the working
-folder. No syntax newer than Python 3.6, so that an old interpreter is told apart from a broken one.
+folder. --parent: the process that waits for this one; when it is gone, this one is asked to stop, then ended. No syntax
+newer than Python 3.6, so that an old interpreter is told apart from a broken one.
 """
 
 import importlib.util
 import os
 import runpy
+import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 PACKAGE = "physgen"
 PACKAGES_VARIABLE = "PHYSGEN_PACKAGES"
 OLDEST = (3, 11)
+ORPHAN_GRACE_S = 20.0
+"""How long a process that nobody waits for any more may take to put things in order."""
 
 
 def main(arguments: "list[str]") -> None:
@@ -36,6 +42,8 @@ def main(arguments: "list[str]") -> None:
             os.environ[PACKAGES_VARIABLE] = value
         elif option == "--folder":
             os.chdir(value)
+        elif option == "--parent":
+            threading.Thread(target=_end_with, args=(int(value),), daemon=True).start()
         else:
             sys.exit(f"launch.py: unknown option {option}")
     packages = os.environ.get(PACKAGES_VARIABLE, "")
@@ -44,6 +52,15 @@ def main(arguments: "list[str]") -> None:
     load_tree(here.parents[1])
     sys.argv = arguments
     runpy.run_module(PACKAGE + "." + arguments[0], run_name="__main__", alter_sys=True)
+
+
+def _end_with(parent: int) -> None:
+    """Wait until the process ``parent`` is gone, then end this one."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(ORPHAN_GRACE_S)
+    os._exit(130)
 
 
 def load_tree(root: Path) -> None:

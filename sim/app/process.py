@@ -46,15 +46,22 @@ def child_environment() -> dict[str, str]:
 
 
 def own_command(
-    module: str, *arguments: str, python: str = sys.executable, packages: str = "", folder: Path | None = None
+    module: str,
+    *arguments: str,
+    python: str = sys.executable,
+    packages: str = "",
+    folder: Path | None = None,
+    ends_with_us: bool = False,
 ) -> list[str]:
     """The command that runs ``module`` of this very tree, whatever the package is called in this process.
 
     module: from the tree's root, such as ``sim.app.worker``. python: interpreter, this one's by default. packages: a
     site-packages folder that it would not find by itself; those that this process was launched with are passed on by
-    the environment. folder: where it runs, here by default.
+    the environment. folder: where it runs, here by default. ends_with_us: it stops in good order when we die.
     """
     options = [*(["--packages", packages] if packages else []), *(["--folder", str(folder)] if folder else [])]
+    if ends_with_us:
+        options += ["--parent", str(os.getpid())]
     return [python, str(_LAUNCHER), *options, module, *arguments]
 
 
@@ -159,7 +166,7 @@ def _relay(
     while True:
         if asked_at is None and cancelled():
             asked_at = time.monotonic()
-            _ask_to_stop(process)
+            ask_to_stop(process)
         if asked_at is not None and time.monotonic() - asked_at > CANCEL_GRACE_S:
             process.kill()
             raise Cancelled("cancelled; the stage did not stop by itself and was killed, complete frames are kept")
@@ -204,7 +211,8 @@ def read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
         tail.append(line.decode("utf-8", "replace").rstrip())
 
 
-def _ask_to_stop(process: subprocess.Popen[bytes]) -> None:
+def ask_to_stop(process: subprocess.Popen[bytes]) -> None:
+    """Send ``process`` the signal by which all of ours stop in good order."""
     with contextlib.suppress(ProcessLookupError):
         process.send_signal(signal.CTRL_BREAK_EVENT if os.name == "nt" else signal.SIGTERM)  # type: ignore[attr-defined]
 
