@@ -41,12 +41,16 @@ class Plan:
     """All tasks of a job file, those that others need first.
 
     name: of the job. root: absolute folder that all paths are relative to. version: of the program that planned it.
+    out: folder of the results, relative to the root.
+    meanings: what each variant is, for people, by the beginning of its tasks' ids: ``cup/soft-1``.
     """
 
     name: str
     root: Path
     version: str
     tasks: tuple[Task, ...]
+    out: str = "."
+    meanings: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
