@@ -14,7 +14,8 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.version import VERSION
-from . import bakes, diagnosis, doctor, photos, pipeline, videos
+from . import bakes, diagnosis, doctor, photos, pipeline, variants, videos
+from .farm import command as farm_command
 from .terminal import Terminal
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
@@ -39,6 +40,8 @@ def build_parser() -> argparse.ArgumentParser:
     photos.add_run(command("run", photos.run_run, "photo → video: all stages"))
     photos.add_reconstruct(command("reconstruct", photos.run_reconstruct, "photo → scene folder"))
     photos.add_import(command("import", photos.run_import, "output folder of PhysGen3D → scene folder"))
+    varied = "scene folder → the same with other physics and effects, in a folder of its own"
+    variants.add_variant(command("variant", variants.run_variant, varied))
     bakes.add_bake(command("bake", bakes.run_bake, "scene folder → bake folder"))
     cost = "what a bake would cost in time, memory and disk; nothing is written"
     bakes.add_estimate(command("estimate", bakes.run_estimate, cost))
@@ -48,6 +51,8 @@ def build_parser() -> argparse.ArgumentParser:
     photos.add_render(command("render", photos.run_render, "scene and bake → frames, video"))
     sheet = "frames → video or animated contact sheet"
     videos.add_encode(command("encode", videos.run_encode, sheet))
+    many = "job file → scenes, bakes and videos of all its variants, on one machine or many"
+    farm_command.add_batch(command("batch", farm_command.run_batch, many))
     lack = "capture of a real motion → which effect the simulation lacks"
     diagnosis.add_diagnose(command("diagnose", diagnosis.run_diagnose, lack))
     diagnosis.add_track(command("track", diagnosis.run_track, "videos of a scene → capture folder"))

@@ -47,6 +47,7 @@ class _Ended:
     """
 
     code: int = 0
+    seconds: float = 0.0
     cpu_seconds: float = 0.0
     final: Event | None = None
     words: str = ""
@@ -71,7 +72,6 @@ def execute(
 
     Whatever goes wrong is in the outcome, with ``attempts`` 1, or 0 where nothing was started; nothing is raised.
     """
-    started = time.monotonic()
     outcome = Outcome(task=task.id, state="failed", exit_code=InputError.exit_code, worker=worker)
     if version != VERSION:
         message = (
@@ -92,7 +92,7 @@ def execute(
             outcome,
             exit_code=ended.code,
             attempts=1,
-            seconds=time.monotonic() - started,
+            seconds=ended.seconds,
             cpu_seconds=ended.cpu_seconds,
         )
         if ended.cancelled and ended.code != 0:
@@ -169,6 +169,7 @@ def _run(task: Task, root: Path, cancelled: IsCancelled, on_event: OnEvent, thre
     if threads > 0 and task.stage == "render":
         argv += ["--threads", str(threads)]
     with TaskLog(log_path(task, root), f"physgen {shlex.join(argv)}") as log:
+        started = time.monotonic()
         process = start_process(own_command("batch.cli", *argv, "--json", folder=root, ends_with_us=True))
         # Bounded, so that a command that prints without end waits.
         lines: Queue[bytes | None] = Queue(maxsize=256)
@@ -180,6 +181,7 @@ def _run(task: Task, root: Path, cancelled: IsCancelled, on_event: OnEvent, thre
             _attend(process, lines, ended, log, cancelled, lambda event: on_event({**event, "task": task.id}))
         finally:
             _reap(process, ended, kill=True)
+            ended.seconds = time.monotonic() - started
             _release(lines, readers)
         log.write(f"==== ended with code {ended.code}, {ended.cpu_seconds:.1f} CPU seconds".encode())
     return ended

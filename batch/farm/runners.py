@@ -2,17 +2,17 @@
 """What can carry out a plan, and what else a plan can be written as: one line each.
 
 A runner tells what happens by events: ``{"event": "task", "state": "started", "task", "stage", "worker", "attempt"}``
-when a task begins, ``{"event": "task", **fields of its Outcome}`` when it has ended for good, ``notice`` for a retry, and
-what the commands themselves say, with ``task``.
+when a task begins, ``{"event": "task", **fields of its Outcome}`` when it has ended for good, ``notice`` for a retry,
+and what the commands themselves say, with ``task``.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
@@ -50,19 +50,11 @@ class FarmOptions:
                 raise InputError(f"--{name} is {getattr(self, name)}: give 0 to {most}")
 
 
-class Runner(Protocol):
-    """Carries out a plan; an outcome for each of its tasks, in their order. Raises InputError when it cannot start."""
+Runner = Callable[[Plan, FarmOptions, OnEvent, IsCancelled], list[Outcome]]
+"""Carries out a plan; an outcome for each of its tasks, in their order. Raises InputError when it cannot start."""
 
-    def __call__(
-        self, plan: Plan, options: FarmOptions, on_event: OnEvent, cancelled: IsCancelled
-    ) -> list[Outcome]: ...
-
-
-class Exporter(Protocol):
-    """Writes a plan for another program; the files that it wrote."""
-
-    def __call__(self, plan: Plan, options: FarmOptions) -> list[Path]: ...
-
+Exporter = Callable[[Plan, FarmOptions], list[Path]]
+"""Writes a plan for another program, to the options' ``out``; the files that it wrote."""
 
 RUNNERS = {"local": "local:run", "dask": "dask_farm:run", "tcp": "dask_farm:run", "tls": "dask_farm:run"}
 """Name, or scheme of an address → module of this package and its function."""

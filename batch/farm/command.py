@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The verb ``batch``: a job file, carried out or written for another program (docs/farm.md)."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...sim.cache.lock import folder_lock
+from ...sim.errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
+from ...sim.events import IsCancelled
+from ..terminal import Terminal
+from .graph import make_plan
+from .jobs import load_job
+from .monitor import SUMMARY_PAGE, Monitor
+from .retry import RETRIES
+from .runners import EXPORTERS, FarmOptions, find_exporter, find_runner
+from .task import Outcome, Plan
+
+_OF_STAGE: dict[str, type[PhysGenError]] = {"bake": SimulationError, "render": RenderError, "encode": RenderError}
+
+
+def add_batch(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen batch``."""
+    parser.add_argument("job", type=Path, metavar="JOBS.toml", help="the job file")
+    where = "local (default), dask, or the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"
+    parser.add_argument("--farm", default="local", metavar="WHERE", help=where)
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="tasks at a time (default: half the cores)")
+    parser.add_argument(
+        "--threads", type=int, default=0, metavar="N", help="CPU threads of a render (default: cores over workers)"
+    )
+    again = f"how often a task is started again after a failure that may pass (default {RETRIES})"
+    parser.add_argument("--retries", type=int, default=RETRIES, metavar="N", help=again)
+    slots = "how much there is of what tasks take up, such as gpu=2 (default: one of each)"
+    parser.add_argument("--slots", type=_slot, nargs="+", action="extend", default=[], metavar="NAME=N", help=slots)
+    fast = "begin nothing new after the first failure (default: all that does not depend on it goes on)"
+    parser.add_argument("--fail-fast", action="store_true", help=fast)
+    parser.add_argument("--dry-run", action="store_true", help="only list the tasks")
+    parser.add_argument("--export", choices=[*EXPORTERS], help="write the job for another program, and run nothing")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file that --export writes")
+    parser.set_defaults(wrong_usage=parser.error)
+
+
+def _slot(text: str) -> tuple[str, int]:
+    name, _, count = text.partition("=")
+    if not name or not count.isdecimal() or int(count) > 10_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=N, such as gpu=2")
+    return name, int(count)
+
+
+def run_batch(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen batch``; the exit code: 0 only when every task is done."""
+    if (options.export is None) != (options.out is None):
+        options.wrong_usage("--export and --out belong together")
+    farm = FarmOptions(
+        farm=options.farm,
+        workers=options.workers,
+        threads=options.threads,
+        retries=options.retries,
+        fail_fast=options.fail_fast,
+        slots=dict(options.slots),
+        out=options.out,
+    )
+    runner = find_runner(farm.farm)
+    plan = make_plan(load_job(options.job))
+    if options.export is not None:
+        files = [str(path) for path in find_exporter(options.export)(plan, farm)]
+        terminal({"event": "done", "files": files})
+        terminal.line("\n".join(files))
+        return 0
+    if options.dry_run:
+        return _list(plan, terminal)
+    results = plan.root / plan.out
+    with folder_lock(results / ".farm"):
+        monitor = Monitor(plan, terminal)
+        outcomes = runner(plan, farm, monitor, cancelled)
+        summary = monitor.finish(outcomes, cancelled=cancelled())
+    page = results / SUMMARY_PAGE
+    if summary.state == "cancelled":
+        raise Cancelled(f"stopped; what was done is kept, run it again to go on: {page}")
+    if summary.state == "failed":
+        raise _failure(plan, outcomes, page)
+    terminal({"event": "done", "counts": dict(summary.counts), "summary": str(page), "out": str(results)})
+    terminal.line(f"summary: {page}")
+    return 0
+
+
+def _list(plan: Plan, terminal: Terminal) -> int:
+    for task in plan.tasks:
+        terminal({"event": "task", "state": "planned", "task": task.id, "stage": task.stage, "argv": list(task.argv)})
+        terminal.line(f"{task.id}: physgen {shlex.join(task.argv)}")
+    terminal({"event": "done", "tasks": len(plan.tasks), "variants": len(plan.meanings)})
+    terminal.line(f"{len(plan.tasks)} tasks, {len(plan.meanings)} variants")
+    return 0
+
+
+def _failure(plan: Plan, outcomes: Sequence[Outcome], page: Path) -> PhysGenError:
+    """The error that a job with failures ends with: of the kind of the first of them."""
+    failed = [(task, o) for task, o in zip(plan.tasks, outcomes, strict=True) if o.state == "failed"]
+    task, outcome = failed[0]
+    kinds = {kind.exit_code: kind for kind in (InputError, SimulationError, RenderError)}
+    kind = kinds.get(outcome.exit_code) or _OF_STAGE.get(task.stage, InputError)
+    return kind(
+        f"{len(failed)} of {len(plan.tasks)} tasks failed, the first is {task.id}: {outcome.message}; run it again to "
+        f"go on, {page} has the logs"
+    )

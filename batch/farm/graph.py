@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Job file → plan: reconstruct once a photo, then variant → bake → render in chunks → encode for each variant."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+
+from ...sim.app.bake_inputs import BakeOptions
+from ...sim.errors import InputError
+from ...sim.reconstruct.pipeline import object_names
+from ...sim.scene.folder import SCENE_FILE, referenced_files
+from ...sim.scene.model import Vector
+from ...sim.version import VERSION
+from .jobs import Job, JobScene
+from .matrix import Variant
+from .physics import describe
+from .task import Plan, Task
+
+MOST_TASKS = 100_000
+GPU = "gpu"
+_VIDEO_FILES = {"mp4": "video.mp4", "webm": "video.webm", "sheet": "sheet.png"}
+
+
+def make_plan(job: Job) -> Plan:
+    """All tasks of ``job``, variant by variant, so that the first videos are there soon.
+
+    Raises InputError when they are too many.
+    """
+    tasks: list[Task] = []
+    meanings: dict[str, str] = {}
+    for scene in job.scenes:
+        builder = _Builder(job, scene)
+        tasks += builder.once
+        for variant in scene.variants:
+            meanings[f"{scene.name}/{variant.name}"] = describe(variant.physics)
+            tasks += builder.variant(variant)
+            if len(tasks) > MOST_TASKS:
+                raise InputError(
+                    f"{job.name}: is more than {MOST_TASKS} tasks; give fewer variants or larger chunks of frames"
+                )
+    return Plan(name=job.name, root=job.root, version=VERSION, tasks=tuple(tasks), out=job.out, meanings=meanings)
+
+
+def frame_chunks(frames: Sequence[int], size: int) -> list[tuple[int, ...]]:
+    """``frames`` in order, ``size`` at a time."""
+    return [tuple(frames[i : i + size]) for i in range(0, len(frames), size)]
+
+
+def range_text(frames: Sequence[int]) -> str:
+    """Rising frame numbers as ``--frames`` takes them: ``1-12``, ``1-23x2`` or ``1,5,6``."""
+    steps = {b - a for a, b in itertools.pairwise(frames)}
+    if len(frames) == 1:
+        return str(frames[0])
+    if len(steps) == 1:
+        step = steps.pop()
+        return f"{frames[0]}-{frames[-1]}" + (f"x{step}" if step > 1 else "")
+    return ",".join(map(str, frames))
+
+
+def number_text(number: float) -> str:
+    """A number without loss, and without a point where it is whole."""
+    return str(int(number)) if number == int(number) and abs(number) < 1e15 else repr(number)
+
+
+def _positional(path: str) -> str:
+    """``path`` as an argument that is not taken for a flag."""
+    return f"./{path}" if path.startswith("-") else path
+
+
+def _vectors(flag: str, vectors: Sequence[Vector]) -> list[str]:
+    return [f"{flag}={','.join(map(number_text, vector))}" for vector in vectors]
+
+
+class _Builder:
+    """Tasks of one scene of a job; paths are relative to the job file's folder."""
+
+    def __init__(self, job: Job, scene: JobScene) -> None:
+        self._scene = scene
+        self._farm = f"{job.out}/.farm"
+        self._folder = f"{job.out}/{scene.name}"
+        if scene.folder is None:
+            self._names = tuple(object_names(scene.objects))
+            self._source = f"{self._folder}/scene"
+            self._files = _reconstructed_files(self._names)
+            self.once = [self._reconstruct()]
+        else:
+            self._names = tuple(item.name for item in scene.folder.scene.objects)
+            self._source = scene.folder.root.relative_to(job.root).as_posix()
+            self._files = (SCENE_FILE, *dict.fromkeys(referenced_files(scene.folder.scene)))
+            self.once = []
+
+    def _task(
+        self,
+        id: str,
+        stage: str,
+        argv: Sequence[str],
+        *,
+        needs: Sequence[str] = (),
+        inputs: Sequence[str],
+        produces: Sequence[str],
+        gpu: bool = False,
+    ) -> Task:
+        return Task(
+            id=id,
+            stage=stage,
+            argv=tuple(argv),
+            needs=tuple(needs),
+            inputs=tuple(inputs),
+            produces=tuple(produces),
+            slots={GPU: 1} if gpu else {},
+            farm_folder=self._farm,
+        )
+
+    def _reconstruct(self) -> Task:
+        scene = self._scene
+        assert scene.photo is not None
+        argv = ["reconstruct", _positional(scene.photo), "--out", self._source]
+        argv += [f"--box={','.join(map(number_text, item.box))}" for item in scene.objects]
+        argv += [f"--name={name}" for name in self._names]
+        # Sizes are taken in the order of the objects: one that is left out ends them.
+        sizes = [item.size_m for item in scene.objects if item.size_m is not None]
+        argv += [f"--size={number_text(size)}" for size in sizes]
+        options = scene.options
+        for flag, value in (("horizon", options.horizon_y), ("pitch", options.pitch_deg), ("fov", options.fov_deg)):
+            argv += [] if value is None else [f"--{flag}={number_text(value)}"]
+        return self._task(
+            f"{scene.name}/reconstruct",
+            "reconstruct",
+            argv,
+            inputs=[scene.photo],
+            produces=[f"{self._source}/{name}" for name in self._files],
+        )
+
+    def variant(self, variant: Variant) -> list[Task]:
+        """From the scene to the videos of one variant."""
+        prefix, folder = f"{self._scene.name}/{variant.name}", f"{self._folder}/{variant.name}"
+        copy = self._copy(variant, prefix, f"{folder}/scene")
+        bake = self._bake(variant, prefix, folder)
+        renders = self._renders(prefix, folder)
+        return [copy, bake, *renders, *self._encodes(prefix, folder, renders)]
+
+    def _copy(self, variant: Variant, prefix: str, out: str) -> Task:
+        physics = variant.physics
+        argv = ["variant", _positional(self._source), "--out", out]
+        argv += [f"--preset={name}" for name in physics.presets]
+        argv += _vectors("--velocity", physics.velocities) + _vectors("--spin", physics.spins)
+        argv += [f"--set={text}" for text in physics.settings]
+        if physics.effects is not None:
+            listed = [
+                {
+                    "name": e.name,
+                    "parameters": dict(e.parameters),
+                    **({"objects": list(e.objects)} if e.objects else {}),
+                }
+                for e in physics.effects
+            ]
+            argv.append(f"--effects-json={json.dumps(listed, ensure_ascii=False)}")
+        return self._task(
+            f"{prefix}/variant",
+            "variant",
+            argv,
+            needs=[task.id for task in self.once],
+            inputs=[f"{self._source}/{name}" for name in self._files],
+            produces=[f"{out}/{name}" for name in self._files],
+        )
+
+    def _bake(self, variant: Variant, prefix: str, folder: str) -> Task:
+        options = self._scene.bake
+        seed = options.seed if variant.physics.seed is None else variant.physics.seed
+        out = f"{folder}/bake"
+        argv = ["bake", f"{folder}/scene", "--out", out, "--frames", str(options.frames)]
+        argv += ["--fps", number_text(options.fps), "--quality", options.quality, "--arch", options.arch]
+        argv += ["--seed", str(seed), *(["--points"] if options.points else [])]
+        return self._task(
+            f"{prefix}/bake",
+            "bake",
+            argv,
+            needs=[f"{prefix}/variant"],
+            inputs=[f"{folder}/scene"],
+            produces=[f"{out}/manifest.json", *(f"{out}/{name}.pc2" for name in self._names)],
+            gpu=options.arch != BakeOptions.arch,
+        )
+
+    def _renders(self, prefix: str, folder: str) -> list[Task]:
+        settings = self._scene.render
+        tasks = []
+        for frames in frame_chunks(self._scene.frames, settings.chunk):
+            name = f"{frames[0]:04d}-{frames[-1]:04d}"
+            out = f"{folder}/frames/{name}"
+            argv = ["render", f"{folder}/scene", "--bake", f"{folder}/bake", "--out", out]
+            argv += ["--frames", range_text(frames), "--engine", settings.engine]
+            argv += [] if settings.samples is None else ["--samples", str(settings.samples)]
+            argv += ["--scale", number_text(settings.scale)]
+            argv += [] if settings.device is None else ["--device", settings.device]
+            tasks.append(
+                self._task(
+                    f"{prefix}/render-{name}",
+                    "render",
+                    argv,
+                    needs=[f"{prefix}/bake"],
+                    inputs=[f"{folder}/scene", f"{folder}/bake"],
+                    produces=[f"{out}/{number:04d}.png" for number in frames],
+                    gpu=settings.device not in (None, "cpu"),
+                )
+            )
+        return tasks
+
+    def _encodes(self, prefix: str, folder: str, renders: Sequence[Task]) -> list[Task]:
+        frames = self._scene.frames
+        steps = {b - a for a, b in itertools.pairwise(frames)}
+        # Every second frame, shown as long as two, keeps the pace of the motion.
+        fps = self._scene.bake.fps / (steps.pop() if len(steps) == 1 else 1)
+        folders = [str(task.produces[0].rpartition("/")[0]) for task in renders]
+        return [
+            self._task(
+                f"{prefix}/encode-{kind}",
+                "encode",
+                ["encode", *folders, "--out", f"{folder}/{_VIDEO_FILES[kind]}", "--fps", number_text(fps)],
+                needs=[task.id for task in renders],
+                inputs=[name for task in renders for name in task.produces],
+                produces=[f"{folder}/{_VIDEO_FILES[kind]}"],
+            )
+            for kind in self._scene.render.video
+        ]
+
+
+def _reconstructed_files(names: Sequence[str]) -> tuple[str, ...]:
+    """What ``physgen reconstruct`` leaves of a photo with objects of these ``names``."""
+    each = [f for name in names for f in (f"meshes/{name}.glb", f"masks/{name}.png", f"shadows/{name}.png")]
+    return (SCENE_FILE, "photo.png", "background.png", "light/environment.exr", *each)
