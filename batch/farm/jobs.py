@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
@@ -26,6 +27,9 @@ from .physics import FIELDS, Physics, brief, read_physics
 FORMAT = "physgen-jobs/1"
 MAX_BYTES = 2**20
 MOST_SCENES = 1000
+_ENDLESS_NAME = re.compile(r"""(?<![\w"'.-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){32}""")
+"""Dotted names of so many parts mean nothing here, and the time that reading one takes grows with their square."""
+
 VIDEOS = ("mp4", "webm", "sheet")
 ARCHITECTURES = ("cpu", "cuda", "vulkan", "metal")
 
@@ -163,7 +167,10 @@ def _read(path: Path) -> dict[str, Any]:
             content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB, so this is no job file")
-        return tomllib.loads(content.decode("utf-8"))
+        text = content.decode("utf-8")
+        if endless := _ENDLESS_NAME.search(text):
+            raise InputError(f"{path}: {brief(endless[0])}: is nested too deeply; this is none of our files")
+        return tomllib.loads(text)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}; give the name of a job file") from None
     except ValueError as error:

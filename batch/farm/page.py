@@ -104,7 +104,7 @@ def _head(summary: Summary) -> str:
     return (
         f"<h1>{escape(summary.job)}</h1>"
         f'<p class="dim">{_WORDS[summary.state]} · {_count(len(summary.tasks), "task")} · {duration(summary.seconds)}, '
-        f"{duration(cpu)} of CPU time · begun {escape(summary.started)} · PhysGen {escape(summary.version)}</p>"
+        f"{duration(cpu)} of CPU time · begun {escape(summary.started[:16].replace('T', ' '))} UTC · PhysGen {escape(summary.version)}</p>"
         f'<div class="bar">{bar}</div><ul class="legend">{legend}</ul>'
     )
 
