@@ -96,7 +96,7 @@ class _Board:
     def __init__(self, plan: Plan, options: FarmOptions) -> None:
         self.plan, self.options = plan, options
         self.broken: BaseException | None = None
-        self._changed = threading.Condition()
+        self._changed = threading.Condition(threading.RLock())
         self._index = {task.id: number for number, task in enumerate(plan.tasks)}
         self._missing = {task.id: len(set(task.needs)) for task in plan.tasks}
         self._followers: dict[str, list[Task]] = defaultdict(list)
@@ -122,8 +122,7 @@ class _Board:
         """The first task of the plan that can begin, once there is one; None when no more will."""
         with self._changed:
             while not (self.broken or self._closed or cancelled()):
-                fitting = [k for k, queue in self._ready.items() if queue and all(self._free[n] >= c for n, c in k)]
-                if fitting:
+                if fitting := self._fitting():
                     slots = min(fitting, key=lambda k: self._ready[k][0])
                     task = self.plan.tasks[heapq.heappop(self._ready[slots])]
                     self._free.subtract(dict(slots))
@@ -134,6 +133,11 @@ class _Board:
                 self._changed.wait(timeout=LOOK_S)
             self._changed.notify_all()
             return None
+
+    def has_ready(self) -> bool:
+        """Whether a task could begin now."""
+        with self._changed:
+            return bool(self._fitting())
 
     def settle(self, task: Task, outcome: Outcome) -> list[Outcome]:
         """Take notice of how ``task`` ended; the outcomes of those that are skipped for it."""
@@ -167,6 +171,10 @@ class _Board:
         state = "skipped" if self._closed else "cancelled"
         rest = self._closed or "not begun"
         return [self._outcomes.get(t.id, Outcome(task=t.id, state=state, message=rest)) for t in self.plan.tasks]
+
+    def _fitting(self) -> list[tuple[tuple[str, int], ...]]:
+        """Slots for which there are tasks that are ready and room for one."""
+        return [k for k, queue in self._ready.items() if queue and all(self._free[n] >= c for n, c in k)]
 
     def _make_ready(self, task: Task) -> None:
         heapq.heappush(self._ready[tuple(sorted(task.slots.items()))], self._index[task.id])

@@ -100,11 +100,15 @@ def _head(summary: Summary) -> str:
         if summary.counts[s]
     )
     legend = "".join(f"<li>{_state(s)} {summary.counts[s]}</li>" for s in STATES if summary.counts[s])
-    cpu = sum(stage.cpu_seconds for stage in summary.stages)
+    facts = [
+        _WORDS[summary.state],
+        _count(len(summary.tasks), "task"),
+        f"{duration(summary.seconds)}, {duration(sum(stage.cpu_seconds for stage in summary.stages))} of CPU time",
+        f"begun {summary.started[:16].replace('T', ' ')} UTC",
+        f"PhysGen {summary.version}",
+    ]
     return (
-        f"<h1>{escape(summary.job)}</h1>"
-        f'<p class="dim">{_WORDS[summary.state]} · {_count(len(summary.tasks), "task")} · {duration(summary.seconds)}, '
-        f"{duration(cpu)} of CPU time · begun {escape(summary.started[:16].replace('T', ' '))} UTC · PhysGen {escape(summary.version)}</p>"
+        f'<h1>{escape(summary.job)}</h1><p class="dim">{escape(" · ".join(facts))}</p>'
         f'<div class="bar">{bar}</div><ul class="legend">{legend}</ul>'
     )
 
