@@ -2,6 +2,10 @@
 """Tasks carried out for real, in processes of their own: done once, kept by content, stopped, refused, retried."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -86,7 +90,7 @@ def test_a_cancelled_task_stops_its_command(ball_scene, tmp_path):
     task = Task(id="bake", stage="bake", argv=argv, inputs=("scene",), produces=("bake/manifest.json",))
     outcome = carry_out(task, tmp_path, cancelled=going.is_set, on_event=hear)
     assert (outcome.state, outcome.exit_code) == ("cancelled", 130), outcome
-    assert not (tmp_path / "bake" / ".lock").exists() and not (tmp_path / ".farm" / "records").exists()
+    assert not (tmp_path / ".farm" / "records").exists(), "what was stopped is not remembered as done"
 
 
 def test_a_failure_costs_what_depends_on_it_and_nothing_else(ball_scene, tmp_path):
@@ -104,6 +108,29 @@ def test_a_failure_costs_what_depends_on_it_and_nothing_else(ball_scene, tmp_pat
     ended = [e["task"] for e in events if e["event"] == "task" and e["state"] != "started"]
     assert sorted(ended) == sorted(t.id for t in tasks)
     assert [o.state for o in run(plan, FarmOptions(), ignore, lambda: True)] == ["cancelled"] * 4
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals as on Unix")
+def test_a_job_that_is_interrupted_stops_in_good_order(ball_scene, tmp_path):
+    ball_scene()
+    job = tmp_path / "jobs.toml"
+    job.write_text(
+        'format = "physgen-jobs/1"\nname = "job"\n[[scenes]]\nname = "balls"\nscene = "scene"\n'
+        'bake = { frames = 5000, quality = "preview" }\nrender = { video = [] }\n'
+    )
+    command = [sys.executable, "-m", "physgen.batch.cli", "batch", str(job), "--json"]
+    planned = subprocess.run([*command, "--dry-run"], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert json.loads(planned[-1]) == {"event": "done", "tasks": 211, "variants": 1}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    events = []
+    for line in process.stdout:
+        events.append(json.loads(line))
+        if events[-1].get("task") == "balls/base/bake":
+            process.send_signal(signal.SIGINT)
+    assert process.wait() == 130 and events[-1]["kind"] == "Cancelled", events[-1]
+    summary = json.loads((tmp_path / "job" / "summary.json").read_text())
+    assert summary["state"] == "cancelled" and summary["counts"]["cancelled"] == 210
+    assert not (tmp_path / "job" / ".farm" / ".lock").exists()
 
 
 def test_what_is_worth_another_attempt():
