@@ -13,6 +13,7 @@ from ...sim.reconstruct.pipeline import object_names
 from ...sim.scene.folder import SCENE_FILE, referenced_files
 from ...sim.scene.model import Vector
 from ...sim.version import VERSION
+from ..render_arguments import render_arguments
 from .jobs import Job, JobScene
 from .matrix import Variant
 from .physics import describe
@@ -122,8 +123,8 @@ class _Builder:
         # Sizes are taken in the order of the objects: one that is left out ends them.
         sizes = [item.size_m for item in scene.objects if item.size_m is not None]
         argv += [f"--size={number_text(size)}" for size in sizes]
-        options = scene.options
-        for flag, value in (("horizon", options.horizon_y), ("pitch", options.pitch_deg), ("fov", options.fov_deg)):
+        reading = scene.reading
+        for flag, value in (("horizon", reading.horizon_y), ("pitch", reading.pitch_deg), ("fov", reading.fov_deg)):
             argv += [] if value is None else [f"--{flag}={number_text(value)}"]
         return self._task(
             f"{scene.name}/reconstruct",
@@ -172,7 +173,7 @@ class _Builder:
         out = f"{folder}/bake"
         argv = ["bake", f"{folder}/scene", "--out", out, "--frames", str(options.frames)]
         argv += ["--fps", number_text(options.fps), "--quality", options.quality, "--arch", options.arch]
-        argv += ["--seed", str(seed), *(["--points"] if options.points else [])]
+        argv += ["--seed", str(seed), *([] if options.points else ["--no-points"])]
         return self._task(
             f"{prefix}/bake",
             "bake",
@@ -184,16 +185,14 @@ class _Builder:
         )
 
     def _renders(self, prefix: str, folder: str) -> list[Task]:
-        settings = self._scene.render
+        options = self._scene.options
+        suffix = ".png" if getattr(options, "format", "png") == "png" else ".exr"
         tasks = []
-        for frames in frame_chunks(self._scene.frames, settings.chunk):
+        for frames in frame_chunks(self._scene.frames, self._scene.render.chunk):
             name = f"{frames[0]:04d}-{frames[-1]:04d}"
             out = f"{folder}/frames/{name}"
             argv = ["render", f"{folder}/scene", "--bake", f"{folder}/bake", "--out", out]
-            argv += ["--frames", range_text(frames), "--engine", settings.engine]
-            argv += [] if settings.samples is None else ["--samples", str(settings.samples)]
-            argv += ["--scale", number_text(settings.scale)]
-            argv += [] if settings.device is None else ["--device", settings.device]
+            argv += ["--frames", range_text(frames), *render_arguments(options)]
             tasks.append(
                 self._task(
                     f"{prefix}/render-{name}",
@@ -201,8 +200,8 @@ class _Builder:
                     argv,
                     needs=[f"{prefix}/bake"],
                     inputs=[f"{folder}/scene", f"{folder}/bake"],
-                    produces=[f"{out}/{number:04d}.png" for number in frames],
-                    gpu=settings.device not in (None, "cpu"),
+                    produces=[f"{out}/{number:04d}{suffix}" for number in frames],
+                    gpu=getattr(options, "device", "cpu") != "cpu",
                 )
             )
         return tasks

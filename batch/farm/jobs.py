@@ -9,7 +9,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ...physgen_addon.bridge.plan import parse_range
+from ...physgen_addon.bridge.frame_range import parse_range
+from ...physgen_addon.bridge.options import RenderOptions
 from ...sim.app.bake_inputs import BakeOptions
 from ...sim.app.quality import load_quality
 from ...sim.app.reconstruct import require_physics, with_physics
@@ -20,7 +21,6 @@ from ...sim.reconstruct.pipeline import object_names
 from ...sim.scene.folder import SceneFolder, inside, load_scene
 from ...sim.scene.json_fields import parse
 from ...sim.scene.overrides import check_overrides
-from ..pipeline import RenderRequest, check_render
 from .matrix import Variant, read_variants, require_name
 from .physics import FIELDS, Physics, brief, read_physics
 
@@ -36,20 +36,15 @@ ARCHITECTURES = ("cpu", "cuda", "vulkan", "metal")
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How a variant's frames are made.
+    """What of a variant is rendered, besides ``RenderOptions``.
 
-    engine, samples, scale, frames: as ``physgen render`` takes them; frames: None for all that are baked.
-    chunk: frames a task, 1 to 10000. video: what the frames are put together to, some of ``VIDEOS``, may be empty.
-    device: as ``physgen render`` takes it; None leaves it out.
+    frames: range such as ``1-48x2``; None for all that are baked. chunk: frames a task, 1 to 10000.
+    video: what the frames are put together to, some of ``VIDEOS``, may be empty.
     """
 
-    engine: str = "cycles"
-    samples: int | None = None
-    scale: float = 1.0
     frames: str | None = None
     chunk: int = 24
     video: tuple[str, ...] = ("mp4",)
-    device: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.chunk <= 10_000:
@@ -57,25 +52,23 @@ class RenderSettings:
         for name in self.video:
             if name not in VIDEOS or self.video.count(name) > 1:
                 raise InputError(f"video is {list(self.video)!r}: give each of {', '.join(VIDEOS)} at most once")
-        if self.device is not None and not (self.device.isascii() and self.device.isalnum()):
-            raise InputError(f"device is {self.device!r}: give a word such as cpu, cuda or optix")
-        check_render(RenderRequest(engine=self.engine, samples=self.samples, scale=self.scale), None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JobScene:
     """A scene of a job with all its variants.
 
-    photo: relative to the job file's folder, with the ``objects`` to cut out and the ``options`` to do it with; or
+    photo: relative to the job file's folder, with the ``objects`` to cut out and the ``reading`` of it; or
     folder: the scene folder that is there already. frames: numbers of those that are rendered, rising.
     """
 
     name: str
     photo: str | None
     objects: tuple[ObjectRequest, ...]
-    options: ReconstructOptions
+    reading: ReconstructOptions
     folder: SceneFolder | None
     bake: BakeOptions
+    options: RenderOptions
     render: RenderSettings
     frames: tuple[int, ...]
     variants: tuple[Variant, ...]
@@ -190,12 +183,12 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
     require_name(said.name, f"{where}.name")
     bake = _bake(_merged(defaults.bake, rest.get("bake"), f"{file}.defaults.bake", f"{where}.bake"), where)
     render_table = _merged(defaults.render, rest.get("render"), f"{file}.defaults.render", f"{where}.render")
-    render = parse(RenderSettings, render_table, f"{where}.render")
+    options, render = _render(render_table, f"{where}.render")
     try:
         frames = tuple(parse_range(render.frames, 1, bake.frames))
     except InputError as error:
         raise InputError(f"{where}.render.frames: {error}") from None
-    objects, options, folder = _source(said, root, where)
+    objects, reading, folder = _source(said, root, where)
     matrices = [(top.matrix, f"{file}.matrix"), (rest.get("matrix"), f"{where}.matrix")]
     variants = read_variants(
         read_physics(rest, where), [(t, w) for t, w in matrices if t is not None], rest.get("variants"), where
@@ -207,9 +200,10 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
         name=said.name,
         photo=said.photo,
         objects=objects,
-        options=options,
+        reading=reading,
         folder=folder,
         bake=bake,
+        options=options,
         render=render,
         frames=frames,
         variants=variants,
@@ -236,6 +230,24 @@ def _bake(table: dict[str, Any], where: str) -> BakeOptions:
     except InputError as error:
         raise InputError(f"{where}.bake: {error}") from None
     return options
+
+
+def _render(table: dict[str, Any], where: str) -> tuple[RenderOptions, RenderSettings]:
+    """The fields that are flags of ``physgen render``, and those of the job file alone."""
+    flags = {f.name: f.metadata.get("choices") for f in fields(RenderOptions) if "help" in f.metadata}
+    del flags["threads"]
+    own = [f.name for f in fields(RenderSettings)]
+    unknown = sorted(set(table) - {*flags, *own})
+    if unknown:
+        remedy = (
+            "give --threads to physgen batch" if unknown[0] == "threads" else f"known are {', '.join([*own, *flags])}"
+        )
+        raise InputError(f"{where}.{unknown[0]}: unknown field; {remedy}")
+    for name, choices in flags.items():
+        if choices is not None and table.get(name, choices[0]) not in choices:
+            raise InputError(f"{where}.{name}: is {brief(table[name])}: choose one of {', '.join(choices)}")
+    settings = parse(RenderSettings, {name: table[name] for name in own if name in table}, where)
+    return parse(RenderOptions, {name: table[name] for name in flags if name in table}, where), settings
 
 
 def _source(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from physgen.batch.cli import build_parser
 from physgen.batch.farm.graph import frame_chunks, make_plan, range_text
 from physgen.batch.farm.jobs import MAX_BYTES, load_job
-from physgen.physgen_addon.bridge.plan import parse_range
+from physgen.physgen_addon.bridge.frame_range import parse_range
 from physgen.sim.errors import InputError
 
 HEAD = 'format = "physgen-jobs/1"\nname = "job"\n'
@@ -131,7 +131,10 @@ def test_a_scene_has_axes_and_variants_of_its_own_over_what_is_common(job):
         (HEAD + SCENE + "render = { samples = 0 }", "samples is 0"),
         (HEAD + SCENE + 'render = { frames = "1-99" }', "frames 1 to 48 are baked"),
         (HEAD + SCENE + 'render = { video = ["gif"] }', "each of mp4, webm, sheet"),
-        (HEAD + SCENE + 'render = { device = "--x" }', "give a word such as cpu"),
+        (HEAD + SCENE + 'render = { engine = "povray" }', "engine: is 'povray': choose one of cycles"),
+        (HEAD + SCENE + 'render = { engine = ["cycles"] }', "choose one of cycles"),
+        (HEAD + SCENE + "render = { threads = 2 }", "give --threads"),
+        (HEAD + SCENE + "render = { seed = 2 }", "render.seed: unknown field"),
         (HEAD + "[defaults]\ncook = 1\n" + SCENE, "defaults.cook: unknown field"),
         (HEAD + "a" + ".a" * 200_000 + " = 1\n" + SCENE, "nested too deeply"),
         (HEAD + "x = " + "[" * 50_000, "nested too deeply|not readable"),
