@@ -3,6 +3,10 @@
 
 import json
 import random
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -79,6 +83,16 @@ def test_a_scene_has_axes_and_variants_of_its_own_over_what_is_common(job):
     assert scene.bake.frames == 10 and scene.bake.fps == 12 and scene.render.chunk == 7
     assert scene.variants[0].physics.presets == ("jelly",)
     assert scene.variants[2].physics.presets == () and scene.variants[2].physics.velocities == ((0.0, 0.0, 1.0),)
+
+
+def test_the_example_of_the_documentation_works(tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "farm.md").read_text(encoding="utf-8")
+    (tmp_path / "coffee.toml").write_text(re.search(r"```toml\n(.*?)```", text, re.S)[1])
+    code = re.search(r'python -c "(.*)"', text)[1]
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    loaded = load_job(tmp_path / "coffee.toml")
+    assert names(loaded) == ["jelly-v1", "jelly-v2", "rubber-v1", "rubber-v2", "gale"]
+    assert (tmp_path / "coffee.png").stat().st_size > 100_000
 
 
 @pytest.mark.parametrize(
