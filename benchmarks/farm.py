@@ -2,10 +2,14 @@
 """What the local farm adds to its tasks: milliseconds a task, apart from the time of the commands themselves.
 
     python benchmarks/farm.py [--tasks 1000] [--workers 1] [--json]
+    python benchmarks/farm.py --scene SCENE --bake BAKE [--frames 1-16] [--samples 16] [--json]
 
 The command of every task is a shell that writes one byte, so that no interpreter's start is measured. Of a run with one
 worker, the time that its commands ran (from their start to their end) is taken off; what is left is the scheduler, its
 events and summary, logs, hashes and records. The second run finds everything done: all of its time is overhead.
+
+With a scene, its frames are rendered by one worker and by two, with one CPU thread each, in four chunks: how many times
+faster the two are. It means something on a machine with two idle cores.
 """
 
 from __future__ import annotations
@@ -18,9 +22,11 @@ import time
 from pathlib import Path
 
 from physgen.batch.farm import execute, local
+from physgen.batch.farm.graph import frame_chunks, range_text
 from physgen.batch.farm.monitor import Monitor
 from physgen.batch.farm.runners import FarmOptions
 from physgen.batch.farm.task import Plan, Task
+from physgen.physgen_addon.bridge.frame_range import parse_range
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
 
@@ -51,6 +57,41 @@ def shell_command(module: str, argument: str, *rest: str, folder: Path, ends_wit
     return ["/bin/sh", "-c", 'printf x > "$0"', str(folder / argument)]
 
 
+def render_plan(root: Path, scene: Path, bake: Path, frames: str, samples: int) -> Plan:
+    """The frames of a scene in four chunks."""
+    numbers = parse_range(frames, 1, 100_000)
+    tasks = []
+    for chunk in frame_chunks(numbers, -(-len(numbers) // 4)):
+        out = f"out/{chunk[0]:04d}"
+        argv = ["render", str(scene), "--bake", str(bake), "--out", out, "--frames", range_text(chunk)]
+        tasks.append(
+            Task(
+                id=f"scene/frames/{chunk[0]:04d}",
+                stage="render",
+                argv=(*argv, "--samples", str(samples)),
+                produces=tuple(f"{out}/{number:04d}.png" for number in chunk),
+                farm_folder="out/.farm",
+            )
+        )
+    return Plan(name="frames", root=root, version=VERSION, tasks=tuple(tasks), out="out")
+
+
+def compare_workers(options: argparse.Namespace) -> int:
+    """Render with one worker and with two; print how long each took."""
+    seconds = {}
+    for workers in (1, 2):
+        with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+            root = Path(folder).resolve()
+            plan = render_plan(root, options.scene.resolve(), options.bake.resolve(), options.frames, options.samples)
+            seconds[workers] = measure(plan, workers)["seconds"]
+    ratio = seconds[1] / seconds[2]
+    if options.json:
+        print(json.dumps({"one_worker_s": seconds[1], "two_workers_s": seconds[2], "times_faster": ratio}))
+    else:
+        print(f"one worker {seconds[1]:.1f} s, two {seconds[2]:.1f} s: {ratio:.2f} times faster")
+    return 0
+
+
 def measure(plan: Plan, workers: int) -> dict[str, float]:
     """Seconds of one run, and milliseconds a task of it that were not its commands'."""
     monitor = Monitor(plan, ignore)
@@ -77,7 +118,13 @@ def main() -> int:
     parser.add_argument("--tasks", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--scene", type=Path)
+    parser.add_argument("--bake", type=Path)
+    parser.add_argument("--frames", default="1-16")
+    parser.add_argument("--samples", type=int, default=16)
     options = parser.parse_args()
+    if options.scene is not None:
+        return compare_workers(options)
     execute.own_command = shell_command  # type: ignore[assignment]
     with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
         plan = tiny_plan(Path(folder).resolve() / "job", options.tasks)

@@ -30,7 +30,7 @@ from .task import Outcome, Task
 STOP_GRACE_S = CANCEL_GRACE_S + 5.0
 """Longer than the command itself waits for the processes that it has started."""
 
-FOLDER_WAIT_S = 60.0
+FOLDER_WAIT_S = 300.0
 """How long a task waits for a folder that a killed attempt's process still holds: it ends with its frame."""
 
 DRAIN_S = 2.0

@@ -15,7 +15,16 @@ from hypothesis import strategies as st
 from physgen.batch.farm.execute import execute
 from physgen.batch.farm.local import _Board, run
 from physgen.batch.farm.log import EARLIER_BYTES, HEAD_BYTES, TAIL_BYTES, TaskLog, log_end
-from physgen.batch.farm.records import log_path
+from physgen.batch.farm.records import (
+    Record,
+    input_hashes,
+    kept_record,
+    load_record,
+    log_path,
+    produced_hashes,
+    record_path,
+    save_record,
+)
 from physgen.batch.farm.retry import is_worth_retrying
 from physgen.batch.farm.runners import FarmOptions, find_runner
 from physgen.batch.farm.task import Outcome, Plan, Task
@@ -131,6 +140,27 @@ def test_a_job_that_is_interrupted_stops_in_good_order(ball_scene, tmp_path):
     summary = json.loads((tmp_path / "job" / "summary.json").read_text())
     assert summary["state"] == "cancelled" and summary["counts"]["cancelled"] == 210
     assert not (tmp_path / "job" / ".farm" / ".lock").exists()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.binary(max_size=80), st.integers(0, 2**32))
+def test_a_damaged_record_is_none(tmp_path_factory, noise, seed):
+    root = tmp_path_factory.mktemp("record")
+    (root / "in").write_text("in")
+    (root / "made").write_text("made")
+    task = Task(id="a/b", stage="bake", argv=("x",), inputs=("in",), produces=("made",))
+    fields = {"task": "a/b", "version": VERSION, "argv": ("x",), "seconds": 1.0, "cpu_seconds": 2.0, "worker": "w"}
+    record = Record(**fields, inputs=input_hashes(task, root), produced=produced_hashes(task, root))
+    save_record(task, root, record)
+    assert kept_record(task, root, VERSION) == record
+    path = record_path(task, root)
+    content = bytearray(path.read_bytes())
+    at = seed % len(content)
+    content[at : at + 1 + len(noise) // 2] = noise
+    path.write_bytes(bytes(content))
+    assert kept_record(task, root, VERSION) in (None, record) or load_record(task, root).produced == record.produced
+    path.write_bytes(noise)
+    assert kept_record(task, root, VERSION) is None
 
 
 def test_what_is_worth_another_attempt():
