@@ -7,6 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
+from ...physgen_addon.bridge.formats import FrameFormat
 from ...sim.app.bake_inputs import BakeOptions
 from ...sim.errors import InputError
 from ...sim.reconstruct.pipeline import object_names
@@ -186,7 +187,7 @@ class _Builder:
 
     def _renders(self, prefix: str, folder: str) -> list[Task]:
         options = self._scene.options
-        suffix = ".png" if getattr(options, "format", "png") == "png" else ".exr"
+        suffix = FrameFormat(kind=options.format).suffix
         tasks = []
         for frames in frame_chunks(self._scene.frames, self._scene.render.chunk):
             name = f"{frames[0]:04d}-{frames[-1]:04d}"

@@ -220,7 +220,7 @@ def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):
         + '[matrix]\nseeds = [0, 1]\nvelocities = [[-1, -1e-7, 0.1]]\neffects = [[{ name = "wind" }]]\n'
         + SCENE.replace('["cup"]', '["-my cup"]')
         + "pitch = -5\nset = { '-my cup.density' = 300 }\n"
-        + '[[scenes]]\nname = "balls"\nscene = "my scene"\nbake = { arch = "cuda" }\n'
+        + '[[scenes]]\nname = "balls"\nscene = "my scene"\nbake = { arch = "cuda" }\nrender = { format = "exr" }\n'
     )
     plan = make_plan(job(text))
     assert plan.out == "results" and plan.root == tmp_path.resolve() and len(plan.meanings) == 4
@@ -231,8 +231,9 @@ def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):
         for name in task.produces:
             assert name.startswith("results/") and name not in seen, "no two tasks write one file"
             seen[name] = task.id
-        if task.stage != "encode":
-            build_parser().parse_args(task.argv)
+        build_parser().parse_args(task.argv)
+        if task.stage == "render":
+            assert {name[-4:] for name in task.produces} == {".exr" if task.id.startswith("balls") else ".png"}
     stages = [task.stage for task in plan.tasks]
     assert [stages.count(s) for s in ("reconstruct", "variant", "bake", "render", "encode")] == [1, 4, 4, 12, 8]
     last = plan.tasks[-1]
