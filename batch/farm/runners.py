@@ -16,6 +16,7 @@ from typing import cast
 
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
+from .cluster_options import ClusterOptions
 from .retry import RETRIES
 from .task import Outcome, Plan, Task
 
@@ -27,13 +28,15 @@ MOST_RETRIES = 100
 class FarmOptions:
     """How a plan is carried out.
 
-    farm: ``local``, ``dask``, or the address of a Dask scheduler, ``tcp://…`` or ``tls://…``.
+    farm: ``local``, ``dask`` (on this machine), ``slurm`` (Dask workers as SLURM's jobs), or the address of a Dask
+        scheduler, ``tcp://…`` or ``tls://…``.
     workers: tasks at a time, 1 to 1024; 0 leaves it to the runner: half the cores, or what the cluster has.
     threads: CPU threads of each render, 0 (all) to 1024; it changes nothing in the results.
     retries: how often a task is started again after a failure that may pass, 0 to 100.
     fail_fast: whether nothing new is started after the first failure; else all that does not depend on it goes on.
     slots: how much there is at a time of what tasks take up by name, such as ``{"gpu": 1}``; of others there is one.
-    out: file that an exporter writes.
+    out: folder or file that an exporter writes.
+    cluster: what there is to say about other machines.
     """
 
     farm: str = "local"
@@ -43,6 +46,7 @@ class FarmOptions:
     fail_fast: bool = False
     slots: Mapping[str, int] = field(default_factory=dict)
     out: Path | None = None
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
 
     def __post_init__(self) -> None:
         for name, most in (("workers", MOST_WORKERS), ("threads", 1024), ("retries", MOST_RETRIES)):
@@ -56,7 +60,13 @@ Runner = Callable[[Plan, FarmOptions, OnEvent, IsCancelled], list[Outcome]]
 Exporter = Callable[[Plan, FarmOptions], list[Path]]
 """Writes a plan for another program, to the options' ``out``; the files that it wrote."""
 
-RUNNERS = {"local": "local:run", "dask": "dask_farm:run", "tcp": "dask_farm:run", "tls": "dask_farm:run"}
+RUNNERS = {
+    "local": "local:run",
+    "dask": "dask_farm:run",
+    "tcp": "dask_farm:run",
+    "tls": "dask_farm:run",
+    "slurm": "dask_farm:run",
+}
 """Name, or scheme of an address → module of this package and its function."""
 
 EXPORTERS = {"flamenco": "flamenco:export", "slurm": "slurm:export"}
@@ -66,7 +76,9 @@ def find_runner(farm: str) -> Runner:
     """The runner for ``--farm``. Raises InputError for one that nobody knows."""
     name, colon, rest = farm.partition("://")
     if name not in RUNNERS or bool(colon) != (name in ("tcp", "tls")) or (colon and not rest):
-        raise InputError(f"--farm is {farm!r}: choose local, dask, or the address of a scheduler, tcp://HOST:PORT")
+        raise InputError(
+            f"--farm is {farm!r}: choose local, dask, slurm, or the address of a scheduler, tcp://HOST:PORT"
+        )
     return cast(Runner, _load(RUNNERS[name]))
 
 

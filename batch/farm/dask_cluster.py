@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A Dask cluster to work with: on this machine, at an address, or as SLURM's jobs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import shutil
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ...sim.app.process import own_command, read_errors, start_process
+from ...sim.errors import Cancelled, InputError
+from ...sim.events import IsCancelled
+from .dask_security import check_trust, file_security
+from .runners import FarmOptions
+
+CONNECT_S = 10.0
+START_S = 60.0
+"""How long workers on this machine may take to start."""
+
+LOOK_S = 0.2
+MOST_FAILED_STARTS = 3
+"""Workers on this machine that die before any has come up: then something is wrong with all of them."""
+
+
+@contextmanager
+def connected(
+    options: FarmOptions, slots: Mapping[str, int], in_all: Mapping[str, int], scratch: Path, cancelled: IsCancelled
+) -> Iterator[Any]:
+    """A ``distributed.Client`` with at least one worker; whatever was started for it ends with it.
+
+    slots: by name, what a worker needs that can carry out any task. in_all: what this machine has.
+    scratch: folder that all machines see.
+    Raises InputError when Dask is not installed, nobody answers, or no worker comes.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise InputError(
+            f"--farm {options.farm} needs Dask.distributed, which cannot be imported ({error}): "
+            "pip install 'physgen[farm]'"
+        ) from error
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    # It tells of every worker that goes, with its stack.
+    logger.setLevel(logging.CRITICAL)
+    try:
+        if options.farm == "dask":
+            with _on_this_machine(distributed, options, slots, in_all, cancelled) as client:
+                yield client
+        elif options.farm == "slurm":
+            with _on_slurm(distributed, options, slots, scratch, cancelled) as client:
+                yield client
+        else:
+            with _at_address(distributed, options, cancelled) as client:
+                yield client
+    finally:
+        logger.setLevel(level)
+
+
+@contextmanager
+def _at_address(distributed: Any, options: FarmOptions, cancelled: IsCancelled) -> Iterator[Any]:
+    cluster = options.cluster
+    security = file_security(options.farm, cluster.tls_ca, cluster.tls_cert, cluster.tls_key)
+    check_trust(options.farm, trust_network=cluster.trust_network)
+    try:
+        client = distributed.Client(options.farm, security=security, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f"{options.farm}: no scheduler answers there ({_first_line(error)}); start one with 'dask scheduler', "
+            "check address and certificates"
+        ) from error
+    with client:
+        remedy = f"start some: python -m physgen.batch.farm.dask_worker {options.farm}"
+        _await_workers(client, 1, CONNECT_S, cancelled, lambda: f"{options.farm} has no workers; {remedy}")
+        yield client
+
+
+@contextmanager
+def _on_this_machine(
+    distributed: Any,
+    options: FarmOptions,
+    slots: Mapping[str, int],
+    in_all: Mapping[str, int],
+    cancelled: IsCancelled,
+) -> Iterator[Any]:
+    """Workers on the loopback, with certificates that exist in the memory of these processes only.
+
+    Without them any other user of this machine could connect, and run anything as this one.
+    """
+    import dask
+
+    count = options.workers or max(1, (os.cpu_count() or 1) // 2)
+    security = distributed.Security.temporary()
+    # Deaths of workers that a task outlives before Dask gives it up; the last word has the retry rule.
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": options.retries}),
+        distributed.LocalCluster(
+            n_workers=0, host="127.0.0.1", protocol="tls://", security=security, dashboard_address=None
+        ) as cluster,
+        _LocalWorkers(cluster.scheduler_address, security, shares(slots, in_all, count)) as workers,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        _await_workers(client, count, START_S, cancelled, workers.complaint, workers.have_failed)
+        yield client
+
+
+def shares(slots: Mapping[str, int], in_all: Mapping[str, int], workers: int) -> list[dict[str, int]]:
+    """What each of ``workers`` workers has of ``in_all``, dealt out in portions of ``slots``."""
+    result: list[dict[str, int]] = [{} for _ in range(workers)]
+    for name, portion in sorted(slots.items()):
+        for index in range(in_all[name] // portion):
+            share = result[index % workers]
+            share[name] = share.get(name, 0) + portion
+    return result
+
+
+class _LocalWorkers:
+    """Worker processes of this machine; one that dies is started again, as long as this object is open."""
+
+    def __init__(self, address: str, security: Any, shares: list[dict[str, int]]) -> None:
+        self._address = address
+        self._credentials = json.dumps(
+            {"require_encryption": True, **{k: getattr(security, k) for k in vars_of(security)}}
+        ).encode()
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._shares = shares
+        self._words: deque[str] = deque(maxlen=20)
+        self._closing = threading.Event()
+        self._failed_starts = 0
+        self._keeper = threading.Thread(target=self._keep, daemon=True)
+
+    def __enter__(self) -> _LocalWorkers:
+        try:
+            self._processes.extend(self._start(share) for share in self._shares)
+        except BaseException:
+            self._end()
+            raise
+        self._keeper.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._keeper.join()
+        self._end()
+
+    def have_failed(self) -> bool:
+        """Whether nothing else is to be expected."""
+        return self._failed_starts >= MOST_FAILED_STARTS
+
+    def complaint(self) -> str:
+        """Why none came up."""
+        return "workers of this machine do not start: " + ("\n".join(self._words).strip() or "they say nothing")
+
+    def _start(self, share: Mapping[str, int]) -> subprocess.Popen[bytes]:
+        slots = [word for name, count in share.items() for word in ("--slot", f"{name}={count}")]
+        arguments = [self._address, "--host", "127.0.0.1", "--security-on-stdin", *slots]
+        command = own_command("batch.farm.dask_worker", *arguments, ends_with_us=True)
+        process = start_process(command, stdin=subprocess.PIPE)
+        assert process.stdin is not None and process.stdout is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin:
+            process.stdin.write(self._credentials)
+        threading.Thread(target=read_errors, args=(process, self._words), daemon=True).start()
+        threading.Thread(target=_drain, args=(process,), daemon=True).start()
+        return process
+
+    def _keep(self) -> None:
+        while not self._closing.wait(LOOK_S):
+            for index, process in enumerate(self._processes):
+                if process.poll() is None or self.have_failed():
+                    continue
+                if process.returncode > 0:
+                    self._failed_starts += 1
+                with contextlib.suppress(InputError):
+                    self._processes[index] = self._start(self._shares[index])
+
+    def _end(self) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.terminate()
+        for process in self._processes:
+            try:
+                process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def vars_of(security: Any) -> list[str]:
+    """Names of the fields of ``security`` that a worker needs."""
+    return [name for name in ("tls_ca_file", "tls_worker_cert", "tls_worker_key") if getattr(security, name)]
+
+
+def _drain(process: subprocess.Popen[bytes]) -> None:
+    assert process.stdout is not None
+    while process.stdout.read(65536):
+        pass
+
+
+@contextmanager
+def _on_slurm(
+    distributed: Any, options: FarmOptions, slots: Mapping[str, int], scratch: Path, cancelled: IsCancelled
+) -> Iterator[Any]:
+    """One worker a job; they come when SLURM lets them. The scheduler is this process, reached by TLS."""
+    if shutil.which("sbatch") is None:
+        raise InputError("--farm slurm: there is no sbatch on this machine; run it on a login node of the cluster")
+    with (
+        slurm_cluster(options, slots, scratch) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        cluster.scale(jobs=options.workers or 1)
+        _await_workers(client, 1, None, cancelled, lambda: "")
+        yield client
+
+
+def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path) -> Any:
+    """dask-jobqueue's ``SLURMCluster`` as ``options`` ask for it, without jobs yet.
+
+    slots: what each worker has, by name. scratch: folder that all nodes see; certificates are written there, for this
+    user only. Raises InputError when dask-jobqueue is not installed.
+    """
+    try:
+        from dask_jobqueue.slurm import SLURMCluster
+    except ImportError as error:
+        raise InputError(
+            f"--farm slurm needs dask-jobqueue, which is not installed ({error}): pip install 'physgen[farm]'"
+        ) from error
+    wanted = options.cluster
+    resources = ["--resources", ",".join(f"{name}={count}" for name, count in sorted(slots.items()))] if slots else []
+    scratch.mkdir(parents=True, exist_ok=True)
+    return SLURMCluster(
+        queue=wanted.queue or None,
+        account=wanted.account or None,
+        walltime=wanted.walltime or "1-00:00:00",
+        # Dask's threads and memory are those of its own process: one task at a time, and no limit of its own.
+        cores=1,
+        processes=1,
+        memory="1GB",
+        job_cpu=wanted.cores,
+        job_mem=wanted.memory or None,
+        job_directives_skip=[] if wanted.memory else ["--mem"],
+        job_extra_directives=[*(f"--gres={name}:{count}" for name, count in sorted(slots.items())), *wanted.sbatch],
+        worker_extra_args=[*resources, "--memory-limit", "0", "--no-dashboard"],
+        python=wanted.python,
+        log_directory=str(scratch),
+        local_directory="$TMPDIR",
+        shared_temp_directory=str(scratch),
+        security=True,
+        protocol="tls://",
+        scheduler_options={"dashboard": False, "dashboard_address": None},
+    )
+
+
+def _await_workers(
+    client: Any,
+    count: int,
+    seconds: float | None,
+    cancelled: IsCancelled,
+    complaint: Callable[[], str],
+    hopeless: Callable[[], bool] = lambda: False,
+) -> None:
+    """Wait for ``count`` workers; a part of them is enough after ``seconds``. None waits as long as it takes."""
+    waited = 0.0
+    pause = threading.Event()
+    while (present := len(worker_addresses(client))) < count:
+        if cancelled():
+            raise Cancelled("cancelled while waiting for workers; run it again to continue")
+        if hopeless() or (seconds is not None and waited >= seconds):
+            if present and not hopeless():
+                return
+            raise InputError(complaint())
+        pause.wait(LOOK_S)
+        waited += LOOK_S
+
+
+def worker_addresses(client: Any) -> list[str]:
+    """Addresses of the workers that the scheduler has now."""
+    return sorted(client.nthreads())
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]
