@@ -12,6 +12,7 @@ from ...sim.cache.lock import folder_lock
 from ...sim.errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ...sim.events import IsCancelled
 from ..terminal import Terminal
+from .cluster_options import add_cluster_options, cluster_options
 from .graph import make_plan
 from .jobs import load_job
 from .monitor import SUMMARY_PAGE, Monitor
@@ -25,7 +26,7 @@ _OF_STAGE: dict[str, type[PhysGenError]] = {"bake": SimulationError, "render": R
 def add_batch(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen batch``."""
     parser.add_argument("job", type=Path, metavar="JOBS.toml", help="the job file")
-    where = "local (default), dask, or the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"
+    where = "local (default), dask, slurm, or the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"
     parser.add_argument("--farm", default="local", metavar="WHERE", help=where)
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="tasks at a time (default: half the cores)")
     parser.add_argument(
@@ -39,7 +40,8 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fail-fast", action="store_true", help=fast)
     parser.add_argument("--dry-run", action="store_true", help="only list the tasks")
     parser.add_argument("--export", choices=[*EXPORTERS], help="write the job for another program, and run nothing")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file that --export writes")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder that --export writes")
+    add_cluster_options(parser)
     parser.set_defaults(wrong_usage=parser.error)
 
 
@@ -62,6 +64,7 @@ def run_batch(options: argparse.Namespace, terminal: Terminal, cancelled: IsCanc
         fail_fast=options.fail_fast,
         slots=dict(options.slots),
         out=options.out,
+        cluster=cluster_options(options),
     )
     runner = find_runner(farm.farm)
     plan = make_plan(load_job(options.job))

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import shutil
 import subprocess
 import threading
@@ -98,7 +97,6 @@ def _on_this_machine(
     """
     import dask
 
-    count = options.workers or max(1, (os.cpu_count() or 1) // 2)
     security = distributed.Security.temporary()
     # Deaths of workers that a task outlives before Dask gives it up; the last word has the retry rule.
     with (
@@ -106,10 +104,10 @@ def _on_this_machine(
         distributed.LocalCluster(
             n_workers=0, host="127.0.0.1", protocol="tls://", security=security, dashboard_address=None
         ) as cluster,
-        _LocalWorkers(cluster.scheduler_address, security, shares(slots, in_all, count)) as workers,
+        _LocalWorkers(cluster.scheduler_address, security, shares(slots, in_all, options.workers)) as workers,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
-        _await_workers(client, count, START_S, cancelled, workers.complaint, workers.have_failed)
+        _await_workers(client, options.workers, START_S, cancelled, workers.complaint, workers.have_failed)
         yield client
 
 

@@ -8,28 +8,21 @@ as it is for ``--farm local``.
 from __future__ import annotations
 
 import dataclasses
-import pydoc
 import secrets
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
-from ...sim.atomic import write_bytes
 from ...sim.errors import Cancelled, InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from .dask_cluster import LOOK_S, connected, worker_addresses
-from .dask_worker import carry_out, read_token, stop
+from .dask_crew import Crew, check_slots, slots_of_a_worker, token_file
+from .dask_worker import carry_out, stop
 from .execute import STOP_GRACE_S
+from .local import cores
 from .retry import is_worth_retrying
 from .runners import FarmOptions, ended_event, started_event
 from .task import STAGES, Outcome, Plan
-
-VERSION_NAME = "physgen.sim.version.VERSION"
-ASK_S = 30.0
-"""How long a worker may take to say what it is."""
 
 LONELY_S = 30.0
 """After so long without any worker, that is said."""
@@ -43,101 +36,20 @@ def run(plan: Plan, options: FarmOptions, on_event: OnEvent, cancelled: IsCancel
     the scheduler goes away.
     """
     scratch = plan.root / (plan.tasks[0].farm_folder if plan.tasks else ".farm") / "dask"
-    a_worker = _a_worker(plan)
+    if options.farm == "dask":
+        workers = options.workers or max(1, cores() // 2)
+        threads = options.threads or max(1, cores() // workers)
+        options = dataclasses.replace(options, workers=workers, threads=threads)
+    a_worker = slots_of_a_worker(plan)
     in_all = {name: options.slots.get(name, 1) for name in a_worker}
-    with connected(options, a_worker, in_all, scratch, cancelled) as client, _token(scratch) as token:
+    with connected(options, a_worker, in_all, scratch, cancelled) as client, token_file(scratch) as token:
         run_name = f"physgen-{secrets.token_hex(8)}"
-        crew = _Crew(client, plan, token)
+        crew = Crew(client, plan, token)
         crew.refuse_strangers()
-        _check_slots(plan, client.run(_resources))
+        check_slots(plan, client)
         heard: Queue[tuple[str, Any]] = Queue()
         client.subscribe_topic(run_name, lambda event: heard.put(("said", event[1])))
         return _Run(plan, options, on_event, cancelled, client, crew, heard, run_name).outcomes()
-
-
-def _a_worker(plan: Plan) -> dict[str, int]:
-    """What a worker needs that can carry out any task, by name."""
-    slots: dict[str, int] = {}
-    for task in plan.tasks:
-        for name, count in task.slots.items():
-            slots[name] = max(count, slots.get(name, 0))
-    return slots
-
-
-def _resources(dask_worker: Any) -> dict[str, float]:
-    return dict(dask_worker.state.total_resources)
-
-
-def _check_slots(plan: Plan, present: Mapping[str, Mapping[str, float]]) -> None:
-    for task in plan.tasks:
-        if not any(all(has.get(name, 0) >= count for name, count in task.slots.items()) for has in present.values()):
-            wanted = ", ".join(f"{name}={count}" for name, count in task.slots.items())
-            raise InputError(
-                f"{task.id}: takes {wanted}, and no worker has that; start workers with --slot {wanted} "
-                f"(dask worker: --resources '{wanted}'), or leave it out of the job"
-            )
-
-
-@contextmanager
-def _token(folder: Path) -> Iterator[Path]:
-    """A file with a random text, by which workers show that they see the same folder."""
-    path = folder / f"token-{secrets.token_hex(8)}"
-    write_bytes(path, secrets.token_hex(16).encode())
-    try:
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
-
-
-class _Crew:
-    """The workers, and which of them are fit for the plan."""
-
-    def __init__(self, client: Any, plan: Plan, token: Path) -> None:
-        self._client = client
-        self._plan = plan
-        self._token = token
-        self._asked: set[str] = set()
-        self.refused: set[str] = set()
-
-    def refuse_strangers(self) -> None:
-        """Ask all workers; InputError for the first that is not fit."""
-        complaints = self.ask_new()
-        if complaints:
-            raise InputError("; ".join(complaints))
-
-    def ask_new(self) -> list[str]:
-        """Ask those that have come since; what is wrong, for people. Those get no more tasks."""
-        new = [address for address in worker_addresses(self._client) if address not in self._asked]
-        if not new:
-            return []
-        self._asked.update(new)
-        complaints: list[str] = []
-        # ``locate`` is Python's own: a worker without PhysGen can still answer.
-        versions = self._client.run(pydoc.locate, VERSION_NAME, workers=new, on_error="return")
-        for address, version in versions.items():
-            if version != self._plan.version:
-                found = f"PhysGen {version}" if isinstance(version, str) else "no PhysGen that can be imported"
-                complaints.append(
-                    f"worker {address} has {found}, this is PhysGen {self._plan.version}; "
-                    "install the same version there"
-                )
-                self.refused.add(address)
-        fit = [address for address in new if address not in self.refused]
-        expected = self._token.read_text(encoding="utf-8")
-        tokens = self._client.run(read_token, str(self._token), workers=fit, on_error="return") if fit else {}
-        for address, text in tokens.items():
-            if text != expected:
-                complaints.append(
-                    f"worker {address} does not see {self._plan.root}; mount the same folder at the same place there"
-                )
-                self.refused.add(address)
-        return complaints
-
-    def fit(self) -> list[str] | None:
-        """Addresses that may be given work; None for all."""
-        if not self.refused:
-            return None
-        return [address for address in worker_addresses(self._client) if address not in self.refused]
 
 
 class _Run:
@@ -150,7 +62,7 @@ class _Run:
         on_event: OnEvent,
         cancelled: IsCancelled,
         client: Any,
-        crew: _Crew,
+        crew: Crew,
         heard: Queue[tuple[str, Any]],
         name: str,
     ) -> None:
