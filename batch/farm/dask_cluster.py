@@ -47,11 +47,7 @@ def connected(
             f"--farm {options.farm} needs Dask.distributed, which cannot be imported ({error}): "
             "pip install 'physgen[farm]'"
         ) from error
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    # It tells of every worker that goes, with its stack.
-    logger.setLevel(logging.CRITICAL)
-    try:
+    with _quiet():
         if options.farm == "dask":
             with _on_this_machine(distributed, options, slots, in_all, cancelled) as client:
                 yield client
@@ -61,8 +57,20 @@ def connected(
         else:
             with _at_address(distributed, options, cancelled) as client:
                 yield client
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Dask's own log, which tells of every worker that goes, with its stack."""
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        yield
     finally:
-        logger.setLevel(level)
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
 
 
 @contextmanager
@@ -249,7 +257,6 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         worker_extra_args=[*resources, "--memory-limit", "0", "--no-dashboard"],
         python=wanted.python,
         log_directory=str(scratch),
-        local_directory="$TMPDIR",
         shared_temp_directory=str(scratch),
         security=True,
         protocol="tls://",

@@ -66,8 +66,10 @@ class Crew:
         self.refused: set[str] = set()
 
     def refuse_strangers(self) -> None:
-        """Ask all workers; InputError for the first that is not fit."""
-        complaints = self.ask_new()
+        """Ask the scheduler and all workers. Raises InputError when one of them is not fit."""
+        # The scheduler unpacks what it passes on.
+        complaints = self._wrong_versions({"scheduler": self._client.run_on_scheduler(pydoc.locate, VERSION_NAME)})
+        complaints += self.ask_new()
         if complaints:
             raise InputError("; ".join(complaints))
 
@@ -77,17 +79,10 @@ class Crew:
         if not new:
             return []
         self._asked.update(new)
-        complaints: list[str] = []
         # ``locate`` is Python's own: a worker without PhysGen can still answer.
         versions = self._client.run(pydoc.locate, VERSION_NAME, workers=new, on_error="return")
-        for address, version in versions.items():
-            if version != self._plan.version:
-                found = f"PhysGen {version}" if isinstance(version, str) else "no PhysGen that can be imported"
-                complaints.append(
-                    f"worker {address} has {found}, this is PhysGen {self._plan.version}; "
-                    "install the same version there"
-                )
-                self.refused.add(address)
+        complaints = self._wrong_versions({f"worker {address}": version for address, version in versions.items()})
+        self.refused.update(address for address, version in versions.items() if version != self._plan.version)
         fit = [address for address in new if address not in self.refused]
         expected = self._token.read_text(encoding="utf-8")
         tokens = self._client.run(read_token, str(self._token), workers=fit, on_error="return") if fit else {}
@@ -99,8 +94,17 @@ class Crew:
                 self.refused.add(address)
         return complaints
 
+    def _wrong_versions(self, found: Mapping[str, object]) -> list[str]:
+        """Complaints about those that have another version than the plan; values that are no text: none at all."""
+        return [
+            f"{who} has {f'PhysGen {version}' if isinstance(version, str) else 'no PhysGen that can be imported'}, "
+            f"this is PhysGen {self._plan.version}; install the same version there"
+            for who, version in found.items()
+            if version != self._plan.version
+        ]
+
     def fit(self) -> list[str] | None:
-        """Addresses that may be given work; None for all."""
+        """Addresses that may be given work; None for all, as long as none had to be refused."""
         if not self.refused:
             return None
         return [address for address in worker_addresses(self._client) if address not in self.refused]

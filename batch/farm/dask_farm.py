@@ -82,6 +82,7 @@ class _Run:
                 self._dependants[need].append(task.id)
         self._starts = dict.fromkeys(self._tasks, 0)
         self._submissions = dict.fromkeys(self._tasks, 0)
+        self._refused_then = dict.fromkeys(self._tasks, 0)
         self._running: dict[str, Any] = {}
         self._ended: dict[str, Outcome] = {}
         self._stopping = False
@@ -117,6 +118,7 @@ class _Run:
     def _submit(self, name: str) -> None:
         task = self._tasks[name]
         self._submissions[name] += 1
+        self._refused_then[name] = len(self._crew.refused)
         future = self._client.submit(
             carry_out,
             task,
@@ -146,9 +148,12 @@ class _Run:
         """What came of a task that Dask has done with."""
         if future.status == "finished":
             outcome: Outcome = future.result()
-            if outcome.state == "failed" and outcome.attempts == 0 and self._met_strangers():
+            if outcome.state == "failed" and outcome.attempts == 0 and self._met_stranger(name):
+                self._starts[name] = max(0, self._starts[name] - 1)
                 self._submit(name)
                 return
+            # Of the attempts before, what it said has come, unless their machine has died.
+            attempts = max(0, self._starts[name] - 1) + outcome.attempts
             if outcome.state == "cancelled" and self._starts[name] == 0:
                 outcome = self._not_begun(name)
         elif future.status == "cancelled":
@@ -156,8 +161,7 @@ class _Run:
             self._lost_scheduler()
         else:
             outcome = self._failure(name, future)
-        # What it said has come before, unless the machine has died.
-        attempts = max(self._starts[name], outcome.attempts)
+            attempts = self._starts[name]
         outcome = dataclasses.replace(outcome, attempts=attempts)
         if not self._stopping and is_worth_retrying(outcome, attempts=attempts, retries=self._options.retries):
             task = self._tasks[name]
@@ -178,7 +182,7 @@ class _Run:
             return Outcome(
                 task=name, state="failed", exit_code=1, message=f"its worker died {self._starts[name]} times"
             )
-        if self._met_strangers():
+        if self._met_stranger(name):
             return Outcome(task=name, state="failed", exit_code=1, message="its worker was not fit")
         return Outcome(
             task=name,
@@ -187,12 +191,11 @@ class _Run:
             message=f"the worker cannot run it ({type(error).__name__}: {error})",
         )
 
-    def _met_strangers(self) -> bool:
-        """Whether workers have come that are not fit; they are told of and left alone from now on."""
-        complaints = self._crew.ask_new()
-        for message in complaints:
+    def _met_stranger(self, name: str) -> bool:
+        """Whether workers that are not fit have come since the task was given out; they are left alone from now on."""
+        for message in self._crew.ask_new():
             self._on_event({"event": "notice", "message": message})
-        return bool(complaints)
+        return len(self._crew.refused) > self._refused_then[name]
 
     def _end(self, outcome: Outcome) -> None:
         """A task has ended for good: tell it, and do what follows from it."""
@@ -237,7 +240,8 @@ class _Run:
         """Notice the loss of the scheduler or of all workers; since when there are none."""
         if self._client.status != "running":
             self._lost_scheduler()
-        if worker_addresses(self._client):
+        fit = self._crew.fit()
+        if worker_addresses(self._client) if fit is None else fit:
             return None
         if lonely_since is not None and time.monotonic() - lonely_since > LONELY_S:
             self._on_event({"event": "notice", "message": "no worker is left; waiting for one to come"})

@@ -35,9 +35,9 @@ def export(plan: Plan, options: FarmOptions) -> list[Path]:
         raise InputError("--out is missing: name the folder that the job is written to")
     if options.out.is_file():
         raise InputError(f"{options.out}: is a file; name a folder for the job")
+    if "{" in str(plan.root):
+        raise InputError(f"{plan.root}: braces are variables in Flamenco; rename the folder")
     plan_file = save_plan(plan)
-    if "{" in str(plan_file):
-        raise InputError(f"{plan_file}: braces are variables in Flamenco; rename the folder")
     script = options.out / SCRIPT_FILE
     write_bytes(script, Path(__file__).with_name("flamenco_job_type.js").read_bytes())
     job = options.out / JOB_FILE

@@ -102,9 +102,6 @@ def test_a_killed_worker_and_a_killed_command_cost_a_retry_and_nothing_else(ball
     assert "nothing" in outcomes[2].message and outcomes[2].exit_code == 3
     ends = [e["task"] for e in killer.events if e["event"] == "task" and e["state"] != "started"]
     assert sorted(ends) == ["a/bake", "b", "c", "d"]
-    # What is done is not done again, by whomever.
-    again = run(a_plan(tmp_path, plan.tasks[0]), FarmOptions(farm="dask", workers=1), ignore, never)
-    assert [(o.state, o.attempts) for o in again] == [("kept", 0)]
 
 
 def test_strangers_are_refused(tmp_path):
@@ -165,10 +162,8 @@ def test_tls_and_a_wish_to_stop(ball_scene, tmp_path):
             assert [(o.state, o.attempts) for o in outcomes[::2]] == [("cancelled", 1), ("cancelled", 0)]
             assert outcomes[1].state in ("cancelled", "done")
             assert not psutil.Process(worker.pid).children()
-            assert [o.state for o in run(a_plan(tmp_path, plan.tasks[1]), options, ignore, never)][0] in (
-                "done",
-                "kept",
-            )
+            again = run(a_plan(tmp_path, plan.tasks[1]), options, ignore, never)
+            assert again[0].state in ("done", "kept")
         with pytest.raises(InputError, match="--tls-ca is missing"):
             run(plan, FarmOptions(farm=address), ignore, never)
         gone = ClusterOptions(**{**pems, "tls_key": tmp_path / "gone.pem"})
