@@ -13,7 +13,7 @@ from typing import Any
 from ...sim.atomic import write_bytes
 from ...sim.errors import InputError
 from .dask_cluster import worker_addresses
-from .dask_worker import read_token
+from .dask_tasks import read_token
 from .task import Plan
 
 VERSION_NAME = "physgen.sim.version.VERSION"
@@ -47,7 +47,7 @@ def check_slots(plan: Plan, client: Any) -> None:
 @contextmanager
 def token_file(folder: Path) -> Iterator[Path]:
     """A file with a random text, by which workers show that they see the same folder."""
-    path = folder / f"token-{secrets.token_hex(8)}"
+    path = folder / "token"
     write_bytes(path, secrets.token_hex(16).encode())
     try:
         yield path

@@ -17,7 +17,7 @@ from ...sim.errors import Cancelled, InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from .dask_cluster import LOOK_S, connected, worker_addresses
 from .dask_crew import Crew, check_slots, slots_of_a_worker, token_file
-from .dask_worker import carry_out, stop
+from .dask_tasks import carry_out, stop
 from .execute import STOP_GRACE_S
 from .local import cores
 from .retry import is_worth_retrying
