@@ -107,7 +107,7 @@ def test_the_zip_holds_the_program_and_nothing_else(archive):
     names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
     assert tops == {"__init__.py", "blender_manifest.toml", "README.md", "batch", "physgen_addon", "presets", "sim"}
-    assert {PurePosixPath(name).suffix for name in names} == {".py", ".toml", ".md"}
+    assert {PurePosixPath(name).suffix for name in names} == {".py", ".toml", ".md", ".js"}
     tree = {
         p.relative_to(ROOT).as_posix() for top in ("batch", "physgen_addon", "sim") for p in ROOT.glob(f"{top}/**/*.py")
     }
