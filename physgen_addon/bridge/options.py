@@ -7,6 +7,7 @@ is added here alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,6 +36,16 @@ class RenderOptions:
     seed: of the sampling pattern, the same for all frames, so that what stands still does not flicker.
     threads: CPU threads, 0 for all; it changes nothing in the picture.
     format, bits, compression: of the frames' files, as ``formats.FrameFormat`` has them.
+
+    What makes things belong to the photo (docs/rendering.md); each can be switched off:
+
+    motion_blur: how long the shutter is open before each frame, over the frame interval, 0 (off) to 1.
+    grain: give what lacks the photo's noise as much of it as is missing.
+    match_sharpness: make the outlines of what has moved as soft as the photo's own.
+    f_number: aperture of a lens on a sensor 36 mm wide, 0.5 to 64; blurs what leaves the plane of focus. None: off.
+    focus_distance: metres along the view to the plane of focus, above 0; None: each object is in focus where it rests.
+    reflections: mirror the objects in a ground whose ``reflectivity`` is above 0.
+    sun_angle: apparent diameter of the sun in radians, 0 (hard shadows) to pi; None takes the scene's.
     """
 
     engine: str = option("cycles", "render engine", choices=ENGINES)
@@ -48,6 +59,15 @@ class RenderOptions:
     format: str = option("png", "of the frames; exr-layers has all layers in parts", choices=tuple(FRAME_KINDS))
     bits: int | None = option(None, "a channel: PNG 8 or 16, EXR 16 or 32 (default: 8 and 16)", metavar="N")
     compression: str = option("zip", "of EXR frames", choices=COMPRESSIONS)
+    motion_blur: float = option(0.5, "time the shutter is open, of a frame; 0 for none", metavar="F")
+    grain: bool = option(True, "give what lacks the photo's grain the missing part")
+    match_sharpness: bool = option(True, "outlines of what moves as soft as the photo's")
+    f_number: float | None = option(None, "blur what leaves the plane of focus: aperture at 36 mm width", metavar="N")
+    focus_distance: float | None = option(None, "plane of focus (default: where things rest)", metavar="M")
+    reflections: bool = option(True, "mirror objects in a ground that is reflective")
+    sun_angle: float | None = option(
+        None, "the sun's diameter, 0 for hard shadows (default: as in the scene)", metavar="RAD"
+    )
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -62,6 +82,14 @@ class RenderOptions:
             raise InputError(f"threads is {self.threads}: give 0 (all) to 1024")
         if not 0 <= self.seed < 2**31:
             raise InputError(f"seed is {self.seed}: give 0 to 2147483647")
+        if not 0 <= self.motion_blur <= 1:
+            raise InputError(f"motion_blur is {self.motion_blur}: give 0 (off) to 1, the whole frame interval")
+        if self.f_number is not None and not 0.5 <= self.f_number <= 64:
+            raise InputError(f"f_number is {self.f_number}: give 0.5 to 64, or leave it out")
+        if self.focus_distance is not None and not 0 < self.focus_distance < math.inf:
+            raise InputError(f"focus_distance is {self.focus_distance}: give metres above 0, or leave it out")
+        if self.sun_angle is not None and not 0 <= self.sun_angle <= math.pi:
+            raise InputError(f"sun_angle is {self.sun_angle}: give 0 to pi radians, or leave it out")
         _ = self.frame_format
 
     @property

@@ -57,6 +57,15 @@ def set_denoising(scene: bpy.types.Scene, wanted: bool) -> None:
         cycles.denoising_quality = "BALANCED"
 
 
+def open_shutter(scene: bpy.types.Scene, share: float, samples: int) -> None:
+    """Blur what moves in the ``share`` of a frame interval before the frame, 0 for none, with so many samples."""
+    settings = scene.render
+    settings.use_motion_blur = share > 0
+    scene.cycles.samples = samples
+    if share > 0:
+        settings.motion_blur_shutter, settings.motion_blur_position = share, "END"
+
+
 def render(scene: bpy.types.Scene, frame: int, box: Box, folder: Path) -> Channels:
     """Render ``box`` of ``scene`` at ``frame``; channels (h, w) of the box such as ``Combined.R``.
 

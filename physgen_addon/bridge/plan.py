@@ -10,29 +10,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...sim.app.bake_inputs import file_hash
-from ...sim.cache.pc2 import Pc2Reader
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.json_fields import to_json
 from ...sim.version import VERSION
+from . import stroke
 from .caches import Bake
 from .options import RenderOptions
+from .stroke import Pose
 
-RENDER_REVISION = 2
+RENDER_REVISION = 3
 """Raised with every change of rendering that changes what a frame looks like."""
-
-STILL_PX = 0.02
-"""Two frames are the same when no vertex moved farther than this on the image."""
 
 
 @dataclass(frozen=True)
 class Frame:
     """Frame ``number`` shows ``sample`` of every cache; ``inputs`` is the hash of all that it depends on.
 
-    Frames in which nothing moved share the sample of the first of them, and so the hash. ``after`` and ``before`` are
-    the samples of the next frame and the one before, where they count (for optical flow); else ``sample`` too.
+    Frames in which nothing moved share the sample of the first of them, and so the hash. A frame that shows motion
+    since the sample before it depends on both, and is like no other. ``after`` and ``before`` are the samples of the
+    next frame and the one before, where they count (for optical flow); else ``sample`` too.
     """
 
     number: int
@@ -71,49 +69,27 @@ def plan_frames(
 
 def _shown(folder: SceneFolder, bake: Bake, count: int, *, base: str, options: RenderOptions) -> list[tuple[int, str]]:
     """For each of the first ``count`` samples the earlier one that looks the same, or itself, and the hash of that."""
-    still = _still_distance(folder, bake.every, options)
-    key = rest = _pose(bake, 0)
-    key_index, key_hash = 0, _hash(base, rest)
+    before = key = rest = stroke.pose(bake, 0)
+    key_index, key_hash, sharp = 0, _hash(base, rest), True
     rest_hash = key_hash
+    still = stroke.still_distance(folder.scene.camera, rest, options.scale)
     shown = []
     for index in range(count):
-        now = _pose(bake, index)
-        if now.same(rest, still):
-            key, key_index, key_hash = rest, 0, rest_hash
-        elif not now.same(key, still):
-            key, key_index, key_hash = now, index, _hash(base, now)
+        now = stroke.pose(bake, index)
+        if options.motion_blur > 0 and not now.same(before, still):
+            key, key_index, key_hash, sharp = now, index, _hash(base, before, now), False
+        elif now.same(rest, still):
+            key, key_index, key_hash, sharp = rest, 0, rest_hash, True
+        elif not sharp or not now.same(key, still):
+            key, key_index, key_hash, sharp = now, index, _hash(base, now), True
+        before = now
         shown.append((key_index, key_hash))
     return shown
 
 
-@dataclass(frozen=True)
-class _Pose:
-    """Where everything is: positions (N, 3) by cache, and which objects show their particles."""
-
-    positions: list[NDArray[np.float32]]
-    flowing: tuple[bool, ...]
-
-    def same(self, other: _Pose, within: float) -> bool:
-        """Whether nothing is farther than ``within`` metres from where it is in ``other``."""
-        pairs = zip(self.positions, other.positions, strict=True)
-        return self.flowing == other.flowing and all(float(np.abs(a - b).max()) <= within for a, b in pairs)
-
-
-def _pose(bake: Bake, sample: int) -> _Pose:
-    flowing = tuple(flow is not None and flow.shown_at(sample) for flow in bake.flows)
-    return _Pose([cache.sample(sample) for cache in bake.every], flowing)
-
-
-def _still_distance(folder: SceneFolder, caches: Sequence[Pc2Reader], options: RenderOptions) -> float:
-    """World metres that nothing can move by and be seen to: ``STILL_PX`` at the nearest vertex of the rest pose."""
-    camera = folder.scene.camera
-    depth = min(float(camera.project(cache.sample(0))[:, 2].min()) for cache in caches)
-    return max(depth, 0.0) / (max(camera.fx, camera.fy) * options.scale) * STILL_PX
-
-
 def _scene_hash(folder: SceneFolder, options: RenderOptions, blender: str) -> str:
     """Everything but motion; what only moves things (material, velocity, effects, gravity) does not count."""
-    scene = folder.scene
+    scene, ground = folder.scene, folder.scene.ground
     settings = to_json(options)
     del settings["threads"]
     files = [scene.photo, scene.background, scene.light.environment]
@@ -124,7 +100,7 @@ def _scene_hash(folder: SceneFolder, options: RenderOptions, blender: str) -> st
     content = {
         "revision": [RENDER_REVISION, VERSION, blender],
         "camera": to_json(scene.camera),
-        "ground": scene.ground and [scene.ground.point, scene.ground.normal],
+        "ground": ground and [ground.point, ground.normal, ground.reflectivity, ground.reflection_roughness],
         "light": to_json(scene.light),
         "objects": objects,
         "files": [[name, _file_hash(folder, name)] for name in files if name is not None],
@@ -138,8 +114,9 @@ def _file_hash(folder: SceneFolder, name: str) -> str:
     return file_hash(path)
 
 
-def _hash(base: str, pose: _Pose) -> str:
-    digest = hashlib.sha256(f"{base} {pose.flowing}".encode())
-    for sample in pose.positions:
-        digest.update(np.ascontiguousarray(sample, dtype="<f4").tobytes())
+def _hash(base: str, *poses: Pose) -> str:
+    digest = hashlib.sha256(f"{base} {[pose.flowing for pose in poses]}".encode())
+    for pose in poses:
+        for sample in pose.every:
+            digest.update(np.ascontiguousarray(sample, dtype="<f4").tobytes())
     return digest.hexdigest()

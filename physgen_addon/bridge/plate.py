@@ -16,7 +16,8 @@ from ...sim.scene.folder import SceneFolder
 class Plate:
     """Photo and background in linear light, masks, and the weight of what is still at rest.
 
-    photo, background: (H, W, 3) linear light. masks: (H, W) True where the photo shows an object.
+    photo, background: (H, W, 3) linear light. masks: (H, W) True where the photo shows an object; object_masks: of
+    each object.
     """
 
     def __init__(
@@ -28,7 +29,7 @@ class Plate:
         """
         self._folder, self._scene, self._size, self._rest = folder, folder.scene, size, list(rest_vertices)
         self.photo, self.background = (self._image(name) for name in (self._scene.photo, self._scene.background))
-        masks = [self._mask(item.mask) for item in self._scene.objects]
+        self.object_masks = masks = [self._mask(item.mask) for item in self._scene.objects]
         self.masks: NDArray[np.bool_] = np.logical_or.reduce(masks)
         self._shares = rest.influence(
             [mask | self._mask(item.shadow) for mask, item in zip(masks, self._scene.objects, strict=True)]

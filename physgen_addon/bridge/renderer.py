@@ -6,24 +6,28 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import bpy
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.composite import layers
+from ...sim.composite import layers, mirror
 from ...sim.scene.folder import SceneFolder
-from . import passes, photo_particles, rest_light
+from ...sim.scene.model import Camera
+from . import passes, photo_particles, rest_light, stroke
 from .caches import Bake
 from .camera import render_size
 from .data_passes import STEPS, DataLayers, DataScene
+from .look import Look
 from .objects import COLOUR_LAYER
 from .options import RenderOptions
 from .plate import Plate
+from .reflection import reflections
 from .regions import Box, feather, ground_depth, object_box, shadow_region
 from .scene import BlenderScene, build, everything, remove
+from .stroke import Moment
+from .sun import with_sun_angle
 from .view import View
-
-Samples = list[NDArray[np.float32]]
 
 
 class Renderer:
@@ -31,6 +35,7 @@ class Renderer:
 
     def __init__(self, scene: SceneFolder, bake: Bake, options: RenderOptions) -> None:
         """Raises InputError for images, meshes or light that cannot be used, RenderError when Blender fails."""
+        scene = with_sun_angle(scene, options.sun_angle)
         self._folder, self._scene, self._bake, self._options = scene, scene.scene, bake, options
         self._built: BlenderScene | None = None
         self._data_scene: DataScene | None = None
@@ -38,7 +43,10 @@ class Renderer:
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
         try:
-            self._plate = Plate(scene, self._size, self._samples(0))
+            self._still = stroke.still_distance(self._scene.camera, stroke.pose(bake, 0), options.scale)
+            rest = self._moment(0)
+            self._plate = Plate(scene, self._size, rest.now)
+            self._look = Look(self._scene, self._plate, rest.now, options)
             self._built = build(scene, bake, options)
             rest_light.measure(self._built, self._scratch)
             if options.frame_format.layered:
@@ -46,7 +54,9 @@ class Renderer:
             self._reach = self._add_particles(self._built)
             self._ground_depth = ground_depth(self._scene, self._built.light_size)
             self._open_ground = self._empty_ground()
-            self._rest_shadow = self._shadow(0)
+            self._rest_shadow = self._shadow(rest)
+            self._reflections = reflections(self._scene, self._built, options, self._objects)
+            self._rest_reflection = self._reflections and self._reflections.layer(self._scene.camera, rest)
         except BaseException:
             self.close()
             raise
@@ -60,18 +70,22 @@ class Renderer:
 
     def frame(self, sample: int) -> layers.FrameLayers:
         """``sample`` of the bake as a picture (linear light), with what it was made of."""
-        view = View(self._scene.camera)
-        shadow = self._rest_shadow if sample == 0 else self._shadow(sample)
+        view, moment = View(self._scene.camera), self._moment(sample)
+        shadow = self._rest_shadow if sample == 0 else self._shadow(moment)
+        at_rest = view.warp(self._plate.at_rest(moment.now))
         ground = layers.ground_layer(
             photo=view.warp(self._plate.photo),
             background=view.warp(self._plate.background),
             shadow=shadow,
             rest_shadow=view.warp(self._rest_shadow),
-            at_rest=view.warp(self._plate.at_rest(self._samples(sample))),
+            at_rest=at_rest,
             masks=view.warp(self._plate.masks),
         )
-        objects = self._objects(sample)
-        beauty = layers.compose(objects, ground)
+        if self._reflections is not None:
+            now = self._rest_reflection if sample == 0 else self._reflections.layer(view.camera, moment)
+            ground = mirror.with_reflection(ground, now, self._rest_reflection, at_rest)
+        objects = self._look.objects(self._objects(view.camera, moment), view.camera, moment.now)
+        beauty = self._look.finish(layers.compose(objects, ground), objects, view.camera, moment.now, at_rest)
         return layers.FrameLayers(ground=ground, shadow=shadow, objects=objects, beauty=beauty)
 
     def _add_particles(self, built: BlenderScene) -> float:
@@ -102,45 +116,50 @@ class Renderer:
         camera = self._scene.camera
         return self._data_scene.render(
             self._bake.first_frame + sample,
-            self._object_box(self._shown(sample), self._size),
+            self._object_box(camera, self._moment(sample), self._size),
             self._scratch,
             scene=self._scene,
             cameras=(camera, camera, camera),
             steps=steps,
         )
 
-    def _samples(self, sample: int) -> Samples:
-        return [cache.sample(sample) for cache in self._bake.caches]
+    def _moment(self, sample: int) -> Moment:
+        before, now = (stroke.pose(self._bake, index) for index in (max(sample - 1, 0), sample))
+        return stroke.moment(
+            self._bake.first_frame + sample,
+            before,
+            now,
+            shutter=self._options.motion_blur,
+            still=self._still,
+            camera=self._scene.camera,
+            scale=self._options.scale,
+        )
 
-    def _shown(self, sample: int) -> Samples:
-        """Where the objects are, with their particles as far as these are shown: (V + N, 3) each."""
-        shown = []
-        for vertices, flow in zip(self._samples(sample), self._bake.flows, strict=True):
-            if flow is not None and flow.shown_at(sample):
-                vertices = np.concatenate([vertices, flow.cache.sample(sample)])
-            shown.append(vertices)
-        return shown
-
-    def _objects(self, sample: int) -> layers.ObjectLayer:
+    def _objects(self, camera: Camera, moment: Moment) -> layers.ObjectLayer:
+        """The objects as ``camera`` sees them, which Blender's scenes have."""
         assert self._built is not None
         layer = layers.empty_layer(*self._size)
-        number, positions = self._bake.first_frame + sample, self._shown(sample)
-        box, light_box = (self._object_box(positions, size) for size in (self._size, self._built.light_size))
+        box, light_box = (self._object_box(camera, moment, size) for size in (self._size, self._built.light_size))
         if box is None or light_box is None:
             return layer
-        colours = passes.render(self._built.colour_scene, number, box, self._scratch)
+        colours = self._render(self._built.colour_scene, moment, box, most_samples=4)
         layer.texture[box.slices] = passes.stack(colours, COLOUR_LAYER)
         layer.alpha[box.slices] = colours["Combined.A"]
-        lit = passes.render(self._built.light_scene, number, light_box, self._scratch)
+        lit = self._render(self._built.light_scene, moment, light_box, most_samples=1)
         light = np.ones((*self._built.light_size[::-1], 3), np.float32)
         light[light_box.slices] = layers.light_ratio(passes.stack(lit, "Combined"), lit["Combined.A"])
         layer.light[:] = cv2.resize(light, self._size, interpolation=cv2.INTER_LINEAR)
         return layer
 
-    def _object_box(self, positions: Samples, size: tuple[int, int]) -> Box | None:
+    def _object_box(self, camera: Camera, moment: Moment, size: tuple[int, int]) -> Box | None:
         if not self._options.crop:
             return Box(0, 0, *size)
-        return object_box(self._scene.camera, positions, size, self._reach)
+        return object_box(camera, moment.swept, size, self._reach)
+
+    def _render(self, scene: bpy.types.Scene, moment: Moment, box: Box, *, most_samples: int) -> passes.Channels:
+        """``box`` of ``scene`` with the shutter open; up to ``most_samples`` times the samples for long strokes."""
+        passes.open_shutter(scene, moment.shutter, moment.samples(self._options.samples, at_most=most_samples))
+        return passes.render(scene, moment.number, box, self._scratch)
 
     def _empty_ground(self) -> NDArray[np.float32]:
         """Light on the ground without objects (h, w, 3), in the resolution of light."""
@@ -153,16 +172,15 @@ class Renderer:
             target.item.hide_render = False
         return passes.stack(channels, "Combined")
 
-    def _shadow(self, sample: int) -> NDArray[np.float32]:
+    def _shadow(self, moment: Moment) -> NDArray[np.float32]:
         """Light on the ground over light on the empty ground (H, W, 3), 1 where no object reaches."""
         assert self._built is not None
         size = self._built.light_size
         ratio = np.ones((size[1], size[0], 3), np.float32)
-        region = shadow_region(self._scene, self._shown(sample), size)
+        region = shadow_region(self._scene, moment.swept, size)
         if region is not None:
             box = region.box if self._options.crop else Box(0, 0, *size)
-            number = self._bake.first_frame + sample
-            lit = passes.stack(passes.render(self._built.shadow_scene, number, box, self._scratch), "Combined")
+            lit = passes.stack(self._render(self._built.shadow_scene, moment, box, most_samples=1), "Combined")
             empty = self._open_ground[box.slices]
             # Objects only take light from the ground here; more than all of it is noise.
             quotient = np.clip(lit / np.maximum(empty, 1e-6), 0.0, 1.0)

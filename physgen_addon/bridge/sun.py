@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import bpy
 import numpy as np
 from mathutils import Quaternion, Vector
 from numpy.typing import NDArray
 
+from ...sim.scene.folder import SceneFolder
 from ...sim.scene.model import Light
 
 MIN_SUN_COSINE = 0.05
@@ -30,3 +33,11 @@ def new_sun(
     data.color = colour.tolist()
     data.angle = light.sun_angle
     return data, Vector(direction.tolist()).to_track_quat("Z", "Y")
+
+
+def with_sun_angle(folder: SceneFolder, angle: float | None) -> SceneFolder:
+    """``folder`` with a sun of this apparent diameter in radians; None leaves the scene's."""
+    if angle is None:
+        return folder
+    light = dataclasses.replace(folder.scene.light, sun_angle=angle)
+    return dataclasses.replace(folder, scene=dataclasses.replace(folder.scene, light=light))

@@ -16,6 +16,7 @@ from ..cache.manifest import SPACES, WORLD_SPACE
 from ..errors import InputError
 from ..scene.folder import SceneFolder
 from ..scene.json_fields import to_json
+from ..scene.model import Ground
 
 ENGINE_REVISION = 3
 """Raised with every change of the engine or the skinning that changes what a scene does."""
@@ -70,7 +71,7 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
     content = {
         "engine": ENGINE_REVISION,
         "objects": objects,
-        "ground": to_json(scene.ground),
+        "ground": _ground(scene.ground),
         "gravity": scene.gravity,
         "gravity_track": to_json(scene.gravity_track),
         "contacts": to_json(scene.contacts),
@@ -78,6 +79,16 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
         "options": _said(options),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _ground(ground: Ground | None) -> dict[str, Any] | None:
+    """The ground without what is only seen."""
+    if ground is None:
+        return None
+    fields: dict[str, Any] = to_json(ground)
+    for irrelevant in ("reflectivity", "reflection_roughness"):
+        del fields[irrelevant]
+    return fields
 
 
 def _said(options: BakeOptions) -> dict[str, Any]:

@@ -117,6 +117,9 @@ class Ground:
     static_friction: Coulomb's static coefficient, not below ``friction``; None takes ``friction``.
     restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1; of matter that deforms, the share of its
         outermost layer's energy that comes back.
+    reflectivity: share of light that it mirrors, looked at from straight above: 0 (matte) to 1 (a mirror); 0.04 is
+        varnish, glass or water. Seen at a slant, it is more.
+    reflection_roughness: how blurred what it mirrors is, 0 (polished) to 1, as the roughness of Blender's shaders.
     """
 
     point: Vector = (0.0, 0.0, 0.0)
@@ -124,6 +127,8 @@ class Ground:
     friction: float = 0.4
     static_friction: float | None = None
     restitution: float = 0.0
+    reflectivity: float = 0.0
+    reflection_roughness: float = 0.15
 
     def __post_init__(self) -> None:
         require(finite(*self.point), "ground.point", self.point, "give three finite numbers in metres")
@@ -147,6 +152,9 @@ class Ground:
             self.restitution,
             "give 0 to 1",
         )
+        for name in ("reflectivity", "reflection_roughness"):
+            value = getattr(self, name)
+            require(finite(value) and 0 <= value <= 1, f"ground.{name}", value, "give 0 to 1")
 
     @property
     def unit_normal(self) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ SHAPE_FIELDS = ("name", "mesh", "world_from_mesh", "size_m", "occlusion_order", 
 
 PHYSICS_FIELDS = tuple(f.name for f in dataclasses.fields(SceneObject) if f.name not in SHAPE_FIELDS)
 MATERIAL_FIELDS = tuple(f.name for f in dataclasses.fields(Material))
-GROUND_FIELDS = ("friction", "static_friction", "restitution")
+GROUND_FIELDS = ("friction", "static_friction", "restitution", "reflectivity", "reflection_roughness")
 SCENE_FIELDS = ("gravity", "gravity_track", "contacts")
 
 

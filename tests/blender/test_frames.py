@@ -20,7 +20,7 @@ from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
 from physgen.physgen_addon.bridge.video import encode  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
-QUICK = RenderOptions(samples=1, scale=0.5)
+QUICK = RenderOptions(samples=1, scale=0.5, motion_blur=0)
 SHIFTS = [(0, 0, 0), (0.02, 0, 0), (0.02, 0, 0), (0.04, 0, 0)]
 
 

@@ -6,11 +6,9 @@ from physgen.sim.composite.metrics import psnr
 from physgen.sim.composite.transfer import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge import renderer as renderer_module  # noqa: E402
 from physgen.physgen_addon.bridge.caches import open_bake  # noqa: E402
 from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
 from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.bridge.regions import Box, ShadowRegion  # noqa: E402
 from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
 from scipy import ndimage  # noqa: E402
 
@@ -21,7 +19,7 @@ LIFTED = (0.0, 0.0, 0.004)
 @pytest.fixture
 def frames(world, bake, tmp_path):
     shifts = [(0, 0, 0), (1e-4, 0, 0), SHIFT]
-    paths = render_frames(world.folder, bake(shifts), tmp_path / "out", RenderOptions(samples=32))
+    paths = render_frames(world.folder, bake(shifts), tmp_path / "out", RenderOptions(samples=32, motion_blur=0))
     return [read_rgb(path) for path in paths]
 
 
@@ -50,17 +48,11 @@ def test_rest_is_the_photo_and_motion_is_the_truth(world, frames):
     assert abs(float((moved.astype(float) - world.moved)[inside].mean())) < 6
 
 
-def test_only_rendering_what_can_be_seen_changes_nothing(world, bake, monkeypatch):
+def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
     opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.scene)
-    options = RenderOptions(samples=64)
     pictures = []
-    for whole in (False, True):
-        if whole:
-            monkeypatch.setattr(renderer_module, "object_box", lambda _camera, _vertices, size: Box(0, 0, *size))
-            monkeypatch.setattr(
-                renderer_module, "shadow_region", lambda _scene, _vertices, size: ShadowRegion(Box(0, 0, *size), 1e3)
-            )
-        renderer = Renderer(world.folder, opened, options)
+    for crop in (True, False):
+        renderer = Renderer(world.folder, opened, RenderOptions(samples=64, crop=crop))
         pictures.append(linear_to_bytes(renderer.frame(1).beauty).astype(int))
         renderer.close()
     difference = np.abs(pictures[0] - pictures[1])
@@ -70,7 +62,7 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake, monkeypatc
 
 def test_out_of_view_is_the_background_alone(world, bake):
     opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.scene)
-    renderer = Renderer(world.folder, opened, RenderOptions(samples=4))
+    renderer = Renderer(world.folder, opened, RenderOptions(samples=4, grain=False))
     gone = linear_to_bytes(renderer.frame(1).beauty)
     renderer.close()
     mask = read_mask(world.folder.file("masks/ball.png"))

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""The photo's grain, and what of it a frame lacks.
+
+Inpainted ground has none; a texture that is averaged, magnified, blurred by motion or focus has less. A noise level
+function (Liu, Freeman, Szeliski and Kang, "Noise estimation from a single image", CVPR 2006) says how strong the
+photo's noise is by brightness: shot noise rises with light, read noise does not, and the camera's own tone curve and
+noise reduction bend both, so it is measured and not modelled. It is taken apart into octaves of fineness, because
+demosaicking, noise reduction and JPEG leave grain that is coarser than a pixel; and into luma and chroma.
+
+All in 8-bit sRGB steps, where a photo's noise is about even and where it is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .transfer import Linear, linear_to_srgb, srgb_to_linear
+
+SIGMAS = (0.8, 1.6, 3.2)
+"""Blurs, in pixels, whose differences are the octaves."""
+BLOCK = 16
+LEVELS = 16
+FLATTEST = 0.2
+"""Share of the blocks of one brightness that counts as flat, by what is coarser than the octaves."""
+QUIET = 0.2
+"""Quantile of the flat blocks' energies that is taken for the noise: fine texture only ever adds to it. How far below
+the mean it lies for noise alone is measured on white noise, and set right."""
+STEEPEST = (0.1, 0.12)
+"""The most that noise rises from one level of brightness to the next: steps, or share of the usual noise. Levels of
+which the photo shows texture alone are held by their neighbours."""
+CLIPPED = 2
+"""Levels at either end whose noise may be cut off by black or white, and which hold nobody."""
+COARSEST = (1.0, 0.8, 0.5)
+"""The most of each octave over the first: of grain a little under a pixel coarse. Coarser is texture or shading."""
+FEWEST_BLOCKS = 12
+ROUNDING = 1 / 12
+"""Variance of rounding to whole steps, which every file has: it comes with writing and is not added."""
+LEAST = 0.6
+"""Grain below this, in steps, is the rounding of a clean picture and its compression."""
+WINDOWS = (11, 15, 23)
+"""Pixels across the windows in which a frame's own grain is measured, for each octave."""
+MEDIAN_TO_SIGMA = 1.4826
+ROUNDS = 12
+"""Of fitting the octaves' strengths; they are within a percent then."""
+QUANTUM = 60.0
+"""Steps of one sigma in which medians are taken; OpenCV's fast median takes bytes."""
+
+Planes = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """sigma: (LEVELS, 3 octaves, 3 planes Y, Cb, Cr) standard deviation of the noise at brightness level i · 255 /
+    (LEVELS − 1), in 8-bit steps, rounding taken off."""
+
+    sigma: NDArray[np.float32]
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether there is no grain to speak of."""
+        return not bool(self.sigma.any())
+
+    def at(self, luma: NDArray[np.float32], octave: int, plane: int) -> NDArray[np.float32]:
+        """Standard deviation (...) at brightness ``luma`` (...) of 0 to 255."""
+        return np.interp(luma, np.linspace(0, 255, LEVELS), self.sigma[:, octave, plane]).astype(np.float32)
+
+
+def estimate(photo: Linear) -> NoiseModel:
+    """The noise of ``photo`` (H, W, 3), from the flattest blocks of each brightness."""
+    planes = _planes(photo)
+    height, width = (n // BLOCK * BLOCK for n in planes.shape[:2])
+    sigma = np.zeros((LEVELS, len(SIGMAS), 3), np.float32)
+    if height < 3 * BLOCK or width < 3 * BLOCK:
+        return NoiseModel(sigma)
+    bands, coarse = _octaves(planes)
+    luma = _blocks(planes[:height, :width, 0]).mean(axis=1)
+    structure = np.sum([np.ptp(_blocks(coarse[:height, :width, p]), axis=1) for p in range(3)], axis=0)
+    energy = _energies(bands)
+    white = _energies(_octaves(_white(256, 256, 0))[0])[:, 0]
+    usual, quiet = white.mean(axis=-1), np.quantile(white, QUIET, axis=-1)
+    known = []
+    centres = np.linspace(0, 255, LEVELS)
+    for index, centre in enumerate(centres):
+        here = np.nonzero(np.abs(luma - centre) <= 255 / (LEVELS - 1))[0]
+        if len(here) < FEWEST_BLOCKS:
+            continue
+        count = max(FEWEST_BLOCKS // 2, round(FLATTEST * len(here)))
+        flat = here[np.argsort(structure[here], kind="stable")[:count]]
+        variance = np.quantile(energy[:, :, flat], QUIET, axis=-1) * (usual / quiet)[:, None]
+        sigma[index] = np.sqrt(np.maximum(variance - ROUNDING * usual[:, None], 0.0))
+        known.append(index)
+    if not known:
+        return NoiseModel(sigma)
+    inner = [level for level in known if CLIPPED <= level < LEVELS - CLIPPED] or known
+    distance = np.abs(np.arange(LEVELS)[:, None] - np.array(inner)[None])
+    for plane in range(3):
+        for octave in range(len(SIGMAS)):
+            found = sigma[inner, octave, plane]
+            slope = max(STEEPEST[0], STEEPEST[1] * float(np.median(found)))
+            even = np.interp(centres, centres[known], sigma[known, octave, plane])
+            even = np.minimum(even, (found[None] + slope * distance).min(axis=1))
+            sigma[:, octave, plane] = np.minimum(even, COARSEST[octave] * (sigma[:, 0, plane] if octave else even))
+    sigma[np.sqrt((sigma**2).sum(axis=(1, 2))) < LEAST] = 0.0
+    return NoiseModel(sigma)
+
+
+def _energies(bands: list[Planes]) -> NDArray[np.float64]:
+    """Mean square of each octave, plane and block (octaves, 3, N) of bands (H, W, 3); incomplete blocks left out."""
+    height, width = (n // BLOCK * BLOCK for n in bands[0].shape[:2])
+    return np.array([[(_blocks(band[:height, :width, p]) ** 2).mean(axis=1) for p in range(3)] for band in bands])
+
+
+class Grain:
+    """Adds what frames lack of one photo's grain. Its pattern stands still, as the photo's own does."""
+
+    def __init__(self, model: NoiseModel, size: tuple[int, int], seed: int) -> None:
+        """``size`` is width and height of the frames."""
+        self._model = model
+        self._patterns: list[Planes] = []
+        if not model.is_clean:
+            bands, _ = _octaves(_white(*size, seed))
+            self._patterns = [band / band.std(axis=(0, 1)) for band in bands]
+            self._overlap = _overlap()
+
+    def add(self, frame: Linear, changed: NDArray[np.float32]) -> Linear:
+        """``frame`` (H, W, 3) with the missing grain, by the weight ``changed`` (H, W, 0 to 1); 0 leaves it exactly.
+
+        What a pixel's surroundings have is measured in the frame itself, by medians, so that outlines and texture do
+        not pass for grain any more than they must.
+        """
+        rows, columns = np.nonzero(changed.max(axis=1) > 0)[0], np.nonzero(changed.max(axis=0) > 0)[0]
+        if self._model.is_clean or not len(rows):
+            return frame
+        margin = 2 * max(WINDOWS)
+        height, width = changed.shape
+        window = (
+            slice(max(0, rows[0] - margin), min(height, rows[-1] + margin + 1)),
+            slice(max(0, columns[0] - margin), min(width, columns[-1] + margin + 1)),
+        )
+        weight = changed[window]
+        planes = _planes(frame[window])
+        bands, coarse = _octaves(planes)
+        added = np.zeros_like(planes)
+        for plane in range(3):
+            if not self._model.sigma[:, :, plane].any():
+                continue
+            missing = []
+            for octave, band in enumerate(bands):
+                wanted = self._model.at(coarse[..., 0], octave, plane)
+                there = _local_sigma(band[..., plane], wanted, WINDOWS[octave])
+                missing.append(np.maximum(wanted**2 - there**2, 0.0))
+            for gain, pattern in zip(_gains(missing, self._overlap), self._patterns, strict=True):
+                added[..., plane] += pattern[window][..., plane] * gain
+        result, grainy = frame.copy(), weight > 0
+        shown = _rgb(planes + added * weight[..., None])[grainy]
+        result[window][grainy] = srgb_to_linear(np.clip(shown / 255.0, 0.0, 1.0))
+        return result
+
+
+def _overlap() -> NDArray[np.float64]:
+    """What each octave k measures of patterns i and j of unit variance together: mean of their product (k, i, j)."""
+    patterns = [band / band.std() for band in _octaves(_white(256, 256, 1))[0]]
+    measured = [_octaves(pattern)[0] for pattern in patterns]
+    count = len(SIGMAS)
+    return np.array(
+        [[[float((measured[i][k] * measured[j][k]).mean()) for j in range(count)] for i in range(count)]
+         for k in range(count)]
+    )  # fmt: skip
+
+
+def _gains(missing: list[NDArray[np.float32]], overlap: NDArray[np.float64]) -> list[NDArray[np.float32]]:
+    """Strengths (octaves, H, W) of the patterns that together measure as the variances ``missing`` in every octave.
+
+    Octaves overlap, so each is asked for again until all fit. Solved at a quarter of the size: these are smooth.
+    """
+    height, width = missing[0].shape
+    small = (max(1, width // 4), max(1, height // 4))
+    wanted = np.stack([cv2.resize(m, small, interpolation=cv2.INTER_AREA) for m in missing]).astype(np.float64)
+    gains = np.sqrt(wanted)
+    for _ in range(ROUNDS):
+        measured = np.einsum("kij,ihw,jhw->khw", overlap, gains, gains, optimize=True)
+        gains *= np.sqrt(np.sqrt(wanted / np.maximum(measured, 1e-6)))
+    return [np.asarray(cv2.resize(g.astype(np.float32), (width, height))) for g in gains]
+
+
+def _local_sigma(band: NDArray[np.float32], wanted: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    """Standard deviation of ``band`` (H, W) around each pixel; read to one part in ``QUANTUM`` of ``wanted``."""
+    relative = np.asarray(np.abs(band) / np.maximum(wanted, 1e-3) * QUANTUM)
+    median = cv2.medianBlur(np.clip(np.rint(relative), 0, 255).astype(np.uint8), window)
+    smooth = cv2.GaussianBlur(median.astype(np.float32), (0, 0), window / 4)
+    return np.asarray(smooth * (MEDIAN_TO_SIGMA / QUANTUM) * wanted)
+
+
+def _octaves(planes: Planes) -> tuple[list[Planes], Planes]:
+    """Differences of ever more blurred ``planes`` (H, W, C), fine to coarse, and what remains."""
+    bands, finer = [], planes
+    for sigma in SIGMAS:
+        blurred = np.asarray(cv2.GaussianBlur(planes, (0, 0), sigma), dtype=np.float32)
+        bands.append(finer - blurred)
+        finer = blurred
+    return bands, finer
+
+
+def _white(width: int, height: int, seed: int) -> Planes:
+    return np.random.default_rng(seed).standard_normal((height, width, 3), dtype=np.float32)
+
+
+def _blocks(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``plane`` (H, W), both multiples of BLOCK, as (N, BLOCK²)."""
+    rows, columns = (n // BLOCK for n in plane.shape)
+    return plane.reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2).reshape(rows * columns, -1)
+
+
+def _planes(linear: Linear) -> Planes:
+    """Y, Cb, Cr (H, W, 3) in steps of 255, not rounded."""
+    return np.asarray(cv2.cvtColor(linear_to_srgb(linear), cv2.COLOR_RGB2YCrCb) * np.float32(255.0))
+
+
+def _rgb(planes: Planes) -> NDArray[np.float32]:
+    return np.asarray(cv2.cvtColor(planes / np.float32(255.0), cv2.COLOR_YCrCb2RGB) * np.float32(255.0))
