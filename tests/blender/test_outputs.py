@@ -32,7 +32,7 @@ def stack(channels, name, letters):
 
 def test_layers_hold_the_frame_and_where_everything_goes(world, bake, tmp_path):
     folder = bake(SHIFTS)
-    quick = {"samples": 1, "scale": 0.5}
+    quick = {"samples": 1, "scale": 0.5, "grain": False, "motion_blur": 0.0}
     layered = render_frames(world.folder, folder, tmp_path / "exr", RenderOptions(format="exr-layers", **quick))
     assert [path.name for path in layered] == ["0001.exr", "0002.exr", "0003.exr", "0004.exr"]
     # The third looks like the second, but moves on.
