@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ..sim.app.bake_inputs import BakeOptions
+from ..sim.app.light import LightRequest
 from ..sim.cache.manifest import SPACES
 from ..sim.errors import InputError
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.scene.environment import FRAMES
 from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector
 
@@ -56,6 +58,42 @@ def add_photo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fov", type=float, metavar="DEGREES", help="field of view of the longer side (default: EXIF, else 50)"
     )
+
+
+def add_environment(parser: argparse.ArgumentParser) -> None:
+    """Light from a file in place of what the photo tells."""
+    text = ".hdr or .exr that replaces the light estimated from the photo; of DiffusionLight hdr/NAME.exr"
+    parser.add_argument("--environment", type=Path, metavar="FILE", help=text)
+    frame = "where the file's middle looks: ahead, level (default); along the camera's axis, as DiffusionLight's; or +X"
+    parser.add_argument("--environment-frame", choices=FRAMES, default="ahead", help=frame)
+    parser.add_argument("--no-sun", action="store_true", help="no sun beside the environment")
+
+
+def add_sun(parser: argparse.ArgumentParser) -> None:
+    """A sun as told, or as the photo tells."""
+    direction = "towards the sun: right, away, up, of any length"
+    parser.add_argument("--sun-direction", type=_vector, metavar="x,y,z", help=direction)
+    strength = "light of the sun on open ground over that of everything else, 0 to 20"
+    parser.add_argument("--sun-strength", type=float, metavar="S", help=strength)
+    angle = "its apparent diameter; 0.5 is the real sun, more is softer"
+    parser.add_argument("--sun-angle", type=float, metavar="DEGREES", help=angle)
+    parser.add_argument("--estimate", action="store_true", help="look for the sun in the photo's shadows again")
+
+
+def light_request(options: argparse.Namespace) -> LightRequest:
+    """The light of ``physgen light``. Raises InputError when nothing is asked for, or what contradicts itself."""
+    request = LightRequest(
+        environment=options.environment,
+        frame=options.environment_frame,
+        sun=not options.no_sun,
+        sun_direction=options.sun_direction,
+        sun_strength=options.sun_strength,
+        sun_angle_deg=options.sun_angle,
+        estimate=options.estimate,
+    )
+    if dataclasses.replace(request, frame="ahead") == LightRequest():
+        raise InputError("nothing to do: give --environment FILE, --sun-direction x,y,z, --no-sun or --estimate")
+    return request
 
 
 def add_physics(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +164,14 @@ def physics(options: argparse.Namespace) -> dict[str, Any]:
 
 def reconstruct_options(options: argparse.Namespace) -> ReconstructOptions:
     """Options of the reconstruction; what was not given is the default."""
-    changes = {"horizon_y": options.horizon, "pitch_deg": options.pitch, "fov_deg": options.fov}
+    changes = {
+        "horizon_y": options.horizon,
+        "pitch_deg": options.pitch,
+        "fov_deg": options.fov,
+        "environment": options.environment,
+        "environment_frame": options.environment_frame,
+        "sun": not options.no_sun,
+    }
     return dataclasses.replace(ReconstructOptions(), **{k: v for k, v in changes.items() if v is not None})
 
 

@@ -42,6 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     photos.add_import(command("import", photos.run_import, "output folder of PhysGen3D → scene folder"))
     varied = "scene folder → the same with other physics and effects, in a folder of its own"
     variants.add_variant(command("variant", variants.run_variant, varied))
+    photos.add_light(command("light", photos.run_light, "another light for a scene folder"))
     bakes.add_bake(command("bake", bakes.run_bake, "scene folder → bake folder"))
     cost = "what a bake would cost in time, memory and disk; nothing is written"
     bakes.add_estimate(command("estimate", bakes.run_estimate, cost))

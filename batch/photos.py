@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``import``, ``render``."""
+"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``import``, ``light``, ``render``."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ from pathlib import Path
 
 from ..physgen_addon.bridge.formats import require_video_name
 from ..sim.app.import_physgen3d import import_physgen3d
+from ..sim.app.light import set_light
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
 from ..sim.events import IsCancelled
 from ..sim.reconstruct.pipeline import object_names
+from ..sim.scene.json_fields import to_json
 from ..sim.scene.overrides import check_overrides
 from . import pipeline
 from .arguments import (
     add_bake_options,
+    add_environment,
     add_photo,
     add_physics,
+    add_sun,
     bake_options,
+    light_request,
     object_requests,
     physics,
     reconstruct_options,
@@ -29,6 +34,7 @@ from .terminal import Terminal
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen run``."""
     add_photo(parser)
+    add_environment(parser)
     add_physics(parser)
     add_bake_options(parser)
     add_render_options(parser)
@@ -41,6 +47,7 @@ def add_run(parser: argparse.ArgumentParser) -> None:
 def add_reconstruct(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen reconstruct``."""
     add_photo(parser)
+    add_environment(parser)
     add_physics(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
 
@@ -51,6 +58,13 @@ def add_import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
     scale = "largest extent of the first object; sets the scale of the scene (default 0.15)"
     parser.add_argument("--size", type=float, metavar="METRES", help=scale)
+
+
+def add_light(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen light``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    add_environment(parser)
+    add_sun(parser)
 
 
 def add_render(parser: argparse.ArgumentParser) -> None:
@@ -104,6 +118,14 @@ def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
     import_physgen3d(options.folder, options.out, size_m=options.size, on_event=terminal)
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def run_light(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen light``; the exit code."""
+    light = set_light(options.scene, light_request(options), terminal).scene.light
+    terminal({"event": "done", "scene": str(options.scene), "light": to_json(light)})
+    terminal.line(f"scene: {options.scene}")
     return 0
 
 

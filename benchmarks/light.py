@@ -26,8 +26,6 @@ import numpy as np
 import trimesh
 from mathutils import Vector
 from numpy.typing import NDArray
-from PIL import Image
-
 from physgen.physgen_addon.bridge import camera as bridge_camera
 from physgen.physgen_addon.bridge import compat, passes
 from physgen.physgen_addon.bridge.ground import add_ground
@@ -38,6 +36,7 @@ from physgen.sim.composite.transfer import linear_to_bytes
 from physgen.sim.errors import PhysGenError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.model import Camera, Ground, Light
+from PIL import Image
 
 FOV_DEG = 45.0
 WANTED_DEG, WANTED_SHARE = 10.0, 0.15
@@ -48,7 +47,7 @@ class Case:
     """A photo under a known light.
 
     azimuth, elevation: degrees, of the direction towards the sun; azimuth 0 is right of the camera, 90 ahead.
-    strength: irradiance of the sun over that of the sky on open ground; 0: no sun. angle: the sun's diameter in degrees.
+    strength: irradiance of the sun over that of the sky on open ground, 0: no sun. angle: its diameter in degrees.
     shape: ``ball``, ``box``, ``jug`` or ``monkey``. ground: ``grain``, ``planks``, ``tiles`` or ``plain``.
     """
 
@@ -78,6 +77,8 @@ CASES = (
     Case(azimuth=120, elevation=50, strength=4.0, shape="ball", ground="plain", angle=20, pitch=45),
     Case(azimuth=0, elevation=90, strength=0.0, shape="ball", ground="grain"),
     Case(azimuth=0, elevation=90, strength=0.0, shape="box", ground="tiles"),
+    Case(azimuth=170, elevation=60, strength=0.6, shape="box", ground="plain", angle=10),
+    Case(azimuth=-160, elevation=55, strength=0.5, shape="jug", ground="plain", angle=15),
 )
 
 
@@ -214,7 +215,7 @@ def _floor(kind: str) -> bpy.types.Material:
 
 
 def judge(case: Case, light: Light) -> dict[str, object]:
-    """What was found against the truth: ``direction_deg``, ``ratio_share`` (found over true, minus 1), ``angle_deg``."""
+    """Found against true: ``direction_deg``, ``ratio_share`` (found over true, minus 1), ``angle_deg``."""
     found: dict[str, object] = {"direction_deg": None, "ratio_share": None, "angle_deg": None}
     if light.sun_direction is not None:
         found["angle_deg"] = math.degrees(light.sun_angle)

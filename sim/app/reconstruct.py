@@ -13,6 +13,7 @@ from ..atomic import write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct
+from ..scene.environment import read_environment
 from ..scene.folder import SceneFolder, load_scene, save_scene
 from ..scene.json_fields import read_json, to_json
 from ..scene.materials import load_preset
@@ -21,7 +22,7 @@ from ..scene.overrides import apply_overrides, without_physics
 from .bake_inputs import file_hash
 
 STAMP_FILE = "reconstruct.json"
-RECONSTRUCT_REVISION = 2
+RECONSTRUCT_REVISION = 3
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 
@@ -41,6 +42,9 @@ def reconstruct_scene(
     options = options or ReconstructOptions()
     if not photo.is_file():
         raise InputError(f"{photo}: there is no such photo; check its name")
+    if options.environment is not None:
+        # Before anything is hashed or cut out: nobody should wait for a message about the last step.
+        read_environment(options.environment)
     stamp = {"inputs_hash": _inputs_hash(photo, objects, options)}
     if _stamp(out) == stamp:
         try:
@@ -73,7 +77,8 @@ def _inputs_hash(photo: Path, objects: Sequence[ObjectRequest], options: Reconst
         "revision": RECONSTRUCT_REVISION,
         "photo": file_hash(photo),
         "objects": shapes,
-        "options": to_json(options),
+        "options": to_json(dataclasses.replace(options, environment=None)),
+        "environment": None if options.environment is None else file_hash(options.environment),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -54,7 +54,8 @@ class Caster:
         # OpenCV looks up at most 32767 points a row.
         self._count, columns = len(at), 1024
         padded = -(-max(self._count, 1) // columns) * columns
-        self._at = [np.pad(at[:, i], (0, padded - self._count)).reshape(-1, columns) for i in (0, 1)]
+        x, y = (np.pad(at[:, i], (0, padded - self._count)).reshape(-1, columns) for i in (0, 1))
+        self._x, self._y = x, y
 
     def _shadow(self, direction: Points) -> NDArray[np.float32]:
         """The shadow (rows, columns) of light from the unit vector ``direction`` (3,) on the grid: 1 inside."""
@@ -80,7 +81,7 @@ class Caster:
         blocked = np.zeros(self._shape, dtype=np.float32)
         for direction, share in zip(directions[use], shares, strict=True):
             blocked += np.float32(share) * self._shadow(direction)
-        seen = cv2.remap(blocked, *self._at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.remap(blocked, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return 1.0 - np.clip(seen.reshape(-1)[: self._count].astype(np.float64), 0.0, 1.0)
 
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 
-SKY_LOSS, SKY_LOSS_SPREAD = 0.85, 0.15
-"""k before the photo is asked, and how far it usually is from that: objects of middling colour give back some 15 %."""
+SKY_LOSS = 0.85
+"""k before the photo is asked: objects of middling colour give back some 15 % of what they hide."""
 MAX_SHARE = 0.952
 """Of the sun: 20 times the sky."""
 HUBER = 1.5
@@ -45,19 +45,19 @@ def smooth_terms(ground: Values) -> Values:
 
 
 def fit_ground(
-    brightness: Values, terms: Values, sky: Values, sun: Values | None, scale: float, start: float = 0.4, rounds: int = 4
+    brightness: Values, terms: Values, sky: Values, sun: Values | None, scale: float, rounds: int = 4
 ) -> GroundLight:
     """Share out the light of the ground.
 
     brightness: (N,) natural logarithm; terms: (N, 6) of ``smooth_terms``; sky, sun: V and v (N,), no sun: None.
-    scale: of the residuals that texture leaves. start: q to begin with.
+    scale: of the residuals that texture leaves. rounds: of Gauss and Newton.
     """
-    share, loss = (start if sun is not None else 0.0), SKY_LOSS
+    share, loss = (0.4 if sun is not None else 0.0), SKY_LOSS
     direct = np.zeros_like(sky) if sun is None else sun
     hidden = 1.0 - sky
     count = len(brightness)
     # What is known beforehand, as if so many points had said it: a little, or colour could pass for curvature.
-    prior = np.diag([0.0, *([0.002 * count] * 2), *([0.01 * count] * 3), 0.0, 0.01 * count * (0.1 / SKY_LOSS_SPREAD) ** 2])
+    prior = count * np.diag([0.0, 0.002, 0.002, 0.01, 0.01, 0.01, 0.0, 0.005])
     smooth = np.zeros(terms.shape[1])
     smooth[0] = float(np.median(brightness))
     residual = np.zeros(count)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,17 @@ def build_mesh(camera: Camera, silhouette: Silhouette, target: int = 12_000) -> 
             break
     assert best is not None
     return best
+
+
+def bare_mesh(camera: Camera, silhouette: Silhouette, target: int = 3000) -> BodyMesh:
+    """The body as its outline alone has it: neither moved back nor filled behind so that it stands safely.
+
+    For what must be where the thing in the photo is, and need not carry it: the shadow that it casts. Raises
+    InputError as ``build_mesh`` does.
+    """
+    reference = replace(next(references(camera, silhouette)), back=1.0)
+    points, faces = _surface_of_size(_DepthField(silhouette, reference), silhouette, target)
+    return _to_world(silhouette, reference, points, faces)
 
 
 def _surface_of_size(field: _DepthField, silhouette: Silhouette, target: int) -> tuple[Points, Faces]:

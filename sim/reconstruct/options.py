@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..errors import InputError
+from ..scene.environment import FRAMES
 from ..scene.model import Vector
 
 
@@ -69,6 +71,10 @@ class ReconstructOptions:
     seed: seed of PatchMatch; equal inputs give equal backgrounds.
     mesh_vertices: aimed number of vertices of each object, 500 to 200000.
     friction: Coulomb coefficient of the ground, 0 to 10.
+    environment: .hdr or .exr file that replaces the environment guessed from the photo (sim/scene/environment).
+    environment_frame: where its middle looks: ``ahead`` of the camera, level; along the ``camera``'s axis, as maps by
+        DiffusionLight do; or along +X of the ``world``.
+    sun: False for none; True looks for it in the shadows, unless ``environment`` has one.
     """
 
     max_size: int = 1920
@@ -84,6 +90,9 @@ class ReconstructOptions:
     seed: int = 0
     mesh_vertices: int = 12_000
     friction: float = 0.4
+    environment: Path | None = None
+    environment_frame: str = "ahead"
+    sun: bool = True
 
     def __post_init__(self) -> None:
         limits: tuple[tuple[str, float | None, float, float, str], ...] = (
@@ -103,6 +112,8 @@ class ReconstructOptions:
         )
         for name, value, low, high, unit in limits:
             _check(_inside(value, low, high), name, value, f"give {unit} from {low:g} to {high:g}")
+        frames = f"choose {', '.join(FRAMES)}"
+        _check(self.environment_frame in FRAMES, "environment_frame", self.environment_frame, frames)
         if self.horizon_y is not None and self.pitch_deg is not None:
             raise InputError(
                 f"horizon_y is {self.horizon_y!r} and pitch_deg is {self.pitch_deg!r}: give one of them, not both"

@@ -15,6 +15,8 @@ from PIL import Image
 
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..scene.environment import prepared as prepared_environment
+from ..scene.environment import write_environment
 from ..scene.folder import SceneFolder, save_scene
 from ..scene.materials import load_preset
 from ..scene.model import Camera, Ground, Light, Scene, SceneObject
@@ -23,9 +25,9 @@ from .body import contact_pixel
 from .horizon import estimate_pitch
 from .inflate import Silhouette, inflate
 from .inpaint import FillOptions, inpaint
-from .light import environment_map, sun, write_environment
+from .light import ENVIRONMENT_FILE, LitScene, estimate_light
 from .mask_cleanup import largest_component
-from .mesh import BodyMesh, build_mesh
+from .mesh import BodyMesh, bare_mesh, build_mesh
 from .options import ObjectRequest, ReconstructOptions
 from .output import replacing_folder
 from .photo import Photo, load_photo
@@ -88,7 +90,7 @@ def reconstruct(
         raise InputError("objects: none given; draw a box around at least one object")
     names = object_names(objects)
     materials = [load_preset(item.preset) for item in objects]
-    steps = _Steps(4 + 3 * len(objects), on_event, cancelled)
+    steps = _Steps(5 + 3 * len(objects), on_event, cancelled)
     with replacing_folder(out) as folder:
         steps.begin("photo")
         picture = load_photo(photo, options.max_size)
@@ -106,8 +108,11 @@ def reconstruct(
         for name, silhouette in zip(names, silhouettes, strict=True):
             steps.begin(f"mesh {name}")
             bodies.append(_body(name, view, silhouette, options, steps))
+        (folder / "light").mkdir()
+        steps.begin("light")
+        light = _light(folder, picture, layers, view, silhouettes, options, steps)
         steps.begin("write")
-        scene = _write(folder, picture, layers, view, bodies, names, objects, materials, options, steps)
+        scene = _write(folder, picture, layers, view, bodies, names, objects, materials, options, light, steps)
         save_scene(folder, scene)
         steps.finish()
     return SceneFolder(root=out, scene=scene)
@@ -247,12 +252,13 @@ def _write(
     objects: Sequence[ObjectRequest],
     materials: Sequence[Any],
     options: ReconstructOptions,
+    light: Light,
     steps: _Steps,
 ) -> Scene:
     metres = _metres_per_unit(bodies, objects, options, steps)
     bases = [_base_centre(body) for body in bodies]
     origin = bases[0]
-    for sub in ("masks", "shadows", "holes", "meshes", "light"):
+    for sub in ("masks", "shadows", "holes", "meshes"):
         (folder / sub).mkdir()
     _save_png(folder / "photo.png", picture.pixels)
     _save_png(folder / "background.png", layers.background)
@@ -281,7 +287,7 @@ def _write(
         camera=cameras.scaled_to_metres(view, origin, metres),
         objects=tuple(items),
         ground=Ground(friction=options.friction),
-        light=_light(folder, picture, layers, view, bodies, steps),
+        light=light,
     )
 
 
@@ -292,17 +298,29 @@ def _base_centre(body: BodyMesh) -> NDArray[np.float64]:
 
 
 def _light(
-    folder: Path, picture: Photo, layers: _Layers, view: Camera, bodies: Sequence[BodyMesh], steps: _Steps
+    folder: Path,
+    picture: Photo,
+    layers: _Layers,
+    view: Camera,
+    silhouettes: Sequence[Silhouette],
+    options: ReconstructOptions,
+    steps: _Steps,
 ) -> Light:
-    pitch = math.asin(max(-1.0, min(1.0, -view.world_from_camera[2][2])))
-    horizon = cameras.horizon_row(picture.height, view.fy, pitch)
-    environment = environment_map(picture.pixels, layers.background, horizon)
-    write_environment(folder / "light" / "environment.exr", environment)
-    heights = [float(np.ptp(body.vertices[:, 2])) for body in bodies]
-    direction, strength, seen = sun(view, picture.pixels, layers.masks, layers.shadows, heights)
-    if not seen:
-        steps.notice("no shadow tells where the light comes from; it is set to above, left and behind the camera")
-    return Light(environment="light/environment.exr", sun_direction=direction, sun_strength=strength, sun_angle=0.3)
+    bare = [bare_mesh(view, silhouette) for silhouette in silhouettes]
+    scene = LitScene(
+        camera=view,
+        ground=Ground(),
+        pixels=picture.pixels,
+        background=layers.background,
+        masks=layers.masks,
+        meshes=[(body.vertices, body.faces) for body in bare],
+    )
+    given = None
+    if options.environment is not None:
+        given = prepared_environment(options.environment, options.environment_frame, view, scene.ground)
+    radiance, light = estimate_light(scene, given, steps.notice, with_sun=options.sun)
+    write_environment(folder / ENVIRONMENT_FILE, radiance)
+    return light
 
 
 def _save_png(path: Path, pixels: NDArray[np.uint8]) -> None:

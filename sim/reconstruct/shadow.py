@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .mask_cleanup import enclosed_holes, surrounding_ring
+from .mask_cleanup import enclosed_holes
 
 Mask = NDArray[np.bool_]
 
@@ -91,18 +91,6 @@ def _lit_ground(grey: NDArray[np.float32], ground: Mask) -> NDArray[np.float32]:
     rows, columns = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float32)
     plane = fit[0] + fit[1] * (columns - centre[0]) / scale + fit[2] * (rows - centre[1]) / scale
     return np.asarray(np.clip(plane, values.min(), values.max()), dtype=np.float32)
-
-
-def lit_over_shaded(pixels: NDArray[np.uint8], mask: Mask, shadow: Mask) -> float | None:
-    """How many times brighter the ground beside the shadow is, in linear light; None without a clear shadow."""
-    if shadow.sum() < max(30, 0.01 * mask.sum()):
-        return None
-    beside = surrounding_ring(mask | shadow, max(3, round(0.1 * np.sqrt(mask.sum()))))
-    if beside.sum() < 30:
-        return None
-    linear = (pixels.astype(np.float32) / 255.0) ** 2.2
-    lit, shaded = float(np.median(linear[beside].mean(axis=1))), float(np.median(linear[shadow].mean(axis=1)))
-    return lit / max(shaded, 1e-4)
 
 
 def object_holes(masks: Sequence[Mask], shadows: Sequence[Mask], dilation: float) -> list[Mask]:

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Environment maps: light from all around as an equirectangular picture in linear light.
+
+Row 0 is the zenith, the middle column looks along +X, columns to its right turn to the right, as Blender has it.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .model import Camera, Ground
+
+Radiance = NDArray[np.float32]
+"""(H, 2 H, 3), linear Rec. 709."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+FRAMES = ("ahead", "camera", "world")
+"""Where the middle of a file looks: ahead of the camera with the horizon level; along the camera's own axis, as
+DiffusionLight has it; or along the scene's +X."""
+SUFFIXES = (".exr", ".hdr")
+MAX_PIXELS = 64_000_000
+MAX_WIDTH = 2048
+"""Of what is kept in a scene; larger maps are averaged down, which loses no light."""
+MIN_HEIGHT = 8
+SPOT_DEG, SPOT_SHARE = 10.0, 0.2
+"""A spot of this radius that gives this share of the ground's light casts shadows like a sun."""
+
+
+def read_environment(path: Path) -> Radiance:
+    """Read a Radiance (.hdr) or OpenEXR file of up to 64 megapixels, twice as wide as high.
+
+    Raises InputError, with the way out, for a file that is missing, no such picture, cut off, of another shape, or
+    holds values that are not finite, negative, or dark all over.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"environment {path}: light is read from .hdr and .exr files, not {path.suffix or 'without suffix'!r}, for "
+            "8-bit pictures have lost what is brighter than white; of DiffusionLight take hdr/NAME.exr, which its "
+            "exposure2hdr.py makes of envmap/NAME_ev-*.png"
+        )
+    if not path.is_file():
+        raise InputError(f"environment {path}: there is no such file; check its name")
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise InputError(f"environment {path}: is not a readable picture ({oiio.geterror()}); export it again")
+    try:
+        spec = source.spec()
+        width, height, names = int(spec.width), int(spec.height), [n.upper() for n in spec.channelnames]
+        _check_shape(path, width, height)
+        if {"R", "G", "B"} <= set(names):
+            wanted = [names.index(name) for name in "RGB"]
+        elif len(names) in (1, 2):
+            wanted = [0, 0, 0]
+        else:
+            raise InputError(
+                f"environment {path}: has the channels {', '.join(spec.channelnames)}; export it with R, G and B"
+            )
+        pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+        if pixels is None:
+            raise InputError(f"environment {path}: is cut off or damaged ({source.geterror()}); export it again")
+    finally:
+        source.close()
+    return _checked(path, np.asarray(pixels, dtype=np.float32).reshape(height, width, -1)[..., wanted])
+
+
+def _check_shape(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"environment {path}: {width}x{height} pixels are more than {MAX_PIXELS // 10**6} million; scale it down, "
+            f"{MAX_WIDTH}x{MAX_WIDTH // 2} are kept"
+        )
+    if height < MIN_HEIGHT or abs(width - 2 * height) > max(1, 0.01 * width):
+        raise InputError(
+            f"environment {path}: is {width}x{height} pixels; an equirectangular map of all directions is "
+            f"twice as wide as high, at least {2 * MIN_HEIGHT}x{MIN_HEIGHT} (a picture of a mirror ball has to be unwrapped first)"
+        )
+
+
+def _checked(path: Path, radiance: Radiance) -> Radiance:
+    bad = int((~np.isfinite(radiance)).any(axis=2).sum())
+    if bad:
+        raise InputError(f"environment {path}: {bad} pixels are not finite; export it again, as 32-bit float")
+    darkest, brightest = float(radiance.min()), float(radiance.max())
+    # Filters leave a little below zero beside what is very bright.
+    if darkest < -0.01 * brightest or darkest < -1e4:
+        raise InputError(f"environment {path}: has negative light ({darkest:g}); export it again without grading")
+    radiance = np.maximum(radiance, 0.0)
+    upper = radiance[: radiance.shape[0] // 2] @ LUMINANCE
+    if not float(upper.mean()) > 1e-9:
+        raise InputError(
+            f"environment {path}: is black where the sky should be; give a map with light above the horizon"
+        )
+    return radiance
+
+
+def prepared(path: Path, frame: str, camera: Camera, ground: Ground | None) -> Radiance:
+    """The environment in the file ``path`` as a scene keeps it, turned so that it fits ``camera``.
+
+    frame: one of ``FRAMES``. Raises InputError as ``read_environment`` does.
+    """
+    if frame not in FRAMES:
+        raise InputError(f"frame of the environment is {frame!r}: choose {', '.join(FRAMES)}")
+    radiance = read_environment(path)
+    # One scale for all: only the ratio of a sun to it matters.
+    radiance = (radiance / float((radiance @ LUMINANCE).mean())).astype(np.float32)
+    height, width = radiance.shape[:2]
+    if width > MAX_WIDTH or width != 2 * height:
+        kept = min(MAX_WIDTH, width) // 2 * 2
+        radiance = np.asarray(cv2.resize(radiance, (kept, kept // 2), interpolation=cv2.INTER_AREA), dtype=np.float32)
+    return turned(radiance, world_from_file(frame, camera, ground))
+
+
+def world_from_file(frame: str, camera: Camera, ground: Ground | None) -> NDArray[np.float64]:
+    """Rotation (3, 3) from a map's own axes (x: its middle, y: left of it, z: up) to the scene's."""
+    if frame == "world":
+        return np.eye(3)
+    pose = np.asarray(camera.world_from_camera, dtype=np.float64)[:3, :3]
+    ahead, up = pose[:, 2], -pose[:, 1]
+    if frame == "ahead":
+        normal = np.array([0.0, 0.0, 1.0]) if ground is None else ground.unit_normal
+        level = ahead - (ahead @ normal) * normal
+        if np.linalg.norm(level) < 1e-6:
+            # Straight down: the picture's upper edge is ahead.
+            level = up - (up @ normal) * normal
+        ahead, up = level / np.linalg.norm(level), normal
+    return np.column_stack([ahead, np.cross(up, ahead), up])
+
+
+def turned(radiance: Radiance, rotation: NDArray[np.float64]) -> Radiance:
+    """``radiance`` of a map whose axes become the scene's by ``rotation`` (3, 3)."""
+    if np.allclose(rotation, np.eye(3)):
+        return radiance
+    height, width = radiance.shape[:2]
+    x, y, z = np.moveaxis(directions(height, width)[0] @ rotation, -1, 0)
+    column = (0.5 - np.arctan2(y, x) / (2 * math.pi)) * width - 0.5
+    row = (0.5 - np.arcsin(np.clip(z, -1, 1)) / math.pi) * height - 0.5
+    around = np.concatenate([radiance[:, -1:], radiance, radiance[:, :1]], axis=1)
+    return np.asarray(
+        cv2.remap(
+            around,
+            (column + 1).astype(np.float32),
+            row.astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )
+
+
+def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World direction (H, W, 3) and solid angle (H, W) in sr of each pixel of a map."""
+    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * math.pi
+    edges = np.sin((0.5 - np.arange(height + 1) / height) * math.pi)
+    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
+    x = np.cos(latitude)[:, None] * np.cos(azimuth)
+    y = np.cos(latitude)[:, None] * np.sin(azimuth)
+    z = np.broadcast_to(np.sin(latitude)[:, None], x.shape)
+    solid = np.broadcast_to(((edges[:-1] - edges[1:]) * 2 * math.pi / width)[:, None], x.shape)
+    return np.stack([x, y, z], axis=-1), solid
+
+
+def ground_light(radiance: Radiance, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit vectors (D, 3) over the ground, in its own axes, and how much light each gives to it (D,).
+
+    axes: rows (3, 3) two unit vectors along the ground, and its normal. The map is averaged down to 32 by 16 pixels.
+    """
+    small = cv2.resize(radiance, (32, 16), interpolation=cv2.INTER_AREA)
+    towards, solid = directions(16, 32)
+    local = (towards @ axes.T).reshape(-1, 3)
+    weight = ((small @ LUMINANCE) * solid).reshape(-1) * np.maximum(local[:, 2], 0.0)
+    above = weight > 0
+    return local[above], weight[above]
+
+
+def sun_in(radiance: Radiance, normal: NDArray[np.float64]) -> float:
+    """Share (0 to 1) of the light on ground of unit ``normal`` (3,) that comes from the brightest spot, 10° in radius.
+
+    Of an even sky it is about 0.06 at most.
+    """
+    height = min(radiance.shape[0], 128)
+    small = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA)
+    towards, solid = directions(height, 2 * height)
+    light = (small @ LUMINANCE) * solid * np.maximum(towards @ normal, 0.0)
+    total = float(light.sum())
+    if not total > 0:
+        return 0.0
+    brightest = towards.reshape(-1, 3)[int(np.argmax(small @ LUMINANCE * (towards @ normal > 0)))]
+    return float(light[towards @ brightest > math.cos(math.radians(SPOT_DEG))].sum()) / total
+
+
+def write_environment(path: Path, radiance: Radiance) -> None:
+    """Write ``radiance`` as 32-bit EXR. Raises InputError when it cannot be written."""
+    height, width, channels = radiance.shape
+    spec = oiio.ImageSpec(width, height, channels, "float")
+    spec.attribute("compression", "zip")
+    output = oiio.ImageOutput.create(str(path))
+    written = (
+        output is not None
+        and output.open(str(path), spec)
+        and output.write_image(np.ascontiguousarray(radiance, dtype=np.float32))
+        and output.close()
+    )
+    if not written:
+        raise InputError(f"{path}: cannot be written ({oiio.geterror() or 'no space?'}); choose another folder")
