@@ -29,8 +29,9 @@ USUAL_ANGLE = 0.15
 """rad; where the search begins, and what is taken where the shadow's edge does not tell."""
 STARTS = 2
 MIN_STRENGTH = 0.12
-MIN_CLEARNESS = 5.0
-"""Without any sun, the direction under which a patchy ground looks most like a shadow reaches about 3."""
+MIN_CLEARNESS = 7.0
+"""Without any sun, the direction under which a patchy ground looks most like a shadow reaches about 3; photos in which
+other things stand, whose shadows are not known, reach 6."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Row 0 is the zenith, the middle column looks along +X, columns to its right turn
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -49,7 +50,7 @@ def read_environment(path: Path) -> Radiance:
         raise InputError(f"environment {path}: there is no such file; check its name")
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise InputError(f"environment {path}: is not a readable picture ({oiio.geterror()}); export it again")
+        raise InputError(f"environment {path}: is not a readable picture ({_why(oiio.geterror)}); export it again")
     try:
         spec = source.spec()
         width, height, names = int(spec.width), int(spec.height), [n.upper() for n in spec.channelnames]
@@ -64,10 +65,18 @@ def read_environment(path: Path) -> Radiance:
             )
         pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None:
-            raise InputError(f"environment {path}: is cut off or damaged ({source.geterror()}); export it again")
+            raise InputError(f"environment {path}: is cut off or damaged ({_why(source.geterror)}); export it again")
     finally:
         source.close()
     return _checked(path, np.asarray(pixels, dtype=np.float32).reshape(height, width, -1)[..., wanted])
+
+
+def _why(error: Callable[[], str]) -> str:
+    """The message of OpenImageIO, which quotes a damaged file's bytes as they are."""
+    try:
+        return error().strip() or "no reason given"
+    except UnicodeDecodeError:
+        return "its header is damaged"
 
 
 def _check_shape(path: Path, width: int, height: int) -> None:
@@ -79,7 +88,8 @@ def _check_shape(path: Path, width: int, height: int) -> None:
     if height < MIN_HEIGHT or abs(width - 2 * height) > max(1, 0.01 * width):
         raise InputError(
             f"environment {path}: is {width}x{height} pixels; an equirectangular map of all directions is "
-            f"twice as wide as high, at least {2 * MIN_HEIGHT}x{MIN_HEIGHT} (a picture of a mirror ball has to be unwrapped first)"
+            f"twice as wide as high, at least {2 * MIN_HEIGHT}x{MIN_HEIGHT}; a picture of a mirror ball has to be "
+            "unwrapped first"
         )
 
 
@@ -190,7 +200,9 @@ def sun_in(radiance: Radiance, normal: NDArray[np.float64]) -> float:
     total = float(light.sum())
     if not total > 0:
         return 0.0
-    brightest = towards.reshape(-1, 3)[int(np.argmax(small @ LUMINANCE * (towards @ normal > 0)))]
+    # The middle of a spot, not the first of its equal pixels.
+    smooth = cv2.GaussianBlur(light / solid, (0, 0), height * SPOT_DEG / 2 / 180)
+    brightest = towards.reshape(-1, 3)[int(np.argmax(smooth))]
     return float(light[towards @ brightest > math.cos(math.radians(SPOT_DEG))].sum()) / total
 
 

@@ -10,8 +10,6 @@ import OpenImageIO as oiio
 import pytest
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions, reconstruct
-from physgen.sim.reconstruct.camera import camera_above_ground
-from physgen.sim.reconstruct.light import environment_map, sun
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from PIL import Image
@@ -111,23 +109,6 @@ def test_environment_has_mean_luminance_one(result):
     weight = np.cos((0.5 - (np.arange(32) + 0.5) / 32) * math.pi)
     luminance = (pixels @ [0.2126, 0.7152, 0.0722]).mean(axis=1)
     assert np.average(luminance, weights=weight) == pytest.approx(1.0, rel=1e-3)
-
-
-def test_sun_stands_opposite_the_shadow():
-    pixels, ball, _crate, shadow = draw_photo()
-    camera = camera_above_ground(WIDTH, HEIGHT, 390.0, math.radians(25))
-    direction, strength, seen = sun(camera, pixels, [ball], [shadow], [0.2])
-    assert seen
-    assert direction[0] < -0.2
-    assert direction[2] > 0.3
-    assert np.linalg.norm(direction) == pytest.approx(1)
-    assert 0.2 <= strength <= 5
-    assert not sun(camera, pixels, [ball], [np.zeros_like(ball)], [0.2])[2]
-
-
-def test_environment_of_a_black_photo_is_finite():
-    black = np.zeros((60, 80, 3), np.uint8)
-    assert np.isfinite(environment_map(black, black, -100.0)).all()
 
 
 def test_progress_counts_up_to_the_end(result):
