@@ -79,6 +79,12 @@ CASES = (
     Case(azimuth=0, elevation=90, strength=0.0, shape="box", ground="tiles"),
     Case(azimuth=170, elevation=60, strength=0.6, shape="box", ground="plain", angle=10),
     Case(azimuth=-160, elevation=55, strength=0.5, shape="jug", ground="plain", angle=15),
+    Case(azimuth=30, elevation=50, strength=1.0, shape="box", ground="planks", angle=4, pitch=40),
+    Case(azimuth=140, elevation=35, strength=2.0, shape="box", ground="grain", angle=8),
+    Case(azimuth=60, elevation=45, strength=1.0, shape="jug", ground="plain", angle=10),
+    Case(azimuth=180, elevation=40, strength=2.0, shape="jug", ground="tiles", angle=5),
+    Case(azimuth=150, elevation=45, strength=0.8, shape="monkey", ground="grain", angle=6, pitch=25),
+    Case(azimuth=20, elevation=35, strength=3.0, shape="monkey", ground="planks", angle=2),
 )
 
 

@@ -19,6 +19,8 @@ Points = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 RELAXATION_ROUNDS = 6
+BARE_THICKNESS = 0.8
+"""Of things that are neither round nor boxes, over their widest inscribed circle: few are as deep as they are wide."""
 GROUND_TOLERANCE_PX = 0.75
 """Vertices nearer to the ground than this are put onto it; marching cubes leaves them a little off."""
 
@@ -132,6 +134,8 @@ def bare_mesh(camera: Camera, silhouette: Silhouette, target: int = 3000) -> Bod
     For what must be where the thing in the photo is, and need not carry it: the shadow that it casts. Raises
     InputError as ``build_mesh`` does.
     """
+    thin = 1.0 if silhouette.slab else 1.0 - (1.0 - BARE_THICKNESS) * (1.0 - silhouette.roundness)
+    silhouette = replace(silhouette, square_height=silhouette.square_height * thin**2)
     reference = replace(next(references(camera, silhouette)), back=1.0)
     points, faces = _surface_of_size(_DepthField(silhouette, reference), silhouette, target)
     return _to_world(silhouette, reference, points, faces)
