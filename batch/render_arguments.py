@@ -8,6 +8,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from ..physgen_addon.bridge.options import RenderOptions
@@ -40,7 +41,11 @@ def add_render_options(parser: argparse.ArgumentParser) -> None:
 
 def render_options(options: argparse.Namespace) -> RenderOptions:
     """The options that were given. Raises InputError for a value out of its range."""
-    return RenderOptions(**{item.name: getattr(options, item.name) for item, _, _ in _fields()})
+    values = {item.name: getattr(options, item.name) for item, _, _ in _fields()}
+    if values["camera"] is not None:
+        # The process that renders may have another working folder.
+        values["camera"] = str(Path(values["camera"]).absolute())
+    return RenderOptions(**values)
 
 
 def render_arguments(options: RenderOptions) -> list[str]:

@@ -21,6 +21,7 @@ from .ledger import Ledger
 from .options import RenderOptions
 from .plan import Frame, plan_frames
 from .renderer import Renderer
+from .shot import Shot, make_shot
 
 
 def render_frames(
@@ -52,8 +53,11 @@ def render_frames(
     denoised = options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
     opened = photo_particles.find_tears(opened, scene)
-    planned = plan_frames(scene, opened, numbers, options=options, blender=blender)
-    suffix, fps = options.frame_format.suffix, opened.manifest.fps
+    rest = [cache.sample(0) for cache in opened.caches]
+    count, fps = max(opened.manifest.frames, opened.last_frame - opened.first_frame + 1), opened.manifest.fps
+    shot = make_shot(scene, rest, options, first_frame=opened.first_frame, count=count, fps=fps)
+    planned = plan_frames(scene, opened, numbers, options=options, shot=shot, blender=blender)
+    suffix = options.frame_format.suffix
     Ledger(out, suffix=suffix)
     with folder_lock(out):
         ledger = Ledger(out, suffix=suffix, fps=fps)
@@ -62,7 +66,9 @@ def render_frames(
             progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
         if options.denoise and not denoised:
             progress.notice("this Blender has no OpenImageDenoise; raise the samples if frames are grainy")
-        _make(scene, opened, planned, ledger, options, progress, cancelled)
+        for notice in shot.notices:
+            progress.notice(notice)
+        _make(scene, opened, planned, ledger, options, shot, progress, cancelled)
     return [ledger.path(frame.number) for frame in planned]
 
 
@@ -72,6 +78,7 @@ def _make(
     planned: list[Frame],
     ledger: Ledger,
     options: RenderOptions,
+    shot: Shot,
     progress: StageProgress,
     cancelled: IsCancelled,
 ) -> None:
@@ -90,10 +97,10 @@ def _make(
                 with replacing(path) as partial:
                     shutil.copyfile(twin, partial)
             else:
-                renderer = renderer or Renderer(scene, bake, options)
-                layers, data = renderer.frame(frame.sample), None
+                renderer = renderer or Renderer(scene, bake, options, shot)
+                layers, data = renderer.frame(frame.sample, frame.cameras[0]), None
                 if options.frame_format.layered:
-                    data = renderer.data(frame.sample, after=frame.after, before=frame.before)
+                    data = renderer.data(frame.sample, after=frame.after, before=frame.before, cameras=frame.cameras)
                 write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             ledger.record(frame.number, frame.inputs)
         progress.report(len(planned))

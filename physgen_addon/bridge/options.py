@@ -36,6 +36,9 @@ class RenderOptions:
     seed: of the sampling pattern, the same for all frames, so that what stands still does not flicker.
     threads: CPU threads, 0 for all; it changes nothing in the picture.
     format, bits, compression: of the frames' files, as ``formats.FrameFormat`` has them.
+    camera: a file of the camera's path (docs/camera.md); None leaves it where the photo was taken. In its place,
+        one smooth move over all baked frames, from the photo's camera to the one that these say:
+    orbit, rise: degrees around the objects, to the right and upwards. dolly: change of the distance over it.
 
     What makes things belong to the photo (docs/rendering.md); each can be switched off:
 
@@ -59,6 +62,10 @@ class RenderOptions:
     format: str = option("png", "of the frames; exr-layers has all layers in parts", choices=tuple(FRAME_KINDS))
     bits: int | None = option(None, "a channel: PNG 8 or 16, EXR 16 or 32 (default: 8 and 16)", metavar="N")
     compression: str = option("zip", "of EXR frames", choices=COMPRESSIONS)
+    camera: str | None = option(None, "path of the camera: a physgen-camera/1 file", metavar="FILE")
+    orbit: float = option(0.0, "the camera goes around the objects to the right, over the clip", metavar="DEGREES")
+    rise: float = option(0.0, "the camera rises around the objects, over the clip", metavar="DEGREES")
+    dolly: float = option(0.0, "the camera's distance changes by this share, over the clip; -0.1 nears", metavar="F")
     motion_blur: float = option(0.5, "time the shutter is open, of a frame; 0 for none", metavar="F")
     grain: bool = option(True, "give what lacks the photo's grain the missing part")
     match_sharpness: bool = option(True, "outlines of what moves as soft as the photo's")
@@ -82,6 +89,9 @@ class RenderOptions:
             raise InputError(f"threads is {self.threads}: give 0 (all) to 1024")
         if not 0 <= self.seed < 2**31:
             raise InputError(f"seed is {self.seed}: give 0 to 2147483647")
+        for name, value, most in (("orbit", self.orbit, 30.0), ("rise", self.rise, 30.0), ("dolly", self.dolly, 0.3)):
+            if not -most <= value <= most:
+                raise InputError(f"{name} is {value}: give {-most:g} to {most:g}")
         if not 0 <= self.motion_blur <= 1:
             raise InputError(f"motion_blur is {self.motion_blur}: give 0 (off) to 1, the whole frame interval")
         if self.f_number is not None and not 0.5 <= self.f_number <= 64:

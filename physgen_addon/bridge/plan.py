@@ -8,16 +8,19 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...sim.app.bake_inputs import file_hash
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.json_fields import to_json
+from ...sim.scene.model import Camera
 from ...sim.version import VERSION
 from . import stroke
 from .caches import Bake
 from .options import RenderOptions
+from .shot import Shot
 from .stroke import Pose
 
 RENDER_REVISION = 3
@@ -28,9 +31,11 @@ RENDER_REVISION = 3
 class Frame:
     """Frame ``number`` shows ``sample`` of every cache; ``inputs`` is the hash of all that it depends on.
 
-    Frames in which nothing moved share the sample of the first of them, and so the hash. A frame that shows motion
+    Frames in which nothing moved share the sample of the first of them, and, where the camera did not either, the
+    hash. A frame that shows motion
     since the sample before it depends on both, and is like no other. ``after`` and ``before`` are the samples of the
-    next frame and the one before, where they count (for optical flow); else ``sample`` too.
+    next frame and the one before, where they count (for optical flow); else ``sample`` too. ``cameras`` are this
+    frame's, the next one's and that of the one before, in pixels of the photo.
     """
 
     number: int
@@ -38,6 +43,7 @@ class Frame:
     inputs: str
     after: int
     before: int
+    cameras: tuple[Camera, Camera, Camera]
 
 
 def plan_frames(
@@ -46,13 +52,15 @@ def plan_frames(
     numbers: Sequence[int],
     *,
     options: RenderOptions,
+    shot: Shot,
     blender: str,
 ) -> list[Frame]:
     """Hash the inputs of the frames ``numbers`` (ascending); ``blender`` names the renderer and its version."""
     base = _scene_hash(folder, options, blender)
     flow, first_frame = options.frame_format.layered, bake.first_frame
     last = max(numbers) - first_frame + int(flow) if numbers else -1
-    shown = _shown(folder, bake, min(last, bake.last_frame - first_frame) + 1, base=base, options=options)
+    count = min(last, bake.last_frame - first_frame) + 1
+    shown = _shown(folder, bake, count, base=base, options=options, shot=shot)
     frames = []
     for number in numbers:
         index = number - first_frame
@@ -63,12 +71,18 @@ def plan_frames(
             following, preceding = shown[min(index + 1, len(shown) - 1)], shown[max(index - 1, 0)]
             (after, next_inputs), (before, last_inputs) = following, preceding
             inputs = hashlib.sha256(f"{inputs} {next_inputs} {last_inputs}".encode()).hexdigest()
-        frames.append(Frame(number=number, sample=sample, inputs=inputs, after=after, before=before))
+        cameras = tuple(shot.camera(i) for i in (index, min(index + 1, len(shown) - 1), max(index - 1, 0)))
+        frames.append(Frame(number=number, sample=sample, inputs=inputs, after=after, before=before, cameras=cameras))
     return frames
 
 
-def _shown(folder: SceneFolder, bake: Bake, count: int, *, base: str, options: RenderOptions) -> list[tuple[int, str]]:
-    """For each of the first ``count`` samples the earlier one that looks the same, or itself, and the hash of that."""
+def _shown(
+    folder: SceneFolder, bake: Bake, count: int, *, base: str, options: RenderOptions, shot: Shot
+) -> list[tuple[int, str]]:
+    """For each of the first ``count`` samples the earlier one that looks the same, or itself, and the hash of that.
+
+    The hash is that of what the sample's own camera sees of it.
+    """
     before = key = rest = stroke.pose(bake, 0)
     key_index, key_hash, sharp = 0, _hash(base, rest), True
     rest_hash = key_hash
@@ -83,15 +97,26 @@ def _shown(folder: SceneFolder, bake: Bake, count: int, *, base: str, options: R
         elif not sharp or not now.same(key, still):
             key, key_index, key_hash, sharp = now, index, _hash(base, now), True
         before = now
-        shown.append((key_index, key_hash))
+        shown.append((key_index, _seen_hash(folder, key_hash, shot.inputs(index))))
     return shown
+
+
+def _seen_hash(folder: SceneFolder, inputs: str, view: Any) -> str:
+    """The hash ``inputs`` with that of the camera's ``view``; as it is for the photo's own camera, None."""
+    if view is None:
+        return inputs
+    depth = folder.scene.depth
+    content = [inputs, view, None if depth is None else _file_hash(folder, depth)]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _scene_hash(folder: SceneFolder, options: RenderOptions, blender: str) -> str:
     """Everything but motion; what only moves things (material, velocity, effects, gravity) does not count."""
     scene, ground = folder.scene, folder.scene.ground
     settings = to_json(options)
-    del settings["threads"]
+    # Of the camera's path each frame's own hash holds what concerns it.
+    for name in ("threads", "camera", "orbit", "rise", "dolly"):
+        del settings[name]
     files = [scene.photo, scene.background, scene.light.environment]
     objects = []
     for item in scene.objects:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import fields, replace
 from pathlib import Path
 
 import bpy
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.composite import layers, mirror
+from ...sim.composite.relief import Relief
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.model import Camera
 from . import passes, photo_particles, rest_light, stroke
@@ -24,7 +26,8 @@ from .options import RenderOptions
 from .plate import Plate
 from .reflection import reflections
 from .regions import Box, feather, ground_depth, object_box, shadow_region
-from .scene import BlenderScene, build, everything, remove
+from .scene import BlenderScene, aim, build, everything, remove
+from .shot import Shot, make_relief
 from .stroke import Moment
 from .sun import with_sun_angle
 from .view import View
@@ -33,10 +36,15 @@ from .view import View
 class Renderer:
     """Renders samples of one bake into the photo. Opening it measures the light at rest; close it after use."""
 
-    def __init__(self, scene: SceneFolder, bake: Bake, options: RenderOptions) -> None:
-        """Raises InputError for images, meshes or light that cannot be used, RenderError when Blender fails."""
+    def __init__(self, scene: SceneFolder, bake: Bake, options: RenderOptions, shot: Shot | None = None) -> None:
+        """``shot``: what the camera does; None leaves it where the photo was taken.
+
+        Raises InputError for images, meshes or light that cannot be used, RenderError when Blender fails.
+        """
         scene = with_sun_angle(scene, options.sun_angle)
         self._folder, self._scene, self._bake, self._options = scene, scene.scene, bake, options
+        self._shot = shot
+        self._relief: Relief | None = None
         self._built: BlenderScene | None = None
         self._data_scene: DataScene | None = None
         self._temporary = tempfile.TemporaryDirectory(prefix="physgen-render-")
@@ -53,8 +61,8 @@ class Renderer:
                 self._data_scene = DataScene(self._built)
             self._reach = self._add_particles(self._built)
             self._ground_depth = ground_depth(self._scene, self._built.light_size)
-            self._open_ground = self._empty_ground()
-            self._rest_shadow = self._shadow(rest)
+            self._open_ground = self._empty_ground(Box(0, 0, *self._built.light_size))
+            self._rest_shadow = self._shadow(rest, self._view(None))
             self._reflections = reflections(self._scene, self._built, options, self._objects)
             self._rest_reflection = self._reflections and self._reflections.layer(self._scene.camera, rest)
         except BaseException:
@@ -68,25 +76,43 @@ class Renderer:
             self._built = None
         self._temporary.cleanup()
 
-    def frame(self, sample: int) -> layers.FrameLayers:
-        """``sample`` of the bake as a picture (linear light), with what it was made of."""
-        view, moment = View(self._scene.camera), self._moment(sample)
-        shadow = self._rest_shadow if sample == 0 else self._shadow(moment)
-        at_rest = view.warp(self._plate.at_rest(moment.now))
+    def frame(self, sample: int, camera: Camera | None = None) -> layers.FrameLayers:
+        """``sample`` of the bake as a picture (linear light), with what it was made of.
+
+        camera: of this frame, one of the shot's; None is the photo's own.
+        """
+        assert self._built is not None
+        view, moment = self._view(camera), self._moment(sample)
+        aim(self._built, view.camera)
+        seen = self._plate.seen(view, moment.now)
+        rest_shadow = view.warp(self._rest_shadow)
+        shadow = rest_shadow if sample == 0 else self._shadow(moment, view)
         ground = layers.ground_layer(
-            photo=view.warp(self._plate.photo),
-            background=view.warp(self._plate.background),
+            photo=seen.photo,
+            background=seen.background,
             shadow=shadow,
-            rest_shadow=view.warp(self._rest_shadow),
-            at_rest=at_rest,
-            masks=view.warp(self._plate.masks),
+            rest_shadow=rest_shadow,
+            at_rest=seen.at_rest,
+            masks=seen.masks,
         )
         if self._reflections is not None:
-            now = self._rest_reflection if sample == 0 else self._reflections.layer(view.camera, moment)
-            ground = mirror.with_reflection(ground, now, self._rest_reflection, at_rest)
+            # The photo's own mirror images are part of its ground, so they are moved with it.
+            rest = self._rest_reflection
+            rest = replace(rest, **{item.name: view.warp(getattr(rest, item.name)) for item in fields(rest)})
+            now = rest if sample == 0 else self._reflections.layer(view.camera, moment)
+            ground = mirror.with_reflection(ground, now, rest, seen.at_rest)
         objects = self._look.objects(self._objects(view.camera, moment), view.camera, moment.now)
-        beauty = self._look.finish(layers.compose(objects, ground), objects, view.camera, moment.now, at_rest)
+        beauty = self._look.finish(layers.compose(objects, ground), objects, view.camera, moment.now, seen.at_rest)
         return layers.FrameLayers(ground=ground, shadow=shadow, objects=objects, beauty=beauty)
+
+    def _view(self, camera: Camera | None) -> View:
+        """What ``camera``, one of the shot's, sees; the background becomes geometry when it first moves."""
+        still = self._scene.camera
+        if camera is None or camera == still or self._shot is None:
+            return View(still, self._size)
+        if self._relief is None:
+            self._relief = make_relief(self._shot, self._folder, self._plate, self._size)
+        return View(camera, self._size, self._relief)
 
     def _add_particles(self, built: BlenderScene) -> float:
         """Add the particles of what flows; how far beyond their centres something of them is seen, m."""
@@ -102,9 +128,12 @@ class Renderer:
         built.own += list(everything() - before)
         return reach
 
-    def data(self, sample: int, *, after: int, before: int) -> DataLayers:
+    def data(
+        self, sample: int, *, after: int, before: int, cameras: tuple[Camera, Camera, Camera] | None = None
+    ) -> DataLayers:
         """Depth, object ids and flow of ``sample``, which ``after`` follows and ``before`` precedes.
 
+        cameras: of this frame, the next and the one before; None is the photo's own.
         Only of a renderer whose options ask for layered frames.
         """
         assert self._data_scene is not None
@@ -113,13 +142,15 @@ class Renderer:
         for cache in (*self._bake.caches, *shown):
             now = cache.sample(sample)
             steps.append((cache.sample(after) - now, cache.sample(before) - now))
-        camera = self._scene.camera
+        assert self._built is not None
+        cameras = cameras or (self._scene.camera,) * 3
+        aim(self._built, cameras[0])
         return self._data_scene.render(
             self._bake.first_frame + sample,
-            self._object_box(camera, self._moment(sample), self._size),
+            self._object_box(cameras[0], self._moment(sample), self._size),
             self._scratch,
             scene=self._scene,
-            cameras=(camera, camera, camera),
+            cameras=cameras,
             steps=steps,
         )
 
@@ -161,30 +192,31 @@ class Renderer:
         passes.open_shutter(scene, moment.shutter, moment.samples(self._options.samples, at_most=most_samples))
         return passes.render(scene, moment.number, box, self._scratch)
 
-    def _empty_ground(self) -> NDArray[np.float32]:
-        """Light on the ground without objects (h, w, 3), in the resolution of light."""
+    def _empty_ground(self, box: Box) -> NDArray[np.float32]:
+        """Light on the ground without objects (h, w, 3), within ``box`` of the resolution of light."""
         assert self._built is not None
         for target in self._built.objects:
             target.item.hide_render = True
-        box = Box(0, 0, *self._built.light_size)
         channels = passes.render(self._built.shadow_scene, self._bake.first_frame, box, self._scratch)
         for target in self._built.objects:
             target.item.hide_render = False
         return passes.stack(channels, "Combined")
 
-    def _shadow(self, moment: Moment) -> NDArray[np.float32]:
+    def _shadow(self, moment: Moment, view: View) -> NDArray[np.float32]:
         """Light on the ground over light on the empty ground (H, W, 3), 1 where no object reaches."""
         assert self._built is not None
         size = self._built.light_size
         ratio = np.ones((size[1], size[0], 3), np.float32)
-        region = shadow_region(self._scene, moment.swept, size)
+        scene = replace(self._scene, camera=view.camera)
+        region = shadow_region(scene, moment.swept, size)
         if region is not None:
             box = region.box if self._options.crop else Box(0, 0, *size)
             lit = passes.stack(self._render(self._built.shadow_scene, moment, box, most_samples=1), "Combined")
-            empty = self._open_ground[box.slices]
+            empty = self._empty_ground(box) if view.moved else self._open_ground[box.slices]
+            depth = ground_depth(scene, size) if view.moved else self._ground_depth
             # Objects only take light from the ground here; more than all of it is noise.
             quotient = np.clip(lit / np.maximum(empty, 1e-6), 0.0, 1.0)
             # Towards the horizon pixels see ever more ground, and above it none at all.
-            near = np.clip(3.0 - 2.0 * self._ground_depth[box.slices] / region.far, 0.0, 1.0)
+            near = np.clip(3.0 - 2.0 * depth[box.slices] / region.far, 0.0, 1.0)
             ratio[box.slices] = 1.0 + (quotient - 1.0) * (feather(box, size) * near)[..., None]
         return np.asarray(cv2.resize(ratio, self._size, interpolation=cv2.INTER_LINEAR))

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 import bpy
 
 from ...sim.scene.folder import SceneFolder, require_photo
+from ...sim.scene.model import Camera
 from . import caches, compat, passes
-from .camera import add_camera, render_size
+from .camera import add_camera, aim_camera, render_size
 from .ground import add_ground
 from .light import add_light
 from .objects import COLOUR_LAYER, RenderObject, add_object
@@ -66,6 +67,12 @@ def build(folder: SceneFolder, bake: caches.Bake | None, options: RenderOptions)
         raise
     built.own = list(everything() - before)
     return built
+
+
+def aim(built: BlenderScene, camera: Camera) -> None:
+    """Let all scenes of ``built`` be seen by ``camera``."""
+    for scene in (built.colour_scene, built.light_scene, built.shadow_scene):
+        aim_camera(scene, camera)
 
 
 def remove(built: BlenderScene) -> None:

@@ -14,7 +14,9 @@ from ...sim.app.process import run_stage
 from ...sim.cache.manifest import MANIFEST_FILE, load_manifest
 from ...sim.errors import InputError, RenderError
 from ...sim.events import Event, IsCancelled, OnEvent
-from ...sim.scene.folder import SCENE_FILE
+from ...sim.scene.camera_path import CameraPath, save_camera_path
+from ...sim.scene.folder import SCENE_FILE, load_scene
+from ..bridge import export_camera
 from ..jobs import JobOperator, Work
 from ..paths import require_folder
 from ..props.body import bodies
@@ -63,6 +65,15 @@ def _output_folder(scene: bpy.types.Scene) -> Path:
     return require_folder(path, "Output")
 
 
+def _camera_path(scene: bpy.types.Scene, photo: Path, bake: Path) -> CameraPath | None:
+    """What the scene's camera does over the frames of ``bake``, against that of the scene folder ``photo``."""
+    manifest = load_manifest(bake)
+    first = scene.physgen.simulation.frame_start
+    frames = range(first, first + max(manifest.frames_done, 1))
+    camera = load_scene(photo).scene.camera
+    return export_camera.camera_path(scene, camera, frames, first_frame=manifest.frame_start)
+
+
 class _Render(JobOperator):
     job_title = "Render"
     bl_options = {"UNDO"}  # noqa: RUF012
@@ -98,6 +109,7 @@ class _Render(JobOperator):
         if rendering.samples:
             arguments += ["--samples", str(rendering.samples)]
         start = render_command()
+        path = _camera_path(scene, photo, bake)
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             if strangers:
@@ -109,6 +121,9 @@ class _Render(JobOperator):
                     rendered = Path(scratch) / "bake"
                     place_bake(photo, baked_scene, bake, rendered, names, on_event)
                 command = [*start, str(photo), "--bake", str(rendered), *arguments]
+                if path is not None:
+                    save_camera_path(Path(scratch) / "camera.json", path)
+                    command += ["--camera", str(Path(scratch) / "camera.json")]
                 # Which frames were asked for is not in the result.
                 return {**run_stage(command, on_event, cancelled, failure=RenderError, restarts=1), "out": str(out)}
 

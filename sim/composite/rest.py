@@ -81,17 +81,26 @@ def rest_map(shares: NDArray[np.float32], weights: Sequence[float]) -> NDArray[n
     return np.clip(1.0 - np.tensordot(moved, shares, axes=1), 0.0, 1.0).astype(np.float32)
 
 
+def rim_strength(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How much of the object with ``mask`` its rim shows (H, W), 0 to 1; ``others`` (H, W) are never rim."""
+    strength = np.zeros(mask.shape, np.float32)
+    if mask.any():
+        width = max(2.0, RIM_SHARE * max(mask.shape))
+        distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+        rim = (distance <= width) & ~mask & ~others
+        strength[rim] = _fade(np.asarray(distance[rim], dtype=np.float64), width / 2, width)
+    return strength
+
+
 class Rim:
     """The pixels around one object's mask that still show some of it, and which of its vertices each belongs to."""
 
-    def __init__(self, mask: NDArray[np.bool_], others: NDArray[np.bool_], rest_px: NDArray[np.floating]) -> None:
-        """``mask``, and ``others`` that are never rim, are (H, W); ``rest_px`` (V, 2) are vertices in pixels."""
-        self._shape, self._rest_px = mask.shape, np.asarray(rest_px, dtype=np.float64)
-        width = max(2.0, RIM_SHARE * max(mask.shape))
-        distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
-        self._pixels = np.nonzero((distance <= width) & ~mask & ~others) if mask.any() else (np.empty(0, int),) * 2
+    def __init__(self, strength: NDArray[np.float32], rest_px: NDArray[np.floating]) -> None:
+        """``strength`` (H, W): how much of the object a pixel shows; ``rest_px`` (V, 2) are its vertices in pixels."""
+        self._rest_px = np.asarray(rest_px, dtype=np.float64)
+        self._pixels = np.nonzero(strength > 0)
         rows, columns = self._pixels
-        self._strength = _fade(np.asarray(distance[rows, columns], dtype=np.float64), width / 2, width)
+        self._strength = strength[self._pixels].astype(np.float64)
         known = np.isfinite(self._rest_px).all(axis=1)
         self._known = np.nonzero(known)[0]
         if len(self._known):

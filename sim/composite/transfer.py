@@ -72,3 +72,10 @@ def resized(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.f
     shrinking = width * height < image.shape[0] * image.shape[1]
     method = cv2.INTER_AREA if shrinking else cv2.INTER_CUBIC
     return np.maximum(cv2.resize(image, (width, height), interpolation=method), 0.0)
+
+
+def nearest(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """``image`` (H, W, …) at another size, every pixel one of its own: for what must not be mixed, such as depth."""
+    if image.shape[:2] == (height, width):
+        return image
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST))

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from ..errors import InputError
 
 Mask = NDArray[np.bool_]
+Guide = NDArray[np.float32]
 
 SOLVE_SIDE = 220.0
 """Pixels; larger holes are filled at a scale that makes them this large. On more pixels PatchMatch's patches see too
@@ -42,11 +43,16 @@ class FillOptions:
 
 
 def inpaint(
-    pixels: NDArray[np.uint8], hole: Mask, objects: Mask, options: FillOptions | None = None
+    pixels: NDArray[np.uint8],
+    hole: Mask,
+    objects: Mask,
+    options: FillOptions | None = None,
+    guide: Guide | None = None,
 ) -> NDArray[np.uint8]:
     """``pixels`` (H, W, 3) with ``hole`` filled from elsewhere; outside the hole equal to the photo bit for bit.
 
     objects: what may be seen neither in the filling nor through the feather at its edge, inside ``hole``.
+    guide: two numbers from 0 to 1 for every pixel; sources are preferred that are alike in them. It replaces by_row.
     Raises InputError when hardly any background is left to fill from, or the native library is missing.
     """
     options = options or FillOptions()
@@ -59,7 +65,7 @@ def inpaint(
         )
     filling = pixels.copy()
     for part in _parts(hole):
-        _fill_part(filling, part, hole, options)
+        _fill_part(filling, part, hole, options, guide)
     alpha = _feather(hole, objects)[..., None]
     mixed = np.where(alpha >= 1.0, filling, pixels + alpha * (filling.astype(np.float32) - pixels))
     return np.where(hole[..., None], np.clip(mixed + 0.5, 0, 255).astype(np.uint8), pixels)
@@ -72,7 +78,7 @@ def _parts(hole: Mask) -> list[Mask]:
     return [np.asarray(labels == index) for index in order]
 
 
-def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillOptions) -> None:
+def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillOptions, guide: Guide | None) -> None:
     """Fill the connected ``part`` of ``hole`` in ``pixels``, in place, from its surroundings outside of ``hole``."""
     rows, columns = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
     margin = max(48, round(0.7 * max(np.ptp(rows), np.ptp(columns))))
@@ -85,11 +91,21 @@ def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillO
     crop, own, closed = pixels[window], part[window], hole[window]
     side = float(np.sqrt(np.ptp(rows) * np.ptp(columns)))
     scale = min(1.0, SOLVE_SIDE / max(side, 1.0), float(np.sqrt(options.limit / own.size)))
-    filled = _patch_match(crop, own, closed, options) if scale > 0.8 else _at_scale(crop, own, closed, scale, options)
+    if guide is not None:
+        guide = guide[window]
+    elif options.by_row:
+        guide = np.zeros((*own.shape, 2), dtype=np.float32)
+        guide[..., 0] = np.linspace(0.0, 1.0, len(guide), dtype=np.float32)[:, None]
+    if scale > 0.8:
+        filled = _patch_match(crop, own, closed, options, guide)
+    else:
+        filled = _at_scale(crop, own, closed, scale, options, guide)
     crop[own] = filled[own]
 
 
-def _patch_match(pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: FillOptions) -> NDArray[np.uint8]:
+def _patch_match(
+    pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: FillOptions, guide: Guide | None
+) -> NDArray[np.uint8]:
     """``pixels`` with ``hole`` filled; ``closed`` pixels outside of it are no source."""
     # Imported late: loading a native library must not be the price of importing the package.
     from patchmatch import patch_match
@@ -101,14 +117,14 @@ def _patch_match(pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: F
     barred = closed & ~hole
     excluded = barred.astype(np.uint8) if barred.any() else None
     try:
-        if options.by_row:
-            guide = np.zeros(pixels.shape, dtype=np.float32)
-            guide[..., 0] = np.linspace(0.0, GUIDE_SCALE, len(guide), dtype=np.float32)[:, None]
+        if guide is not None:
+            scaled = np.zeros(pixels.shape, dtype=np.float32)
+            scaled[..., :2] = GUIDE_SCALE * guide
             return np.asarray(
                 patch_match.inpaint_regularity(
                     image,
                     holes,
-                    guide,
+                    scaled,
                     global_mask=excluded,
                     patch_size=options.radius,
                     guide_weight=GUIDE_WEIGHT,
@@ -120,7 +136,7 @@ def _patch_match(pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: F
 
 
 def _at_scale(
-    pixels: NDArray[np.uint8], hole: Mask, closed: Mask, scale: float, options: FillOptions
+    pixels: NDArray[np.uint8], hole: Mask, closed: Mask, scale: float, options: FillOptions, guide: Guide | None
 ) -> NDArray[np.uint8]:
     """Fill a smaller copy, where patches span whole structures, then give the enlargement its fine detail back.
 
@@ -132,7 +148,9 @@ def _at_scale(
     small_hole, small_closed = (
         cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0 for mask in (hole, closed)
     )
-    filled = _patch_match(small, small_hole, small_closed, options)
+    if guide is not None:
+        guide = np.asarray(cv2.resize(guide, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    filled = _patch_match(small, small_hole, small_closed, options, guide)
     enlarged = cv2.resize(filled, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
     source_rows, source_columns = _alike(filled, small_hole, small_closed)
     rows, columns = np.indices(hole.shape)

@@ -90,14 +90,17 @@ def _diffuse(material, tree, colour) -> bpy.types.Material:
     return material
 
 
-def render_truth(shift: tuple[float, float, float] | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def render_truth(
+    shift: tuple[float, float, float] | None, folder: Path, camera: Camera | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The picture (H, W, 3) in 8-bit sRGB and the ball's mask (H, W), by Cycles alone; None leaves the ball out."""
+    camera = camera or photo_camera()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     compat.enable_cycles()
     scene = bpy.data.scenes.new("truth")
     passes.set_up(scene, RenderOptions(samples=256, seed=7), denoise=False)
     scene.render.use_persistent_data = False
-    bridge_camera.add_camera(scene, photo_camera(), (WIDTH, HEIGHT))
+    bridge_camera.add_camera(scene, camera, (WIDTH, HEIGHT))
     scene.world = bpy.data.worlds.new("sky")
     tree = compat.node_tree(scene.world)
     sky, output = tree.nodes.new("ShaderNodeBackground"), tree.nodes.new("ShaderNodeOutputWorld")
@@ -164,6 +167,12 @@ def _extended(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
     rows, columns = ndimage.distance_transform_edt(~mask, return_indices=True)[1]
     return photo[rows, columns]
+
+
+@pytest.fixture
+def truth():
+    """``render_truth``, for other cameras and places."""
+    return render_truth
 
 
 @pytest.fixture

@@ -30,9 +30,9 @@ def rendered(monkeypatch):
     calls = []
     original = frames_module.Renderer.frame
 
-    def count(self, sample):
+    def count(self, sample, camera=None):
         calls.append(sample)
-        return original(self, sample)
+        return original(self, sample, camera)
 
     monkeypatch.setattr(frames_module.Renderer, "frame", count)
     return calls

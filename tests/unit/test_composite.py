@@ -118,7 +118,7 @@ def test_the_rim_gives_way_where_its_outline_moves():
     mask = np.zeros((30, 40), bool)
     mask[10:20, 10:30] = True
     corners = np.array([[10.0, 15.0], [30.0, 15.0]])
-    rim = rest.Rim(mask, mask, corners)
+    rim = rest.Rim(rest.rim_strength(mask, mask), corners)
     weights = np.ones(mask.shape, np.float32)
     rim.apply(weights, corners)
     assert (weights == 1).all()
