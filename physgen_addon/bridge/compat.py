@@ -30,6 +30,17 @@ def enable_cycles() -> None:
         raise RenderError(f"Blender {bpy.app.version_string} was built without Cycles; use an official build")
 
 
+def cycles_preferences() -> bpy.types.AddonPreferences | None:
+    """Where Cycles keeps which devices it uses; None when it is not enabled."""
+    addon = bpy.context.preferences.addons.get("cycles")
+    return addon.preferences if addon is not None else None
+
+
+def eevee() -> str:
+    """Blender's name of the engine EEVEE; 4.x called the present one after the one before it."""
+    return "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
+
+
 def denoiser_available() -> bool:
     """Whether this build can denoise on the CPU."""
     try:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.scene.model import Camera, Scene
-from . import compat, passes
+from . import compat, cycles, passes
 from .regions import Box, ground_depth
 from .scene import BlenderScene
 
@@ -26,6 +26,8 @@ FAR_M = 1e10
 """Depth where nothing is, neither object nor ground; Blender writes the same."""
 STEPS = ("physgen_step_next", "physgen_step_previous")
 """Vector at each vertex, and pass, that holds how far it moves to the next frame and to the one before, in metres."""
+NUMBER = "physgen_number"
+"""Pass that holds the object's number for EEVEE, which has no pass of its own for it."""
 CENTRE_FILTER_PX = 0.01
 """Width of the pixel filter, the least that Cycles knows: rays go through the pixels' centres."""
 
@@ -56,18 +58,24 @@ class DataScene:
         self.scene = built.colour_scene.copy()
         self.scene.name = "PhysGen data"
         built.own.append(self.scene)
-        cycles, layer = self.scene.cycles, self.scene.view_layers[0]
-        cycles.samples = 1
-        # A filter of the kind BOX has one width only.
-        cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", CENTRE_FILTER_PX
-        passes.set_denoising(self.scene, False)
+        layer = self.scene.view_layers[0]
+        self._traced = built.options.engine == "cycles"
+        if self._traced:
+            self.scene.cycles.samples = 1
+            # A filter of the kind BOX has one width only.
+            self.scene.cycles.pixel_filter_type, self.scene.cycles.filter_width = "GAUSSIAN", CENTRE_FILTER_PX
+            cycles.set_denoising(self.scene, False)
+        else:
+            # The colours' own settings look through the middle of each of their subpixels.
+            self.scene.render.resolution_x, self.scene.render.resolution_y = built.size
         layer.use_pass_z = layer.use_pass_object_index = True
-        for name in STEPS:
+        for name in (*STEPS, NUMBER):
             layer.aovs.add().name = name
         for number, target in enumerate(built.objects, start=1):
             self.follow(target.item, number)
             for name in STEPS:
                 _show_attribute(target.item.data.materials[0], name)
+            _show_number(target.item.data.materials[0])
 
     def follow(self, item: bpy.types.Object, number: int) -> None:
         """Count ``item`` as (part of) the object ``number``; its vertices' steps are the next of ``render``'s."""
@@ -101,7 +109,7 @@ class DataScene:
             for mesh, pair in zip(self._followers, steps, strict=True):
                 _set_vectors(mesh, pair)
             channels = passes.render(self.scene, frame, box, folder)
-            number = np.rint(channels[compat.OBJECT_INDEX])
+            number = np.rint(channels[compat.OBJECT_INDEX] if self._traced else channels[f"{NUMBER}.R"])
             seen = number > 0
             # What has sunk into the ground is seen all the same in the picture, so it is here too.
             depth[box.slices] = np.where(seen, channels["Depth.Z"], depth[box.slices])
@@ -137,6 +145,13 @@ def _show_attribute(material: bpy.types.Material, name: str) -> None:
     attribute, output = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeOutputAOV")
     attribute.attribute_name, output.aov_name = name, name
     links.new(attribute.outputs["Vector"], output.inputs["Color"])
+
+
+def _show_number(material: bpy.types.Material) -> None:
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    info, output = nodes.new("ShaderNodeObjectInfo"), nodes.new("ShaderNodeOutputAOV")
+    output.aov_name = NUMBER
+    links.new(info.outputs["Object Index"], output.inputs["Color"])
 
 
 def _set_vectors(mesh: bpy.types.Mesh, pair: tuple[Vectors, Vectors]) -> None:

@@ -18,9 +18,9 @@ from . import caches, compat, photo_particles
 from .frame_output import write_frame
 from .frame_range import parse_range
 from .ledger import Ledger
+from .open_renderer import OpenRenderer
 from .options import RenderOptions
 from .plan import Frame, plan_frames
-from .renderer import Renderer
 from .shot import Shot, make_shot
 
 
@@ -50,7 +50,8 @@ def render_frames(
         caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
     remedy = opened.unfinished or f"bake more in {bake}, or ask for fewer"
     numbers = parse_range(frames, opened.first_frame, opened.last_frame, there=f"baked; {remedy}")
-    denoised = options.denoise and compat.denoiser_available()
+    traces = options.engine == "cycles"
+    denoised = traces and options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
     opened = photo_particles.find_tears(opened, scene)
     rest = [cache.sample(0) for cache in opened.caches]
@@ -64,7 +65,7 @@ def render_frames(
         progress = StageProgress(on_event, "render", len(planned))
         if frames is None and opened.unfinished:
             progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
-        if options.denoise and not denoised:
+        if traces and options.denoise and not denoised:
             progress.notice("this Blender has no OpenImageDenoise; raise the samples if frames are grainy")
         for notice in shot.notices:
             progress.notice(notice)
@@ -86,7 +87,7 @@ def _make(
     if len(missing) < len(planned):
         progress.notice(f"{len(planned) - len(missing)} of {len(planned)} frames are up to date")
     names = [item.name for item in scene.scene.objects]
-    renderer: Renderer | None = None
+    renderer: OpenRenderer | None = None
     try:
         for done, frame in enumerate(missing, start=len(planned) - len(missing)):
             if cancelled():
@@ -97,10 +98,8 @@ def _make(
                 with replacing(path) as partial:
                     shutil.copyfile(twin, partial)
             else:
-                renderer = renderer or Renderer(scene, bake, options, shot)
-                layers, data = renderer.frame(frame.sample, frame.cameras[0]), None
-                if options.frame_format.layered:
-                    data = renderer.data(frame.sample, after=frame.after, before=frame.before, cameras=frame.cameras)
+                renderer = renderer or OpenRenderer(scene, bake, options, shot, progress.notice)
+                layers, data = renderer.layers(frame)
                 write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             ledger.record(frame.number, frame.inputs)
         progress.report(len(planned))

@@ -114,7 +114,8 @@ def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     """Diffuse with albedo 1 / (L₀ + k) plus emission k / (L₀ + k): its radiance is (L + k) / (L₀ + k), 1 at rest."""
     material = bpy.data.materials.new(name)
     # It glows only towards the camera: emission that Cycles would sample as a lamp costs time and adds noise.
-    material.cycles.emission_sampling = "NONE"
+    if hasattr(material, "cycles"):
+        material.cycles.emission_sampling = "NONE"
     tree = compat.node_tree(material)
     new, link = tree.nodes.new, tree.links.new
     rest = new("ShaderNodeAttribute")

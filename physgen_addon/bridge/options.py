@@ -14,7 +14,8 @@ from typing import Any
 from ...sim.errors import InputError
 from .formats import COMPRESSIONS, FRAME_KINDS, FrameFormat
 
-ENGINES = ("cycles",)
+ENGINES = ("cycles", "eevee")
+DEVICES = ("cpu", "auto", "optix", "cuda", "hip", "oneapi", "metal")
 
 
 def option(default: Any, text: str, *, metavar: str | None = None, choices: tuple[str, ...] | None = None) -> Any:
@@ -26,13 +27,15 @@ def option(default: Any, text: str, *, metavar: str | None = None, choices: tupl
 class RenderOptions:
     """How frames are rendered.
 
-    engine: render engine; ``cycles``.
+    engine: render engine; ``cycles`` traces rays, ``eevee`` draws with the graphics card.
+    device: where Cycles renders; ``auto`` takes a graphics card if there is one. What is not there falls back to the
+        CPU. It changes nothing in the picture but noise.
     samples: rays and light samples a pixel, 1 to 4096.
     scale: width of the frames over the photo's, above 0 to 4.
     light_scale: resolution in which light is computed over the frames', above 0 to 1; outlines and colours are not
         affected. None takes half, and less for large frames, down to a quarter.
     crop: render only where objects and shadows can be seen; off renders whole frames, which look the same.
-    denoise: use OpenImageDenoise where Blender has it.
+    denoise: use OpenImageDenoise where Blender has it; Cycles only.
     seed: of the sampling pattern, the same for all frames, so that what stands still does not flicker.
     threads: CPU threads, 0 for all; it changes nothing in the picture.
     format, bits, compression: of the frames' files, as ``formats.FrameFormat`` has them.
@@ -52,6 +55,7 @@ class RenderOptions:
     """
 
     engine: str = option("cycles", "render engine", choices=ENGINES)
+    device: str = option("cpu", "where Cycles renders; falls back to cpu", choices=DEVICES)
     samples: int = option(16, "rays and light samples a pixel", metavar="N")
     scale: float = option(1.0, "of the photo's resolution", metavar="F")
     light_scale: float | None = option(None, "resolution of light over the frames' (default: by size)", metavar="F")
@@ -79,6 +83,8 @@ class RenderOptions:
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
             raise InputError(f"engine is {self.engine!r}: choose one of {', '.join(ENGINES)}")
+        if self.device not in DEVICES:
+            raise InputError(f"device is {self.device!r}: choose one of {', '.join(DEVICES)}")
         if not 1 <= self.samples <= 4096:
             raise InputError(f"samples is {self.samples}: give 1 to 4096")
         if not 0 < self.scale <= 4:

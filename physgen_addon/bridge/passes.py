@@ -12,56 +12,36 @@ from numpy.typing import NDArray
 from ...sim.errors import InputError, RenderError
 from . import compat
 from .exr import read_layers
-from .options import RenderOptions
 from .regions import Box
+
+EEVEE_STEPS = 8
+"""Moments of a stroke that EEVEE draws."""
 
 Channels = dict[str, NDArray[np.float32]]
 
 
-def set_up(scene: bpy.types.Scene, options: RenderOptions, *, denoise: bool) -> None:
-    """Cycles for exact image formation: one pixel is the mean over its area, light is direct, nothing is clamped."""
-    render, cycles = scene.render, scene.cycles
-    render.engine = "CYCLES"
-    cycles.device = "CPU"
-    cycles.samples = options.samples
-    cycles.use_adaptive_sampling = False
-    cycles.seed, cycles.use_animated_seed = options.seed, False
-    # The ratio of light to rest light is only independent of albedo without bounces.
-    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = cycles.transmission_bounces = 0
-    cycles.transparent_max_bounces = 0
-    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
-    cycles.light_sampling_threshold = 0.0
-    cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
-    cycles.use_auto_tile = False
-    set_denoising(scene, denoise and options.denoise)
-    render.threads_mode = "FIXED" if options.threads else "AUTO"
-    if options.threads:
-        render.threads = options.threads
+def set_up(scene: bpy.types.Scene) -> None:
+    """What every engine needs: transparent where nothing is, only the border, linear numbers as they are."""
+    render = scene.render
     render.film_transparent = True
     render.use_compositing = render.use_sequencer = render.use_motion_blur = False
-    # Keeps textures, lamps and the denoiser from one frame to the next.
-    render.use_persistent_data = True
     render.use_border = render.use_crop_to_border = True
     scene.view_settings.view_transform = "Standard"
     compat.set_exr(render.image_settings)
 
 
-def set_denoising(scene: bpy.types.Scene, wanted: bool) -> None:
-    """Denoise with OpenImageDenoise if ``wanted`` and there."""
-    cycles = scene.cycles
-    cycles.use_denoising = wanted and compat.denoiser_available()
-    if cycles.use_denoising:
-        cycles.denoiser = compat.DENOISER
-        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_prefilter = "FAST"
-        cycles.denoising_quality = "BALANCED"
-
-
 def open_shutter(scene: bpy.types.Scene, share: float, samples: int) -> None:
-    """Blur what moves in the ``share`` of a frame interval before the frame, 0 for none, with so many samples."""
+    """Blur what moves in the ``share`` of a frame interval before the frame, 0 for none, with so many samples.
+
+    EEVEE's samples stay; they are spread over at least ``EEVEE_STEPS`` moments.
+    """
     settings = scene.render
     settings.use_motion_blur = share > 0
-    scene.cycles.samples = samples
+    if settings.engine == "CYCLES":
+        scene.cycles.samples = samples
+    else:
+        # Without its blur along the picture's own motion, which smears outlines over the ground.
+        scene.eevee.motion_blur_steps, scene.eevee.motion_blur_max = EEVEE_STEPS, 0
     if share > 0:
         settings.motion_blur_shutter, settings.motion_blur_position = share, "END"
 

@@ -114,8 +114,9 @@ def _scene_hash(folder: SceneFolder, options: RenderOptions, blender: str) -> st
     """Everything but motion; what only moves things (material, velocity, effects, gravity) does not count."""
     scene, ground = folder.scene, folder.scene.ground
     settings = to_json(options)
-    # Of the camera's path each frame's own hash holds what concerns it.
-    for name in ("threads", "camera", "orbit", "rise", "dolly"):
+    # Of the camera's path each frame's own hash holds what concerns it. What computes a picture does not change it, and
+    # a run that falls back to the CPU must be able to go on.
+    for name in ("threads", "device", "camera", "orbit", "rise", "dolly"):
         del settings[name]
     files = [scene.photo, scene.background, scene.light.environment]
     objects = []

@@ -56,7 +56,7 @@ class Reflections:
         kept = [scene.camera for scene in scenes]
         added = []
         try:
-            for scene, size in zip(scenes, (self._built.size, self._built.light_size), strict=True):
+            for scene, size in zip(scenes, (self._built.drawn_size, self._built.light_size), strict=True):
                 added.append(add_camera(scene, camera, size))
             return self._objects(camera, moment)
         finally:

@@ -21,7 +21,6 @@ from .caches import Bake
 from .camera import render_size
 from .data_passes import STEPS, DataLayers, DataScene
 from .look import Look
-from .objects import COLOUR_LAYER
 from .options import RenderOptions
 from .plate import Plate
 from .reflection import reflections
@@ -173,10 +172,10 @@ class Renderer:
         box, light_box = (self._object_box(camera, moment, size) for size in (self._size, self._built.light_size))
         if box is None or light_box is None:
             return layer
-        colours = self._render(self._built.colour_scene, moment, box, most_samples=4)
-        layer.texture[box.slices] = passes.stack(colours, COLOUR_LAYER)
-        layer.alpha[box.slices] = colours["Combined.A"]
-        lit = self._render(self._built.light_scene, moment, light_box, most_samples=1)
+        self._open_shutter(self._built.colour_scene, moment, most_samples=4)
+        layer.texture[box.slices], layer.alpha[box.slices] = self._built.colours(moment.number, box, self._scratch)
+        self._open_shutter(self._built.light_scene, moment, most_samples=1)
+        lit = passes.render(self._built.light_scene, moment.number, light_box, self._scratch)
         light = np.ones((*self._built.light_size[::-1], 3), np.float32)
         light[light_box.slices] = layers.light_ratio(passes.stack(lit, "Combined"), lit["Combined.A"])
         layer.light[:] = cv2.resize(light, self._size, interpolation=cv2.INTER_LINEAR)
@@ -187,20 +186,20 @@ class Renderer:
             return Box(0, 0, *size)
         return object_box(camera, moment.swept, size, self._reach)
 
-    def _render(self, scene: bpy.types.Scene, moment: Moment, box: Box, *, most_samples: int) -> passes.Channels:
-        """``box`` of ``scene`` with the shutter open; up to ``most_samples`` times the samples for long strokes."""
+    def _open_shutter(self, scene: bpy.types.Scene, moment: Moment, *, most_samples: int) -> None:
+        """Let ``scene`` show the stroke; with up to ``most_samples`` times the samples if it is long."""
         passes.open_shutter(scene, moment.shutter, moment.samples(self._options.samples, at_most=most_samples))
-        return passes.render(scene, moment.number, box, self._scratch)
 
     def _empty_ground(self, box: Box) -> NDArray[np.float32]:
         """Light on the ground without objects (h, w, 3), within ``box`` of the resolution of light."""
         assert self._built is not None
-        for target in self._built.objects:
-            target.item.hide_render = True
-        channels = passes.render(self._built.shadow_scene, self._bake.first_frame, box, self._scratch)
-        for target in self._built.objects:
-            target.item.hide_render = False
-        return passes.stack(channels, "Combined")
+        hidden = list(self._built.collection.objects)
+        for item in hidden:
+            item.hide_render = True
+        light = self._built.ground_light(self._bake.first_frame, box, self._scratch)
+        for item in hidden:
+            item.hide_render = False
+        return light
 
     def _shadow(self, moment: Moment, view: View) -> NDArray[np.float32]:
         """Light on the ground over light on the empty ground (H, W, 3), 1 where no object reaches."""
@@ -211,7 +210,8 @@ class Renderer:
         region = shadow_region(scene, moment.swept, size)
         if region is not None:
             box = region.box if self._options.crop else Box(0, 0, *size)
-            lit = passes.stack(self._render(self._built.shadow_scene, moment, box, most_samples=1), "Combined")
+            self._open_shutter(self._built.shadow_scene, moment, most_samples=1)
+            lit = self._built.ground_light(moment.number, box, self._scratch)
             empty = self._empty_ground(box) if view.moved else self._open_ground[box.slices]
             depth = ground_depth(scene, size) if view.moved else self._ground_depth
             # Objects only take light from the ground here; more than all of it is noise.

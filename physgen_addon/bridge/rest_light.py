@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """L₀: the light that each surface point has at rest, which the photo's colours already contain.
 
-Measured twice. A bake at the vertices covers all sides. Then the rest frame is rendered once, and where the camera
+Measured twice. A bake at the vertices covers all sides; for EEVEE, whose lights are lamps alone and which need not have
+Cycles beside it, rays towards the lamps do the same. Then the rest frame is rendered once, and where the camera
 sees a vertex its value is multiplied by what the frame shows instead of 1: the same renderer, sampling, denoiser and
 interpolation then cancel, and rest is rest to a fraction of a percent.
 """
@@ -15,13 +16,13 @@ import bpy
 import cv2
 import numpy as np
 from mathutils import Vector
-from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 from scipy import sparse
 
 from ...sim.errors import RenderError
-from . import passes
+from . import cycles, passes
 from .objects import RenderObject, get_rest_light, set_rest_light
+from .ray_light import cast, surfaces
 from .regions import object_box
 from .scene import BlenderScene
 
@@ -46,7 +47,8 @@ def measure(built: BlenderScene, folder: Path) -> None:
     for target in built.objects:
         set_rest_light(target, np.ones_like(target.mesh.vertices), 0.0)
     for target in built.objects:
-        baked = _smoothed(_bake(built, target), target)
+        baked = cast(built, target) if built.options.engine == "eevee" else _bake(built, target)
+        baked = _smoothed(baked, target)
         set_rest_light(target, np.clip(baked, 0.0, None) + ambient, ambient)
     seen = _visible(built)
     for _ in range(CALIBRATION_ROUNDS):
@@ -61,7 +63,7 @@ def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
         other.item.select_set(other is target, view_layer=layer)
     layer.objects.active = item
     scene.cycles.samples = int(np.clip(BAKE_BUDGET / max(len(item.data.loops), 1), 4, 256))
-    passes.set_denoising(scene, False)
+    cycles.set_denoising(scene, False)
     context = {"scene": scene, "view_layer": layer, "active_object": item, "object": item, "selected_objects": [item]}
     try:
         with bpy.context.temp_override(**context):
@@ -70,7 +72,7 @@ def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
         raise RenderError(f"object {target.source.name!r}: its light at rest could not be baked: {error}") from error
     finally:
         scene.cycles.samples = built.options.samples
-        passes.set_denoising(scene, built.options.denoise)
+        cycles.set_denoising(scene, built.options.denoise)
     values = get_rest_light(target)
     if not np.isfinite(values).all():
         raise RenderError(f"object {target.source.name!r}: its light at rest is not finite")
@@ -92,10 +94,7 @@ def _smoothed(values: NDArray[np.float64], target: RenderObject) -> NDArray[np.f
 
 def _visible(built: BlenderScene) -> list[NDArray[np.bool_]]:
     """Which vertices of each object the camera sees at rest."""
-    vertices = np.concatenate([target.mesh.vertices for target in built.objects])
-    offsets = np.cumsum([0, *(len(target.mesh.vertices) for target in built.objects)])
-    faces = np.concatenate([t.mesh.faces + o for t, o in zip(built.objects, offsets[:-1], strict=True)])
-    tree = BVHTree.FromPolygons(vertices.tolist(), faces.tolist(), all_triangles=True)
+    vertices, offsets, tree = surfaces(built.objects)
     eye = built.folder.scene.camera.position
     origin = Vector(eye.tolist())
     towards = vertices - eye

@@ -32,7 +32,12 @@ def new_sun(
     # tint the shadows.
     data.color = colour.tolist()
     data.angle = light.sun_angle
-    return data, Vector(direction.tolist()).to_track_quat("Z", "Y")
+    return data, turn_to(direction)
+
+
+def turn_to(direction: NDArray[np.floating]) -> Quaternion:
+    """How a lamp is turned whose light comes from ``direction`` (3,)."""
+    return Vector(direction.tolist()).to_track_quat("Z", "Y")
 
 
 def with_sun_angle(folder: SceneFolder, angle: float | None) -> SceneFolder:

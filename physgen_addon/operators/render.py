@@ -105,6 +105,8 @@ class _Render(JobOperator):
         names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)
         arguments = ["--out", str(out), "--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}"]
+        if rendering.engine == "cycles":
+            arguments += ["--device", rendering.device]
         arguments += ["--parent", str(os.getpid()), "--json", *choices]
         if rendering.samples:
             arguments += ["--samples", str(rendering.samples)]

@@ -43,6 +43,8 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     choices = layout.column()
     choices.enabled = under_way is None
     choices.prop(rendering, "engine")
+    if rendering.engine == "cycles":
+        choices.prop(rendering, "device")
     choices.prop(rendering, "samples")
     if not rendering.samples:
         text.sentences(choices, context, "Samples 0: as many as the engine thinks right.")

@@ -191,7 +191,25 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     """How a scene with a photo is rendered into it."""
 
     engine: EnumProperty(
-        name="Engine", description="Render engine", items=[("cycles", "Cycles", "Path tracing, matched to the photo")]
+        name="Engine",
+        description="Render engine",
+        items=[
+            ("cycles", "Cycles", "Traces rays"),
+            ("eevee", "EEVEE", "Draws with the graphics card: much the same picture; slow without one"),
+        ],
+    )
+    device: EnumProperty(
+        name="Device",
+        description="Where Cycles renders; what is not there falls back to the processor",
+        items=[
+            ("cpu", "CPU", "The processor: frames are small, and it leaves the graphics card to Blender's windows"),
+            ("auto", "Automatic", "A graphics card, if there is one that Cycles can use"),
+            ("optix", "OptiX", "NVIDIA cards with hardware for rays"),
+            ("cuda", "CUDA", "NVIDIA cards"),
+            ("hip", "HIP", "AMD cards"),
+            ("oneapi", "oneAPI", "Intel cards"),
+            ("metal", "Metal", "Apple's graphics"),
+        ],
     )
     samples: IntProperty(
         name="Samples", description="Rays and light samples a pixel; 0 is the engine's own choice", min=0, soft_max=256

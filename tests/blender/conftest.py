@@ -23,7 +23,7 @@ else:
     import bpy
     from mathutils import Vector
     from physgen.physgen_addon.bridge import camera as bridge_camera
-    from physgen.physgen_addon.bridge import compat, passes
+    from physgen.physgen_addon.bridge import compat, cycles, passes
     from physgen.physgen_addon.bridge.ground import add_ground
     from physgen.physgen_addon.bridge.options import RenderOptions
     from physgen.physgen_addon.bridge.regions import Box
@@ -98,7 +98,8 @@ def render_truth(
     bpy.ops.wm.read_factory_settings(use_empty=True)
     compat.enable_cycles()
     scene = bpy.data.scenes.new("truth")
-    passes.set_up(scene, RenderOptions(samples=256, seed=7), denoise=False)
+    passes.set_up(scene)
+    cycles.set_up(scene, RenderOptions(samples=256, seed=7), denoise=False)
     scene.render.use_persistent_data = False
     bridge_camera.add_camera(scene, camera, (WIDTH, HEIGHT))
     scene.world = bpy.data.worlds.new("sky")

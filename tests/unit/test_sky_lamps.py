@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""An environment as lamps lights the ground as the map does, wherever its light comes from."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physgen.physgen_addon.bridge.environment import environment_irradiance
+from physgen.physgen_addon.bridge.sky_lamps import sky_lamps
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 40), st.sampled_from([0.0, 50.0, 1e4]), st.integers(3, 24))
+def test_the_ground_is_lit_as_by_the_map(seed, count, sun, height):
+    rng = np.random.default_rng(seed)
+    radiance = rng.uniform(0, 1, (height, 2 * height, 3)).astype(np.float32)
+    radiance[rng.integers(height), rng.integers(2 * height)] += sun
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    above, below = sky_lamps(radiance, normal, above=count, below=count)
+    assert 0 < len(above) <= count and 0 < len(below) <= count
+    got = sum(lamp.irradiance * max(lamp.direction @ normal, 0.0) for lamp in above)
+    np.testing.assert_allclose(got, environment_irradiance(radiance, normal), rtol=1e-6)
+    for lamp in above + below:
+        assert np.isfinite(lamp.irradiance).all() and (lamp.irradiance >= 0).all()
+        assert abs(np.linalg.norm(lamp.direction) - 1) < 1e-9 and 0 < lamp.angle <= 2 * np.pi
+
+
+def test_a_bright_spot_has_a_small_lamp_of_its_own():
+    radiance = np.full((32, 64, 3), 0.1, np.float32)
+    radiance[8, 40] = 1000.0
+    above, _ = sky_lamps(radiance, np.array([0.0, 0.0, 1.0]), above=16, below=8)
+    brightest = max(above, key=lambda lamp: lamp.irradiance.sum())
+    elevation, azimuth = np.pi * (0.5 - 8.5 / 32), 2 * np.pi * (0.5 - 40.5 / 64)
+    across = np.cos(elevation)
+    spot = [across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)]
+    assert brightest.direction @ spot > np.cos(np.radians(5))
+    assert brightest.angle < 0.3
+
+
+def test_a_black_half_has_no_lamps():
+    radiance = np.zeros((8, 16, 3), np.float32)
+    radiance[:4] = 1.0
+    above, below = sky_lamps(radiance, np.array([0.0, 0.0, 1.0]), above=4, below=4)
+    assert len(above) == 4 and not below
