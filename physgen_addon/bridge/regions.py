@@ -16,6 +16,8 @@ MARGIN_PX = 3
 SHADOW_REACH = 4.0
 """How far around an object its contact shadow is rendered, over the height of its top above the ground. Beyond, it
 takes less than about 1/250 of the light of an even sky."""
+NEAR_REACH = 0.25
+"""The same, of the part that is rendered finely; beyond, the sky's shadow changes slowly."""
 MIN_DEPTH_M = 1e-3
 
 
@@ -63,10 +65,15 @@ class ShadowRegion(NamedTuple):
     far: float
 
 
-def shadow_region(scene: Scene, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int]) -> ShadowRegion | None:
-    """Pixels whose ground the objects can darken: along the sun with its penumbra, and all around by the sky."""
+def shadow_region(
+    scene: Scene, vertices: Sequence[NDArray[np.floating]], size: tuple[int, int], *, sky_reach: float = SHADOW_REACH
+) -> ShadowRegion | None:
+    """Pixels whose ground the objects can darken: along the sun with its penumbra, and all around by the sky.
+
+    sky_reach: how far all around, over the height of an object's top.
+    """
     found = []
-    for points in (_footprint(scene, v) for v in vertices):
+    for points in (_footprint(scene, v, sky_reach) for v in vertices):
         box = _bounds(scene.camera, points, size, MARGIN_PX)
         if box is not None:
             found.append((box, float(scene.camera.project(points)[:, 2].max())))
@@ -90,14 +97,14 @@ def ground_depth(scene: Scene, size: tuple[int, int]) -> NDArray[np.float32]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf).astype(np.float32)
 
 
-def _footprint(scene: Scene, vertices: NDArray[np.floating]) -> NDArray[np.float64]:
+def _footprint(scene: Scene, vertices: NDArray[np.floating], sky_reach: float) -> NDArray[np.float64]:
     """Points (N, 3) on the ground that span where one object's shadow can fall."""
     normal, origin = np.asarray(scene.ground.normal), np.asarray(scene.ground.point)
     points = np.asarray(vertices, dtype=np.float64)
     heights = np.clip((points - origin) @ normal, 0.0, None)
     feet = points - ((points - origin) @ normal)[:, None] * normal
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    reach = SHADOW_REACH * max(float(heights.max()), 0.25 * size)
+    reach = sky_reach * max(float(heights.max()), 0.25 * size)
     spans = [_grown(feet, normal, reach)]
     sun = scene.light.sun_direction
     if sun is not None and scene.light.sun_strength > 0:

@@ -10,7 +10,6 @@ from pathlib import Path
 import bpy
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ...sim.composite import layers, mirror
 from ...sim.composite.relief import Relief
@@ -20,11 +19,12 @@ from . import passes, photo_particles, rest_light, stroke
 from .caches import Bake
 from .camera import render_size
 from .data_passes import STEPS, DataLayers, DataScene
+from .ground_shadow import GroundShadow
 from .look import Look
 from .options import RenderOptions
 from .plate import Plate
 from .reflection import reflections
-from .regions import Box, feather, ground_depth, object_box, shadow_region
+from .regions import Box, object_box
 from .scene import BlenderScene, aim, build, everything, remove
 from .shot import Shot, make_relief
 from .stroke import Moment
@@ -59,9 +59,8 @@ class Renderer:
             if options.frame_format.layered:
                 self._data_scene = DataScene(self._built)
             self._reach = self._add_particles(self._built)
-            self._ground_depth = ground_depth(self._scene, self._built.light_size)
-            self._open_ground = self._empty_ground(Box(0, 0, *self._built.light_size))
-            self._rest_shadow = self._shadow(rest, self._view(None))
+            self._shadows = GroundShadow(self._scene, self._built, options, self._scratch)
+            self._rest_shadow = self._shadows.ratio(rest, self._scene.camera, self._size)
             self._reflections = reflections(self._scene, self._built, options, self._objects)
             self._rest_reflection = self._reflections and self._reflections.layer(self._scene.camera, rest)
         except BaseException:
@@ -85,7 +84,7 @@ class Renderer:
         aim(self._built, view.camera)
         seen = self._plate.seen(view, moment.now)
         rest_shadow = view.warp(self._rest_shadow)
-        shadow = rest_shadow if sample == 0 else self._shadow(moment, view)
+        shadow = rest_shadow if sample == 0 else self._shadows.ratio(moment, view.camera, self._size)
         ground = layers.ground_layer(
             photo=seen.photo,
             background=seen.background,
@@ -189,34 +188,3 @@ class Renderer:
     def _open_shutter(self, scene: bpy.types.Scene, moment: Moment, *, most_samples: int) -> None:
         """Let ``scene`` show the stroke; with up to ``most_samples`` times the samples if it is long."""
         passes.open_shutter(scene, moment.shutter, moment.samples(self._options.samples, at_most=most_samples))
-
-    def _empty_ground(self, box: Box) -> NDArray[np.float32]:
-        """Light on the ground without objects (h, w, 3), within ``box`` of the resolution of light."""
-        assert self._built is not None
-        hidden = list(self._built.collection.objects)
-        for item in hidden:
-            item.hide_render = True
-        light = self._built.ground_light(self._bake.first_frame, box, self._scratch)
-        for item in hidden:
-            item.hide_render = False
-        return light
-
-    def _shadow(self, moment: Moment, view: View) -> NDArray[np.float32]:
-        """Light on the ground over light on the empty ground (H, W, 3), 1 where no object reaches."""
-        assert self._built is not None
-        size = self._built.light_size
-        ratio = np.ones((size[1], size[0], 3), np.float32)
-        scene = replace(self._scene, camera=view.camera)
-        region = shadow_region(scene, moment.swept, size)
-        if region is not None:
-            box = region.box if self._options.crop else Box(0, 0, *size)
-            self._open_shutter(self._built.shadow_scene, moment, most_samples=1)
-            lit = self._built.ground_light(moment.number, box, self._scratch)
-            empty = self._empty_ground(box) if view.moved else self._open_ground[box.slices]
-            depth = ground_depth(scene, size) if view.moved else self._ground_depth
-            # Objects only take light from the ground here; more than all of it is noise.
-            quotient = np.clip(lit / np.maximum(empty, 1e-6), 0.0, 1.0)
-            # Towards the horizon pixels see ever more ground, and above it none at all.
-            near = np.clip(3.0 - 2.0 * depth[box.slices] / region.far, 0.0, 1.0)
-            ratio[box.slices] = 1.0 + (quotient - 1.0) * (feather(box, size) * near)[..., None]
-        return np.asarray(cv2.resize(ratio, self._size, interpolation=cv2.INTER_LINEAR))

@@ -12,6 +12,7 @@ from physgen.physgen_addon.bridge.caches import open_bake  # noqa: E402
 from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
 from physgen.physgen_addon.bridge.plan import plan_frames  # noqa: E402
 from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
+from physgen.physgen_addon.bridge.shot import make_shot  # noqa: E402
 
 OFF = RenderOptions(samples=16, motion_blur=0, grain=False, match_sharpness=False, reflections=False)
 LIFT = 0.02
@@ -96,7 +97,9 @@ def test_blurred_frames_depend_on_the_frame_before(world, bake):
     def hashes(shifts, name):
         opened = open_bake(bake(shifts, name), world.folder.scene)
         numbers = range(1, len(shifts) + 1)
-        made = plan_frames(world.folder, opened, numbers, options=options, blender="")
+        rest = [cache.sample(0) for cache in opened.caches]
+        shot = make_shot(world.folder, rest, options, first_frame=1, count=len(shifts), fps=24.0)
+        made = plan_frames(world.folder, opened, numbers, options=options, shot=shot, blender="")
         return [frame.inputs for frame in made], [frame.sample for frame in made]
 
     a, b = (0.02, 0, 0), (0.04, 0, 0)
