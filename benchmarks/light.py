@@ -27,7 +27,7 @@ import trimesh
 from mathutils import Vector
 from numpy.typing import NDArray
 from physgen.physgen_addon.bridge import camera as bridge_camera
-from physgen.physgen_addon.bridge import compat, passes
+from physgen.physgen_addon.bridge import compat, cycles, passes
 from physgen.physgen_addon.bridge.ground import add_ground
 from physgen.physgen_addon.bridge.options import RenderOptions
 from physgen.physgen_addon.bridge.regions import Box
@@ -140,7 +140,8 @@ def photograph(case: Case, path: Path, size: tuple[int, int] = (480, 360), sampl
     compat.enable_cycles()
     mesh = shape(case.shape)
     scene = bpy.data.scenes.new("truth")
-    passes.set_up(scene, RenderOptions(samples=samples, seed=3), denoise=True)
+    passes.set_up(scene)
+    cycles.set_up(scene, RenderOptions(samples=samples, seed=3), denoise=True)
     scene.cycles.max_bounces, scene.cycles.diffuse_bounces = 6, 6
     scene.render.use_persistent_data = False
     view = camera(case, size)

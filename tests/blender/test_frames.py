@@ -12,11 +12,11 @@ from physgen.sim.errors import Cancelled, InputError
 
 bpy = pytest.importorskip("bpy")
 import cv2  # noqa: E402
-from physgen.physgen_addon.bridge import frames as frames_module  # noqa: E402
 from physgen.physgen_addon.bridge.frame_file import Part, write_exr, write_png  # noqa: E402
 from physgen.physgen_addon.bridge.frame_range import parse_range  # noqa: E402
 from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
 from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
 from physgen.physgen_addon.bridge.video import encode  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,13 +28,13 @@ SHIFTS = [(0, 0, 0), (0.02, 0, 0), (0.02, 0, 0), (0.04, 0, 0)]
 def rendered(monkeypatch):
     """Samples that were really rendered."""
     calls = []
-    original = frames_module.Renderer.frame
+    original = Renderer.frame
 
     def count(self, sample, camera=None):
         calls.append(sample)
         return original(self, sample, camera)
 
-    monkeypatch.setattr(frames_module.Renderer, "frame", count)
+    monkeypatch.setattr(Renderer, "frame", count)
     return calls
 
 
