@@ -14,7 +14,7 @@ from ..sim.app.light import LightRequest
 from ..sim.cache.manifest import SPACES
 from ..sim.errors import InputError
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
-from ..sim.scene.environment import FRAMES
+from ..sim.scene.equirectangular import FRAMES
 from ..sim.scene.materials import preset_names
 from ..sim.scene.model import Vector
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..physgen_addon.bridge.formats import require_video_name
+from ..physgen_addon.bridge.option_flags import render_arguments
 from ..physgen_addon.bridge.options import RenderOptions
 from ..sim.app import worker
 from ..sim.app.bake_inputs import BakeOptions, inputs_hash
@@ -25,7 +26,6 @@ from ..sim.reconstruct.pipeline import object_names
 from ..sim.scene.folder import SceneFolder, load_scene, require_photo
 from ..sim.scene.model import Vector
 from ..sim.scene.overrides import check_overrides
-from .render_arguments import render_arguments
 
 
 def bake_stage(

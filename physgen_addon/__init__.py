@@ -12,6 +12,7 @@ from types import ModuleType
 MODULES = (
     "props.preferences",
     "props.body",
+    "props.rendering",
     "props.scene",
     "props.photo",
     "props.diagnose",

@@ -16,6 +16,9 @@ from ..sim.cache.manifest import load_manifest
 from ..sim.errors import InputError
 from ..sim.scene.names import DEVICES
 
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+"""Option of a property that may begin with ``//``."""
+
 
 def require_folder(path: str, what: str) -> Path:
     """``path``, where ``//`` is beside the .blend, as an absolute path; InputError when it is empty."""

@@ -8,13 +8,13 @@ import json
 from collections.abc import Sequence
 
 from ...physgen_addon.bridge.formats import FrameFormat
+from ...physgen_addon.bridge.option_flags import render_arguments
 from ...sim.app.bake_inputs import BakeOptions
 from ...sim.errors import InputError
 from ...sim.reconstruct.pipeline import object_names
 from ...sim.scene.folder import SCENE_FILE, referenced_files
 from ...sim.scene.model import Vector
 from ...sim.version import VERSION
-from ..render_arguments import render_arguments
 from .jobs import Job, JobScene
 from .matrix import Variant
 from .physics import describe

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.scene.environment import LUMINANCE, directions
+from ...sim.scene.equirectangular import LUMINANCE, directions
 
 __all__ = ["LUMINANCE", "environment_irradiance"]
 

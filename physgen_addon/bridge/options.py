@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a user chooses about rendering. Needs no bpy, so that a form can be filled in before Blender is loaded.
 
-Each field carries what the command line says of it; ``batch/render_arguments.py`` makes the flags of it, and an option
-is added here alone.
+Each field carries what the command line says of it: ``batch/render_arguments.py`` makes its flag of that, and
+``props/rendering.py`` its tooltip.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.scene.environment import LUMINANCE
-from ...sim.scene.environment import directions as sky_directions
+from ...sim.scene.equirectangular import LUMINANCE
+from ...sim.scene.equirectangular import directions as sky_directions
 
 
 @dataclass(frozen=True)

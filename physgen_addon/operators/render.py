@@ -17,16 +17,17 @@ from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.camera_path import CameraPath, save_camera_path
 from ...sim.scene.folder import SCENE_FILE, load_scene
 from ..bridge import export_camera
+from ..bridge.ledger import frame_name
+from ..bridge.option_flags import render_arguments
 from ..jobs import JobOperator, Work
 from ..paths import require_folder
 from ..props.body import bodies
+from ..props.rendering import render_options
 from ..views import show_result
 
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
 NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
 """Modules that rendering into a photo imports, and what people call them."""
-
-VIDEO_FILE = "video.mp4"
 
 
 def missing_modules() -> list[str]:
@@ -97,19 +98,14 @@ class _Render(JobOperator):
                 f"this Blender's Python lacks {', '.join(lacking)}, needed to render into a photo: install PhysGen "
                 "from the zip for your system, which brings them, or render with `physgen render`"
             )
-        rendering = scene.physgen.rendering
         bake = require_folder(scene.physgen.simulation.bake, "Bake")
         if not (bake / MANIFEST_FILE).is_file():
             raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost (see Simulate, Cache)")
         photo, baked_scene = require_folder(scene.physgen.folder, "Scene Folder"), bake.parent.parent / "scene"
         names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)
-        arguments = ["--out", str(out), "--engine", rendering.engine, "--scale", f"{rendering.scale:.6g}"]
-        if rendering.engine == "cycles":
-            arguments += ["--device", rendering.device]
-        arguments += ["--parent", str(os.getpid()), "--json", *choices]
-        if rendering.samples:
-            arguments += ["--samples", str(rendering.samples)]
+        arguments = ["--out", str(out), "--parent", str(os.getpid()), "--json", *choices]
+        arguments += render_arguments(render_options(scene.physgen.rendering))
         start = render_command()
         path = _camera_path(scene, photo, bake)
 
@@ -148,9 +144,9 @@ class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
         if not 0 <= sample < manifest.frames_done:
             last = first + manifest.frames_done - 1
             raise InputError(f"frame {scene.frame_current} is not baked: go to one from {first} to {last}")
-        number = str(manifest.frame_start + sample)
-        work = self._work(scene, "--frames", number)
-        name = f"{int(number):04d}.png"
+        number = manifest.frame_start + sample
+        work = self._work(scene, "--frames", str(number))
+        name = frame_name(number, render_options(scene.physgen.rendering).frame_format.suffix)
         return lambda on_event, cancelled: {**work(on_event, cancelled), "still": name}
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
@@ -174,8 +170,9 @@ class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
     def request(self, context: bpy.types.Context) -> Work:
         """All frames."""
         scene = context.scene
-        work = self._work(scene, "--video", str(_output_folder(scene) / VIDEO_FILE))
-        return lambda on_event, cancelled: {**work(on_event, cancelled), "video": VIDEO_FILE}
+        name = f"video.{scene.physgen.rendering.video}"
+        work = self._work(scene, "--video", str(_output_folder(scene) / name))
+        return lambda on_event, cancelled: {**work(on_event, cancelled), "video": name}
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Say where it is."""

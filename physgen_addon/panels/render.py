@@ -8,13 +8,14 @@ from pathlib import Path
 import bpy
 
 from .. import text
+from ..bridge.formats import VIDEO_CODECS
 from ..jobs import running
 from ..operators.render import PHYSGEN_OT_render_still, PHYSGEN_OT_render_video, missing_modules
 from ..operators.share import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_usd, PHYSGEN_OT_make_independent
 from .job import draw_job
 from .sidebar import RENDER, Sidebar
 
-RESULTS = (".png", ".mp4")
+RESULTS = (".png", ".exr", *VIDEO_CODECS)
 """What rendering makes."""
 
 
@@ -49,6 +50,8 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     if not rendering.samples:
         text.sentences(choices, context, "Samples 0: as many as the engine thinks right.")
     choices.prop(rendering, "scale")
+    choices.prop(rendering, "format")
+    choices.prop(rendering, "video")
     choices.prop(rendering, "output")
     if rendering.output.startswith("//") and not bpy.data.filepath:
         words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
@@ -101,6 +104,37 @@ def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> 
     video.animation, video.use_viewport = True, True
 
 
+class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
+    """What makes things belong to the photo"""
+
+    bl_parent_id = "PHYSGEN_PT_render"
+    bl_label = "Look"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A photo, to which things can belong."""
+        return bool(context.scene.physgen.folder)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """A line for each effect."""
+        rendering = context.scene.physgen.rendering
+        column = self.layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.enabled = running() is None
+        column.prop(rendering, "motion_blur", slider=True)
+        matched = column.column(heading="From the Photo", align=True)
+        matched.prop(rendering, "grain")
+        matched.prop(rendering, "match_sharpness")
+        column.prop(rendering, "reflections")
+        column.prop(rendering, "f_number")
+        if rendering.f_number:
+            column.prop(rendering, "focus_distance")
+            if not rendering.focus_distance:
+                text.sentences(column, context, "Focus 0: each object is sharp where it rests.")
+        text.sentences(column, context, "Frame 1 stays the photo, whatever is chosen here.")
+
+
 class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
     """The motion for other programs, and for people without PhysGen"""
 
@@ -120,4 +154,4 @@ class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
         text.sentences(layout, context, "Independent: the file plays and renders without PhysGen.")
 
 
-CLASSES = (PHYSGEN_PT_render, PHYSGEN_PT_out)
+CLASSES = (PHYSGEN_PT_render, PHYSGEN_PT_look, PHYSGEN_PT_out)

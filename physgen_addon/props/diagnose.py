@@ -19,8 +19,8 @@ from bpy.props import (
 
 from ..bridge import capture_view, overlay
 from ..bridge.capture_materials import LAYERS
+from ..paths import RELATIVE
 
-RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 NOT_KNOWN = -1.0
 """Stands for a number that the report does not have; Blender's properties have no null."""
 

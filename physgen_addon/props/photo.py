@@ -14,8 +14,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..paths import RELATIVE
 from ..views import redraw
-from .scene import RELATIVE
 
 
 def _on_box(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:

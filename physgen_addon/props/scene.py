@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What PhysGen knows of a scene: where it comes from, its world, how it is simulated and rendered.
+"""What PhysGen knows of a scene: where it comes from, its world, how it is simulated.
 
 Blender reads the classes' annotations as properties, so they must not be postponed to strings.
 """
@@ -20,13 +20,12 @@ from bpy.props import (
 )
 
 from ...sim.effects.registry import Effect, Parameter, effect, effects
+from ..paths import RELATIVE
 from ..text import readable
 from ..typed import decimal
 from .body import is_body
+from .rendering import PHYSGEN_PG_rendering
 from .surface import Surface
-
-RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
-
 
 EFFECT_ITEMS = [
     # Blender stores the number: it must stay that effect's when the registry grows.
@@ -187,46 +186,6 @@ class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
     estimate_of: StringProperty(description="Fingerprint of the scene that was estimated")
 
 
-class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
-    """How a scene with a photo is rendered into it."""
-
-    engine: EnumProperty(
-        name="Engine",
-        description="Render engine",
-        items=[
-            ("cycles", "Cycles", "Traces rays"),
-            ("eevee", "EEVEE", "Draws with the graphics card: much the same picture; slow without one"),
-        ],
-    )
-    device: EnumProperty(
-        name="Device",
-        description="Where Cycles renders; what is not there falls back to the processor",
-        items=[
-            ("cpu", "CPU", "The processor: frames are small, and it leaves the graphics card to Blender's windows"),
-            ("auto", "Automatic", "A graphics card, if there is one that Cycles can use"),
-            ("optix", "OptiX", "NVIDIA cards with hardware for rays"),
-            ("cuda", "CUDA", "NVIDIA cards"),
-            ("hip", "HIP", "AMD cards"),
-            ("oneapi", "oneAPI", "Intel cards"),
-            ("metal", "Metal", "Apple's graphics"),
-        ],
-    )
-    samples: IntProperty(
-        name="Samples", description="Rays and light samples a pixel; 0 is the engine's own choice", min=0, soft_max=256
-    )
-    scale: FloatProperty(
-        name="Size", description="Of the photo's resolution", default=1.0, min=0.05, max=4.0, soft_max=1.0
-    )
-    output: StringProperty(
-        name="Output",
-        description="Folder of the frames; // is beside the .blend",
-        subtype="DIR_PATH",
-        default="//physgen_render",
-        options=RELATIVE,
-    )
-    result: StringProperty(name="Result", description="What was rendered last", subtype="FILE_PATH", options=RELATIVE)
-
-
 def _get_body_index(self: "PHYSGEN_PG_scene") -> int:
     """Nothing of its own is kept, so that list and viewport cannot come apart."""
     scene, layer = self.id_data, getattr(bpy.context, "view_layer", None)
@@ -274,7 +233,6 @@ CLASSES = (
     PHYSGEN_PG_effect_entry,
     PHYSGEN_PG_world,
     PHYSGEN_PG_simulation,
-    PHYSGEN_PG_rendering,
     PHYSGEN_PG_scene,
 )
 

@@ -20,7 +20,8 @@ from ..events import OnEvent, ignore
 from ..reconstruct.inflate import inflate
 from ..reconstruct.light import LitScene, described, estimate_light, sunny
 from ..reconstruct.mesh import bare_mesh
-from ..scene.environment import FRAMES, Radiance, prepared, write_environment
+from ..scene.environment import prepared, write_environment
+from ..scene.equirectangular import FRAMES, Radiance
 from ..scene.folder import SceneFolder, load_scene, require_photo, save_scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import Ground, Light, Vector
@@ -33,7 +34,7 @@ LIGHT_FOLDER = "light"
 class LightRequest:
     """What the light of a scene shall be; what is not given stays as it is.
 
-    environment: .hdr or .exr file; frame: where its middle looks (``sim.scene.environment.FRAMES``).
+    environment: .hdr or .exr file; frame: where its middle looks (``sim.scene.equirectangular.FRAMES``).
     sun: False takes the sun away. sun_direction: towards the sun (right, away, up), of any length; sun_strength: its
     irradiance over the environment's on open ground, 0 to 20; sun_angle_deg: its apparent diameter, 0 to 180.
     estimate: look for the sun in the photo's shadows, and without ``environment`` take the photo's own again. A new

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.environment import SPOT_SHARE, Radiance, ground_light, sun_in
+from ..scene.environment import SPOT_SHARE, ground_light, sun_in
+from ..scene.equirectangular import Radiance
 from ..scene.model import Camera, Ground, Light, Vector
 from .ground_view import Mask, Mesh, ground_axes
 from .photo_environment import photo_environment

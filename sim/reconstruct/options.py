@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from ..scene.environment import FRAMES
+from ..scene.equirectangular import FRAMES
 from ..scene.model import Vector
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..composite.transfer import bytes_to_linear
-from ..scene.environment import LUMINANCE, directions
+from ..scene.equirectangular import LUMINANCE, directions
 from ..scene.model import Camera
 
 SIZE = (64, 32)
@@ -23,7 +23,7 @@ EDGE = 0.12
 
 
 def photo_environment(pixels: NDArray[np.uint8], background: NDArray[np.uint8], camera: Camera) -> NDArray[np.float32]:
-    """Equirectangular environment (32, 64, 3) in linear light with mean luminance 1 (``sim/scene/environment``).
+    """Equirectangular environment (32, 64, 3) in linear light with mean luminance 1 (``sim/scene/equirectangular``).
 
     pixels, background: (H, W, 3) sRGB, with and without objects. camera: above the ground z = 0, without roll.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Environment maps: light from all around as an equirectangular picture in linear light.
+"""Environment maps in files: read, turned to fit a camera, written; and what light the ground has of one.
 
-Row 0 is the zenith, the middle column looks along +X, columns to its right turn to the right, as Blender has it.
+How a map lies around the scene is in ``equirectangular``.
 """
 
 from __future__ import annotations
@@ -16,15 +16,9 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
 from .model import Camera, Ground
 
-Radiance = NDArray[np.float32]
-"""(H, 2 H, 3), linear Rec. 709."""
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-FRAMES = ("ahead", "camera", "world")
-"""Where the middle of a file looks: ahead of the camera with the horizon level; along the camera's own axis, as
-DiffusionLight has it; or along the scene's +X."""
 SUFFIXES = (".exr", ".hdr")
 MAX_PIXELS = 64_000_000
 MAX_WIDTH = 2048
@@ -161,18 +155,6 @@ def turned(radiance: Radiance, rotation: NDArray[np.float64]) -> Radiance:
             borderMode=cv2.BORDER_REPLICATE,
         )
     )
-
-
-def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World direction (H, W, 3) and solid angle (H, W) in sr of each pixel of a map."""
-    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * math.pi
-    edges = np.sin((0.5 - np.arange(height + 1) / height) * math.pi)
-    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
-    x = np.cos(latitude)[:, None] * np.cos(azimuth)
-    y = np.cos(latitude)[:, None] * np.sin(azimuth)
-    z = np.broadcast_to(np.sin(latitude)[:, None], x.shape)
-    solid = np.broadcast_to(((edges[:-1] - edges[1:]) * 2 * math.pi / width)[:, None], x.shape)
-    return np.stack([x, y, z], axis=-1), solid
 
 
 def ground_light(radiance: Radiance, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,5 +1,6 @@
 """What stands behind the panels: operators, the list that follows the viewport, presets, effects, rendering."""
 
+import dataclasses
 import inspect
 from pathlib import Path
 
@@ -10,8 +11,12 @@ bpy = pytest.importorskip("bpy")
 import physgen  # noqa: E402
 from mathutils import Vector  # noqa: E402
 from physgen import physgen_addon  # noqa: E402
+from physgen.batch.render import build_parser  # noqa: E402
+from physgen.batch.render_arguments import render_options  # noqa: E402
 from physgen.physgen_addon import text  # noqa: E402
+from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
 from physgen.physgen_addon.operators import render  # noqa: E402
+from physgen.physgen_addon.panels.render import RESULTS  # noqa: E402
 from physgen.physgen_addon.panels.sidebar import is_in  # noqa: E402
 from physgen.physgen_addon.props import presets  # noqa: E402
 from physgen.physgen_addon.props.body import bodies  # noqa: E402
@@ -93,7 +98,8 @@ def registered_groups():
         kind
         for module in physgen_addon._modules()
         for kind in module.CLASSES
-        if issubclass(kind, bpy.types.PropertyGroup) and kind.__module__.endswith((".body", ".material", ".scene"))
+        if issubclass(kind, bpy.types.PropertyGroup)
+        and kind.__module__.endswith((".body", ".material", ".rendering", ".scene"))
     ]
 
 
@@ -506,6 +512,56 @@ def test_a_still_and_a_video_are_rendered_in_a_process_of_their_own(world, bake,
         bpy.ops.physgen.render_still()
     assert bpy.ops.physgen.render_video() == {"FINISHED"}
     assert Path(state.rendering.result).stat().st_size > 1000
+
+
+def flags_of(scene, monkeypatch):
+    """What Render Still hands to the script, which is not started."""
+    given = []
+
+    def stage(command, *_, **__):
+        given.extend(command)
+        return {"event": "done"}
+
+    monkeypatch.setattr(render, "run_stage", stage)
+    with pytest.raises(RuntimeError, match="is not there"):
+        bpy.ops.physgen.render_still()
+    return build_parser().parse_args(given[given.index(scene.physgen.folder) :])
+
+
+def test_every_choice_of_the_panel_reaches_the_command(world, bake, tmp_path, monkeypatch):
+    state = a_photo_scene(world, bake([(0, 0, 0)]), tmp_path)
+    scene, rendering = bpy.context.scene, state.rendering
+    scene.frame_set(11)
+    rendering.samples, rendering.scale = 0, 1.0
+    # Untouched, the panel renders what the command line renders.
+    assert render_options(flags_of(scene, monkeypatch)) == RenderOptions()
+    rendering.engine, rendering.device, rendering.samples, rendering.scale = "cycles", "cuda", 5, 0.3
+    rendering.motion_blur, rendering.grain, rendering.match_sharpness, rendering.reflections = 0.2, False, False, False
+    rendering.f_number, rendering.focus_distance, rendering.format = 2.8, 0.4, "png16"
+    chosen = RenderOptions(
+        device="cuda", samples=5, scale=0.3, motion_blur=0.2, grain=False, match_sharpness=False, reflections=False,
+        f_number=2.8, focus_distance=0.4, bits=16,
+    )  # fmt: skip
+    assert render_options(flags_of(scene, monkeypatch)) == chosen
+    rendering.engine, rendering.motion_blur, rendering.f_number, rendering.format = "eevee", 0.0, 0.1, "exr_layers"
+    changed = {"engine": "eevee", "device": "cpu", "motion_blur": 0.0, "f_number": 0.5, "bits": None}
+    chosen = dataclasses.replace(chosen, **changed, format="exr-layers")
+    assert render_options(flags_of(scene, monkeypatch)) == chosen
+
+
+def test_layers_of_a_still_are_shown_and_another_format_wants_another_folder(world, bake, tmp_path):
+    state = a_photo_scene(world, bake([(0, 0, 0), (-0.02, 0, 0)]), tmp_path)
+    state.rendering.format, state.rendering.video = "exr_layers", "webm"
+    bpy.context.scene.frame_set(11)
+    assert bpy.ops.physgen.render_still() == {"FINISHED"}
+    assert Path(state.rendering.result) == tmp_path / "out é" / "0001.exr"
+    shown = bpy.data.images["0001.exr"]
+    assert (shown.type, shown.size[0]) == ("MULTILAYER", 80)
+    assert bpy.ops.physgen.render_video() == {"FINISHED"}
+    assert Path(state.rendering.result).name == "video.webm" and Path(state.rendering.result).suffix in RESULTS
+    state.rendering.format = "png"
+    with pytest.raises(RuntimeError, match=r"holds frames as 000\d.exr; choose another folder"):
+        bpy.ops.physgen.render_still()
 
 
 def test_what_cannot_be_rendered_says_why(world, bake, tmp_path, monkeypatch):

@@ -16,8 +16,6 @@ from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.camera import camera_above_ground
 from physgen.sim.reconstruct.photo_environment import photo_environment
 from physgen.sim.scene.environment import (
-    LUMINANCE,
-    directions,
     prepared,
     read_environment,
     sun_in,
@@ -25,6 +23,7 @@ from physgen.sim.scene.environment import (
     world_from_file,
     write_environment,
 )
+from physgen.sim.scene.equirectangular import LUMINANCE, directions
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.model import Ground, Light, Scene, SceneObject
 from PIL import Image

@@ -6,7 +6,8 @@ import argparse
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.batch.render_arguments import add_render_options, render_arguments, render_options
+from physgen.batch.render_arguments import add_render_options, render_options
+from physgen.physgen_addon.bridge.option_flags import render_arguments
 from physgen.physgen_addon.bridge.options import RenderOptions
 from physgen.sim.errors import InputError
 

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Light from all around as an equirectangular picture in linear light.
+
+Row 0 is the zenith, the middle column looks along +X, columns to its right turn to the right, as Blender has it. Needs
+numpy alone: the extension imports this wherever it is enabled, and Blender may have no image library.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Radiance = NDArray[np.float32]
+"""(H, 2 H, 3), linear Rec. 709."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+FRAMES = ("ahead", "camera", "world")
+"""Where the middle of a file looks: ahead of the camera with the horizon level; along the camera's own axis, as
+DiffusionLight has it; or along the scene's +X."""
+
+
+def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World direction (H, W, 3) and solid angle (H, W) in sr of each pixel of a map."""
+    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * math.pi
+    edges = np.sin((0.5 - np.arange(height + 1) / height) * math.pi)
+    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
+    x = np.cos(latitude)[:, None] * np.cos(azimuth)
+    y = np.cos(latitude)[:, None] * np.sin(azimuth)
+    z = np.broadcast_to(np.sin(latitude)[:, None], x.shape)
+    solid = np.broadcast_to(((edges[:-1] - edges[1:]) * 2 * math.pi / width)[:, None], x.shape)
+    return np.stack([x, y, z], axis=-1), solid
