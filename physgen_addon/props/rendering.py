@@ -69,11 +69,11 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         description="Of the frames' files; each format needs an output folder of its own",
         items=[
             ("png", "PNG", "8 bits a channel, as the photo has them"),
-            ("png16", "PNG, 16 Bits", "Smooth where colours are changed afterwards"),
+            ("png16", "PNG 16 Bit", "Smooth where colours are changed afterwards"),
             ("exr", "EXR", "Linear light, 16-bit floats: keeps what is brighter than white"),
             (
                 "exr_layers",
-                "EXR with Layers",
+                "EXR Layers",
                 "Also objects, ground, shadow, depth, object ids and flow, for compositing",
             ),
         ],

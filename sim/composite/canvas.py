@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..reconstruct.inpaint import FillOptions, inpaint
 from . import transfer
+from .inpaint import FillOptions, inpaint
 
 MAX_SHARE = 0.35
 """Of width or height, the widest border; beyond, a picture would show more invention than photo."""

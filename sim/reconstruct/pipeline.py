@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ..composite.inpaint import FillOptions, inpaint
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..scene.environment import prepared as prepared_environment
@@ -24,7 +25,6 @@ from . import camera as cameras
 from .body import contact_pixel
 from .horizon import estimate_pitch
 from .inflate import Silhouette, inflate
-from .inpaint import FillOptions, inpaint
 from .light import ENVIRONMENT_FILE, LitScene, estimate_light
 from .mask_cleanup import largest_component
 from .mesh import BodyMesh, bare_mesh, build_mesh

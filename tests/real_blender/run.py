@@ -134,7 +134,7 @@ def main() -> int:
     parser.add_argument("--zip", type=Path, default=default_zip(), help="the extension (default: %(default)s)")
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
-    parser.add_argument("--size", default="1000x2800", help="of Blender's window, tall enough for every panel")
+    parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds for the work inside Blender")
     options = parser.parse_args()
     shutil.rmtree(options.out, ignore_errors=True)

@@ -237,6 +237,29 @@ def imported():
     return {"moved_m": far, **measured}
 
 
+def rendered():
+    """A frame of it rendered into the photo, with all layers, as the panel does it; shown in a window of its own."""
+    own = extension("physgen_addon.operators.render")
+    if own.missing_modules():
+        return {"skipped": f"this Blender lacks {', '.join(own.missing_modules())}"}
+    rendering = bpy.context.scene.physgen.rendering
+    rendering.format, rendering.samples, rendering.f_number = "exr_layers", 4, 2.8
+    windows = set(bpy.context.window_manager.windows)
+    with screens.focus():
+        assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    running = extension("physgen_addon.jobs").running
+    job = running()
+    yield from session.until(lambda: running() is None, 300, "the still")
+    yield from screens.shoot(SCREENS, "7_rendered")
+    job.result()
+    assert rendering.result.endswith(f"{SHOWN:04d}.exr") and Path(rendering.result).is_file(), rendering.result
+    shown = next(item for item in bpy.context.window_manager.windows if item not in windows)
+    screens.picture(shown, SCREENS / "7_rendered_shown.png")
+    with bpy.context.temp_override(window=shown):
+        bpy.ops.wm.window_close()
+    yield 0.5
+
+
 def capture_loaded():
     """A recording in the Diagnose panel."""
     bpy.ops.wm.read_homefile()
@@ -271,7 +294,7 @@ def capture_loaded():
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     with screens.focus():
         assert bpy.ops.physgen.load_capture() == {"FINISHED"}
-    yield from screens.shoot(SCREENS, "7_capture")
+    yield from screens.shoot(SCREENS, "8_capture")
 
 
 STEPS = [
@@ -285,6 +308,7 @@ STEPS = [
     saved,
     photographed,
     imported,
+    rendered,
     capture_loaded,
 ]
 session.run("work", STEPS)

@@ -3,8 +3,8 @@
 
 import numpy as np
 import pytest
+from physgen.sim.composite.inpaint import FillOptions, inpaint
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.inpaint import FillOptions, inpaint
 from physgen.sim.reconstruct.mask_cleanup import drop_ground_shadow, fill_holes, largest_component, settle_outline
 from physgen.sim.reconstruct.segment import check_distinct, pixel_box, segment
 from physgen.sim.reconstruct.shadow import find_shadow, ground_brightness, object_holes
