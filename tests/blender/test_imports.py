@@ -7,8 +7,8 @@ import sys
 import pytest
 
 pytest.importorskip("bpy")
-from physgen.batch.modules import RENDERING  # noqa: E402
-from physgen.sim.app.requirements import REQUIREMENTS  # noqa: E402
+from physgen.batch.modules import RENDERING
+from physgen.sim.app.requirements import REQUIREMENTS
 
 
 def run_without(modules, code):
