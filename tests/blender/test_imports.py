@@ -20,7 +20,7 @@ def run_without(modules, code):
 
 
 def test_enabling_needs_numpy_alone():
-    run_without(set(REQUIREMENTS) - {"numpy"}, "import physgen; physgen.register()")
+    run_without(set(REQUIREMENTS) - {"numpy"}, "import physgen; physgen.register(); physgen.unregister()")
 
 
 def test_rendering_needs_no_more_than_it_says():

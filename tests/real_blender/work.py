@@ -250,14 +250,15 @@ def rendered():
     running = extension("physgen_addon.jobs").running
     job = running()
     yield from session.until(lambda: running() is None, 300, "the still")
-    yield from screens.shoot(SCREENS, "7_rendered")
     job.result()
     assert rendering.result.endswith(f"{SHOWN:04d}.exr") and Path(rendering.result).is_file(), rendering.result
     shown = next(item for item in bpy.context.window_manager.windows if item not in windows)
+    yield 1.0
     screens.picture(shown, SCREENS / "7_rendered_shown.png")
     with bpy.context.temp_override(window=shown):
         bpy.ops.wm.window_close()
     yield 0.5
+    yield from screens.shoot(SCREENS, "7_rendered")
 
 
 def capture_loaded():
