@@ -126,7 +126,7 @@ class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
         matched = column.column(heading="From the Photo", align=True)
         matched.prop(rendering, "grain")
         matched.prop(rendering, "match_sharpness")
-        column.prop(rendering, "reflections")
+        column.column(heading="Floor").prop(rendering, "reflections")
         column.prop(rendering, "f_number")
         if rendering.f_number:
             column.prop(rendering, "focus_distance")
