@@ -260,7 +260,8 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         shared_temp_directory=str(scratch),
         security=True,
         protocol="tls://",
-        scheduler_options={"dashboard": False, "dashboard_address": None},
+        # Its pages about itself are there without a dashboard too.
+        scheduler_options={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
     )
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ...sim.errors import PhysGenError
-from .dask_security import file_security
+from .dask_security import check_trust, file_security
 from .dask_tasks import ending
 
 
@@ -30,10 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("address", help="of the scheduler: tcp://HOST:PORT or tls://HOST:PORT")
     slots = "what this machine has of the resources that tasks take, such as gpu=1"
     parser.add_argument("--slot", action="append", default=[], metavar="NAME=COUNT", help=slots)
-    parser.add_argument("--host", help="address of this machine that the others see")
+    parser.add_argument("--host", help="address of this machine that the others see (default: the one facing ADDRESS)")
     parser.add_argument("--tls-ca", type=Path, metavar="PEM")
     parser.add_argument("--tls-cert", type=Path, metavar="PEM")
     parser.add_argument("--tls-key", type=Path, metavar="PEM")
+    trust = "take a scheduler on another machine without TLS: whoever reaches this one can run commands as you"
+    parser.add_argument("--trust-network", action="store_true", help=trust)
     parser.add_argument("--security-on-stdin", action="store_true", help="certificates come as JSON on standard input")
     options = parser.parse_args(arguments)
     try:
@@ -47,6 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             security: Any = Security(**json.load(sys.stdin))
         else:
             security = file_security(options.address, options.tls_ca, options.tls_cert, options.tls_key)
+            check_trust(options.address, trust_network=options.trust_network)
     except PhysGenError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code
@@ -56,20 +59,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 async def _work(address: str, host: str | None, resources: dict[str, float], security: Any) -> None:
     from distributed import Worker
+    from distributed.comm.addressing import get_address_host
+    from distributed.utils import get_ip
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory(prefix="physgen-worker-", ignore_cleanup_errors=True) as scratch:
         # The work is done by processes that it starts, so its own memory says nothing.
         worker = Worker(
             address,
-            host=host,
+            # Told nothing, a worker listens on all interfaces.
+            host=host or get_ip(get_address_host(address)),
             nthreads=1,
             resources=resources,
             security=security,
             local_directory=scratch,
             memory_limit=0,
             dashboard=False,
-            dashboard_address=None,
+            # Its pages about itself are there without a dashboard too.
+            dashboard_address="127.0.0.1:0",
         )
 
         def end() -> None:

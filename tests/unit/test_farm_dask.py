@@ -12,6 +12,7 @@ from pathlib import Path
 import distributed
 import psutil
 import pytest
+from physgen.batch.farm import dask_worker
 from physgen.batch.farm.cluster_options import ClusterOptions
 from physgen.batch.farm.dask_cluster import shares, slurm_cluster
 from physgen.batch.farm.dask_farm import run
@@ -115,8 +116,12 @@ def test_strangers_are_refused(tmp_path):
     other = [sys.executable, str(copy / "sim/app/launch.py"), "batch.farm.dask_worker"]
     plan = a_plan(tmp_path, a_task("x", "effects", "wind"))
     with a_scheduler() as address:
-        with pytest.raises(InputError, match="takes gpu=1, and no worker has that"), a_worker(address):
-            run(a_plan(tmp_path, a_task("y", "effects", slots={"gpu": 1})), FarmOptions(farm=address), ignore, never)
+        with a_worker(address) as worker:
+            greedy = a_plan(tmp_path, a_task("y", "effects", slots={"gpu": 1}))
+            with pytest.raises(InputError, match="takes gpu=1, and no worker has that"):
+                run(greedy, FarmOptions(farm=address), ignore, never)
+            open_ports = [c.laddr for c in psutil.Process(worker.pid).net_connections() if c.status == "LISTEN"]
+            assert open_ports and {place.ip for place in open_ports} == {"127.0.0.1"}
         with a_worker(address, command=other), pytest.raises(InputError, match=rf"PhysGen 0\.0\.7.*PhysGen {VERSION}"):
             run(plan, FarmOptions(farm=address), ignore, never)
         elsewhere = tmp_path / "elsewhere"
@@ -182,7 +187,8 @@ def test_the_loopback_needs_no_trust(host):
 
 
 @pytest.mark.parametrize("host", ["10.0.0.7", "render-01", "127.0.0.1.example.org", "[::]", "0.0.0.0"])
-def test_another_machine_in_the_clear_has_to_be_trusted(host):
+def test_another_machine_in_the_clear_has_to_be_trusted(host, capsys):
+    assert dask_worker.main([f"tcp://{host}:8786"]) == 3 and "--trust-network" in capsys.readouterr().err
     with pytest.raises(InputError, match="--trust-network"):
         check_trust(f"tcp://{host}:8786", trust_network=False)
     check_trust(f"tcp://{host}:8786", trust_network=True)
