@@ -7,8 +7,8 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from ...physgen_addon.bridge.formats import FrameFormat
 from ...physgen_addon.bridge.option_flags import render_arguments
+from ...physgen_addon.bridge.sequence import own_fps
 from ...sim.app.bake_inputs import BakeOptions
 from ...sim.errors import InputError
 from ...sim.reconstruct.pipeline import object_names
@@ -187,7 +187,8 @@ class _Builder:
 
     def _renders(self, prefix: str, folder: str) -> list[Task]:
         options = self._scene.options
-        suffix = FrameFormat(kind=options.format).suffix
+        suffix = options.frame_format.suffix
+        files = [] if options.camera is None else [options.camera]
         tasks = []
         for frames in frame_chunks(self._scene.frames, self._scene.render.chunk):
             name = f"{frames[0]:04d}-{frames[-1]:04d}"
@@ -200,18 +201,15 @@ class _Builder:
                     "render",
                     argv,
                     needs=[f"{prefix}/bake"],
-                    inputs=[f"{folder}/scene", f"{folder}/bake"],
+                    inputs=[f"{folder}/scene", f"{folder}/bake", *files],
                     produces=[f"{out}/{number:04d}{suffix}" for number in frames],
-                    gpu=getattr(options, "device", "cpu") != "cpu",
+                    gpu=options.device != "cpu",
                 )
             )
         return tasks
 
     def _encodes(self, prefix: str, folder: str, renders: Sequence[Task]) -> list[Task]:
-        frames = self._scene.frames
-        steps = {b - a for a, b in itertools.pairwise(frames)}
-        # Every second frame, shown as long as two, keeps the pace of the motion.
-        fps = self._scene.bake.fps / (steps.pop() if len(steps) == 1 else 1)
+        fps = own_fps(self._scene.frames, self._scene.bake.fps)
         folders = [str(task.produces[0].rpartition("/")[0]) for task in renders]
         return [
             self._task(

@@ -18,6 +18,7 @@ from ...sim.cache.manifest import WORLD_SPACE
 from ...sim.errors import InputError
 from ...sim.reconstruct import ObjectRequest, ReconstructOptions
 from ...sim.reconstruct.pipeline import object_names
+from ...sim.scene.camera_path import load_camera_path
 from ...sim.scene.folder import SceneFolder, inside, load_scene
 from ...sim.scene.json_fields import parse
 from ...sim.scene.overrides import check_overrides
@@ -183,7 +184,7 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
     require_name(said.name, f"{where}.name")
     bake = _bake(_merged(defaults.bake, rest.get("bake"), f"{file}.defaults.bake", f"{where}.bake"), where)
     render_table = _merged(defaults.render, rest.get("render"), f"{file}.defaults.render", f"{where}.render")
-    options, render = _render(render_table, f"{where}.render")
+    options, render = _render(render_table, root, f"{where}.render")
     try:
         frames = tuple(parse_range(render.frames, 1, bake.frames))
     except InputError as error:
@@ -232,8 +233,8 @@ def _bake(table: dict[str, Any], where: str) -> BakeOptions:
     return options
 
 
-def _render(table: dict[str, Any], where: str) -> tuple[RenderOptions, RenderSettings]:
-    """The fields that are flags of ``physgen render``, and those of the job file alone."""
+def _render(table: dict[str, Any], root: Path, where: str) -> tuple[RenderOptions, RenderSettings]:
+    """The fields that are flags of ``physgen render``, paths in them relative to ``root``, and the job file's own."""
     flags = {f.name: f.metadata.get("choices") for f in fields(RenderOptions) if "help" in f.metadata}
     del flags["threads"]
     own = [f.name for f in fields(RenderSettings)]
@@ -247,7 +248,13 @@ def _render(table: dict[str, Any], where: str) -> tuple[RenderOptions, RenderSet
         if choices is not None and table.get(name, choices[0]) not in choices:
             raise InputError(f"{where}.{name}: is {brief(table[name])}: choose one of {', '.join(choices)}")
     settings = parse(RenderSettings, {name: table[name] for name in own if name in table}, where)
-    return parse(RenderOptions, {name: table[name] for name in flags if name in table}, where), settings
+    options = parse(RenderOptions, {name: table[name] for name in flags if name in table}, where)
+    if options.camera is not None:
+        try:
+            load_camera_path(inside(root, options.camera))
+        except InputError as error:
+            raise InputError(f"{where}.camera: {error}") from None
+    return options, settings
 
 
 def _source(

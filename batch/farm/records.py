@@ -7,10 +7,11 @@ import os
 import stat
 import time
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from ...sim.app.bake_inputs import file_hash
 from ...sim.atomic import write_json
+from ...sim.cache.manifest import MANIFEST_FILE, load_manifest
 from ...sim.errors import InputError
 from ...sim.scene.folder import inside
 from ...sim.scene.json_fields import parse, read_json, to_json
@@ -88,8 +89,16 @@ def input_hashes(task: Task, root: Path) -> tuple[tuple[str, str], ...]:
 
 
 def produced_hashes(task: Task, root: Path) -> tuple[tuple[str, str], ...]:
-    """(name, SHA-256) of the files that ``task`` has to leave. Raises InputError for what is missing."""
-    return tuple((name, content_hash(inside(root, name))) for name in sorted(task.produces))
+    """(name, SHA-256) of the files that ``task`` has to leave. Raises InputError for what is missing.
+
+    Of a bake, all caches that its manifest lists are among them: which objects have particles is known only by then.
+    """
+    names = set(task.produces)
+    for manifest in (PurePosixPath(name) for name in task.produces if task.stage == "bake"):
+        if manifest.name == MANIFEST_FILE:
+            caches = load_manifest(inside(root, str(manifest)).parent).files
+            names |= {str(manifest.parent / cache) for cache in caches}
+    return tuple((name, content_hash(inside(root, name))) for name in sorted(names))
 
 
 def content_hash(path: Path) -> str:

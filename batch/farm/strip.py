@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from ...physgen_addon.bridge.frame_file import read_picture
 from ...sim.atomic import replacing
 from ...sim.errors import InputError
 
@@ -49,11 +50,11 @@ def make_strip(frames: Sequence[Path], out: Path) -> bool:
 
 def _small(path: Path) -> Image.Image | None:
     try:
-        with Image.open(path) as image:
-            width = max(1, round(image.width * HEIGHT / image.height))
-            return image.convert("RGB").resize((min(width, 4 * HEIGHT), HEIGHT), Image.Resampling.LANCZOS)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        image = Image.fromarray(read_picture(path))
+    except InputError:
         return None
+    width = max(1, round(image.width * HEIGHT / image.height))
+    return image.resize((min(width, 4 * HEIGHT), HEIGHT), Image.Resampling.LANCZOS)
 
 
 def _stamp(paths: Sequence[Path]) -> bytes:

@@ -98,6 +98,8 @@ class RenderOptions:
         for name, value, most in (("orbit", self.orbit, 30.0), ("rise", self.rise, 30.0), ("dolly", self.dolly, 0.3)):
             if not -most <= value <= most:
                 raise InputError(f"{name} is {value}: give {-most:g} to {most:g}")
+            if self.camera is not None and value:
+                raise InputError(f"camera {self.camera!r} and {name}: give a camera file, or a simple move")
         if not 0 <= self.motion_blur <= 1:
             raise InputError(f"motion_blur is {self.motion_blur}: give 0 (off) to 1, the whole frame interval")
         if self.f_number is not None and not 0.5 <= self.f_number <= 64:

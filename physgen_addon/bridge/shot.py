@@ -141,13 +141,9 @@ def _depth(folder: SceneFolder, size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def _path(options: RenderOptions, first: int, last: int) -> CameraPath | None:
-    moves = {"orbit": options.orbit, "rise": options.rise, "dolly": options.dolly}
-    given = [name for name, value in moves.items() if value]
     if options.camera is not None:
-        if given:
-            raise InputError(f"camera {options.camera!r} and {given[0]}: give a camera file, or a simple move")
         return load_camera_path(Path(options.camera))
-    if not given:
+    if not (options.orbit or options.rise or options.dolly):
         return None
     return swing(first=first, last=last, azimuth_deg=options.orbit, elevation_deg=options.rise, dolly=options.dolly)
 

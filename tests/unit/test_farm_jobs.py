@@ -16,6 +16,7 @@ from physgen.batch.farm.graph import frame_chunks, make_plan, range_text
 from physgen.batch.farm.jobs import MAX_BYTES, load_job
 from physgen.physgen_addon.bridge.frame_range import parse_range
 from physgen.sim.errors import InputError
+from physgen.sim.scene.camera_path import save_camera_path, swing
 
 HEAD = 'format = "physgen-jobs/1"\nname = "job"\n'
 PHOTO = 'photo = "photos/cup.png"\nboxes = [[1, 2, 30, 40]]\n'
@@ -148,6 +149,12 @@ def test_the_example_of_the_documentation_works(tmp_path):
         (HEAD + SCENE + 'render = { engine = "povray" }', "engine: is 'povray': choose one of cycles"),
         (HEAD + SCENE + 'render = { engine = ["cycles"] }', "choose one of cycles"),
         (HEAD + SCENE + "render = { threads = 2 }", "give --threads"),
+        (
+            HEAD + SCENE + 'render = { camera = "../camera.json" }',
+            r"render.camera: file name '../camera.json': must be",
+        ),
+        (HEAD + SCENE + 'render = { camera = "photos/cup.png" }', r"render.camera: .*cup.png: not readable as JSON"),
+        (HEAD + SCENE + 'render = { camera = "photos/cup.png", rise = 2 }', "camera 'photos/cup.png' and rise: give"),
         (HEAD + SCENE + "render = { seed = 2 }", "render.seed: unknown field"),
         (HEAD + "[defaults]\ncook = 1\n" + SCENE, "defaults.cook: unknown field"),
         (HEAD + "a" + ".a" * 200_000 + " = 1\n" + SCENE, "nested too deeply"),
@@ -220,8 +227,10 @@ def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):
         + '[matrix]\nseeds = [0, 1]\nvelocities = [[-1, -1e-7, 0.1]]\neffects = [[{ name = "wind" }]]\n'
         + SCENE.replace('["cup"]', '["-my cup"]')
         + "pitch = -5\nset = { '-my cup.density' = 300 }\n"
-        + '[[scenes]]\nname = "balls"\nscene = "my scene"\nbake = { arch = "cuda" }\nrender = { format = "exr" }\n'
+        + '[[scenes]]\nname = "balls"\nscene = "my scene"\nbake = { arch = "cuda" }\n'
+        + 'render = { format = "exr", engine = "eevee", motion_blur = 0, camera = "photos/path.json" }\n'
     )
+    save_camera_path(tmp_path / "photos" / "path.json", swing(first=1, last=24, azimuth_deg=5))
     plan = make_plan(job(text))
     assert plan.out == "results" and plan.root == tmp_path.resolve() and len(plan.meanings) == 4
     seen, ids = {}, set()
@@ -233,7 +242,10 @@ def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):
             seen[name] = task.id
         build_parser().parse_args(task.argv)
         if task.stage == "render":
-            assert {name[-4:] for name in task.produces} == {".exr" if task.id.startswith("balls") else ".png"}
+            balls = task.id.startswith("balls")
+            assert {name[-4:] for name in task.produces} == {".exr" if balls else ".png"}
+            assert ("photos/path.json" in task.inputs) == ("--camera=photos/path.json" in task.argv) == balls
+            assert {"--engine=eevee", "--motion-blur=0.0"} <= set(task.argv) or not balls
     stages = [task.stage for task in plan.tasks]
     assert [stages.count(s) for s in ("reconstruct", "variant", "bake", "render", "encode")] == [1, 4, 4, 12, 8]
     last = plan.tasks[-1]

@@ -28,6 +28,7 @@ from physgen.batch.farm.records import (
 from physgen.batch.farm.retry import is_worth_retrying
 from physgen.batch.farm.runners import FarmOptions, find_runner
 from physgen.batch.farm.task import Outcome, Plan, Task
+from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
@@ -68,6 +69,25 @@ def test_a_task_is_done_once_and_again_when_something_changed(ball_scene, tmp_pa
     assert carry_out(task, tmp_path).state == "done"
     assert carry_out(variant("a", argv=(*task.argv[:-1], "--preset=hard")), tmp_path).state == "done"
     assert json.loads(made.read_text())["objects"][0]["material"]["preset"] == "hard"
+
+
+def test_a_bakes_particles_are_among_what_it_made(tmp_path):
+    task = Task(id="bake", stage="bake", argv=("bake",), produces=("b/bake/manifest.json", "b/bake/heap.pc2"))
+    heap = BakedObject(name="heap", file="heap.pc2", vertices=3, points_file="heap.points.pc2", points=5)
+    manifest = BakeManifest(
+        inputs_hash="", fps=24.0, frame_start=1, frames=1, frames_done=1, state="complete", engine="mpm",
+        version=VERSION, particles=5, objects=(heap,),
+    )  # fmt: skip
+    folder = tmp_path / "b" / "bake"
+    folder.mkdir(parents=True)
+    save_manifest(folder, manifest)
+    for name in manifest.files:
+        (folder / name).write_bytes(b"any")
+    names = [name for name, _ in produced_hashes(task, tmp_path)]
+    assert names == ["b/bake/heap.pc2", "b/bake/heap.points.pc2", "b/bake/manifest.json"]
+    (folder / "heap.points.pc2").unlink()
+    with pytest.raises(InputError, match=r"heap\.points\.pc2"):
+        produced_hashes(task, tmp_path)
 
 
 def test_what_a_task_cannot_do_is_in_its_outcome(ball_scene, tmp_path):
