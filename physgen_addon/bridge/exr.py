@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.openimageio import last_error
 
 
 def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
@@ -19,9 +20,7 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     """
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        # OpenEXR says the same in several lines; the last one says it best.
-        reason = (oiio.geterror().strip().splitlines() or ["no reason given"])[-1]
-        raise InputError(f"{path}: not a readable image ({reason}); restore it or make it again")
+        raise InputError(f"{path}: not a readable image ({last_error(oiio.geterror)}); restore it or make it again")
     channels: dict[str, NDArray[np.float32]] = {}
     try:
         part = 0
@@ -29,10 +28,13 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
             spec = source.spec()
             pixels = source.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)
             if pixels is None:
-                raise InputError(f"{path}: cut off or damaged ({source.geterror()}); make it again")
+                raise InputError(f"{path}: cut off or damaged ({last_error(source.geterror)}); make it again")
             for index, name in enumerate(spec.channelnames):
                 channels[".".join(name.split(".")[-2:])] = np.asarray(pixels[..., index], dtype=np.float32)
             part += 1
+    except (UnicodeDecodeError, MemoryError) as error:
+        # Damaged bytes reach the channels' names, or ask for an enormous picture.
+        raise InputError(f"{path}: damaged; restore it or make it again") from error
     finally:
         source.close()
     return channels

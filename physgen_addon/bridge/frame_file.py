@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...sim.atomic import replacing
 from ...sim.composite import transfer
 from ...sim.errors import InputError
+from ...sim.openimageio import last_error
 from ...sim.version import VERSION
 from .formats import exact_rate
 
@@ -118,15 +119,15 @@ def _read(path: Path, kind: oiio.BASETYPE) -> NDArray[Any]:
     try:
         source = oiio.ImageInput.open(str(path))
         if source is None:
-            raise OSError(_last_line(oiio.geterror()))
+            raise OSError(last_error(oiio.geterror))
         try:
             pixels = source.read_image(0, 0, 0, source.spec().nchannels, kind)
             if pixels is None:
-                raise OSError(_last_line(source.geterror()))
+                raise OSError(last_error(source.geterror))
         finally:
             source.close()
     except (UnicodeDecodeError, MemoryError) as error:
-        # Damaged bytes reach the message itself, or ask for an enormous picture.
+        # Damaged bytes reach the names of channels, or ask for an enormous picture.
         raise OSError("damaged") from error
     return np.asarray(pixels)
 
@@ -144,7 +145,7 @@ def _write(path: Path, partial: Path, specs: Sequence[oiio.ImageSpec], pictures:
     """Write ``partial``, which is to become ``path``."""
     target = oiio.ImageOutput.create(str(partial))
     if target is None:
-        raise InputError(f"{path}: OpenImageIO cannot write {path.suffix} files ({_last_line(oiio.geterror())})")
+        raise InputError(f"{path}: OpenImageIO cannot write {path.suffix} files ({last_error(oiio.geterror)})")
     good = target.open(str(partial), tuple(specs)) if len(specs) > 1 else target.open(str(partial), specs[0])
     for index, (spec, picture) in enumerate(zip(specs, pictures, strict=True)):
         if good and index > 0:
@@ -153,12 +154,7 @@ def _write(path: Path, partial: Path, specs: Sequence[oiio.ImageSpec], pictures:
     said = target.geterror()
     # What is still in buffers is written here, so a full disk may show only now.
     if not (target.close() and good):
-        raise _unwritable(path, _last_line(said or target.geterror()))
-
-
-def _last_line(said: str) -> str:
-    """OpenEXR says the same in several lines; the last one says it best."""
-    return (said.strip().splitlines() or ["no reason given"])[-1]
+        raise _unwritable(path, last_error(lambda: said or target.geterror()))
 
 
 def _unwritable(path: Path, reason: str) -> InputError:

@@ -7,7 +7,6 @@ How a map lies around the scene is in ``equirectangular``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
+from ..openimageio import last_error
 from .model import Camera, Ground
 
 SUFFIXES = (".exr", ".hdr")
@@ -44,7 +44,9 @@ def read_environment(path: Path) -> Radiance:
         raise InputError(f"environment {path}: there is no such file; check its name")
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise InputError(f"environment {path}: is not a readable picture ({_why(oiio.geterror)}); export it again")
+        raise InputError(
+            f"environment {path}: is not a readable picture ({last_error(oiio.geterror)}); export it again"
+        )
     try:
         spec = source.spec()
         width, height, names = int(spec.width), int(spec.height), [n.upper() for n in spec.channelnames]
@@ -59,18 +61,12 @@ def read_environment(path: Path) -> Radiance:
             )
         pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None:
-            raise InputError(f"environment {path}: is cut off or damaged ({_why(source.geterror)}); export it again")
+            raise InputError(
+                f"environment {path}: is cut off or damaged ({last_error(source.geterror)}); export it again"
+            )
     finally:
         source.close()
     return _checked(path, np.asarray(pixels, dtype=np.float32).reshape(height, width, -1)[..., wanted])
-
-
-def _why(error: Callable[[], str]) -> str:
-    """The message of OpenImageIO, which quotes a damaged file's bytes as they are."""
-    try:
-        return error().strip() or "no reason given"
-    except UnicodeDecodeError:
-        return "its header is damaged"
 
 
 def _check_shape(path: Path, width: int, height: int) -> None:
@@ -201,4 +197,4 @@ def write_environment(path: Path, radiance: Radiance) -> None:
         and output.close()
     )
     if not written:
-        raise InputError(f"{path}: cannot be written ({oiio.geterror() or 'no space?'}); choose another folder")
+        raise InputError(f"{path}: cannot be written ({last_error(oiio.geterror)}); choose another folder")

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from physgen.batch import cli
 from physgen.physgen_addon.bridge.contact_sheet import played, write_sheet
+from physgen.physgen_addon.bridge.exr import read_layers
 from physgen.physgen_addon.bridge.formats import FrameFormat
 from physgen.physgen_addon.bridge.frame_file import Part, encoded, read_picture, write_exr, write_png
 from physgen.physgen_addon.bridge.ledger import Ledger
@@ -121,6 +122,21 @@ def test_damaged_frames_are_refused_or_read_but_break_nothing(whole, suffix, dat
         assert path.name in str(error) and "\n" not in str(error)
     else:
         assert pixels.ndim == 3 and pixels.shape[2] == 3 and pixels.dtype == np.uint8
+    try:
+        channels = read_layers(path)
+    except InputError as error:
+        assert path.name in str(error) and "\n" not in str(error)
+    else:
+        assert all(channel.ndim == 2 for channel in channels.values())
+
+
+def test_bytes_that_are_no_text_in_a_damaged_header_are_named(whole):
+    folder, contents = whole
+    path = folder / "header.exr"
+    path.write_bytes(contents[".exr"].replace(b"chlist", b"\xff\xfe\xfdist"))
+    for read in (read_layers, read_picture):
+        with pytest.raises(InputError, match=r"header\.exr"):
+            read(path)
 
 
 @pytest.mark.parametrize(
