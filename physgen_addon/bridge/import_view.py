@@ -15,12 +15,12 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import SceneFolder
 from ...sim.scene.model import Camera
 from . import compat
 from .bounds import box_corners
 from .camera import add_camera
-from .environment import LUMINANCE, environment_irradiance
 from .regions import plane_axes
 from .sun import new_sun
 
@@ -80,10 +80,10 @@ def build(made: Made, collection: bpy.types.Collection, folder: SceneFolder, ite
     world = made.add(bpy.data.worlds.new("environment"))
     world[MARK] = True
     colour = _fill_world(made, world, folder)
-    irradiance = float(colour @ LUMINANCE)
+    of_environment = float(colour @ LUMINANCE)
     light = scene.light
     if light.sun_direction is not None and light.sun_strength > 0:
-        sun = _add_sun(made, folder, light.sun_strength * irradiance, colour / irradiance)
+        sun = _add_sun(made, folder, light.sun_strength * of_environment, colour / of_environment)
         collection.objects.link(sun)
     corners = np.concatenate([box_corners(item) for item in items])
     ground = _ground(made, scene.ground.unit_normal, np.asarray(scene.ground.point, dtype=float), corners)
@@ -165,7 +165,7 @@ def _fill_world(made: Made, world: bpy.types.World, folder: SceneFolder) -> NDAr
     pixels = np.empty(width * height * image.channels, dtype=np.float32)
     image.pixels.foreach_get(pixels)
     radiance = pixels.reshape(height, width, image.channels)[::-1]
-    colour = environment_irradiance(radiance[..., :3], folder.scene.ground.unit_normal) if image.channels >= 3 else None
+    colour = irradiance(radiance[..., :3], folder.scene.ground.unit_normal) if image.channels >= 3 else None
     if colour is None or not np.isfinite(colour).all() or float(colour @ LUMINANCE) <= 0:
         raise InputError(f"{folder.file(name)}: lights nothing; give an environment with finite light in R, G and B")
     return colour

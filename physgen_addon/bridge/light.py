@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import SceneFolder
 from . import compat, eevee
-from .environment import LUMINANCE, environment_irradiance
 from .exr import read_layers
 from .sky_lamps import SkyLamp, sky_lamps
 from .sun import new_sun
@@ -109,7 +109,7 @@ def _sky(folder: SceneFolder) -> _Sky:
         return _Sky(None, np.ones((32, 64, 3), np.float32), np.full(3, math.pi))
     path = folder.file(name)
     radiance = _read_environment(path)
-    sky = _Sky(path, radiance, environment_irradiance(radiance, np.asarray(folder.scene.ground.normal, dtype=float)))
+    sky = _Sky(path, radiance, irradiance(radiance, folder.scene.ground.unit_normal))
     if not (math.isfinite(sky.irradiance) and sky.irradiance > 0):
         raise InputError(f"{path}: lights the ground with {sky.irradiance}; give an environment with finite light")
     return sky

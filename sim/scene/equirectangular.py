@@ -31,3 +31,10 @@ def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np
     z = np.broadcast_to(np.sin(latitude)[:, None], x.shape)
     solid = np.broadcast_to(((edges[:-1] - edges[1:]) * 2 * math.pi / width)[:, None], x.shape)
     return np.stack([x, y, z], axis=-1), solid
+
+
+def irradiance(radiance: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.float64]:
+    """RGB irradiance (3,) of a map (H, W, 3) on open ground with unit ``normal``."""
+    towards, solid = directions(*radiance.shape[:2])
+    cosine = np.clip(towards @ np.asarray(normal, dtype=float), 0.0, None)
+    return np.einsum("hwc,hw,hw->c", radiance[..., :3].astype(np.float64), cosine, solid)

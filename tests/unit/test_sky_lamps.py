@@ -4,8 +4,8 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.physgen_addon.bridge.environment import environment_irradiance
 from physgen.physgen_addon.bridge.sky_lamps import sky_lamps
+from physgen.sim.scene.equirectangular import irradiance
 
 
 @settings(max_examples=25, deadline=None)
@@ -19,7 +19,7 @@ def test_the_ground_is_lit_as_by_the_map(seed, count, sun, height):
     above, below = sky_lamps(radiance, normal, above=count, below=count)
     assert 0 < len(above) <= count and 0 < len(below) <= count
     got = sum(lamp.irradiance * max(lamp.direction @ normal, 0.0) for lamp in above)
-    np.testing.assert_allclose(got, environment_irradiance(radiance, normal), rtol=1e-6)
+    np.testing.assert_allclose(got, irradiance(radiance, normal), rtol=1e-6)
     for lamp in above + below:
         assert np.isfinite(lamp.irradiance).all() and (lamp.irradiance >= 0).all()
         assert abs(np.linalg.norm(lamp.direction) - 1) < 1e-9 and 0 < lamp.angle <= 2 * np.pi
