@@ -105,7 +105,7 @@ class Stop:
         """What the work asks itself between two steps."""
         return self._asked.is_set() or (self._parent is not None and os.getppid() != self._parent)
 
-    def listen(self, at_last: Callable[[], None]) -> None:
+    def listen(self, at_last: Callable[[], object]) -> None:
         """Take the signals; the main thread calls this.
 
         Work that has not ended ``STOP_GRACE_S`` after it was asked to is inside a long render: ``at_last`` is called
@@ -131,7 +131,7 @@ class Stop:
             if now - heard_at > ECHO_S:
                 self._insisted.set()
 
-    def _end_at_last(self, at_last: Callable[[], None]) -> None:
+    def _end_at_last(self, at_last: Callable[[], object]) -> None:
         while not self():
             time.sleep(0.05)
         self._insisted.wait(STOP_GRACE_S)

@@ -134,11 +134,6 @@ class _Board:
             self._changed.notify_all()
             return None
 
-    def has_ready(self) -> bool:
-        """Whether a task could begin now."""
-        with self._changed:
-            return bool(self._fitting())
-
     def settle(self, task: Task, outcome: Outcome) -> list[Outcome]:
         """Take notice of how ``task`` ended; the outcomes of those that are skipped for it."""
         with self._changed:

@@ -225,7 +225,7 @@ def test_any_graph_is_carried_out_in_order_within_its_slots(graph, rng, workers)
     while True:
         while len(running) < workers:
             # As a worker that has nothing to do asks, but without waiting.
-            task = board.take(lambda: not board.has_ready())
+            task = board.take(lambda: not board._fitting())
             if task is None:
                 break
             assert set(task.needs) <= good and task.id not in begun
