@@ -15,8 +15,8 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
 from ..openimageio import last_error
+from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
 from .model import Camera, Ground
 
 SUFFIXES = (".exr", ".hdr")
