@@ -36,7 +36,11 @@ class Look:
         self._camera, self._plate, self._rest, self._options = scene.camera, plate, list(rest), options
         height, width = plate.photo.shape[:2]
         self._size = (width, height)
-        self._grain = grain.Grain(grain.estimate(plate.photo), self._size, options.seed) if options.grain else None
+        self._grain: grain.Grain | None = None
+        if options.grain:
+            model = grain.estimate(plate.photo)
+            self._grain = grain.Grain(model, self._size, options.seed)
+            self._grainy = [grain.share_of(model, plate.photo, mask) for mask in plate.object_masks]
         self._sigmas = _outline_sigmas(plate) if options.match_sharpness else []
 
     def objects(self, layer: ObjectLayer, camera: Camera, now: Vertices) -> ObjectLayer:
@@ -73,7 +77,8 @@ class Look:
         left = np.where(self._plate.masks, self._map(self._camera, self._rest, moved), 1.0 - at_rest)
         if camera != self._camera:
             left = np.ones_like(left)
-        changed = layer.alpha * self._map(camera, now, moved) + (1.0 - layer.alpha) * left
+        grainy = [weight * share for weight, share in zip(moved, self._grainy, strict=True)]
+        changed = layer.alpha * self._map(camera, now, grainy) + (1.0 - layer.alpha) * left
         changed = (changed - LEAST_CHANGE) / (1.0 - LEAST_CHANGE)
         return self._grain.add(beauty, np.clip(changed, 0.0, 1.0).astype(np.float32))
 

@@ -37,6 +37,7 @@ CLIPPED = 2
 COARSEST = (1.0, 0.8, 0.5)
 """The most of each octave over the first: of grain a little under a pixel coarse. Coarser is texture or shading."""
 FEWEST_BLOCKS = 12
+FEWEST_PIXELS = 100
 ROUNDING = 1 / 12
 """Variance of rounding to whole steps, which every file has: it comes with writing and is not added."""
 LEAST = 0.6
@@ -106,6 +107,20 @@ def estimate(photo: Linear) -> NoiseModel:
             sigma[:, octave, plane] = np.minimum(even, COARSEST[octave] * (sigma[:, 0, plane] if octave else even))
     sigma[np.sqrt((sigma**2).sum(axis=(1, 2))) < LEAST] = 0.0
     return NoiseModel(sigma)
+
+
+def share_of(model: NoiseModel, photo: Linear, mask: NDArray[np.bool_]) -> float:
+    """How much of the photo's grain is seen inside ``mask`` (H, W), 0 to 1; 1 where it is too small to tell.
+
+    Texture that passes for the photo's grain elsewhere must not be strewn over a thing that is smooth in the photo.
+    """
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((WINDOWS[0], WINDOWS[0]), np.uint8), borderValue=0) > 0
+    if model.is_clean or inside.sum() < FEWEST_PIXELS:
+        return 1.0
+    bands, coarse = _octaves(_planes(photo))
+    wanted = model.at(coarse[..., 0], 0, 0)
+    there = _local_sigma(bands[0][..., 0], wanted, WINDOWS[0])
+    return float(np.clip(np.median(there[inside] / np.maximum(wanted[inside], 1e-3)), 0.0, 1.0))
 
 
 def _energies(bands: list[Planes]) -> NDArray[np.float64]:

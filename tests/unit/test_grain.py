@@ -78,3 +78,17 @@ def test_clean_pictures_have_no_grain(jpeg):
 
 def test_pictures_too_small_to_measure_are_clean():
     assert grain.estimate(np.random.default_rng(0).random((20, 30, 3), dtype=np.float32)).is_clean
+
+
+def test_a_smooth_thing_before_rough_ground_bears_little_of_its_grain():
+    clean = picture()
+    rough = clean + noise(1, clean, 0.0)
+    smooth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    smooth[10:90, 200:300] = True
+    rough[smooth] = clean[smooth]
+    photo = linear(rough)
+    model = grain.estimate(photo)
+    assert not model.is_clean
+    assert grain.share_of(model, photo, smooth) < 0.25
+    assert grain.share_of(model, photo, np.roll(smooth, 120, axis=0)) > 0.85
+    assert grain.share_of(model, photo, np.zeros_like(smooth)) == 1.0
