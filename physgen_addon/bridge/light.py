@@ -71,7 +71,7 @@ def add_lamps(light_scene: bpy.types.Scene, shadow_scene: bpy.types.Scene, folde
 
     The luminance of the irradiance on the open ground, as scaled. Raises InputError as ``add_environment`` does.
     """
-    sky, normal = _sky(folder), np.asarray(folder.scene.ground.normal, dtype=float)
+    sky, normal = _sky(folder), folder.scene.ground.unit_normal
     both = [light_scene, shadow_scene]
     strength = folder.scene.light.sun_strength if folder.scene.light.sun_direction is not None else 0.0
     scale = OPEN_RADIANCE * math.pi / (sky.irradiance * (1.0 + strength))
@@ -94,7 +94,7 @@ def _add_sun(scenes: list[bpy.types.Scene], folder: SceneFolder, sky: _Sky, scal
     light = folder.scene.light
     if light.sun_direction is None or light.sun_strength <= 0:
         return None
-    normal = np.asarray(folder.scene.ground.normal, dtype=float)
+    normal = folder.scene.ground.unit_normal
     data, turn = new_sun(light, normal, light.sun_strength * sky.irradiance * scale, sky.colour / sky.irradiance)
     item = bpy.data.objects.new("sun", data)
     item.rotation_euler = turn.to_euler()
