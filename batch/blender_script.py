@@ -19,6 +19,14 @@ Work = Callable[[argparse.Namespace, OnEvent, IsCancelled], tuple[Event, str]]
 """Does what the options ask for; its ``done`` event, and the same in words. Raises a PhysGenError."""
 
 
+def add_script_options(parser: argparse.ArgumentParser) -> None:
+    """Where the script's modules are, whom it works for, how it speaks."""
+    packages = "folder of modules that Blender's Python lacks (docs/headless.md)"
+    parser.add_argument("--packages", type=Path, metavar="DIR", help=packages)
+    parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
+    parser.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+
+
 def run_script(
     parser: argparse.ArgumentParser,
     work: Work,
@@ -32,10 +40,7 @@ def run_script(
     parser: with the script's own arguments. give_up: leaves complete files only, when Blender cannot be waited for, and
     says so. arguments: None for those of the process, which inside Blender come after ``--``. stage: of the events.
     """
-    packages = "folder of modules that Blender's Python lacks (docs/headless.md)"
-    parser.add_argument("--packages", type=Path, metavar="DIR", help=packages)
-    parser.add_argument("--parent", type=int, metavar="PID", help="stop in good order when this parent process is gone")
-    parser.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    add_script_options(parser)
     options = parser.parse_args(script_arguments(sys.argv) if arguments is None else arguments)
     stop = Stop(options.parent)
     with events_apart_from_chatter() as stream, temporary_folder():

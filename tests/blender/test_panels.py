@@ -11,6 +11,7 @@ bpy = pytest.importorskip("bpy")
 import physgen  # noqa: E402
 from mathutils import Vector  # noqa: E402
 from physgen import physgen_addon  # noqa: E402
+from physgen.batch.blender_script import add_script_options  # noqa: E402
 from physgen.batch.render import build_parser  # noqa: E402
 from physgen.batch.render_arguments import render_options  # noqa: E402
 from physgen.physgen_addon import text  # noqa: E402
@@ -525,7 +526,9 @@ def flags_of(scene, monkeypatch):
     monkeypatch.setattr(render, "run_stage", stage)
     with pytest.raises(RuntimeError, match="is not there"):
         bpy.ops.physgen.render_still()
-    return build_parser().parse_args(given[given.index(scene.physgen.folder) :])
+    parser = build_parser()
+    add_script_options(parser)
+    return parser.parse_args(given[given.index(scene.physgen.folder) :])
 
 
 def test_every_choice_of_the_panel_reaches_the_command(world, bake, tmp_path, monkeypatch):
