@@ -27,7 +27,7 @@ from physgen.sim.scene.materials import load_preset
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect, Material
 
-QUICK = BakeOptions(frames=4, fps=24.0, quality="preview")
+QUICK = BakeOptions(frames=4, fps=24.0, quality="preview", points=False)
 POINTS = dataclasses.replace(QUICK, points=True)
 
 CROOKED = ((0.8, 0.3, 0.0, 0.1), (0.0, -1.2, 0.2, -0.2), (0.1, 0.0, 0.5, 0.06), (0.0, 0.0, 0.0, 1.0))
