@@ -171,7 +171,7 @@ class Renderer:
         box, light_box = (self._object_box(camera, moment, size) for size in (self._size, self._built.light_size))
         if box is None or light_box is None:
             return layer
-        self._open_shutter(self._built.colour_scene, moment, most_samples=4)
+        self._open_shutter(self._built.colour_scene, moment, most_samples=2)
         layer.texture[box.slices], layer.alpha[box.slices] = self._built.colours(moment.number, box, self._scratch)
         self._open_shutter(self._built.light_scene, moment, most_samples=1)
         lit = passes.render(self._built.light_scene, moment.number, light_box, self._scratch)
