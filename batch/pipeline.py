@@ -100,7 +100,7 @@ class RunRequest:
 
 def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
     """First guesses for stages that have not begun: the coffee demo on two cores; paces measured later replace them."""
-    guesses = {"reconstruct": 15.0, "bake": 8.0 + 0.6 * frames, "render": 8.0 + 2.5 * frames}
+    guesses = {"reconstruct": 15.0, "bake": 8.0 + 0.6 * frames, "render": 8.0 + 5.0 * frames}
     return {stage: guesses[stage] for stage in stages}
 
 

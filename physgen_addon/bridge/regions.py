@@ -16,7 +16,7 @@ MARGIN_PX = 3
 SHADOW_REACH = 4.0
 """How far around an object its contact shadow is rendered, over the height of its top above the ground. Beyond, it
 takes less than about 1/250 of the light of an even sky."""
-NEAR_REACH = 0.25
+NEAR_REACH = 0.15
 """The same, of the part that is rendered finely; beyond, the sky's shadow changes slowly."""
 MIN_DEPTH_M = 1e-3
 
