@@ -10,6 +10,8 @@ import sys
 import tempfile
 
 from ..sim.app.process import NO_WINDOW, child_environment
+from ..sim.reconstruct.adapters.found import found_adapters, onnxruntime_version
+from ..sim.reconstruct.adapters.names import VARIABLE, adapters_file
 
 Finding = tuple[str, bool, str]
 
@@ -22,6 +24,7 @@ _PACKAGES = (
     "pypatchmatch",
     "opencv-python-headless",
     "openimageio",
+    "pyyaml",
 )
 _BPY_PROBE = "import bpy; print(bpy.app.version_string)"
 _TAICHI_PROBE = "import taichi as ti; ti.init(arch=ti.cpu, log_level=ti.ERROR); print('cpu')"
@@ -48,6 +51,19 @@ def examine() -> list[Finding]:
     findings.append(
         ("temporary space", free > _MINIMUM_FREE_GIB, f"{free:.1f} GiB free; at least {_MINIMUM_FREE_GIB:g} are needed")
     )
+    return findings + adapter_findings()
+
+
+def adapter_findings() -> list[Finding]:
+    """A user's own models, and what runs them: looked at, not run. Missing is only what the user asked for by name."""
+    version = onnxruntime_version()
+    text = version or "not installed; models in .onnx files need it: install physgen[onnx]"
+    findings = [("onnxruntime (optional)", True, text)]
+    adapters = found_adapters()
+    findings += [(f"{item.stage} {item.name}", item.usable, item.text) for item in adapters]
+    if not adapters:
+        place = adapters_file() or f"{VARIABLE} names no file"
+        findings.append(("adapters (optional)", True, f"none has a name ({place}; docs/adapters.md)"))
     return findings
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``import``, ``light``, ``render``."""
+"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``correct``, ``import``, ``light``, ``render``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import argparse
 from pathlib import Path
 
 from ..physgen_addon.bridge.formats import require_video_name
-from ..sim.app.import_physgen3d import import_physgen3d
+from ..sim.app.correct import correct_scene, require_stamp
+from ..sim.app.import_folder import import_folder
 from ..sim.app.light import set_light
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
 from ..sim.events import IsCancelled
@@ -17,14 +18,20 @@ from ..sim.scene.overrides import check_overrides
 from . import pipeline
 from .arguments import (
     add_bake_options,
-    add_environment,
-    add_photo,
     add_physics,
     add_sun,
     bake_options,
     light_request,
-    object_requests,
     physics,
+)
+from .photo_arguments import (
+    add_asking,
+    add_environment,
+    add_objects,
+    add_reading,
+    chat_request,
+    corrected_requests,
+    object_requests,
     reconstruct_options,
 )
 from .render_arguments import add_render_options, render_options
@@ -33,8 +40,10 @@ from .terminal import Terminal
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen run``."""
-    add_photo(parser)
-    add_environment(parser)
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_objects(parser)
+    add_reading(parser)
+    add_asking(parser)
     add_physics(parser)
     add_bake_options(parser)
     add_render_options(parser)
@@ -46,18 +55,29 @@ def add_run(parser: argparse.ArgumentParser) -> None:
 
 def add_reconstruct(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen reconstruct``."""
-    add_photo(parser)
-    add_environment(parser)
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_objects(parser)
+    add_reading(parser)
+    add_asking(parser)
     add_physics(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
 
 
+def add_correct(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen correct``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a scene folder that was reconstructed from a photo")
+    add_objects(parser, boxes=False)
+    add_reading(parser)
+
+
 def add_import(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen import``."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="with transform.json, meshes, mask and inpaint")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of PhysGen3D or PhysGen (docs/importing.md)")
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
-    scale = "largest extent of the first object; sets the scale of the scene (default 0.15)"
+    scale = "largest extent of the first object; sets the scale of the scene (default: as simulated there, else 0.15)"
     parser.add_argument("--size", type=float, metavar="METRES", help=scale)
+    settings = "of PhysGen3D's simulation, with velocities and friction (default: looked for)"
+    parser.add_argument("--settings", type=Path, metavar="FILE.yaml", help=settings)
 
 
 def add_light(parser: argparse.ArgumentParser) -> None:
@@ -80,16 +100,18 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
     require_video_name(options.out)
+    work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
     request = pipeline.RunRequest(
         photo=options.photo,
-        objects=object_requests(options),
+        objects=object_requests(options, work / "scene"),
         video=options.out,
-        work=options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work"),
+        work=work,
         presets=tuple(options.preset),
         velocities=tuple(options.velocity),
         spins=tuple(options.spin),
         overrides=tuple(options.overrides),
         reconstruct=reconstruct_options(options),
+        ask=chat_request(options),
         bake=bake_options(options),
         render=render_options(options),
     )
@@ -103,19 +125,37 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
 
 def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen reconstruct``; the exit code."""
-    requests, settings = object_requests(options), reconstruct_options(options)
+    settings, ask = reconstruct_options(options), chat_request(options)
+    requests = object_requests(options, options.out)
     require_physics(len(requests), options.preset, options.velocity, options.spin)
     check_overrides(object_names(requests), options.overrides)
-    reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled)
+    reconstruct_scene(options.photo, requests, options.out, settings, terminal, cancelled, ask=ask)
     set_all_physics(options.out, **physics(options), friction=settings.friction)
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0
 
 
+def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen correct``; the exit code."""
+    stamp = require_stamp(options.scene)
+    requests, settings = corrected_requests(options, stamp.objects), reconstruct_options(options, stamp.options)
+    correct_scene(options.scene, requests, settings, terminal, cancelled)
+    terminal({"event": "done", "scene": str(options.scene)})
+    terminal.line(f"scene: {options.scene}")
+    return 0
+
+
 def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen import``; the exit code."""
-    import_physgen3d(options.folder, options.out, size_m=options.size, on_event=terminal)
+    import_folder(
+        options.folder,
+        options.out,
+        size_m=options.size,
+        settings=options.settings,
+        on_event=terminal,
+        cancelled=cancelled,
+    )
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0

@@ -22,6 +22,7 @@ from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_ph
 from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.reconstruct.physics.chat import ChatRequest
 from ..sim.reconstruct.pipeline import object_names
 from ..sim.scene.folder import SceneFolder, load_scene, require_photo
 from ..sim.scene.model import Vector
@@ -94,6 +95,7 @@ class RunRequest:
     spins: tuple[Vector, ...] = ()
     overrides: tuple[str, ...] = ()
     reconstruct: ReconstructOptions = dataclasses.field(default_factory=ReconstructOptions)
+    ask: ChatRequest | None = None
     bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
     render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
 
@@ -114,7 +116,7 @@ def run(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
     load_quality(request.bake.quality)
     require_video_name(request.video)
     scene, bake = request.work / "scene", request.work / "bake"
-    reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled)
+    reconstruct_scene(request.photo, request.objects, scene, request.reconstruct, on_event, cancelled, ask=request.ask)
     folder = set_all_physics(
         scene,
         presets=request.presets,

@@ -119,7 +119,7 @@ class _Builder:
         scene = self._scene
         assert scene.photo is not None
         argv = ["reconstruct", _positional(scene.photo), "--out", self._source]
-        argv += [f"--box={','.join(map(number_text, item.box))}" for item in scene.objects]
+        argv += [f"--box={','.join(map(number_text, item.box or ()))}" for item in scene.objects]
         argv += [f"--name={name}" for name in self._names]
         # Sizes are taken in the order of the objects: one that is left out ends them.
         sizes = [item.size_m for item in scene.objects if item.size_m is not None]

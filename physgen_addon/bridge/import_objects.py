@@ -7,6 +7,8 @@ vertices keep their order in the file. The render stage has materials of its own
 
 from __future__ import annotations
 
+from pathlib import PurePosixPath
+
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -34,10 +36,10 @@ def add_object(
     centre = centre_of_mass(vertices, faces).astype(np.float32).astype(np.float64)
     data = made.add(bpy.data.meshes.new(source.name))
     _fill_mesh(data, vertices - centre, faces)
-    uv, picture = _appearance(made, folder, source, mesh, vertices)
+    uv, picture, albedo = _appearance(made, folder, source, mesh, vertices)
     data.uv_layers.new(name=UV).data.foreach_set("uv", uv[faces.ravel()].astype(np.float32).ravel())
     data.shade_smooth()
-    data.materials.append(_material(made, source.name, picture))
+    data.materials.append(_material(made, source.name, picture, albedo))
     item = made.add(bpy.data.objects.new(source.name, data))
     item.matrix_world = Matrix.Translation(centre.tolist())
     collection.objects.link(item)
@@ -70,22 +72,29 @@ def _fill_mesh(data: bpy.types.Mesh, vertices: NDArray[np.float64], faces: NDArr
 
 def _appearance(
     made: Made, folder: SceneFolder, source: SceneObject, mesh: TexturedMesh, vertices: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], bpy.types.Image]:
-    """Texture coordinates (V, 2) and picture; a mesh without wears the photo, projected along the camera's rays."""
+) -> tuple[NDArray[np.float64], bpy.types.Image, bpy.types.Image]:
+    """Texture coordinates (V, 2), picture and albedo.
+
+    A mesh without a picture wears the photo, projected along the camera's rays. The albedo is
+    ``albedo/NAME.png`` for ``meshes/NAME.glb``, laid out as its picture; without one, the picture.
+    """
     if mesh.uv is not None and mesh.picture is not None:
         image = made.add(bpy.data.images.new(source.name, 1, 1))
         image.pack(data=mesh.picture, data_len=len(mesh.picture))
         image.source = "FILE"
         if not image.size[0] or not image.size[1]:
             raise InputError(f"object {source.name}: the picture in {source.mesh} is not readable; export it again")
-        return mesh.uv, image
-    return photo_uv(folder.scene.camera, vertices), load_picture(made, folder.file(folder.scene.photo))
+        path = folder.file(f"albedo/{PurePosixPath(source.mesh).stem}.png")
+        return mesh.uv, image, load_picture(made, path) if path.is_file() else image
+    image = load_picture(made, folder.file(folder.scene.photo))
+    return photo_uv(folder.scene.camera, vertices), image, image
 
 
-def _material(made: Made, name: str, picture: bpy.types.Image) -> bpy.types.Material:
+def _material(made: Made, name: str, picture: bpy.types.Image, albedo: bpy.types.Image) -> bpy.types.Material:
     """The photo's colours as they are towards the camera; towards everything else a matt surface that gives no light.
 
-    So the ground gets a shadow and no glow, and the first frame is the photo.
+    So the ground gets a shadow and no glow, and the first frame is the photo. The matt surface has the ``albedo``, for
+    the photo's own light is already in the ``picture``; both have the same texture coordinates.
     """
     material = made.add(bpy.data.materials.new(name))
     if hasattr(material, "cycles"):
@@ -95,7 +104,11 @@ def _material(made: Made, name: str, picture: bpy.types.Image) -> bpy.types.Mate
     texture, path, matt, photo, mix, output = (tree.nodes.new(f"ShaderNode{kind}") for kind in kinds)
     texture.image, texture.extension = picture, "EXTEND"
     texture.label, photo.label, matt.label = "Photo", "Seen by the camera", "Seen by the light"
-    tree.links.new(texture.outputs["Color"], matt.inputs["Color"])
+    lit = texture
+    if albedo != picture:
+        lit = tree.nodes.new("ShaderNodeTexImage")
+        lit.image, lit.extension, lit.label, lit.location = albedo, "EXTEND", "Albedo", (-900, 0)
+    tree.links.new(lit.outputs["Color"], matt.inputs["Color"])
     tree.links.new(texture.outputs["Color"], photo.inputs["Color"])
     tree.links.new(path.outputs["Is Camera Ray"], mix.inputs[0])
     tree.links.new(matt.outputs[0], mix.inputs[1])

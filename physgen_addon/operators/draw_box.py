@@ -6,12 +6,11 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from mathutils import Vector
+
+from ..photo_request import LEAST_PX
+from ..photo_view import on_screen, place_under, region_under, shows_photo, why_not_seen
 
 CHOSEN, OTHER, DRAGGED = (1.0, 0.55, 0.1, 1.0), (1.0, 1.0, 1.0, 0.8), (1.0, 0.8, 0.2, 1.0)
-LEAST_PX = 8
-"""A smaller rectangle is a slip of the hand, not an object."""
-
 _dragged: list[tuple[int, int, int, int]] = []
 """The rectangle under the mouse, at most one; it ends with the drag and is no part of any file."""
 _handlers: list[Any] = []
@@ -39,14 +38,10 @@ class PHYSGEN_OT_draw_box(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """There is a photo to draw on, and it is seen."""
-        image = context.scene.physgen_photo.image
-        if image is None:
-            cls.poll_message_set("Open a photo first")
-            return False
-        if context.window is None or not _regions(context, image):
-            cls.poll_message_set("No image editor shows the photo")
-            return False
-        return True
+        why = why_not_seen(context)
+        if why:
+            cls.poll_message_set(why)
+        return not why
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Wait for the drag."""
@@ -63,7 +58,7 @@ class PHYSGEN_OT_draw_box(bpy.types.Operator):
         if image is None or event.type in ("ESC", "RIGHTMOUSE"):
             return self._end(context, "CANCELLED")
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            region = _region_under(context, image, event)
+            region = region_under(context, image, event)
             if region is None:
                 self.report({"INFO"}, "drag inside the picture in the image editor")
                 return self._end(context, "CANCELLED")
@@ -95,39 +90,14 @@ class PHYSGEN_OT_draw_box(bpy.types.Operator):
         return {how}
 
 
-def _regions(context: bpy.types.Context, image: bpy.types.Image) -> list[bpy.types.Region]:
-    """The regions of the window in which the photo is seen."""
-    return [
-        region
-        for area in context.window.screen.areas
-        if area.type == "IMAGE_EDITOR" and area.spaces.active.image == image
-        for region in area.regions
-        if region.type == "WINDOW"
-    ]
-
-
-def _region_under(
-    context: bpy.types.Context, image: bpy.types.Image, event: bpy.types.Event
-) -> bpy.types.Region | None:
-    """The one under the mouse, unless a sidebar lies over it there."""
-    x, y = event.mouse_x, event.mouse_y
-    for region in _regions(context, image):
-        area = next(area for area in context.window.screen.areas if region in area.regions.values())
-        covers = [r for r in area.regions if r.type != "WINDOW" and r.width > 1 and r.height > 1]
-        if _inside(region, x, y) and not any(_inside(cover, x, y) for cover in covers):
-            return region
-    return None
-
-
-def _inside(region: bpy.types.Region, x: int, y: int) -> bool:
-    return 0 <= x - region.x < region.width and 0 <= y - region.y < region.height
-
-
 def _pixel(scene: bpy.types.Scene, region: bpy.types.Region, event: bpy.types.Event) -> tuple[int, int]:
     """The upright photo's pixel under the mouse, from its top left corner; may lie outside."""
-    u, v = region.view2d.region_to_view(event.mouse_x - region.x, event.mouse_y - region.y)
-    state = scene.physgen_photo
-    return round(u * state.width), round((1 - v) * state.height)
+    u, v = place_under(region, event)
+    return round(u * scene.physgen_photo.width), round(v * scene.physgen_photo.height)
+
+
+def _label(box: bpy.types.PropertyGroup) -> str:
+    return box.name if box.mask is None else f"{box.name} (mask)"
 
 
 def _draw_boxes() -> None:
@@ -138,12 +108,12 @@ def _draw_boxes() -> None:
 
     context = bpy.context
     state = context.scene.physgen_photo
-    if state.image is None or not state.width or context.space_data.image != state.image:
+    if not shows_photo(context):
         return
-    view, shader = context.region.view2d, gpu.shader.from_builtin("UNIFORM_COLOR")
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     scale = context.preferences.system.ui_scale
     lines = [
-        ((box.x0, box.y0, box.x1, box.y1), CHOSEN if index == state.box_index else OTHER, box.name)
+        ((box.x0, box.y0, box.x1, box.y1), CHOSEN if index == state.box_index else OTHER, _label(box))
         for index, box in enumerate(state.boxes)
     ]
     lines += [(corners, DRAGGED, "") for corners in _dragged]
@@ -151,7 +121,7 @@ def _draw_boxes() -> None:
     gpu.state.line_width_set(2.0 * scale)
     for (x0, y0, x1, y1), colour, name in lines:
         places = [
-            Vector(view.view_to_region(x / state.width, 1 - y / state.height, clip=False))
+            on_screen(context.region, x / state.width, y / state.height)
             for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
         ]
         shader.uniform_float("color", colour)

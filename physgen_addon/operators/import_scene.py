@@ -12,8 +12,8 @@ from bpy.props import BoolProperty, FloatProperty, StringProperty
 from ...sim.app.process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.importers.physgen3d import read_physgen3d
 from ...sim.scene.folder import SCENE_FILE
-from ...sim.scene.physgen3d import read_physgen3d
 from ..bridge.import_scene import import_notes, import_scene
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work

@@ -8,6 +8,7 @@ from bpy.props import StringProperty
 
 from ...sim.errors import InputError
 from ..bridge.photo_image import SUFFIXES, load_photo_image
+from ..photo_masks import drop_mask
 from ..reports import reports_errors
 from ..views import TAB, show_beside
 
@@ -19,7 +20,10 @@ def set_photo(scene: bpy.types.Scene, path: Path) -> None:
     old = state.image
     state.image, (state.width, state.height) = image, size
     if Path(bpy.path.abspath(state.path)) != path:
+        for box in state.boxes:
+            drop_mask(box)
         state.boxes.clear()
+        state.has_found = False
     state.path = str(path)
     if old is not None and old.users == 0:
         bpy.data.images.remove(old)
@@ -93,6 +97,7 @@ class PHYSGEN_OT_remove_box(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove it; the next one is chosen."""
         state = context.scene.physgen_photo
+        drop_mask(state.boxes[state.box_index])
         state.boxes.remove(state.box_index)
         state.box_index = max(0, min(state.box_index, len(state.boxes) - 1))
         return {"FINISHED"}

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+import webbrowser
 from pathlib import Path
 
 import bpy
@@ -11,50 +11,16 @@ import bpy
 from ...sim.app.process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
-from ...sim.scene.names import fitting_names
+from ...sim.scene.folder import load_scene
 from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
-from ..paths import folder_beside, require_folder
+from ..kept_changes import changes, remember, restore
+from ..photo_masks import write_masks
+from ..photo_request import arguments, mask_files, photo_file, scene_folder
+from ..photo_scene import report_page, take_camera
 from ..props.preferences import python
-from .draw_box import LEAST_PX
+from ..reports import reports_errors
 from .import_scene import show_scene
-
-
-def scene_folder(state: bpy.types.PropertyGroup) -> Path:
-    """Where the scene of the photo will be: where the artist says, else beside the .blend, else beside the photo.
-
-    A temporary folder would be gone with everything in it when Blender closes. Raises InputError where nothing can be
-    written.
-    """
-    if state.output.strip():
-        return require_folder(state.output, "Scene Folder")
-    photo = Path(bpy.path.abspath(state.path)).resolve()
-    beside = Path(bpy.data.filepath).resolve().parent if bpy.data.filepath else photo.parent
-    return folder_beside(beside / photo.stem, "scene")
-
-
-def arguments(state: bpy.types.PropertyGroup) -> list[str]:
-    """The command's arguments for the photo, its boxes and the camera. Raises InputError for what is missing."""
-    path = Path(bpy.path.abspath(state.path))
-    if state.image is None or not state.path or not path.is_file():
-        raise InputError("there is no photo; open one first")
-    if not state.boxes:
-        raise InputError("there is no box; draw one around each object that is to move")
-    # The command takes sizes from the first box on, so boxes with one go first.
-    boxes = sorted(state.boxes, key=lambda box: box.size_m <= 0)
-    # A name that begins with a dash would be taken for an option.
-    names = fitting_names([box.name.strip(" -") for box in boxes])
-    for box in boxes:
-        if box.x1 - box.x0 < LEAST_PX or box.y1 - box.y0 < LEAST_PX:
-            raise InputError(f"box {box.name}: is {box.x1 - box.x0} x {box.y1 - box.y0} pixels; draw it larger")
-    sizes = [f"{box.size_m:.7g}" for box in boxes if box.size_m > 0]
-    found = [str(path.resolve()), "--box", *(f"{box.x0},{box.y0},{box.x1},{box.y1}" for box in boxes)]
-    found += ["--name", *names]
-    if sizes:
-        found += ["--size", *sizes]
-    if state.use_pitch:
-        found += ["--pitch", f"{math.degrees(state.pitch):.7g}"]
-    return found
 
 
 class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
@@ -75,9 +41,10 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         return super().poll(context)
 
     def request(self, context: bpy.types.Context) -> Work:
-        """The reconstruction as a child process."""
+        """The reconstruction as a child process, which reads the masks from files."""
         state = context.scene.physgen_photo
         given, out, preferred = arguments(state), scene_folder(state), python(context)
+        write_masks(dict(mask_files(state, out).values()))
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             command = cli_command(find_python(preferred), "reconstruct", *given, "--out", str(out))
@@ -86,8 +53,38 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         return work
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
-        """Open the scene folder."""
-        return show_scene(scene, Path(str(final["scene"])))
+        """Open the scene folder, with what was changed by hand in an earlier one; show the horizon that was found."""
+        root, photo = Path(str(final["scene"])), photo_file(scene.physgen_photo)
+        changed = changes(scene, photo)
+        sentence = show_scene(scene, root)
+        remember(scene, photo)
+        restore(scene, changed)
+        take_camera(scene.physgen_photo, load_scene(root).scene.camera)
+        return sentence
 
 
-CLASSES = (PHYSGEN_OT_reconstruct,)
+class PHYSGEN_OT_open_photo_report(bpy.types.Operator):
+    """Open the page of pictures of every stage in the browser"""
+
+    bl_idname = "physgen.open_photo_report"
+    bl_label = "Open Report"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """The last reconstruction wrote one."""
+        if report_page(context.scene.physgen_photo) is None:
+            cls.poll_message_set("Switch Write Report on and reconstruct")
+            return False
+        return True
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Open report.html."""
+        page = report_page(context.scene.physgen_photo)
+        if page is None:
+            raise InputError("there is no report of this photo; switch Write Report on and reconstruct")
+        webbrowser.open(page.as_uri())
+        return {"FINISHED"}
+
+
+CLASSES = (PHYSGEN_OT_reconstruct, PHYSGEN_OT_open_photo_report)

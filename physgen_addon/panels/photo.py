@@ -11,9 +11,12 @@ from ...sim.errors import PhysGenError
 from .. import text
 from ..operators.draw_box import PHYSGEN_OT_draw_box
 from ..operators.photo import PHYSGEN_OT_open_photo, PHYSGEN_OT_remove_box, PHYSGEN_OT_use_image
-from ..operators.reconstruct import PHYSGEN_OT_reconstruct, scene_folder
+from ..operators.reconstruct import PHYSGEN_OT_reconstruct
+from ..photo_request import scene_folder
+from ..photo_scene import made_folder
 from ..views import TAB
 from .job import draw_job
+from .photo_details import draw_asking, draw_camera, draw_details, draw_files
 
 
 class PHYSGEN_UL_boxes(bpy.types.UIList):
@@ -49,11 +52,11 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         text.sentences(layout, context, "A photo of things that stand on a table or floor. It can be dropped here.")
         return
     _draw_boxes(layout, context, state)
-    row = layout.row(heading="Camera Pitch")
-    row.prop(state, "use_pitch", text="")
-    value = row.row()
-    value.active = state.use_pitch
-    value.prop(state, "pitch", text="")
+    if 0 <= state.box_index < len(state.boxes):
+        draw_details(layout, context, state.boxes[state.box_index])
+    draw_camera(layout, context, state)
+    draw_files(layout, context, state)
+    draw_asking(layout, context, state)
     layout.prop(state, "output", text="Save To")
     if not state.output.strip():
         try:
@@ -62,7 +65,12 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             text.sentences(layout, context, str(error), icon="ERROR")
     row = layout.row()
     row.scale_y = 1.4
-    row.operator(PHYSGEN_OT_reconstruct.bl_idname, icon="MESH_MONKEY")
+    again = made_folder(state) is not None
+    row.operator(
+        PHYSGEN_OT_reconstruct.bl_idname, text="Reconstruct Again" if again else "Reconstruct", icon="MESH_MONKEY"
+    )
+    if again:
+        text.sentences(layout, context, "Only what a change concerns is done anew; physics that you changed stays.")
     draw_job(layout)
 
 
@@ -83,10 +91,7 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     column.use_property_split, column.use_property_decorate = True, False
     column.prop(box, "size_m")
     if not any(other.size_m > 0 for other in state.boxes):
-        text.sentences(layout, context, "Give one object its size, or the first is taken to be 15 cm large.")
-    grid = layout.grid_flow(columns=2, row_major=True, even_columns=True, align=True)
-    for name in ("x0", "x1", "y0", "y1"):
-        grid.prop(box, name)
+        text.sentences(layout, context, "Give one object its size; without one it is guessed.")
 
 
 def _beside() -> str:

@@ -1,53 +1,56 @@
 # SPDX-License-Identifier: MIT
-"""An output folder of PhysGen3D → a scene folder (``sim/scene/physgen3d.py`` says what is read)."""
+"""An output folder of PhysGen3D → a scene folder (``sim/importers/physgen3d.py`` says what is read)."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from PIL import Image
-from trimesh.visual.material import PBRMaterial
 
 from ..errors import InputError
 from ..events import OnEvent, ignore
+from ..importers.physgen3d import Physgen3dFolder, read_physgen3d
+from ..importers.physgen3d_objects import MAX_SIDE, PlacedObject, material_of, object_glb, placed_object
+from ..importers.physgen3d_settings import GRAVITY, Physgen3dSettings, camera_velocity, find_settings, read_settings
 from ..reconstruct.output import replacing_folder
 from ..reconstruct.photo import load_photo
 from ..scene.folder import SceneFolder, load_scene, save_scene
-from ..scene.materials import load_preset
-from ..scene.matter import Material
-from ..scene.meshes import read_mesh
-from ..scene.model import Camera, Matrix4, Scene, SceneObject
+from ..scene.model import Camera, Ground, Matrix4, Scene, SceneObject, Vector
 from ..scene.names import fitting_names
-from ..scene.physgen3d import Physgen3dFolder, Physgen3dObject, read_physgen3d
 
 DEFAULT_SIZE_M = 0.15
-MAX_SIDE = 8192
-"""Pixels; a larger photo is no output of PhysGen3D."""
-NEAR = 0.5
-"""An object that is this share of its size off the ground is taken to stand on it."""
+SAME_GRAVITY = 0.1
+"""How far its gravity may be from the earth's, as a share, before a notice says so."""
+
+Notice = Callable[[str], None]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Placed:
-    """camera_from_mesh: (4, 4) in the folder's unit, the object on the ground; vertices: (V, 3) on camera axes."""
+class _World:
+    """from_camera: (4, 4) in the folder's unit, the origin on the ground below the first object; metres: of a unit."""
 
-    source: Physgen3dObject
-    mesh: trimesh.Trimesh
-    camera_from_mesh: NDArray[np.float64]
-    vertices: NDArray[np.float64]
+    from_camera: NDArray[np.float64]
+    metres: float
 
 
-def import_physgen3d(root: Path, out: Path, *, size_m: float | None = None, on_event: OnEvent = ignore) -> SceneFolder:
+def import_physgen3d(
+    root: Path,
+    out: Path,
+    *,
+    size_m: float | None = None,
+    settings: Path | None = None,
+    on_event: OnEvent = ignore,
+) -> SceneFolder:
     """Turn PhysGen3D's output folder ``root`` into the scene folder ``out``.
 
-    size_m: largest extent of the first object in metres, 1e-4 to 1e3, which sets the scale; None takes 0.15, because
-    the folder does not know.
+    size_m: largest extent of the first object in metres, 1e-4 to 1e3, which sets the scale. None takes the folder's
+    unit of length as its simulation does where its settings are known, else 0.15 m.
+    settings: YAML file of its simulation, with velocities and friction; None looks for it (``find_settings``).
 
     Objects that stand nearly on the ground are put on it along the camera's rays, so that the picture does not change
     (PhysGen3D moves them along the ground's normal). Raises InputError when something is missing or not readable, or
@@ -55,112 +58,116 @@ def import_physgen3d(root: Path, out: Path, *, size_m: float | None = None, on_e
     """
     if size_m is not None and not (math.isfinite(size_m) and 1e-4 <= size_m <= 1e3):
         raise InputError(f"size_m is {size_m!r}: give metres from 0.0001 to 1000")
-    source = read_physgen3d(root)
 
     def notice(message: str) -> None:
         on_event({"event": "notice", "stage": "import", "message": message})
 
-    if size_m is None:
-        notice(f"{source.objects[0].name} is taken to be {DEFAULT_SIZE_M:g} m large, the folder does not say")
+    source = read_physgen3d(root)
+    path = settings or find_settings(root)
+    told = None if path is None else read_settings(path)
     photo = load_photo(source.photo, MAX_SIDE).pixels
     height, width = photo.shape[:2]
     if source.background is None:
         notice("there is no inpainted background; the objects stay in the picture behind themselves")
     background = photo if source.background is None else _sized(source.background, width, height)
-    placed = [_placed(source, item) for item in source.objects]
-    for item in placed:
-        if item.camera_from_mesh is item.source.camera_from_mesh:
-            notice(f"{item.source.name} does not stand on the ground; it is left where it is")
-    world = source.world_from_camera
-    first = placed[0].vertices @ world[:3, :3].T
-    low, high = first.min(axis=0), first.max(axis=0)
-    metres = (size_m or DEFAULT_SIZE_M) / float((high - low).max())
-    world[:2, 3] = -(low + high)[:2] / 2
+    on_ground = told is None or told.on_ground
+    placed = [placed_object(source, item, (width, height), on_ground, notice) for item in source.objects]
+    world = _world(source, placed[0], size_m, told, notice)
+    if told is not None:
+        _say(told, source, world, notice)
     with replacing_folder(out) as folder:
         for sub in ("masks", "meshes"):
             (folder / sub).mkdir()
         Image.fromarray(photo).save(folder / "photo.png")
         Image.fromarray(background).save(folder / "background.png")
         names = fitting_names([item.source.name for item in placed])
-        objects = tuple(
-            _write_object(folder, name, item, world, metres, placed) for name, item in zip(names, placed, strict=True)
-        )
-        for name, item in zip(names, placed, strict=True):
-            if item.source.mask is not None:
-                mask = _sized(item.source.mask, width, height).mean(axis=2) > 127.5
-                Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "masks" / f"{name}.png")
-        save_scene(folder, Scene(camera=_camera(source, world, metres, width, height), objects=objects))
+        objects = []
+        for index, (name, item) in enumerate(zip(names, placed, strict=True)):
+            (folder / "meshes" / f"{name}.glb").write_bytes(object_glb(item))
+            if item.mask is not None:
+                Image.fromarray(item.mask.astype(np.uint8) * 255).save(folder / "masks" / f"{name}.png")
+            order = sum(other.depth < item.depth for other in placed)
+            velocity = _velocity(told, index, source, world)
+            scene_object = _scene_object(name, item, world)
+            objects.append(
+                dataclasses.replace(
+                    scene_object, occlusion_order=order, velocity=velocity, material=material_of(item.source, told)
+                )
+            )
+        ground = Ground() if told is None or told.friction is None else Ground(friction=told.friction)
+        camera = _camera(source, world, width, height)
+        save_scene(folder, Scene(camera=camera, objects=tuple(objects), ground=ground))
     return load_scene(out)
 
 
-def _placed(folder: Physgen3dFolder, item: Physgen3dObject) -> _Placed:
-    mesh = read_mesh(item.mesh)
-    matrix = item.camera_from_mesh
-    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    size = float(np.ptp(vertices, axis=0).max())
-    if not np.isfinite(vertices).all() or size < 1e-9:
-        raise InputError(f"{item.mesh}: has no extent; run PhysGen3D's perception again")
-    if float(vertices[:, 2].max()) <= 0:
-        raise InputError(f"object {item.name}: lies behind the camera; run PhysGen3D's perception again")
-    lowest = float((vertices @ folder.normal).max())
-    if lowest <= 0 or abs(lowest - folder.height) > NEAR * size:
-        return _Placed(item, mesh, matrix, vertices)
-    nearer = folder.height / lowest
-    return _Placed(item, mesh, np.diag([nearer, nearer, nearer, 1.0]) @ matrix, vertices * nearer)
+def _world(
+    source: Physgen3dFolder,
+    first: PlacedObject,
+    size_m: float | None,
+    settings: Physgen3dSettings | None,
+    notice: Notice,
+) -> _World:
+    pose = source.world_from_camera
+    corners = first.vertices @ pose[:3, :3].T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    extent = float((high - low).max())
+    pose[:2, 3] = -(low + high)[:2] / 2
+    name = first.source.name
+    if size_m is not None:
+        return _World(pose, size_m / extent)
+    if settings is not None:
+        metres = 1.0 / settings.scale
+        if not 1e-4 <= metres * extent <= 1e3:
+            raise InputError(f"{settings.path}: scale makes {name} {metres * extent:g} m large; give --size")
+        notice(f"{name} is {metres * extent:.3g} m large, as in PhysGen3D's simulation; --size sets it otherwise")
+        return _World(pose, metres)
+    notice(f"{name} is taken to be {DEFAULT_SIZE_M:g} m large, the folder does not say")
+    return _World(pose, DEFAULT_SIZE_M / extent)
 
 
-def _write_object(
-    folder: Path, name: str, item: _Placed, world: NDArray[np.float64], metres: float, others: list[_Placed]
-) -> SceneObject:
-    (folder / "meshes" / f"{name}.glb").write_bytes(_glb(item))
-    pose = np.diag([metres, metres, metres, 1.0]) @ world @ item.camera_from_mesh
-    depth = float(item.vertices[:, 2].mean())
-    extent = np.ptp(item.vertices @ world[:3, :3].T, axis=0).max()
+def _say(settings: Physgen3dSettings, source: Physgen3dFolder, world: _World, notice: Notice) -> None:
+    """Where the settings are from, and what of them is not carried over."""
+    notice(f"velocities and friction are those of {settings.path}")
+    if settings.folder not in (None, source.root.resolve().name):
+        notice(f"{settings.path} is for the folder {settings.folder}, not for {source.root.resolve().name}")
+    if settings.unused:
+        notice(f"{settings.path}: not used: {', '.join(settings.unused)}")
+    count = 1 if settings.for_all else len(settings.velocities)
+    if not settings.for_all and count != len(source.objects):
+        notice(f"{settings.path}: {count} velocities for {len(source.objects)} objects; those without one are at rest")
+    gravity = GRAVITY * settings.scale * world.metres
+    if abs(gravity / 9.81 - 1) > SAME_GRAVITY:
+        notice(
+            f"at this size PhysGen3D simulated with a gravity of {gravity:.3g} m/s²; here things fall with 9.81, so "
+            "the motion differs; leave --size out to have the same"
+        )
+
+
+def _velocity(settings: Physgen3dSettings | None, index: int, source: Physgen3dFolder, world: _World) -> Vector:
+    told = None if settings is None else settings.velocity(index)
+    if told is None:
+        return (0.0, 0.0, 0.0)
+    x, y, z = world.from_camera[:3, :3] @ camera_velocity(told, source.normal) * world.metres
+    return float(x), float(y), float(z)
+
+
+def _scene_object(name: str, item: PlacedObject, world: _World) -> SceneObject:
+    scale = np.diag([world.metres, world.metres, world.metres, 1.0])
+    extent = np.ptp(item.vertices @ world.from_camera[:3, :3].T, axis=0).max()
     return SceneObject(
         name=name,
         mesh=f"meshes/{name}.glb",
-        world_from_mesh=_rows(pose),
-        size_m=float(extent) * metres,
-        material=_material(item.source),
-        occlusion_order=sum(float(other.vertices[:, 2].mean()) < depth for other in others),
-        mask=f"masks/{name}.png" if item.source.mask is not None else None,
+        world_from_mesh=_rows(scale @ world.from_camera @ item.camera_from_mesh),
+        size_m=float(extent) * world.metres,
+        mask=f"masks/{name}.png" if item.mask is not None else None,
     )
 
 
-def _material(item: Physgen3dObject) -> Material:
-    usual = load_preset("medium")
-    try:
-        return dataclasses.replace(
-            usual,
-            youngs_modulus=usual.youngs_modulus if item.youngs_modulus is None else item.youngs_modulus,
-            density=usual.density if item.density is None else item.density,
-        )
-    except InputError as error:
-        raise InputError(f"object {item.name}: {error}") from None
-
-
-def _glb(item: _Placed) -> bytes:
-    """The mesh with its texture inside; without one it wears the photo later."""
-    uv = getattr(item.mesh.visual, "uv", None)
-    visual = None
-    if uv is not None and item.source.texture is not None and len(uv) == len(item.mesh.vertices):
-        texture = Image.fromarray(load_photo(item.source.texture, MAX_SIDE).pixels)
-        texture.format = "PNG"
-        material = PBRMaterial(name="photo", baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=0.6)
-        visual = trimesh.visual.TextureVisuals(uv=np.asarray(uv), material=material)
-    mesh = trimesh.Trimesh(item.mesh.vertices, item.mesh.faces, visual=visual, process=False)
-    buffer = io.BytesIO()
-    mesh.export(buffer, file_type="glb", include_normals=True)
-    return buffer.getvalue()
-
-
-def _camera(source: Physgen3dFolder, world: NDArray[np.float64], metres: float, width: int, height: int) -> Camera:
-    pose = world.copy()
-    pose[:3, 3] *= metres
-    focal = 0.5 * width / source.tangent
-    return Camera(
-        width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, world_from_camera=_rows(pose)
-    )
+def _camera(source: Physgen3dFolder, world: _World, width: int, height: int) -> Camera:
+    pose = world.from_camera.copy()
+    pose[:3, 3] *= world.metres
+    focal, cx, cy = source.intrinsics(width, height)
+    return Camera(width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy, world_from_camera=_rows(pose))
 
 
 def _rows(matrix: NDArray[np.float64]) -> Matrix4:

@@ -17,9 +17,9 @@ from ..atomic import replacing
 from ..composite.transfer import read_mask, read_rgb
 from ..errors import InputError
 from ..events import OnEvent, ignore
-from ..reconstruct.inflate import inflate
-from ..reconstruct.light import LitScene, described, estimate_light, sunny
-from ..reconstruct.mesh import bare_mesh
+from ..reconstruct.light.estimate import LitScene, described, estimate_light, sunny
+from ..reconstruct.shape.inflate import inflate
+from ..reconstruct.shape.mesh import bare_mesh
 from ..scene.environment import prepared, write_environment
 from ..scene.equirectangular import FRAMES, Radiance
 from ..scene.folder import SceneFolder, load_scene, require_photo, save_scene

@@ -71,6 +71,31 @@ def inpaint(
     return np.where(hole[..., None], np.clip(mixed + 0.5, 0, 255).astype(np.uint8), pixels)
 
 
+def searched(
+    pixels: NDArray[np.uint8],
+    hole: Mask,
+    barred: Mask,
+    options: FillOptions,
+    guide: Guide | None = None,
+    solve_side: float = SOLVE_SIDE,
+) -> NDArray[np.uint8]:
+    """``pixels`` (h, w, 3) with ``hole`` filled in one go from what is in neither it nor ``barred``; no feather.
+
+    guide: as for ``inpaint``. solve_side: larger holes are filled at a scale that makes them this large.
+    Raises InputError as ``inpaint``.
+    """
+    closed = hole | barred
+    if not hole.any():
+        return pixels.copy()
+    if closed.all():
+        raise InputError("objects and shadows cover all of this surface: no background is left to fill from")
+    side = float(np.sqrt(hole.sum()))
+    scale = min(1.0, solve_side / max(side, 1.0), float(np.sqrt(options.limit / hole.size)))
+    if scale > 0.8:
+        return _patch_match(pixels, hole, closed, options, guide)
+    return _at_scale(pixels, hole, closed, scale, options, guide)
+
+
 def _parts(hole: Mask) -> list[Mask]:
     """The connected parts of ``hole``, smallest first: small ones are filled best and then serve as surroundings."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)

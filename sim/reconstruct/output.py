@@ -14,8 +14,24 @@ from ..errors import InputError
 from ..scene.folder import SCENE_FILE
 from ..scene.json_fields import read_json
 
+PHYSICS_FILE = "physics.json"
 OWN_ENTRIES = frozenset(
-    (SCENE_FILE, "reconstruct.json", "photo.png", "background.png", "masks", "shadows", "holes", "meshes", "light")
+    (
+        SCENE_FILE,
+        "reconstruct.json",
+        PHYSICS_FILE,
+        "photo.png",
+        "background.png",
+        "masks",
+        "full",
+        "shadows",
+        "holes",
+        "meshes",
+        "albedo",
+        "light",
+        "stages",
+        "report.html",
+    )
 )
 """What a scene folder of ours holds; anything else in it belongs to somebody."""
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from ..errors import InputError
+from .view.exif_focal import FULL_FRAME_DIAGONAL_MM, ROUNDING_SIGMA, ExifFocal, focal_from_exif
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "MPO")
 MAX_PIXELS = 200_000_000
 """More than the largest phone sensors have; a file that claims more is taken for a decompression bomb."""
 MIN_SIDE = 32
 _EXIF_IFD = 0x8769
-_FOCAL_LENGTH_35MM = 0xA405
-_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,15 @@ class Photo:
     scale: working pixels per pixel of the upright original, at most 1.
     original_size: width and height of the upright original in pixels.
     focal_35mm: focal length in millimetres for a 36x24 mm frame with the same diagonal, or None.
+    exif_focal_sigma: standard deviation of the logarithm of that focal length. exif_source: which tags it is from.
     """
 
     pixels: NDArray[np.uint8]
     scale: float
     original_size: tuple[int, int]
     focal_35mm: float | None
+    exif_focal_sigma: float = ROUNDING_SIGMA
+    exif_source: str = "EXIF"
 
     @property
     def width(self) -> int:
@@ -54,7 +56,7 @@ class Photo:
         """Focal length in working pixels by EXIF (the 35 mm equivalent compares diagonals, CIPA DCG-001)."""
         if self.focal_35mm is None:
             return None
-        return self.focal_35mm / _FULL_FRAME_DIAGONAL_MM * math.hypot(self.width, self.height)
+        return self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(self.width, self.height)
 
 
 def load_photo(path: Path, max_size: int) -> Photo:
@@ -99,7 +101,7 @@ def _decode(path: Path, image: Image.Image, max_size: int) -> Photo:
         raise _too_large(path, f"{width}x{height}, more")
     if min(width, height) < MIN_SIDE:
         raise InputError(f"{path}: is {width}x{height} pixels; give a photo of at least {MIN_SIDE}x{MIN_SIDE}")
-    focal = _focal_35mm(image)
+    focal = _focal(image)
     profile = image.info.get("icc_profile")
     orientation = image.getexif().get(0x0112, 1)
     if image.format == "JPEG" and image.mode in ("RGB", "L"):
@@ -115,17 +117,25 @@ def _decode(path: Path, image: Image.Image, max_size: int) -> Photo:
         upright = upright.resize(target, Image.Resampling.LANCZOS)
     pixels = np.array(upright, dtype=np.uint8)
     pixels.setflags(write=False)
-    return Photo(pixels=pixels, scale=target[0] / width, original_size=(width, height), focal_35mm=focal)
+    photo = Photo(pixels=pixels, scale=target[0] / width, original_size=(width, height), focal_35mm=None)
+    if focal is None:
+        return photo
+    return replace(
+        photo,
+        focal_35mm=focal.per_diagonal * FULL_FRAME_DIAGONAL_MM,
+        exif_focal_sigma=focal.sigma,
+        exif_source=focal.source,
+    )
 
 
-def _focal_35mm(image: Image.Image) -> float | None:
-    """EXIF FocalLengthIn35mmFilm, when it is there and believable."""
+def _focal(image: Image.Image) -> ExifFocal | None:
+    """Focal length by EXIF, when it is there and believable."""
     try:
-        value = float(image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM, 0))
-    except (TypeError, ValueError, KeyError, ZeroDivisionError, OSError, SyntaxError):
+        exif = image.getexif()
+        return focal_from_exif(exif, exif.get_ifd(_EXIF_IFD), *image.size)
+    except (TypeError, ValueError, KeyError, ZeroDivisionError, OSError, SyntaxError, OverflowError):
         # Damaged EXIF beside a sound picture: the picture counts.
         return None
-    return value if math.isfinite(value) and 5 <= value <= 2000 else None
 
 
 def _to_rgb(image: Image.Image, profile: bytes | None) -> Image.Image:

@@ -3,72 +3,46 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from ..composite.inpaint import FillOptions, inpaint
-from ..errors import Cancelled, InputError
+from ..atomic import write_json
+from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..scene.environment import prepared as prepared_environment
 from ..scene.environment import write_environment
+from ..scene.equirectangular import Radiance
 from ..scene.folder import SceneFolder, save_scene
 from ..scene.materials import load_preset
-from ..scene.model import Camera, Ground, Light, Scene, SceneObject
-from . import camera as cameras
-from .body import contact_pixel
-from .horizon import estimate_pitch
-from .inflate import Silhouette, inflate
-from .light import ENVIRONMENT_FILE, LitScene, estimate_light
-from .mask_cleanup import largest_component
-from .mesh import BodyMesh, bare_mesh, build_mesh
+from ..scene.model import Camera, Ground, Light, SceneObject
+from .adapters.resolve import resolve
+from .bodies import Body, casters, make_bodies
+from .layers import Layers, take_apart
+from .light.estimate import ENVIRONMENT_FILE, LitScene, estimate_light
+from .looks import estimate_looks
 from .options import ObjectRequest, ReconstructOptions
-from .output import replacing_folder
+from .outlines import cut_out
+from .output import PHYSICS_FILE, replacing_folder
 from .photo import Photo, load_photo
-from .segment import check_distinct, pixel_box, segment
-from .shadow import find_shadow, ground_brightness, object_holes
-from .texture import crop_texture, glb_bytes, world_from_gltf
+from .physics.answer import Answers, read_answer
+from .physics.apply import DEFAULT_PRESET, ObjectPhysics, decide, ground_friction, in_words
+from .physics.ask import ask as ask_endpoint
+from .physics.by_name import shipped_names
+from .physics.chat import ChatRequest
+from .physics.record import physics_record
+from .report.page import REPORT_FILE, Told, write_report
+from .stage_store import STAGES_FOLDER, Arrays, Notice, StageStore
+from .steps import Steps
+from .view.depth_map import DepthMap, read_depth
+from .view.estimate import ViewEstimate, estimate_view
+from .view.scale import metres_per_unit
+from .writing import Found, write_scene
 
 Mask = NDArray[np.bool_]
-
-
-class _Steps:
-    """Reports progress, passes notices on, and stops between steps when asked to."""
-
-    def __init__(self, total: int, on_event: OnEvent, cancelled: IsCancelled) -> None:
-        self._total, self._done, self._on_event, self._cancelled = total, 0, on_event, cancelled
-
-    def begin(self, name: str) -> None:
-        if self._cancelled():
-            raise Cancelled(f"reconstruction cancelled before step {name!r}; nothing was written")
-        event = {"event": "progress", "stage": "reconstruct", "step": name, "message": name}
-        self._on_event({**event, "done": self._done, "total": self._total})
-        self._done += 1
-
-    def finish(self) -> None:
-        if self._cancelled():
-            raise Cancelled("reconstruction cancelled at its end; nothing was written")
-        event = {"event": "progress", "stage": "reconstruct", "step": "done", "message": "done"}
-        self._on_event({**event, "done": self._total, "total": self._total})
-
-    def notice(self, message: str) -> None:
-        self._on_event({"event": "notice", "stage": "reconstruct", "message": message})
-
-
-@dataclass(frozen=True)
-class _Layers:
-    """What the photo falls apart into, all (H, W) or (H, W, 3) at working size."""
-
-    masks: tuple[Mask, ...]
-    shadows: tuple[Mask, ...]
-    holes: tuple[Mask, ...]
-    background: NDArray[np.uint8]
 
 
 def reconstruct(
@@ -78,20 +52,27 @@ def reconstruct(
     options: ReconstructOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
+    *,
+    ask: ChatRequest | None = None,
+    answered: str | None = None,
 ) -> SceneFolder:
     """Reconstruct the ``objects`` of ``photo`` into the scene folder ``out``, which is replaced when it is a scene.
 
-    The folder appears whole or not at all. ``on_event`` gets progress and notices (docs/reconstruction.md),
-    ``cancelled`` is asked between steps. Raises InputError for a photo, box or option that cannot be used, and
-    Cancelled.
+    What an earlier reconstruction into ``out`` has computed from the same inputs is not computed again. The folder
+    appears whole or not at all. ask: a model to ask what things are; answered: what one answered before, in its place.
+    ``on_event`` gets progress and notices (docs/reconstruction.md), ``cancelled`` is asked between steps. Raises
+    InputError for a photo, box or option that cannot be used, and Cancelled.
     """
     options = options or ReconstructOptions()
     if not objects:
         raise InputError("objects: none given; draw a box around at least one object")
     names = object_names(objects)
-    materials = [load_preset(item.preset) for item in objects]
-    steps = _Steps(5 + 3 * len(objects), on_event, cancelled)
+    objects = [replace(item, name=name) for item, name in zip(objects, names, strict=True)]
+    for item in objects:
+        load_preset(item.preset or DEFAULT_PRESET)
+    steps = Steps(8 + 4 * len(objects) + options.report, on_event, cancelled)
     with replacing_folder(out) as folder:
+        store = StageStore(folder / STAGES_FOLDER, out / STAGES_FOLDER, steps.notice)
         steps.begin("photo")
         picture = load_photo(photo, options.max_size)
         if picture.scale < 1.0:
@@ -99,21 +80,64 @@ def reconstruct(
                 f"photo of {picture.original_size[0]}x{picture.original_size[1]} pixels is worked on at "
                 f"{picture.width}x{picture.height}; max_size changes that"
             )
-        masks = _segment_all(picture, objects, names, options, steps)
-        silhouettes = [inflate(mask, item.thickness) for mask, item in zip(masks, objects, strict=True)]
+        objects = [_in_working_pixels(item, picture.scale) for item in objects]
+        seen, boxes = cut_out(picture, objects, options, store, steps)
+        steps.begin("physics")
+        if answered is not None and ask is None:
+            answers: Answers | None = read_answer(answered, len(names))
+        else:
+            answers = _asked(picture, seen, names, ask, store, steps)
+        physics = decide(objects, names, answers, shipped_names())
+        for name, decided in zip(names, physics, strict=True):
+            steps.notice(in_words(name, decided))
+        # What a thing is tells its shape as well.
+        objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
         steps.begin("camera")
-        view = _camera(picture, masks, silhouettes, names, options, steps)
-        layers = _take_apart(picture, masks, names, view, options, steps)
-        bodies = []
-        for name, silhouette in zip(names, silhouettes, strict=True):
-            steps.begin(f"mesh {name}")
-            bodies.append(_body(name, view, silhouette, options, steps))
+        depth = _depth(picture, options, steps)
+        estimate = estimate_view(picture, seen, names, options, depth, steps.notice)
+        layers = take_apart(
+            picture.pixels,
+            seen,
+            boxes,
+            names,
+            estimate.camera,
+            options,
+            depth=None if depth is None else 1.0 / depth.nearness,
+            inpainter=None if options.inpainter is None else resolve("inpainter", options.inpainter, cancelled),
+            store=store,
+            steps=steps,
+        )
+        bodies = make_bodies(layers, estimate.camera, objects, options, store, steps)
         (folder / "light").mkdir()
         steps.begin("light")
-        light = _light(folder, picture, layers, view, silhouettes, options, steps)
+        radiance, light = _light(folder, picture, layers, estimate.camera, bodies, options, steps)
+        looks = estimate_looks(layers, estimate.camera, bodies, objects, physics, radiance, light, store, steps)
         steps.begin("write")
-        scene = _write(folder, picture, layers, view, bodies, names, objects, materials, options, light, steps)
+        found = Found(
+            pixels=picture.pixels,
+            layers=layers,
+            view=estimate.camera,
+            bodies=bodies,
+            metres=_metres(bodies, physics, estimate, options, steps),
+            light=light,
+            looks=looks,
+        )
+        scene = write_scene(folder, found, objects, physics, _friction(answers, options))
+        write_json(folder / PHYSICS_FILE, physics_record(names, physics, answers, ask))
         save_scene(folder, scene)
+        if options.report:
+            steps.begin("report")
+            told = Told(
+                pixels=picture.pixels,
+                layers=layers,
+                shapes=[body.shape for body in bodies],
+                notices=steps.notices,
+                sources={
+                    "focal length": f"{estimate.focal_source}, ± {estimate.fov_sigma_deg:.0f}°",
+                    "ground": f"{estimate.normal_source}, ± {estimate.normal_sigma_deg:.0f}°",
+                },
+            )
+            write_report(folder / REPORT_FILE, SceneFolder(folder, scene), told)
         steps.finish()
     return SceneFolder(root=out, scene=scene)
 
@@ -130,198 +154,93 @@ def object_names(objects: Sequence[ObjectRequest]) -> list[str]:
     return names
 
 
-def _segment_all(
+def _in_working_pixels(item: ObjectRequest, scale: float) -> ObjectRequest:
+    return replace(item, mesh_points=tuple((place, (x * scale, y * scale)) for place, (x, y) in item.mesh_points))
+
+
+def _asked(
     picture: Photo,
-    objects: Sequence[ObjectRequest],
+    seen: Sequence[Mask],
     names: Sequence[str],
-    options: ReconstructOptions,
-    steps: _Steps,
-) -> list[Mask]:
-    boxes = [
-        pixel_box(item.box, picture.scale, picture.width, picture.height, name)
-        for item, name in zip(objects, names, strict=True)
-    ]
-    masks = []
-    for name, box in zip(names, boxes, strict=True):
-        steps.begin(f"segment {name}")
-        masks.append(segment(picture.pixels, box, name, options.grabcut_iterations, steps.notice))
-    check_distinct(masks, names)
-    # Where two masks still overlap a little, the object that stands nearer (lower in the photo) has it.
-    order = sorted(range(len(masks)), key=lambda i: -int(np.flatnonzero(masks[i].any(axis=1))[-1]))
-    taken = np.zeros(masks[0].shape, dtype=bool)
-    for index in order:
-        masks[index] = largest_component(masks[index] & ~taken)
-        taken |= masks[index]
-    return masks
+    request: ChatRequest | None,
+    store: StageStore,
+    steps: Steps,
+) -> Answers | None:
+    """What the endpoint says of the objects; it is asked once about the same outlines."""
+    if request is None:
+        return None
+    endpoint = {"address": str(request.address), "model": request.model}
+
+    def raw(notice: Notice) -> Arrays:
+        return {"raw": np.array(ask_endpoint(picture.pixels, seen, names, request, notice, steps.cancelled).raw)}
+
+    try:
+        made = store.run("physics", {"pixels": picture.pixels, "seen": seen, "names": names, **endpoint}, raw)
+    except InputError as error:
+        # An hour of corrections should not be lost to an endpoint that is down.
+        steps.notice(f"{error}; the objects are judged by their names")
+        return None
+    return read_answer(str(made["raw"]), len(names))
 
 
-def _camera(
-    picture: Photo,
-    masks: Sequence[Mask],
-    silhouettes: Sequence[Silhouette],
-    names: Sequence[str],
-    options: ReconstructOptions,
-    steps: _Steps,
-) -> Camera:
-    focal, source = cameras.focal_px(picture.width, picture.height, picture.exif_focal_px, options.fov_deg)
-    contacts = [float(contact_pixel(silhouette)[1]) for silhouette in silhouettes]
-    if options.pitch_deg is not None:
-        pitch = math.radians(options.pitch_deg)
-    elif options.horizon_y is not None:
-        pitch = cameras.pitch_of_horizon(picture.height, focal, options.horizon_y * picture.height)
-    else:
-        estimate = estimate_pitch(picture.pixels, np.logical_or.reduce(masks), focal)
-        lowest_allowed = math.radians(cameras.MIN_DECLINATION_DEG * 2) - math.atan2(
-            min(contacts) - picture.height / 2.0, focal
-        )
-        pitch = max(math.radians(cameras.DEFAULT_PITCH_DEG) if estimate is None else estimate, lowest_allowed)
-        how = "taken as" if estimate is None else "estimated from straight lines:"
-        row = cameras.horizon_row(picture.height, focal, pitch) / picture.height
-        steps.notice(
-            f"camera pitch {how} {math.degrees(pitch):.0f}° (horizon at {row:.2f} of the height, focal length "
-            f"{focal:.0f} px by {source}); set horizon_y or pitch_deg where this is wrong"
-        )
-    for name, contact in zip(names, contacts, strict=True):
-        cameras.check_horizon(picture.height, focal, pitch, contact, name)
-    return cameras.camera_above_ground(picture.width, picture.height, focal, pitch)
-
-
-def _take_apart(
-    picture: Photo,
-    masks: Sequence[Mask],
-    names: Sequence[str],
-    view: Camera,
-    options: ReconstructOptions,
-    steps: _Steps,
-) -> _Layers:
-    pitch = math.asin(max(-1.0, min(1.0, -view.world_from_camera[2][2])))
-    horizon = cameras.horizon_row(picture.height, view.fy, pitch)
-    union = np.logical_or.reduce(masks)
-    grey = ground_brightness(picture.pixels)
-    shadows = []
-    for name, mask in zip(names, masks, strict=True):
-        steps.begin(f"shadow {name}")
-        shadows.append(
-            find_shadow(grey, mask, union & ~mask, horizon_row=horizon, fixed_threshold=options.shadow_threshold)
-        )
-    dilation = options.hole_dilation * max(picture.width, picture.height) / 1024.0
-    holes = object_holes(masks, shadows, dilation)
-    steps.begin("background")
-    background = inpaint(
-        picture.pixels,
-        np.logical_or.reduce(holes),
-        union,
-        FillOptions(
-            radius=options.patch_radius,
-            limit=options.inpaint_pixels,
-            seed=options.seed,
-            # Seen from high above, the ground is all there is, and looks the same at all heights.
-            by_row=horizon > -0.5 * picture.height,
-        ),
+def _depth(picture: Photo, options: ReconstructOptions, steps: Steps) -> DepthMap | None:
+    if options.depth is not None:
+        return read_depth(options.depth, picture.width, picture.height)
+    if options.depth_estimator is None:
+        return None
+    found = resolve("depth_estimator", options.depth_estimator, steps.cancelled)(picture.pixels)
+    return DepthMap(
+        values=found.values,
+        disparity=found.meaning == "inverse",
+        metric=found.meaning == "metric",
+        focal=found.focal_px,
     )
-    return _Layers(masks=tuple(masks), shadows=tuple(shadows), holes=tuple(holes), background=background)
 
 
-def _body(name: str, view: Camera, silhouette: Silhouette, options: ReconstructOptions, steps: _Steps) -> BodyMesh:
-    body, margin = build_mesh(view, silhouette, options.mesh_vertices)
-    if margin < 0.05:
-        steps.notice(f"{name}: may topple, its base does not carry its centre of mass; a larger thickness helps")
-    return body
+def _friction(answers: Answers | None, options: ReconstructOptions) -> float:
+    return ground_friction(answers, Ground().friction) if options.friction is None else options.friction
 
 
-def _metres_per_unit(
-    bodies: Sequence[BodyMesh], objects: Sequence[ObjectRequest], options: ReconstructOptions, steps: _Steps
+def _metres(
+    bodies: Sequence[Body],
+    physics: Sequence[ObjectPhysics],
+    estimate: ViewEstimate,
+    options: ReconstructOptions,
+    steps: Steps,
 ) -> float:
-    extents = [float(np.ptp(body.vertices, axis=0).max()) for body in bodies]
-    for extent, item in zip(extents, objects, strict=True):
-        if item.size_m is not None:
-            return item.size_m / extent
-    steps.notice(
-        f"no object has a size: the first one is taken to be {options.default_size_m:g} m large; set its size_m"
-    )
-    return options.default_size_m / extents[0]
-
-
-def _write(
-    folder: Path,
-    picture: Photo,
-    layers: _Layers,
-    view: Camera,
-    bodies: Sequence[BodyMesh],
-    names: Sequence[str],
-    objects: Sequence[ObjectRequest],
-    materials: Sequence[Any],
-    options: ReconstructOptions,
-    light: Light,
-    steps: _Steps,
-) -> Scene:
-    metres = _metres_per_unit(bodies, objects, options, steps)
-    bases = [_base_centre(body) for body in bodies]
-    origin = bases[0]
-    for sub in ("masks", "shadows", "holes", "meshes"):
-        (folder / sub).mkdir()
-    _save_png(folder / "photo.png", picture.pixels)
-    _save_png(folder / "background.png", layers.background)
-    depth = [float(view.project(base)[2]) for base in bases]
-    items = []
-    for i, name in enumerate(names):
-        for sub, layer in (("masks", layers.masks[i]), ("shadows", layers.shadows[i]), ("holes", layers.holes[i])):
-            _save_png(folder / sub / f"{name}.png", layer.astype(np.uint8) * 255)
-        texture = crop_texture(picture.pixels, layers.masks[i])
-        (folder / "meshes" / f"{name}.glb").write_bytes(glb_bytes(bodies[i], texture, bases[i], metres))
-        items.append(
-            SceneObject(
-                name=name,
-                mesh=f"meshes/{name}.glb",
-                world_from_mesh=world_from_gltf((bases[i] - origin) * metres),
-                size_m=float(np.ptp(bodies[i].vertices, axis=0).max()) * metres,
-                material=materials[i],
-                velocity=objects[i].velocity,
-                spin=objects[i].spin,
-                occlusion_order=sum(other < depth[i] for other in depth),
-                mask=f"masks/{name}.png",
-                shadow=f"shadows/{name}.png",
-            )
-        )
-    return Scene(
-        camera=cameras.scaled_to_metres(view, origin, metres),
-        objects=tuple(items),
-        ground=Ground(friction=options.friction),
-        light=light,
-    )
-
-
-def _base_centre(body: BodyMesh) -> NDArray[np.float64]:
-    """Middle (3,) of the part that rests on the ground, in world units."""
-    low = body.vertices[body.vertices[:, 2] <= 1e-6 * np.ptp(body.vertices[:, 2]) + 1e-12]
-    return np.array([*((low[:, :2].min(axis=0) + low[:, :2].max(axis=0)) / 2.0), 0.0])
+    """The scale, by the best that is known: what the user says, what was answered, a depth map, what is usual."""
+    extents, notice = [body.extent for body in bodies], steps.notice
+    for source in ("chosen", "asked", "named"):
+        sizes = [item.size_m if item.size_source == source else None for item in physics]
+        if source == "named" and estimate.metres_per_unit is not None:
+            break
+        if any(size is not None for size in sizes):
+            if source == "named":
+                notice("no object has a size: the scale is guessed from what such things usually measure; set a size_m")
+            return metres_per_unit(extents, sizes, estimate, options.default_size_m, notice)
+    return metres_per_unit(extents, [None] * len(bodies), estimate, options.default_size_m, notice)
 
 
 def _light(
     folder: Path,
     picture: Photo,
-    layers: _Layers,
+    layers: Layers,
     view: Camera,
-    silhouettes: Sequence[Silhouette],
+    bodies: Sequence[Body],
     options: ReconstructOptions,
-    steps: _Steps,
-) -> Light:
-    bare = [bare_mesh(view, silhouette) for silhouette in silhouettes]
+    steps: Steps,
+) -> tuple[Radiance, Light]:
     scene = LitScene(
         camera=view,
         ground=Ground(),
         pixels=picture.pixels,
         background=layers.background,
-        masks=layers.masks,
-        meshes=[(body.vertices, body.faces) for body in bare],
+        masks=layers.seen,
+        meshes=casters(view, layers.full, bodies),
     )
     given = None
     if options.environment is not None:
         given = prepared_environment(options.environment, options.environment_frame, view, scene.ground)
     radiance, light = estimate_light(scene, given, steps.notice, with_sun=options.sun)
     write_environment(folder / ENVIRONMENT_FILE, radiance)
-    return light
-
-
-def _save_png(path: Path, pixels: NDArray[np.uint8]) -> None:
-    Image.fromarray(pixels).save(path, format="PNG", compress_level=4)
+    return radiance, light

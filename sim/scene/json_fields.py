@@ -2,7 +2,7 @@
 """Reading JSON by a dataclass: every complaint names the field's path, the value and what was expected.
 
 Only the shapes that the project's own formats use are understood: nested dataclasses, tuples, optional values,
-strings, numbers and booleans. Unknown keys are refused, so that a misspelt field is never silently ignored.
+strings, paths, numbers and booleans. Unknown keys are refused, so that a misspelt field is never silently ignored.
 """
 
 from __future__ import annotations
@@ -100,7 +100,9 @@ def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
         return value
     if hint in (str, bool) and isinstance(value, hint):
         return value
-    names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    if hint is Path and isinstance(value, str) and value and "\0" not in value:
+        return Path(value)
+    names = {float: "a number", int: "a whole number", str: "a text", Path: "the path of a file", bool: "true or false"}
     raise InputError(f"{path}: expected {names.get(hint, hint)}, found {_brief(value)}")
 
 
@@ -115,4 +117,4 @@ def to_json(value: Any) -> Any:
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, tuple | list):
         return [to_json(item) for item in value]
-    return value
+    return value.as_posix() if isinstance(value, Path) else value

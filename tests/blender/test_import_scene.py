@@ -5,6 +5,7 @@ import io
 import json
 import math
 import shutil
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from physgen.physgen_addon.bridge import import_scene as bridge  # noqa: E402
 from physgen.physgen_addon.bridge.photo_image import load_photo_image  # noqa: E402
 from physgen.physgen_addon.operators.draw_box import add_box  # noqa: E402
 from physgen.physgen_addon.operators.photo import set_photo  # noqa: E402
-from physgen.physgen_addon.operators.reconstruct import arguments, scene_folder  # noqa: E402
+from physgen.physgen_addon.photo_request import arguments, scene_folder  # noqa: E402
 from physgen.physgen_addon.props.material import get_material  # noqa: E402
 from physgen.sim.errors import InputError  # noqa: E402
 from physgen.sim.scene.folder import SceneFolder, load_scene, save_scene  # noqa: E402
@@ -105,6 +106,38 @@ def test_the_texture_is_packed_and_laid_as_the_file_says(copy):
     item.data.loops.foreach_get("vertex_index", corner)
     expected = pixels[corner, :2] / (texture.size[0], texture.size[1])
     assert np.abs(uv.reshape(-1, 2) - np.column_stack([expected[:, 0], 1 - expected[:, 1]])).max() < 1e-5
+
+
+def colours_of(item):
+    """Which picture the camera sees on an imported object, and which the light."""
+    nodes = {node.label: node for node in item.data.materials[0].node_tree.nodes}
+    return tuple(nodes[f"Seen by the {who}"].inputs["Color"].links[0].from_node.image for who in ("camera", "light"))
+
+
+def test_light_meets_the_albedo_where_there_is_one(copy):
+    photo, lit = colours_of(bridge.import_scene(bpy.context.scene, copy.root).objects["ball"])
+    assert lit == photo
+    (copy.root / "albedo").mkdir()
+    Image.new("RGB", (copy.scene.camera.width, copy.scene.camera.height), (200, 100, 50)).save(
+        copy.root / "albedo" / f"{PurePosixPath(copy.scene.objects[0].mesh).stem}.png"
+    )
+    item = bridge.import_scene(bpy.context.scene, copy.root).objects["ball"]
+    photo, lit = colours_of(item)
+    assert item.data.materials[0].node_tree.nodes.active.image == photo != lit
+    assert lit.packed_file is not None and lit.colorspace_settings.name == "sRGB"
+    values = np.empty(4 * lit.size[0] * lit.size[1], dtype=np.float32)
+    lit.pixels.foreach_get(values)
+    assert values[:3] * 255 == pytest.approx([200, 100, 50], abs=0.6)
+
+
+def test_a_damaged_albedo_is_named_and_nothing_is_left(copy):
+    before = census()
+    (copy.root / "albedo").mkdir()
+    path = copy.root / "albedo" / f"{PurePosixPath(copy.scene.objects[0].mesh).stem}.png"
+    path.write_bytes(b"no picture")
+    with pytest.raises(InputError, match="albedo"):
+        bridge.import_scene(bpy.context.scene, copy.root)
+    assert census() == before
 
 
 def test_cycles_renders_the_photo_again(copy, world, tmp_path):
@@ -366,11 +399,11 @@ def test_boxes_become_the_commands_arguments(world, tmp_path):
     state.boxes[1].size_m = 0.2
     box = state.boxes[0]
     assert (box.x0, box.y0, box.x1, box.y1) == (0, 20, 70, 80)
-    state.use_pitch, state.pitch = True, math.radians(40)
+    state.camera, state.pitch = "PITCH", math.radians(40)
     found = arguments(state)
     assert found == [
         *(str(photo), "--box", f"80,20,{state.width},{state.height}", "0,20,70,80"),
-        *("--name", "cup_1", "cup_1_2", "--size", "0.2", "--pitch", "40"),
+        *("--name", "cup_1", "cup_1_2", "--size", "0.2", "--pitch=40"),
     ]
     assert scene_folder(state) == tmp_path / "coffee cup_scene"
     box.x1 = 3

@@ -29,13 +29,13 @@ from physgen.sim.diagnose.diagnosis import (
 )
 from physgen.sim.diagnose.report import parameter_text, pictures, write_report
 from physgen.sim.diagnose.report.gap import growth
-from physgen.sim.diagnose.report.markup import Picture, clean, element, text
 from physgen.sim.diagnose.report.object_picture import object_scores
 from physgen.sim.diagnose.report.quantities import number_text, percent_text, quantity_text
 from physgen.sim.diagnose.report.scene_entry import scene_effects
 from physgen.sim.diagnose.report.tracks import camera_plane
 from physgen.sim.diagnose.report.words import headline
 from physgen.sim.effects.registry import effects
+from physgen.sim.page.markup import Picture, clean, element, text
 
 NAN = math.nan
 FILES = {"report.html", "timeline.svg", "object.svg", "ranking.svg", "gap.svg", "tracks.svg"}

@@ -100,7 +100,8 @@ def test_the_manifest_of_the_tree_is_one_that_blender_takes(setup):
     patterns = manifest.pop("build")["paths_exclude_pattern"]
     assert len(patterns) == len(set(patterns))
     check_manifest(manifest)
-    assert set(manifest["permissions"]) == {"files", "clipboard"}, "PhysGen never asks for the network"
+    assert set(manifest["permissions"]) == {"files", "clipboard", "network"}
+    assert "agree" in manifest["permissions"]["network"], "nothing is sent without consent"
 
 
 def test_the_zip_holds_the_program_and_nothing_else(archive):

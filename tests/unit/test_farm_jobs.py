@@ -253,6 +253,6 @@ def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):
     assert last.argv[1:4] == tuple(f"results/balls/s1/frames/{c}" for c in ("0001-0009", "0011-0019", "0021-0023"))
     assert all(task.slots == {"gpu": 1} for task in plan.tasks if task.id.startswith("balls/") and task.stage == "bake")
     reconstruct = build_parser().parse_args(plan.tasks[0].argv)
-    assert reconstruct.name == ["-my cup"] and reconstruct.pitch == -5
+    assert reconstruct.name == ["-my cup"] and reconstruct.pitch_deg == -5
     varied = build_parser().parse_args(plan.tasks[1].argv)
     assert varied.velocity == [(-1.0, -1e-7, 0.1)] and varied.overrides == ["-my cup.density=300"]

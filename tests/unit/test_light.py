@@ -13,8 +13,8 @@ from physgen.sim.app.light import LightRequest, set_light
 from physgen.sim.app.reconstruct import reconstruct_scene
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.camera import camera_above_ground
-from physgen.sim.reconstruct.photo_environment import photo_environment
+from physgen.sim.reconstruct.light.photo_environment import photo_environment
+from physgen.sim.reconstruct.view.camera import camera_above_ground
 from physgen.sim.scene.environment import (
     prepared,
     read_environment,

@@ -11,13 +11,11 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from physgen.sim.errors import InputError
-from physgen.sim.reconstruct import camera as cameras
-from physgen.sim.reconstruct.horizon import estimate_pitch
-from physgen.sim.reconstruct.inflate import inflate, signed_distance, soap_film
-from physgen.sim.reconstruct.mask_cleanup import largest_component
-from physgen.sim.reconstruct.mesh import build_mesh
-from physgen.sim.reconstruct.texture import crop_texture, glb_bytes, world_from_gltf
+from physgen.sim.reconstruct.cut.mask_cleanup import largest_component
+from physgen.sim.reconstruct.shape.inflate import inflate, signed_distance, soap_film
+from physgen.sim.reconstruct.shape.mesh import build_mesh
+from physgen.sim.reconstruct.shape.texture import crop_texture, glb_bytes, world_from_gltf, worn
+from physgen.sim.reconstruct.view import camera as cameras
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
@@ -137,39 +135,6 @@ def test_ground_points_project_back_and_the_horizon_is_where_it_should_be():
     assert np.isinf(cameras.ground_depth(camera, camera.rays(np.array([[200.0, row - 5]])))).all()
 
 
-def test_focal_length_by_option_exif_and_default():
-    assert cameras.focal_px(400, 300, 500.0, None)[0] == 500.0
-    assert cameras.focal_px(400, 300, 500.0, 90.0)[0] == pytest.approx(200)
-    assert cameras.focal_px(400, 300, None, None)[0] == pytest.approx(200 / math.tan(math.radians(25)))
-
-
-def test_contacts_above_the_horizon_are_refused():
-    with pytest.raises(InputError, match="horizon"):
-        cameras.check_horizon(HEIGHT, FOCAL, math.radians(2), 120.0, "kite")
-
-
-@pytest.mark.parametrize("pitch_deg", [20.0, 40.0, 55.0])
-def test_pitch_is_read_from_tiles(pitch_deg):
-    camera = cameras.camera_above_ground(800, 600, 900.0, math.radians(pitch_deg))
-    rows, columns = np.mgrid[:600, :800] + 0.5
-    points = cameras.on_ground(camera, np.stack([columns, rows], axis=-1))
-    turn = math.radians(30)
-    a = points[..., 0] * math.cos(turn) + points[..., 1] * math.sin(turn)
-    b = points[..., 1] * math.cos(turn) - points[..., 0] * math.sin(turn)
-    with np.errstate(invalid="ignore"):
-        tiles = (np.floor(a / 0.3) + np.floor(b / 0.3)) % 2
-    tiles = np.where(np.isfinite(tiles) & (points[..., 1] < 8), tiles, 0.5)
-    photo = np.repeat((80 + 100 * tiles)[..., None], 3, axis=-1).astype(np.uint8)
-    found = estimate_pitch(photo, np.zeros((600, 800), bool), 900.0)
-    assert found is not None
-    assert math.degrees(found) == pytest.approx(pitch_deg, abs=3)
-
-
-def test_pitch_is_not_made_up_from_noise():
-    noise = np.random.default_rng(0).integers(90, 160, (300, 400, 3), dtype=np.uint8)
-    assert estimate_pitch(noise, np.zeros((300, 400), bool), FOCAL) is None
-
-
 SHAPES = {
     "disc": disc(),
     "ring": ring(),
@@ -237,8 +202,10 @@ def test_random_blobs_are_closed_and_touch_the_ground(seed, detail, pitch, thick
     body, _ = body_of(mask, pitch, thickness, vertices=2500)
     check_closed(body)
     assert body.vertices[:, 2].min() == 0.0
-    # Tendrils a pixel wide and a tenth as thick are lost; anything wider is not.
-    assert overlap(seen(body, view(pitch)), mask) > (0.8 if thickness == 0.1 else 0.93)
+    # Tendrils a pixel wide and a tenth as thick are lost, with what hangs on by them; anything wider is not.
+    held = ndimage.binary_dilation(largest_component(ndimage.binary_erosion(mask)), iterations=2) & mask
+    found = seen(body, view(pitch))
+    assert max(overlap(found, mask), overlap(found, held)) > (0.8 if thickness == 0.1 else 0.93)
 
 
 def test_texture_is_the_photo_inside_and_its_colours_outside():
@@ -260,7 +227,7 @@ def test_glb_keeps_order_uv_and_pixels():
     body, _ = body_of(mask)
     texture = crop_texture(photo, mask)
     centre = np.array([0.1, 2.0, 0.0])
-    data = glb_bytes(body, texture, centre, 0.25)
+    data = glb_bytes(worn(body, texture), centre, 0.25)
     loaded = trimesh.load(io.BytesIO(data), file_type="glb", process=False, force="mesh")
     assert len(loaded.vertices) == len(body.vertices)
     assert (loaded.faces == body.faces).all()

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Segmentation, shadows and the filled background, on drawn photos with known answers."""
+"""Segmentation and the filled background, on drawn photos with known answers."""
 
 import numpy as np
 import pytest
 from physgen.sim.composite.inpaint import FillOptions, inpaint
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.mask_cleanup import drop_ground_shadow, fill_holes, largest_component, settle_outline
-from physgen.sim.reconstruct.segment import check_distinct, pixel_box, segment
-from physgen.sim.reconstruct.shadow import find_shadow, ground_brightness, object_holes
+from physgen.sim.reconstruct.cut.mask_cleanup import drop_ground_shadow, fill_holes, largest_component, settle_outline
+from physgen.sim.reconstruct.cut.segment import check_distinct, pixel_box, segment
 from scipy import ndimage
 
 WIDTH, HEIGHT = 320, 240
@@ -147,51 +146,9 @@ def test_the_same_object_twice_is_refused_and_neighbours_are_not():
     first, second = disc(100, 120, 40), disc(104, 122, 38)
     with pytest.raises(InputError, match="same object"):
         check_distinct([first, second], ["a", "b"])
-    with pytest.raises(InputError, match="same object"):
-        check_distinct([first, disc(100, 120, 10)], ["a", "b"])
+    # A thing on another one lies within its outline.
+    check_distinct([first, disc(100, 120, 10)], ["a", "b"])
     check_distinct([first, disc(170, 120, 38)], ["a", "b"])
-
-
-def _shadow_scene():
-    mask = disc(150, 110, 40)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    truth = (((columns - 185) / 55) ** 2 + ((rows - 148) / 12) ** 2 < 1) & ~mask
-    return paint([(mask, (200, 60, 50))], [truth]), mask, truth
-
-
-def test_shadow_is_found_on_the_ground_only():
-    photo, mask, truth = _shadow_scene()
-    shadow = find_shadow(ground_brightness(photo), mask, np.zeros_like(mask), horizon_row=30.0)
-    assert overlap(shadow, truth) > 0.75
-    assert not (shadow & mask).any()
-    assert not shadow[:100].any()
-
-
-def test_no_shadow_without_one():
-    mask = disc(150, 110, 40)
-    photo = paint([(mask, (200, 60, 50))])
-    shadow = find_shadow(ground_brightness(photo), mask, np.zeros_like(mask), horizon_row=30.0)
-    assert shadow.sum() < 0.03 * mask.sum()
-
-
-def test_fixed_threshold_of_the_paper():
-    photo, mask, truth = _shadow_scene()
-    grey = ground_brightness(photo)
-    none = find_shadow(grey, mask, np.zeros_like(mask), horizon_row=30.0, fixed_threshold=20)
-    some = find_shadow(grey, mask, np.zeros_like(mask), horizon_row=30.0, fixed_threshold=100)
-    assert not none.any()
-    assert overlap(some, truth) > 0.7
-
-
-def test_holes_hold_mask_and_shadow_but_no_neighbour():
-    first, second = disc(100, 120, 30), disc(165, 120, 30)
-    shadow = disc(100, 160, 12)
-    holes = object_holes([first, second], [shadow, np.zeros_like(first)], 21)
-    assert holes[0][first].all()
-    assert holes[0][shadow].all()
-    assert not holes[0][second].any()
-    assert not holes[1][first].any()
-    assert holes[0].sum() > (first | shadow).sum()
 
 
 @pytest.mark.parametrize("by_row", [False, True])
@@ -230,3 +187,60 @@ def test_no_hole_and_no_background():
     assert (inpaint(photo, empty, empty) == photo).all()
     with pytest.raises(InputError, match="no background"):
         inpaint(photo, ~empty, ~empty)
+
+
+def test_object_behind_another_keeps_both_its_parts_and_nothing_of_the_other():
+    bar = disc(150, 120, 60) & (np.abs(np.arange(WIDTH) - 150) < 14)
+    truth = disc(150, 120, 60) & ~bar
+    photo = paint([(truth, (40, 80, 190)), (bar, (200, 60, 50))])
+    mask = segment(photo, (75, 45, 225, 195), "ball", others=bar)
+    assert not (mask & bar).any()
+    assert overlap(mask, truth) > 0.95
+
+
+def test_other_objects_that_fill_the_box_are_refused():
+    with pytest.raises(InputError, match="fill its whole box"):
+        segment(paint([]), (75, 45, 225, 195), "ball", others=np.ones((HEIGHT, WIDTH), bool))
+
+
+def test_two_things_in_a_box_are_told_and_one_is_not():
+    told = []
+    first, second = disc(100, 120, 32), disc(200, 125, 28)
+    photo = paint([(first, (40, 80, 190)), (second, (50, 90, 180))])
+    mask = segment(photo, (55, 75, 245, 170), "balls", warn=told.append)
+    assert any("two separate things" in message for message in told)
+    assert overlap(mask, first) > 0.9
+    told.clear()
+    segment(photo, (55, 75, 145, 170), "ball", warn=told.append)
+    assert not told
+
+
+def test_an_object_cut_by_the_photo_is_told():
+    told = []
+    mask = segment(paint([(disc(300, 120, 45), (40, 80, 190))]), (240, 60, 320, 180), "ball", warn=told.append)
+    assert mask[:, -1].any()
+    assert any("right edge of the photo" in message for message in told)
+    assert not any("its box" in message for message in told)
+
+
+def test_glass_is_told():
+    truth = disc(150, 120, 45)
+    photo = ground(4)
+    rim = truth & ~disc(150, 120, 42)
+    photo[rim] = 60.0
+    photo = np.clip(ndimage.gaussian_filter(photo, (0.5, 0.5, 0)), 0, 255).astype(np.uint8)
+    told = []
+    segment(photo, (95, 65, 205, 175), "glass", warn=told.append)
+    assert any("much like its surroundings" in message or "colour does not tell" in message for message in told)
+    told.clear()
+    segment(paint([(truth, (40, 80, 190))], seed=4), (95, 65, 205, 175), "ball", warn=told.append)
+    assert not told
+
+
+def test_contact_shadow_stays_on_the_ground():
+    truth = disc(150, 110, 40)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    shadow = (((columns - 170) / 50) ** 2 + ((rows - 148) / 12) ** 2 < 1) & ~truth
+    mask = segment(paint([(truth, (200, 60, 50))], [shadow]), (85, 55, 240, 175), "ball")
+    assert overlap(mask, truth) > 0.93
+    assert (mask & shadow).sum() < 0.15 * shadow.sum()

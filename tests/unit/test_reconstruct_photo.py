@@ -2,6 +2,7 @@
 """Photos of all kinds, sound and damaged."""
 
 import io
+import math
 import struct
 import time
 import warnings
@@ -12,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.photo import load_photo
+from physgen.sim.reconstruct.view.exif_focal import focal_from_exif
 from PIL import Image, ImageCms
 
 
@@ -89,6 +91,70 @@ def test_exif_focal_length(tmp_path):
     Image.fromarray(gradient(600, 400)).save(tmp_path / "photo.jpg", exif=exif)
     photo = load_photo(tmp_path / "photo.jpg", 1920)
     assert photo.exif_focal_px == pytest.approx(600 * 50 / 36, rel=1e-6)
+
+
+def photo_with(path, details=None, base=None, size=(600, 400)):
+    exif = Image.Exif()
+    exif.update(base or {})
+    exif.get_ifd(0x8769).update(details or {})
+    Image.fromarray(gradient(*size)).save(path, exif=exif)
+    return load_photo(path, 1920)
+
+
+def test_focal_length_from_the_sensors_resolution(tmp_path):
+    # Canon EOS 40D: 3888 pixels in 0.876 inch, 50 mm.
+    tags = {0x920A: 50.0, 0xA20E: 3888 / 0.876, 0xA20F: 2592 / 0.584, 0xA210: 2, 0xA002: 3888, 0xA003: 2592}
+    photo = photo_with(tmp_path / "photo.jpg", tags)
+    assert photo.exif_focal_px == pytest.approx(600 * 50 / (0.876 * 25.4), rel=1e-3)
+    assert "sensor" in photo.exif_source
+    # A resolution of the thumbnail gives a sensor of a few centimetres: not believed.
+    assert photo_with(tmp_path / "photo.jpg", {**tags, 0xA20E: 100.0, 0xA20F: 100.0}).exif_focal_px is None
+
+
+def test_focal_length_from_a_known_sensor(tmp_path):
+    base = {0x010F: "Canon", 0x0110: "Canon EOS 5D Mark III"}
+    photo = photo_with(tmp_path / "photo.jpg", {0x920A: 50.0}, base)
+    assert photo.exif_focal_px == pytest.approx(600 * 50 / 36, rel=1e-3)
+    assert photo.exif_focal_sigma > 0.02
+    assert photo_with(tmp_path / "photo.jpg", {0x920A: 50.0}, {0x010F: "Nobody", 0x0110: "X1"}).exif_focal_px is None
+    assert photo_with(tmp_path / "photo.jpg", {0x920A: 50.0, 0xA405: 75}, base).exif_focal_px == pytest.approx(
+        75 / math.hypot(36, 24) * math.hypot(600, 400)
+    )
+
+
+def test_a_cropped_photo_keeps_its_focal_length_in_pixels(tmp_path):
+    tags = {0xA405: 26, 0xA002: 4000, 0xA003: 3000}
+    whole = photo_with(tmp_path / "photo.jpg", tags, size=(800, 600))
+    # The middle square of it: the same lens, fewer columns.
+    square = photo_with(tmp_path / "photo.jpg", tags, size=(600, 600))
+    assert square.exif_focal_px == pytest.approx(whole.exif_focal_px)
+    assert square.exif_focal_sigma > 3 * whole.exif_focal_sigma
+    assert "cropped" in square.exif_source
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_turned_photo_is_not_taken_for_a_cropped_one(tmp_path, orientation):
+    tags = {0xA405: 26, 0xA002: 4000, 0xA003: 3000}
+    photo = photo_with(tmp_path / "photo.jpg", tags, {0x0112: orientation}, size=(800, 600))
+    assert photo.exif_focal_px == pytest.approx(1000 * 26 / math.hypot(36, 24))
+    assert "cropped" not in photo.exif_source
+
+
+_values = st.one_of(
+    st.none(),
+    st.integers(-(2**40), 2**40),
+    st.floats(),
+    st.sampled_from(["", "Canon", "LEICA M", b"\xff", (1, 0), "1/0"]),
+)
+
+
+@given(
+    details=st.dictionaries(st.sampled_from([0xA405, 0x920A, 0xA404, 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210]), _values),
+    base=st.dictionaries(st.sampled_from([0x010F, 0x0110]), _values),
+)
+def test_whatever_stands_in_exif_the_focal_length_is_sound_or_none(details, base):
+    found = focal_from_exif(base, details, 640, 480)
+    assert found is None or (0.01 < found.per_diagonal < 500 and found.sigma > 0)
 
 
 def test_forty_megapixels_within_seconds(tmp_path):

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 WIDTH, HEIGHT = 360, 270
 BALL = (95, 105, 175, 185)
-CRATE = (215, 85, 300, 195)
+CRATE = (215, 91, 300, 203)
 QUICK = ReconstructOptions(mesh_vertices=2000, pitch_deg=25.0, patch_radius=3)
 
 
@@ -30,7 +30,7 @@ def draw_photo():
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     ball = (columns - 135) ** 2 + (rows - 145) ** 2 < 35**2
     shadow = (((columns - 165) / 42) ** 2 + ((rows - 176) / 9) ** 2 < 1) & ~ball
-    crate = (np.abs(columns - 257) < 32) & (np.abs(rows - 140) < 42)
+    crate = (np.abs(columns - 257) < 32) & (np.abs(rows - 146) < 42)
     image[shadow] *= 0.45
     image[ball] = np.array([205, 50, 40]) + rng.normal(scale=5, size=(int(ball.sum()), 3))
     image[crate] = np.array([40, 70, 170]) + rng.normal(scale=5, size=(int(crate.sum()), 3))

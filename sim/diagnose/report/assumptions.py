@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 
+from ...page.markup import shortened
 from ..capture import Capture, CaptureObject
-from .markup import shortened
 from .quantities import number_text, quantity_text
 
 MAX_OBJECTS = 8

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .markup import short
+from ...page.markup import short
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...page.markup import Markup, Picture, element, join, label, shortened
 from ..capture import Capture, Trial
 from ..diagnosis import Diagnosis, TrialArrays
 from .axes import Scale, curve
-from .markup import Markup, Picture, element, join, label, shortened
 from .quantities import axis_unit, quantity_text, tick_text
 from .tracks import camera_plane, mean_where
 from .words import found_effects, found_label

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from ...page.markup import Markup, Picture, element, join, label, shortened
 from ..capture import Capture, CaptureObject
 from ..diagnosis import Diagnosis
 from .axes import round_up
 from .colour_map import colours, hex_colour
-from .markup import Markup, Picture, element, join, label, shortened
 from .quantities import number_text, percent_text, tick_text
 from .raster import Raster, View, rasterise, simplified
 

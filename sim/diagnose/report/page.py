@@ -8,18 +8,18 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 
+from ...page.markup import Markup, Picture, element, join, shortened
+from ...page.style import page_style
 from ...version import VERSION
 from ..capture import Capture
 from ..diagnosis import NONE, UNKNOWN, Diagnosis
 from .assumptions import assumptions
 from .gap import gap_bars
-from .markup import Markup, Picture, element, join, shortened
 from .object_picture import VIEWS
 from .pictures import Pictures
 from .quantities import number_text, percent_text, quantity_text
 from .ranking import split, table
 from .scene_entry import scene_effects_json
-from .style import page_style
 from .timeline import bands
 from .words import (
     DIRECTIONS,

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...page.markup import Picture, side_by_side
 from ..capture import Capture
 from ..diagnosis import Diagnosis
 from .gap import bars_picture, growth_picture
-from .markup import Picture, side_by_side
 from .object_picture import object_pictures
 from .ranking import ranking_picture
 from .timeline import is_root, timeline_picture

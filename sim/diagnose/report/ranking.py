@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 
+from ...page.markup import Markup, Picture, element, join, label, shortened
 from ..analysis import Estimate
 from ..diagnosis import Diagnosis, RankedEffect
 from .axes import Scale
-from .markup import Markup, Picture, element, join, label, shortened
 from .quantities import NOTHING, estimate_text, percent_text, quantity_text
 from .words import effect_label, found_effects
 

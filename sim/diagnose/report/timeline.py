@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...page.markup import Markup, Picture, element, join, label, moved, shortened
 from ..analysis import PHASES
 from ..capture import Capture
 from ..diagnosis import Diagnosis, IntervalShare
 from .axes import Scale, curve, peaks, round_up
-from .markup import Markup, Picture, element, join, label, moved, shortened
 from .quantities import number_text, percent_text, tick_text
 from .words import PHASES as PHASE_WORDS
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...page.markup import Markup, Picture, element, join, label, short, shortened
 from ..capture import Capture
 from ..diagnosis import Diagnosis
 from .axes import curve
-from .markup import Markup, Picture, element, join, label, short, shortened
 from .quantities import axis_unit, quantity_text, tick_text, with_unit
 from .tracks import Path, TakeTracks, take_tracks
 from .words import found_effects, found_label

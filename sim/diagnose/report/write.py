@@ -6,11 +6,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...atomic import write_bytes
+from ...page.theme import picture_style
 from ..capture import Capture
 from ..diagnosis import PAGE_FILE, Diagnosis
 from .page import page
 from .pictures import draw
-from .theme import picture_style
 
 
 def write_report(diagnosis: Diagnosis, capture: Capture, out: Path) -> None:

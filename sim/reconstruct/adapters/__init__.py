@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: MIT
+"""A user's own models in place of stages: Python functions, programs, ONNX files (docs/adapters.md)."""
+
+from .crop import object_crop
+from .protocols import Depth, DepthEstimator, Inpainter, Mesher, Segmenter
+from .resolve import resolve
+
+__all__ = ["Depth", "DepthEstimator", "Inpainter", "Mesher", "Segmenter", "object_crop", "resolve"]

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""From what an option says to what takes the stage's place.
+
+python:MODULE:FUNCTION, python:FILE.py:FUNCTION   a function as ``protocols`` says
+command:FILE.toml                                 a program (``command_file``)
+lama:FILE.onnx                                    inpainting by LaMa through onnxruntime (``lama``)
+picture:FILE                                      inpainting from a picture without the objects (``picture``)
+NAME                                              one of these under a name (``names``)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, overload
+
+from ...errors import InputError
+from ...events import IsCancelled, never
+from .command import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
+from .command_file import read_command_file
+from .lama import load_lama
+from .names import KINDS, named_adapters, split_spec
+from .picture import load_picture
+from .protocols import STAGES, DepthEstimator, Inpainter, Mesher, Segmenter
+from .python_function import (
+    DepthFunction,
+    InpainterFunction,
+    MesherFunction,
+    SegmenterFunction,
+    checked_function,
+    load_function,
+)
+
+_FUNCTIONS: dict[str, Callable[[Callable[..., Any], str], Any]] = {
+    "segmenter": SegmenterFunction,
+    "inpainter": InpainterFunction,
+    "depth_estimator": DepthFunction,
+    "mesher": MesherFunction,
+}
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "segmenter": SegmenterCommand,
+    "inpainter": InpainterCommand,
+    "depth_estimator": DepthCommand,
+    "mesher": MesherCommand,
+}
+
+
+@overload
+def resolve(
+    stage: Literal["segmenter"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+) -> Segmenter: ...
+@overload
+def resolve(
+    stage: Literal["inpainter"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+) -> Inpainter: ...
+@overload
+def resolve(
+    stage: Literal["depth_estimator"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+) -> DepthEstimator: ...
+@overload
+def resolve(stage: Literal["mesher"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...) -> Mesher: ...
+def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path | None = None) -> Any:
+    """What ``spec`` names, as ``protocols`` has ``stage``: files are opened and modules imported, nothing is run yet.
+
+    cancelled: asked while a program runs; a Python function is not interrupted. names: the user's file of names, in
+    place of the environment's.
+    Calls raise InputError that names the adapter: for what the user's code raises, for an answer that its stage cannot
+    use. Raises InputError for what cannot be found or cannot be that stage.
+    """
+    if stage not in STAGES:
+        raise InputError(f"stage {stage!r}: there is none of that name; choose one of {', '.join(STAGES)}")
+    parts = split_spec(spec)
+    if parts is not None:
+        return _of_kind(stage, *parts, cancelled)
+    known = named_adapters(names)
+    for adapter in known:
+        if (adapter.stage, adapter.name) != (stage, spec):
+            continue
+        if adapter.spec is not None:
+            kind, _, target = adapter.spec.partition(":")
+            return _of_kind(stage, kind, target, cancelled)
+        assert adapter.entry_point is not None
+        where = f"adapter {spec} of {adapter.source}"
+        try:
+            function = adapter.entry_point.load()
+        # A user's package may fail in any way.
+        except Exception as error:
+            raise InputError(f"{where}: cannot be imported ({type(error).__name__}: {error})") from error
+        return _FUNCTIONS[stage](checked_function(function, stage, where), where)
+    shown = ", ".join(a.name for a in known if a.stage == stage) or "none"
+    raise InputError(
+        f"{stage} {spec!r}: there is no adapter of that name (known: {shown}); give a name, or one of "
+        f"{', '.join(f'{kind}:…' for kind in KINDS)} (docs/adapters.md)"
+    )
+
+
+def _of_kind(stage: str, kind: str, target: str, cancelled: IsCancelled) -> Any:
+    where = f"adapter {kind}:{target}"
+    if not target:
+        raise InputError(f"{where}: names nothing; give {kind}:… with a path or name (docs/adapters.md)")
+    if kind == "python":
+        return _FUNCTIONS[stage](load_function(target, stage, where), where)
+    path = Path(target).expanduser().absolute()
+    if kind == "command":
+        return _COMMANDS[stage](read_command_file(path, stage), cancelled)
+    if stage != "inpainter":
+        raise InputError(f"{where}: fills holes, it is no {stage}")
+    return load_lama(path, where) if kind == "lama" else load_picture(path, where)

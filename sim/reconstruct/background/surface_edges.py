@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""Where one surface ends and another begins behind a hole: a wall on the floor, a table's edge.
+
+Such an edge is straight, is seen on both sides of the hole, and what lies above it differs from what lies below it. A
+line is taken for one only if two surfaces, each with its own slow light, explain the colours much better than one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.float32]
+
+COARSE = 40
+"""Longer side in pixels of the copy in which lines are tried."""
+AROUND = 0.6
+"""How much of the photo around a hole is looked at, over the hole's size."""
+STEEPEST = 0.15
+"""Most that a line falls, over its way across: steeper ones are corners of walls, where both sides are alike."""
+LEAST = 0.08
+"""Share of what is seen that must lie on each side."""
+GAIN, CLEARLY = 0.2, 0.28
+"""Logarithm of the likelihood, each pixel, that two surfaces gain over one; the same with the step over the line. Below
+either, there is but one surface."""
+STEP, STEPS, UNUSUAL = 0.06, 0.8, 2.5
+"""Difference of colours over a line, in logarithms; share of a line's places that must show it, on either side of the
+hole: where nothing changes no surface ends."""
+MOST_STEP = 0.35
+"""Above this a step is no more of an edge."""
+LEAST_ERROR = 0.02
+"""Standard deviation in logarithms below which a surface is told no better from another."""
+RIDGE = 1e-3
+"""Pull of polynomials to zero, over the weight of the data."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A line a x + b y = c in the photo, b > 0, a² + b² = 1, in pixels."""
+
+    a: float
+    b: float
+    c: float
+
+    def height(self, shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Signed distance (H, W) of the pixels' centres in pixels, positive below."""
+        y, x = np.ogrid[: shape[0], : shape[1]]
+        return np.asarray(self.a * (x + 0.5) + self.b * (y + 0.5) - self.c, dtype=np.float32)
+
+    def below(self, shape: tuple[int, int]) -> Mask:
+        """The pixels (H, W) below."""
+        return np.asarray(self.height(shape) > 0.0)
+
+
+def edges_through(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
+    """Edges that pass behind ``part`` (H, W), none or one.
+
+    logs: (H, W, 3) logarithms of the photo's values, true where not ``closed``.
+    """
+    rows, columns = _window(part)
+    known, inner = ~closed[rows, columns], part[rows, columns]
+    scale = min(1.0, COARSE / max(known.shape))
+    size = (max(8, round(known.shape[1] * scale)), max(8, round(known.shape[0] * scale)))
+    share, cut = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) for mask in (known, inner))
+    values = np.where(known[..., None], logs[rows, columns], 0.0).astype(np.float32)
+    sums = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    small = np.asarray(sums / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
+    found = _best_line(small, np.asarray(share > 0.9), np.asarray(cut > 0.5))
+    if found is None:
+        return []
+    left, right, step = found
+    ratio = known.shape[0] / size[1]
+    ends = _settled(values, known, (left * ratio, right * ratio), step, ratio)
+    width = columns.stop - columns.start
+    slope = (ends[1] - ends[0]) / width
+    length = float(np.hypot(slope, 1.0))
+    a, b = -slope / length, 1.0 / length
+    return [Edge(a=a, b=b, c=a * columns.start + b * (ends[0] + rows.start))]
+
+
+def _window(part: Mask) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
+    room = round(AROUND * max(np.ptp(rows), np.ptp(columns))) + 8
+    return (
+        slice(max(0, int(rows[0]) - room), min(part.shape[0], int(rows[-1]) + 1 + room)),
+        slice(max(0, int(columns[0]) - room), min(part.shape[1], int(columns[-1]) + 1 + room)),
+    )
+
+
+def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, NDArray[np.float64]] | None:
+    """Rows at which the best line enters at the left and leaves at the right, and the colour's step down over it."""
+    height, width = known.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=-1)[known]
+    target = small[known].astype(np.float64)
+    if len(basis) < 60 or not cut.any():
+        return None
+    at_y, at_x = (axis + 0.5 for axis in np.nonzero(known))
+    cut_y, cut_x = (axis + 0.5 for axis in np.nonzero(cut))
+    # A little of a flat prior, so that a side of few pixels is not explained by the swing of its polynomial.
+    ridge = RIDGE * len(basis) * np.diag([0.0, 1, 1, 1, 1, 1])
+    powers = np.square(target).sum(axis=1)
+    squares, products, power = basis.T @ basis, basis.T @ target, float(powers.sum())
+
+    def left_over(squares: NDArray[np.float64], products: NDArray[np.float64]) -> float:
+        solved = np.linalg.solve(squares + ridge + 1e-9 * np.eye(6), products)
+        return -float((products * solved).sum())
+
+    def cost(error: float, count: int) -> float:
+        """Negative logarithm of the likelihood of pixels that are spread evenly by ``error`` in all."""
+        return 0.5 * count * float(np.log(max(error, 0.0) / count + 3 * LEAST_ERROR**2))
+
+    changes = _changes(small, known, cut)
+    whole = cost(power + left_over(squares, products), len(basis))
+    best: tuple[float, float, float] | None = None
+    for left in range(1, height):
+        for right in range(1, height):
+            if abs(right - left) > STEEPEST * width or changes[left, right] < 0.0:
+                continue
+            line = left + (right - left) / width * cut_x
+            behind = float((cut_y > line).mean())
+            if not 0.03 < behind < 0.97:
+                continue
+            below = at_y > left + (right - left) / width * at_x
+            count = int(below.sum())
+            if min(count, len(below) - count) < LEAST * len(below):
+                continue
+            part = basis[below]
+            mine, my = part.T @ part, part.T @ target[below]
+            my_power = powers[below].sum()
+            # Each surface has a spread of its own: a table is plain, the room behind it is not.
+            error = cost(my_power + left_over(mine, my), count)
+            error += cost(power - my_power + left_over(squares - mine, products - my), len(below) - count)
+            # Edges far away are seen nearly level.
+            if whole - error < GAIN * len(basis):
+                continue
+            score = error + (abs(right - left) / width - float(changes[left, right])) * len(basis)
+            if best is None or score < best[0]:
+                best = (score, float(left), float(right))
+    if best is None or whole - best[0] < CLEARLY * len(basis):
+        return None
+    distance = at_y - (best[1] + (best[2] - best[1]) / width * at_x)
+    near_below, near_above = (distance > 0.5) & (distance < 4), (distance < -0.5) & (distance > -4)
+    if not near_below.any() or not near_above.any():
+        return None
+    return best[1], best[2], target[near_below].mean(axis=0) - target[near_above].mean(axis=0)
+
+
+def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
+    """For lines by the rows (h, h) where they enter and leave: how much colours change over them on that side of the
+    hole where they change less; negative where that is not enough for an edge."""
+    height, width = known.shape
+    middle = float(np.nonzero(cut)[1].mean()) + 0.5
+    x = np.arange(width) + 0.5
+    rows = np.arange(height, dtype=np.float64)
+    y = rows[:, None, None] + (rows[None, :, None] - rows[:, None, None]) / width * x
+    across = np.broadcast_to(np.arange(width), y.shape)
+    above, below = np.floor(y - 1.0).astype(int), np.floor(y + 1.0).astype(int)
+    inside = (above >= 0) & (below < height)
+    above, below = np.clip(above, 0, height - 1), np.clip(below, 0, height - 1)
+    seen = inside & known[above, across] & known[below, across]
+    # What changes everywhere, as grain of wood does, parts nothing.
+    both = known[2:] & known[:-2]
+    usual = np.median(np.linalg.norm(small[2:] - small[:-2], axis=-1)[both]) if both.any() else 0.0
+    change = np.where(seen[..., None], small[below, across] - small[above, across], 0.0)
+    step = np.linalg.norm(change, axis=-1) > max(STEP, 1.2 * usual)
+    least = np.full((height, height), MOST_STEP)
+    some = np.zeros((height, height), dtype=bool)
+    for side in (x < middle, x >= middle):
+        count = seen[..., side].sum(axis=-1)
+        share = step[..., side].sum(axis=-1) / np.maximum(count, 1)
+        # Steps up and down along a line, as over spots, are no edge either.
+        mean = np.linalg.norm(change[:, :, side].sum(axis=2), axis=-1) / np.maximum(count, 1)
+        # A hole that reaches the border of the picture is open there.
+        open_side = int((side & ~cut.any(axis=0)).sum()) < 2
+        enough = count >= 3
+        clear = enough & (share >= STEPS) & (mean >= max(STEP, UNUSUAL * usual))
+        least = np.minimum(least, np.where(clear, mean, np.where(open_side & ~enough, least, -1.0)))
+        some |= clear
+    return np.asarray(np.where(some, least, -1.0), dtype=np.float32)
+
+
+def _settled(
+    logs: Picture, known: Mask, ends: tuple[float, float], step: NDArray[np.float64], ratio: float
+) -> tuple[float, float]:
+    """``ends`` moved to where the colours change by ``step`` most suddenly."""
+    size = max(float(np.linalg.norm(step)), 1e-6)
+    plane = np.asarray(logs @ (step / size).astype(np.float32), dtype=np.float32)
+    seen = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
+    x = np.linspace(0.5, known.shape[1] - 0.5, min(known.shape[1], 400))
+    # Over a wider reach a sharp step is the same wherever it lies within: the last look is a near one.
+    for spacing, reach in ((max(ratio / 3.0, 0.5), 1.5), (max(ratio / 12.0, 0.25), 1.5), (0.25, 0.5)):
+        moves = spacing * np.arange(-5, 6)
+        shift = np.stack(np.meshgrid(moves, moves, indexing="ij"), axis=-1).reshape(-1, 2)
+        first, last = ends[0] + shift[:, :1], ends[1] + shift[:, 1:]
+        y = first + (last - first) * x / known.shape[1]
+        across = np.broadcast_to(x, y.shape).astype(np.float32) - np.float32(0.5)
+
+        def at(image: Picture, rows: NDArray[np.float64], across: NDArray[np.float32] = across) -> Picture:
+            return np.asarray(cv2.remap(image, across, (rows - 0.5).astype(np.float32), cv2.INTER_LINEAR))
+
+        weight = np.minimum(at(seen, y - 3.0), at(seen, y + 3.0))
+        change = np.clip(at(plane, y + reach) - at(plane, y - reach), -size, size)
+        total = weight.sum(axis=1)
+        score = np.where(total > 0.1 * len(x), (weight * change).sum(axis=1) / np.maximum(total, 1e-6), -np.inf)
+        # Of equals the one that was moved least.
+        score = score - 1e-6 * np.abs(shift).sum(axis=1)
+        index = int(np.argmax(score))
+        if np.isfinite(score[index]):
+            ends = (float(first[index, 0]), float(last[index, 0]))
+    return ends

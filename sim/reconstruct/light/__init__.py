@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The environment and the sun that explain the photo's shadows."""

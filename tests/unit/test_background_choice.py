@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""How a hole's filling is chosen, where the ground ends, and what a filling may not do."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from physgen.sim.composite.inpaint import FillOptions
+from physgen.sim.reconstruct.background.border import blend
+from physgen.sim.reconstruct.background.bounds import bounded
+from physgen.sim.reconstruct.background.fill import fill_background
+from physgen.sim.reconstruct.background.grain import as_grainy
+from physgen.sim.reconstruct.background.leftover import left_over
+from physgen.sim.reconstruct.background.shading import logarithms
+from physgen.sim.reconstruct.background.surface_edges import edges_through
+from physgen.sim.reconstruct.background.trial import choose, likeness, trial_holes
+from physgen.sim.reconstruct.background.ways import WAYS, Task
+from physgen.sim.reconstruct.view.camera import camera_above_ground, on_ground
+
+WIDTH, HEIGHT = 200, 150
+
+
+def camera(pitch=40.0):
+    return camera_above_ground(WIDTH, HEIGHT, 220.0, math.radians(pitch))
+
+
+def disc(x, y, radius):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def checks(side=0.25, samples=3):
+    """A chequered floor, float32."""
+    x, y = np.meshgrid((np.arange(WIDTH * samples) + 0.5) / samples, (np.arange(HEIGHT * samples) + 0.5) / samples)
+    at = on_ground(camera(), np.stack([x, y], axis=-1))
+    odd = (np.floor(at[..., 0] / side) + np.floor(at[..., 1] / side)) % 2 > 0
+    grey = np.where(odd, 180.0, 80.0).reshape(HEIGHT, samples, WIDTH, samples).mean(axis=(1, 3))
+    return np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
+
+
+def wood(seed, mean):
+    """Grain along the rows, float32."""
+    noise = np.random.default_rng(seed).normal(size=(HEIGHT, WIDTH, 1)).astype(np.float32)
+    return np.float32(mean) + 60.0 * cv2.GaussianBlur(noise, (0, 0), sigmaX=6.0, sigmaY=1.0)[..., None] * np.ones(
+        3, np.float32
+    )
+
+
+def test_a_floor_in_perspective_is_filled_from_above_and_a_flat_picture_is_not():
+    hole = disc(100, 85, 22)
+    nothing = np.zeros_like(hole)
+    floor = choose(Task(checks(), hole, nothing, camera(), FillOptions()), ("by rows", "as ground"))
+    assert floor.way == "as ground"
+    assert floor.scores["as ground"] > floor.scores["by rows"] + 1.0
+    assert floor.certain > 1.0
+    # Stripes that are equal all over the photo are no pattern of a plane in perspective.
+    columns = np.arange(WIDTH)[None, :] * np.ones((HEIGHT, 1))
+    stripes = np.where((columns // 6) % 2 > 0, 180.0, 80.0)[..., None] * np.ones(3)
+    flat = choose(Task(stripes.astype(np.float32), hole, nothing, camera(), FillOptions()), ("by rows", "as ground"))
+    assert flat.way == "by rows"
+
+
+def test_without_room_for_a_trial_the_photo_is_filled_by_rows_and_the_user_is_told():
+    said = []
+    photo = np.clip(wood(0, 120.0), 0, 255).astype(np.uint8)
+    hole = np.ones((HEIGHT, WIDTH), dtype=bool)
+    hole[:, :14] = False
+    assert trial_holes(hole, ~hole) == []
+    found = fill_background(photo, hole, hole, camera(), notice=said.append)
+    assert (found[~hole] == photo[~hole]).all()
+    assert len(said) == 1
+    assert "guess" in said[0]
+    assert "columns 14 to 200" in said[0]
+
+
+def test_trial_holes_lie_in_what_is_known_and_apart():
+    hole = disc(60, 75, 20)
+    known = ~hole & ~disc(150, 40, 15)
+    first, second = trial_holes(hole, known)
+    assert not (first & ~known).any()
+    assert not (second & ~known).any()
+    assert not (first & second).any()
+    assert min(first.sum(), second.sum()) >= 0.5 * hole.sum()
+
+
+def test_softness_and_glow_lose_against_the_right_texture():
+    truth = wood(1, 120.0)
+    hole = disc(100, 75, 30)
+    soft = np.where(hole[..., None], cv2.GaussianBlur(truth, (0, 0), 8.0), truth)
+    other = np.where(hole[..., None], np.roll(truth, 1, axis=1), truth)
+    assert likeness(truth, truth, hole) > likeness(other, truth, hole) > likeness(soft, truth, hole)
+    # Of equal squared error, the one without details loses.
+    error = float(np.sqrt(np.square(soft - truth)[hole].mean()))
+    shifted = np.where(hole[..., None], truth + error, truth)
+    assert likeness(shifted, truth, hole) > likeness(soft, truth, hole) + 1.0
+
+
+@pytest.mark.parametrize("border", [50, 62])
+def test_a_table_ends_before_a_cluttered_room(border):
+    table = wood(2, 110.0)
+    blocks = np.random.default_rng(3).uniform(20, 240, size=(10, 12, 3)).astype(np.float32)
+    room = cv2.resize(blocks, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+    room[border - 6 : border] = 225.0
+    photo = np.where(np.arange(HEIGHT)[:, None, None] < border, room, table).astype(np.float32)
+    hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    hole[25:105, 80:130] = True
+    (edge,) = edges_through(logarithms(photo), hole, hole)
+    line = (edge.c - edge.a * np.array([80.0, 130.0])) / edge.b
+    assert np.abs(line - border).max() < 2.5
+    found = fill_background(np.clip(photo, 0, 255).astype(np.uint8), hole, hole, camera(25.0)).astype(float)
+    # The wood does not climb up the room, nor the other way round.
+    assert np.abs(found[border + 4 : 100, 85:125].mean() - 110.0) < 15.0
+    assert np.abs(found[border - 5 : border - 2, 85:125].mean() - 225.0) < 25.0
+
+
+def test_grain_of_wood_is_no_border():
+    hole = disc(100, 75, 35)
+    for seed in range(3):
+        assert edges_through(logarithms(wood(seed, 120.0)), hole, hole) == []
+
+
+def test_no_glow_and_no_gloom_that_is_not_seen_around():
+    hole = disc(100, 75, 30)
+    around = 120.0 + 10.0 * np.linspace(-1, 1, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
+    for colour in ((1.8, 1.0, 0.6), (0.4, 0.4, 0.4), (1.0, 1.0, 1.0)):
+        filled = np.where(hole[..., None], around * np.array(colour), around).astype(np.float32)
+        kept = np.exp(bounded(np.log(filled), hole, ~hole))
+        assert np.abs(kept[~hole] - filled[~hole]).max() < 1e-3
+        deep = disc(100, 75, 20)
+        assert kept[deep].min() > 100.0
+        assert kept[deep].max() < 140.0
+    assert np.abs(kept - filled).max() < 1.5
+
+
+def test_shadow_outside_of_the_hole_is_no_source():
+    photo = wood(4, 130.0)
+    hole = disc(100, 60, 32)
+    shade = disc(100, 66, 34) & ~hole
+    photo[shade] *= 0.25
+    found = left_over(logarithms(photo), hole, hole)
+    assert (found & shade).sum() > 0.8 * shade.sum()
+    assert (found & ~shade).sum() < 0.5 * shade.sum()
+    filled = fill_background(np.clip(photo, 0, 255).astype(np.uint8), hole, hole, camera(60.0))
+    assert filled[hole].mean() > 110.0
+    assert (filled[disc(100, 60, 30)] < 60).mean() < 0.01
+    # Dark checks are part of the floor: they are seen farther away as well.
+    assert left_over(logarithms(checks()), hole, hole).sum() == 0
+
+
+def test_nothing_is_led_up_to_shade():
+    photo = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    hole = disc(100, 75, 30)
+    shade = ~hole & disc(100, 75, 40)
+    photo[shade] = 20
+    photo[hole] = 120
+    filling = np.full_like(photo, 120)
+    inner, thing = disc(100, 75, 26), disc(100, 75, 15)
+    assert blend(photo, filling, hole, thing)[inner].min() < 110
+    assert blend(photo, filling, hole, thing, shade)[inner].min() == 120
+
+
+def test_a_soft_filling_becomes_as_grainy_as_its_surroundings():
+    photo = wood(5, 120.0)
+    hole = disc(100, 75, 30)
+    deep = disc(100, 75, 24)
+    soft = np.where(hole[..., None], 120.0 + 0.6 * (photo - 120.0), photo).astype(np.float32)
+
+    def detail(picture):
+        return float((picture - cv2.GaussianBlur(picture, (0, 0), 1.0))[deep].std())
+
+    matched = as_grainy(soft, hole, ~hole)
+    assert abs(detail(matched) / detail(photo) - 1.0) < 0.25
+    assert detail(soft) < 0.65 * detail(photo)
+    flat = np.where(hole[..., None], np.float32(120.0), photo)
+    assert np.isfinite(as_grainy(flat, hole, ~hole)).all()
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+def test_every_way_fills_and_leaves_the_rest(way):
+    picture = checks()
+    hole = disc(100, 85, 18)
+    task = Task(np.where(hole[..., None], np.float32(-500.0), picture), hole, disc(30, 30, 10), camera(), FillOptions())
+    filled, again = WAYS[way](task), WAYS[way](task)
+    assert (filled[hole] > 20.0).all()
+    assert (filled == again).all()

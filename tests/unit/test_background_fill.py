@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The background behind what is taken out, on drawn surfaces whose hidden part is known."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from physgen.sim.composite.inpaint import FillOptions
+from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.background.border import blend
+from physgen.sim.reconstruct.background.conditional import conditional_mean, foreseen
+from physgen.sim.reconstruct.background.fill import fill_background
+from physgen.sim.reconstruct.background.shading import logarithms
+from physgen.sim.reconstruct.background.surface_edges import edges_through
+from physgen.sim.reconstruct.background.top_view import inside_photo, seen_from_above, seen_in_photo, views_of
+from physgen.sim.reconstruct.view.camera import camera_above_ground, on_ground
+
+WIDTH, HEIGHT = 240, 180
+
+
+def camera(pitch=40.0):
+    return camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(pitch))
+
+
+def tiles(view, side=0.22, samples=3):
+    """A tiled floor under slanting light, as ``view`` sees it, (H, W, 3) uint8."""
+    x, y = np.meshgrid((np.arange(WIDTH * samples) + 0.5) / samples, (np.arange(HEIGHT * samples) + 0.5) / samples)
+    at = on_ground(view, np.stack([x, y], axis=-1))
+    odd = (np.floor(at[..., 0] / side) + np.floor(at[..., 1] / side)) % 2 > 0
+    light = 0.75 + 0.2 * x / WIDTH
+    fine = np.where(odd, 190.0, 90.0) * light
+    grey = fine.reshape(HEIGHT, samples, WIDTH, samples).mean(axis=(1, 3))
+    noise = np.random.default_rng(0).normal(scale=1.5, size=grey.shape)
+    return np.clip(np.stack([grey + noise, 0.9 * grey + noise, 0.8 * grey + noise], axis=-1), 0, 255).astype(np.uint8)
+
+
+def disc(x, y, radius, shape=(HEIGHT, WIDTH)):
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def decibels(first, second, where):
+    return -10.0 * np.log10(np.mean(np.square((first[where].astype(float) - second[where]) / 255.0)))
+
+
+def test_tiles_go_on_behind_an_object_better_than_any_diffusion():
+    view = camera()
+    truth = tiles(view)
+    thing, hole = disc(120, 100, 24), disc(120, 100, 30)
+    photo = truth.copy()
+    photo[thing] = (30, 60, 200)
+    found = fill_background(photo, hole, thing, view)
+    assert (found[~hole] == photo[~hole]).all()
+    flat = max(
+        decibels(cv2.inpaint(photo, hole.astype(np.uint8), 5, kind), truth, hole)
+        for kind in (cv2.INPAINT_NS, cv2.INPAINT_TELEA)
+    )
+    assert decibels(found, truth, hole) > flat + 4.0
+    again = fill_background(photo, hole, thing, view)
+    assert (again == found).all()
+
+
+def test_a_floor_ends_at_its_wall_behind_the_object():
+    rows = np.mgrid[:HEIGHT, :WIDTH][0] + 0.5
+    columns = np.mgrid[:HEIGHT, :WIDTH][1] + 0.5
+    floor = rows > 80.0 + 0.05 * columns
+    grain = np.random.default_rng(1).normal(scale=2.0, size=(HEIGHT, WIDTH, 1))
+    truth = np.where(floor[..., None], (150.0, 110.0, 70.0), (190.0, 200.0, 205.0)) + grain
+    truth = np.clip(truth, 0, 255).astype(np.uint8)
+    thing, hole = disc(120, 86, 24), disc(120, 86, 30)
+    photo = truth.copy()
+    photo[thing] = 20
+    edges = edges_through(logarithms(photo.astype(np.float32)), hole, hole)
+    assert len(edges) == 1
+    assert (edges[0].below(hole.shape) != floor)[hole].mean() < 0.02
+    found = fill_background(photo, hole, thing, camera(20.0))
+    flat = decibels(cv2.inpaint(photo, hole.astype(np.uint8), 5, cv2.INPAINT_NS), truth, hole)
+    assert decibels(found, truth, hole) > flat + 4.0
+    # On one surface there is no edge to be found.
+    plain = np.full((HEIGHT, WIDTH, 3), 120.0, np.float32) + grain.astype(np.float32)
+    assert edges_through(logarithms(plain), hole, hole) == []
+
+
+def test_what_is_barred_is_no_source():
+    view = camera()
+    photo = np.full((HEIGHT, WIDTH, 3), 150, np.uint8)
+    hole = disc(100, 100, 20)
+    other = disc(150, 100, 26) & ~hole
+    photo[other] = (255, 0, 0)
+    found = fill_background(photo, hole, hole, view, barred=other)
+    assert np.abs(found[hole].astype(int) - 150).max() < 12
+    assert (found[other] == photo[other]).all()
+
+
+def test_no_object_shows_through_the_border():
+    photo = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    thing, hole = disc(120, 90, 30), disc(120, 90, 34)
+    photo[disc(120, 90, 31.5)] = 250
+    blended = blend(photo, np.full_like(photo, 100), hole, thing)
+    assert (blended[~hole] == photo[~hole]).all()
+    # The filling is led up to the photo's level at the border, and nothing is brighter than that.
+    assert blended[hole].max() <= 121
+    assert blended[disc(120, 90, 5)].max() <= 104
+    assert blended[hole & ~disc(120, 90, 33)].mean() > 112
+
+
+def test_a_view_from_above_and_back_is_the_photo():
+    view = camera(30.0)
+    photo = cv2.GaussianBlur(tiles(view), (0, 0), 1.0).astype(np.float32)
+    hole = disc(120, 130, 25)
+    ((above, part),) = views_of(view, hole, 400_000)
+    assert (part == hole).all()
+    rows, columns = slice(100, 160), slice(90, 150)
+    back = seen_in_photo(seen_from_above(photo, above), above, rows, columns)
+    inner = hole[rows, columns]
+    assert np.abs(back - photo[rows, columns])[inner].mean() < 2.0
+    assert not inside_photo(above, hole).all()
+
+
+def test_waves_are_foreseen_and_noise_is_not():
+    rows, columns = np.mgrid[:90, :110]
+    wave = np.sin(rows / 3.0 + columns / 5.0)
+    values = np.repeat(wave[..., None], 3, axis=2).astype(np.float32) * np.array([1.0, 0.5, 0.2], np.float32)
+    hole = disc(55, 45, 14, wave.shape)
+    found, certain = foreseen(np.where(hole[..., None], 9.0, values), ~hole, hole)
+    assert certain > 0.8
+    assert np.square(found - values)[hole].mean() < 0.15 * np.square(values[hole]).mean()
+    noise = np.random.default_rng(2).normal(size=values.shape).astype(np.float32)
+    found, certain = foreseen(noise, ~hole, hole)
+    assert certain < 0.1
+    assert np.abs(found[hole]).mean() < 0.3
+    assert (conditional_mean(noise, np.zeros_like(hole), 0.5) == 0).all()
+
+
+def test_a_photo_without_background_is_refused():
+    photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    everything = np.ones((HEIGHT, WIDTH), bool)
+    with pytest.raises(InputError, match="no background"):
+        fill_background(photo, everything, everything, camera())
+    with pytest.raises(InputError, match="hole is"):
+        fill_background(photo, everything[:9], everything, camera(), FillOptions())
+    nothing = np.zeros_like(everything)
+    assert (fill_background(photo, nothing, nothing, camera()) == photo).all()
