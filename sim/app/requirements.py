@@ -28,6 +28,7 @@ REQUIREMENTS = {
     "patchmatch": "pypatchmatch>=2.0,<3",
     "cv2": "opencv-python-headless>=4.10",
     "OpenImageIO": "openimageio>=3.0",
+    "yaml": "pyyaml>=6",
 }
 """Name to import → what to ask pip for; the widest of pyproject.toml."""
 

@@ -142,8 +142,9 @@ def reach(camera: Camera, other: Camera, pivot: FloatArray) -> tuple[float, floa
     """How far ``other`` is from ``camera``: degrees around ``pivot`` (3,), change of the distance to it over it."""
     here, there = camera.position - pivot, other.position - pivot
     near, far = float(np.linalg.norm(here)), float(np.linalg.norm(there))
-    cosine = float(here @ there) / max(near * far, 1e-12)
-    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0))), far / max(near, 1e-12) - 1.0
+    # Not by the cosine alone, which says nothing about angles below 1e-6.
+    angle = math.atan2(float(np.linalg.norm(np.cross(here, there))), float(here @ there))
+    return math.degrees(angle), far / max(near, 1e-12) - 1.0
 
 
 def check_reach(camera: Camera, other: Camera, *, pivot: FloatArray, ground: Ground, where: str) -> None:

@@ -92,7 +92,8 @@ def test_cylinders_and_cones_are_found_again(view, height, taper):
     a, b = found.radii
     # The wanted quarter: of a low stump seen from above, the outline shows little but its base.
     assert found.height * (a**2 + a * b + b**2) == pytest.approx(volume, rel=0.25)
-    assert overlap(drawn(found, camera, mask.shape, 0, 0), mask) > 0.98
+    # What an outline has to reach; of a mask of 1,500 pixels, 2 % are a quarter of a pixel all round.
+    assert overlap(drawn(found, camera, mask.shape, 0, 0), mask) > 0.97
 
 
 @CASES
