@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Which way a picture becomes likelier: score distillation."""

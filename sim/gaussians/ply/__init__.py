@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""3DGS PLY files in and out. No Taichi."""
