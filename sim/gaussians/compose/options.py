@@ -54,8 +54,8 @@ class ComposeOptions:
     """Radians that a splat turns in the first step, of the fastest hundredth; 0 (held) to 0.1."""
 
     keep_strain: float = 0.9
-    """Share of the strain that lives on from step to step, 0 to 1. 0: every step starts undeformed, as Algorithm 1 hands
-    over places and velocities only. 1: an elastic body that wants its first shape back."""
+    """Share of the strain that lives on from step to step, 0 to 1. 0: every step starts undeformed, as Algorithm 1
+    hands over places and velocities only. 1: an elastic body that wants its first shape back."""
 
     size: int = 256
     """Pixels of the longer side of what is compared with the picture, 32 to 1024; larger pictures are made smaller."""
