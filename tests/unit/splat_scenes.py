@@ -45,6 +45,27 @@ class Box:
         return np.linalg.norm(np.maximum(off, 0), axis=1) + np.minimum(off.max(axis=1), 0)
 
 
+class Ring:
+    """A torus around the z axis."""
+
+    def __init__(self, radius, thickness, height=0.0):
+        self.radius, self.thickness, self.height = radius, thickness, height
+
+    def depth(self, origin, rays):
+        """By steps of the distance, which never step through a surface."""
+        unit = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        flat = unit.reshape(-1, 3)
+        far = np.full(len(flat), max(0.0, np.linalg.norm(origin) - 2 * self.radius))
+        for _ in range(80):
+            far += self.distance(origin + far[:, None] * flat)
+        found = np.where(np.abs(self.distance(origin + far[:, None] * flat)) < 1e-3, far, np.inf)
+        return found.reshape(rays.shape[:-1]) / np.linalg.norm(rays, axis=-1)
+
+    def distance(self, points):
+        around = np.hypot(points[:, 0], points[:, 1]) - self.radius
+        return np.hypot(around, points[:, 2] - self.height) - self.thickness
+
+
 def cameras(count=16, side=96):
     """Cameras all around, at three heights, so that a hull has a top and a bottom."""
     heights = (35.0, -20.0, 5.0)
