@@ -2,6 +2,7 @@
 """Compositional assets out of Gaussian splats and meshes (PhyCAGE); docs/compositional-assets.md is the way in.
 
 splats.py        what a splat object is
+sample.py        splats on a mesh, in its colours
 ply/             3DGS PLY files in and out
 views/           pictures of an object from all around: cameras, masks, the hull that they leave, whose each point is
 raster/          pictures from splats and their gradients (Taichi)

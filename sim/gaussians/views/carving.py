@@ -119,8 +119,8 @@ class Lattice:
         return found[0].reshape(self.shape), found[1].reshape(self.shape)
 
     def surface(self, field: Array) -> tuple[Array, Faces]:
-        """Vertices (V, 3) and faces (T, 3) of the closed surface around the places where ``field`` is above 0; none where
-        there are no such places."""
+        """Vertices (V, 3) and faces (T, 3) of the closed surface around the places where ``field`` is above 0; none
+        where there are no such places."""
         field = field.copy()
         border = np.ones(self.shape, dtype=bool)
         border[1:-1, 1:-1, 1:-1] = False
