@@ -15,7 +15,7 @@ from ...errors import InputError
 MAX_PIXELS = 2**26
 """Of all the pictures of an object together: 1 GiB of colours and masks as float32."""
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 _DAMAGED = (OSError, UnidentifiedImageError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
 """What Pillow raises for garbage."""
 

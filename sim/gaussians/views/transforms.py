@@ -15,7 +15,7 @@ from .pictures import Budget, read_colours, read_share
 from .view import Picture, View, before_white
 
 TRANSFORMS = "transforms.json"
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 def read_views(source: Path, *, objects: Sequence[str] = ()) -> tuple[View, ...]:
