@@ -39,8 +39,8 @@ OPACITY = 0.97
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Colours of a mesh by a picture. uv: (V, 2) of each vertex, the origin at the bottom left; picture: (h, w, 3) uint8
-    sRGB, which repeats beyond 0 to 1."""
+    """Colours of a mesh by a picture. uv: (V, 2) of each vertex, the origin at the bottom left; picture: (h, w, 3)
+    uint8 sRGB, which repeats beyond 0 to 1."""
 
     uv: Array
     picture: NDArray[np.uint8]

@@ -194,6 +194,20 @@ def test_what_is_wrong_with_a_folder_is_said(tmp_path, change, said):
         read_views(folder)
 
 
+def test_opacity_that_is_none_is_no_mask(tmp_path):
+    frames = nerf_folder(tmp_path)
+    solid = np.ones((12, 16, 4))
+    solid[4:8, 6:10, :3] = 0.2
+    for index in range(2):
+        picture(tmp_path / f"train/r_{index}.png", solid)
+    label = np.zeros((12, 16))
+    label[4:8, 6:8] = 1 / 255
+    picture(tmp_path / "labels/r_1.png", label)
+    write(tmp_path, {"camera_angle_x": 0.8, "frames": frames})
+    first, second = read_views(tmp_path)
+    assert (first.mask == (solid[..., 0] < 1)).all() and (second.mask == (label > 0)).all()
+
+
 def test_links_that_lead_out_are_refused(tmp_path):
     nerf_folder(tmp_path / "views")
     picture(tmp_path / "secret.png", CLEAR)

@@ -44,15 +44,15 @@ class HullOptions:
     """How the hull is carved. Raises InputError on a value out of range."""
 
     resolution: int = 96
-    """Grid cells along the longest side of the object; 16 to 400."""
+    """Grid cells along the longest side of the object; 16 to 256."""
 
     dissent: float = 0.15
     """Share of the views that see a place and may have it outside, where the others would lack it; 0 to 0.45. 0 is the
     visual hull itself, through which every gap of any one mask cuts a tunnel."""
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.resolution, int) and 16 <= self.resolution <= 400):
-            raise InputError(f"hull option resolution is {self.resolution!r}: give a whole number from 16 to 400")
+        if not (isinstance(self.resolution, int) and 16 <= self.resolution <= 256):
+            raise InputError(f"hull option resolution is {self.resolution!r}: give a whole number from 16 to 256")
         if not (math.isfinite(self.dissent) and 0 <= self.dissent <= 0.45):
             raise InputError(f"hull option dissent is {self.dissent!r}: give a share from 0 to 0.45")
 
@@ -229,7 +229,7 @@ def _carved(
     if not len(faces):
         return lattice.surface(lenient)
     open_places = np.flatnonzero((strict.ravel() <= 0) & (lenient.ravel() > 0))
-    points = lattice.points()[open_places]
+    points = lattice.points(open_places)
     lacking = np.zeros(len(points), dtype=np.int64)
     for view in views:
         bare = (_mask(view) >= 0.5) & ~np.isfinite(depth_buffer(vertices, faces, view.camera))

@@ -39,14 +39,17 @@ class Budget:
 
 
 def read_colours(path: Path, budget: Budget) -> tuple[Colours, Colours | None]:
-    """Colours (H, W, 3) and opacity (H, W), both 0 to 1; None for pictures without transparency.
+    """Colours (H, W, 3) and opacity (H, W), both 0 to 1; None for pictures that are opaque all over.
 
     Raises InputError when the file is missing, no picture, or too large.
     """
     image = _opened(path, budget)
     if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         pixels = _shares(image.convert("RGBA"), 255)
-        return pixels[..., :3], pixels[..., 3]
+        # Many programs write opacity without having any.
+        if pixels[..., 3].min() < 1:
+            return pixels[..., :3], pixels[..., 3]
+        return pixels[..., :3], None
     return _shares(image.convert("RGB"), 255), None
 
 
