@@ -1,2 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pictures from splats, and the gradients of a loss on them (Taichi)."""
+"""Pictures of splats, and gradients back to them (Taichi).
+
+rasteriser.py    the way in: render, gradients
+projection.py    splats ↔ ellipses in the picture
+tiles.py         which splats each tile blends, in which order
+blending.py      ellipses ↔ pixels
+"""
