@@ -6,3 +6,6 @@ projection.py    splats ↔ ellipses in the picture
 tiles.py         which splats each tile blends, in which order
 blending.py      ellipses ↔ pixels
 """
+
+# Importing it keeps Taichi from greeting on standard output, which belongs to the caller's own results.
+from ... import mpm  # noqa: F401

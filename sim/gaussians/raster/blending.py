@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
-# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index, attr-defined"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Ellipses → pixels, front to back, and the gradients of pixels → gradients of ellipses, back to front.
@@ -11,11 +11,10 @@ ellipse, so no two threads ever add to the same number, and sums do not depend o
 
 import taichi as ti
 
-from .projection import ACROSS, ALONG, COLOUR, DEPTH, MIDDLE, OPACITY, REACH, SLANT, SUMS, Table
-from .tiles import Counts, Places, pixels_between, rows_of
+from .projection import ACROSS, ALONG, COLOUR, DEPTH, MIDDLE, OPACITY, REACH, SLANT, SUMS, Places, Reals2, Table
+from .tiles import Counts, pixels_between, rows_of
 
 vec3 = ti.types.vector(3, ti.f32)
-Reals2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 Layers = ti.types.ndarray(dtype=ti.f32, ndim=3)
 Image = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
@@ -53,7 +52,7 @@ def columns_of(ellipses: Table, i, y, first, last):
 
 @ti.func
 def alpha_of(opacity, u, v):
-    """Share of light held back, and what its logarithm's change means for it: α and ∂α/∂(opacity·G)·(opacity·G)."""
+    """α at (u, v), and its derivative by the logarithm of opacity·G."""
     whole = opacity * ti.exp(-0.5 * (u * u + v * v))
     alpha = ti.max(2.0 * whole - FADE, 0.0)
     slope = 2.0 * whole
@@ -106,10 +105,11 @@ def blend(
                         alpha, _ = alpha_of(opacity, u_start + step * ti.cast(x - start, ti.f32), v)
                         weight = alpha * light
                         light *= 1.0 - alpha
+                        # Not +=, which is atomic on arrays.
                         for c in ti.static(range(3)):
-                            pixels[y, x, c] += weight * colour[c]
+                            pixels[y, x, c] = pixels[y, x, c] + weight * colour[c]
                         pixels[y, x, LIGHT] = light
-                        pixels[y, x, MEAN_DEPTH] += weight * depth
+                        pixels[y, x, MEAN_DEPTH] = pixels[y, x, MEAN_DEPTH] + weight * depth
                         if light < LEAST_LIGHT:
                             open_pixels -= 1
                             last[y, x] = k

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
-# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index, attr-defined"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Splats → ellipses in the picture, and gradients of the ellipses → gradients of the splats. One splat a thread.
@@ -31,7 +31,10 @@ LOW_PASS = 0.3
 """Pixels² added to every ellipse's covariance, so that none falls between pixels (Kerbl et al. 2023)."""
 
 NEAREST = 0.01
-"""Metres in front of the camera from which a splat's centre is drawn."""
+"""Metres in front of the camera from which on a splat's centre is drawn."""
+
+FURTHEST = 1e9
+"""Metres from the world's origin along any axis up to which it is: beyond, nothing is left of a double's digits."""
 
 BESIDE = 0.15
 """Share of the picture's width (height) beside it, from which on J is that of the edge: further out, the linear
@@ -127,15 +130,18 @@ def project(
     camera: Doubles,
     low_pass: ti.f64,
     nearest: ti.f64,
+    furthest: ti.f64,
     ellipses: Table,
 ):
     """Write the ellipse of every splat."""
     for i in range(centres.shape[0]):
         view = view_of(camera)
-        p = view @ (load3(centres, i) - dvec3(camera[PLACE], camera[PLACE + 1], camera[PLACE + 2]))
+        centre = load3(centres, i)
+        within = ti.max(ti.abs(centre[0]), ti.abs(centre[1]), ti.abs(centre[2])) < furthest
+        p = view @ (centre - dvec3(camera[PLACE], camera[PLACE + 1], camera[PLACE + 2]))
         ellipses[i, DEPTH] = p[2]
         ellipses[i, REACH] = 0.0
-        if p[2] > nearest and opacities[i] > CUT_OFF:
+        if within and p[2] > nearest and opacities[i] > CUT_OFF:
             q = dvec4(rotations[i, 0], rotations[i, 1], rotations[i, 2], rotations[i, 3])
             spread = axes_of(q)
             for r in ti.static(range(3)):
@@ -153,7 +159,7 @@ def project(
 
 
 @ti.func
-def add_rotation(d_axes, q):
+def quaternion_gradient(d_axes, q):
     """Gradient of a unit quaternion's four numbers, through its normalisation, from R's."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     d = d_axes
@@ -189,7 +195,7 @@ def project_back(
     the splat's own numbers. In the order of the tiles: the same sum each time."""
     for n in range(ranked.shape[0]):
         i = ranked[n]
-        total, first, second, d_colour = dvec3(0.0), dvec3(0.0), dvec3(0.0), dvec3(0.0)
+        total, second, d_colour = dvec3(0.0), dvec3(0.0), dvec3(0.0)
         for slot in range(ti.cast(starts[n], ti.i32), ti.cast(starts[n + 1], ti.i32)):
             for c in ti.static(range(3)):
                 total[c] += sums[slot, c]
@@ -229,7 +235,7 @@ def project_back(
                 d_axes[r, c] *= scales[i, c]
             d_scales[i, c] = along_axis
             d_colours[i, c] = d_colour[c]
-        d_q = add_rotation(d_axes, q)
+        d_q = quaternion_gradient(d_axes, q)
         for c in ti.static(range(4)):
             d_rotations[i, c] = d_q[c]
         d_opacities[i] = total[0] / ellipses[i, OPACITY]

@@ -16,7 +16,7 @@ from ...mpm.runtime import ensure_started
 from ...scene.model import Camera
 from ..splats import Splats
 from .blending import LIGHT, MEAN_DEPTH, STATE, blend, blend_back
-from .projection import ELLIPSE, LOW_PASS, NEAREST, SUMS, numbers_of, project, project_back
+from .projection import ELLIPSE, FURTHEST, LOW_PASS, NEAREST, SUMS, numbers_of, project, project_back
 from .tiles import Pairs, pairs_of
 
 MOST_PIXELS = 2**26
@@ -111,6 +111,7 @@ class Rasteriser:
                 numbers,
                 LOW_PASS,
                 NEAREST,
+                FURTHEST,
                 ellipses,
             )
         pairs = pairs_of(ellipses, width, height, tile)

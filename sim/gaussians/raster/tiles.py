@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 # ruff: noqa: ANN001, ANN201
-# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index"
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type, index, attr-defined"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
 """Which splats each tile of the picture has to blend, nearest first.
@@ -17,9 +17,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .projection import ACROSS, ALONG, DEPTH, MIDDLE, REACH, SLANT, Table
+from .projection import ACROSS, ALONG, DEPTH, MIDDLE, REACH, SLANT, Places, Table
 
-Places = ti.types.ndarray(dtype=ti.i64, ndim=1)
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
 MOST_PAIRS = 16_000_000
@@ -67,8 +66,8 @@ def stretch(ellipses: Table, i, low, high):
 
 @ti.func
 def pixels_between(low, high, first, last):
-    """First and last of the pixels ``first`` to ``last`` whose centres lie between ``low`` and ``high``; the first after
-    the last if there is none."""
+    """First and last of the pixels ``first`` to ``last`` whose centres lie between ``low`` and ``high``; the first of
+    them after the last if there is none."""
     start = ti.min(ti.max(ti.ceil(low - 0.5), ti.cast(first, ti.f64)), ti.cast(last + 1, ti.f64))
     end = ti.max(ti.min(ti.floor(high - 0.5), ti.cast(last, ti.f64)), ti.cast(first - 1, ti.f64))
     return ti.cast(start, ti.i32), ti.cast(end, ti.i32)
@@ -99,8 +98,22 @@ def tiles_in_row(ellipses: Table, i, row, tile, width, height):
 
 
 @ti.kernel
-def count(ellipses: Table, ranked: Places, tile: ti.i32, width: ti.i32, height: ti.i32, counts: Places):
-    """Number of pairs of each drawn splat."""
+def find_pairs(
+    ellipses: Table,
+    ranked: Places,
+    starts: Places,
+    tile: ti.i32,
+    width: ti.i32,
+    height: ti.i32,
+    write: ti.i32,
+    counts: Places,
+    splats: Counts,
+    tiles: Counts,
+):
+    """Number of pairs of each drawn splat; with ``write`` their splats and tiles, from starts[n] on.
+
+    One kernel for both, as two might round differently and not fit each other.
+    """
     for n in range(ranked.shape[0]):
         i = ti.cast(ranked[n], ti.i32)
         found = 0
@@ -108,33 +121,13 @@ def count(ellipses: Table, ranked: Places, tile: ti.i32, width: ti.i32, height: 
         if top <= bottom:
             for row in range(top // tile, bottom // tile + 1):
                 first, last = tiles_in_row(ellipses, i, row, tile, width, height)
+                if write == 1:
+                    for column in range(first, last + 1):
+                        slot = ti.cast(starts[n], ti.i32) + found + column - first
+                        splats[slot] = i
+                        tiles[slot] = row * ((width + tile - 1) // tile) + column
                 found += last - first + 1
         counts[n] = found
-
-
-@ti.kernel
-def fill(
-    ellipses: Table,
-    ranked: Places,
-    starts: Places,
-    tile: ti.i32,
-    width: ti.i32,
-    height: ti.i32,
-    splats: Counts,
-    tiles: Counts,
-):
-    """Write the splat and the tile of each pair."""
-    for n in range(ranked.shape[0]):
-        i = ti.cast(ranked[n], ti.i32)
-        slot = starts[n]
-        top, bottom = rows_of(ellipses, i, 0, height - 1)
-        if top <= bottom:
-            for row in range(top // tile, bottom // tile + 1):
-                first, last = tiles_in_row(ellipses, i, row, tile, width, height)
-                for column in range(first, last + 1):
-                    splats[slot] = i
-                    tiles[slot] = row * ((width + tile - 1) // tile) + column
-                    slot += 1
 
 
 def pairs_of(ellipses: NDArray[np.float64], width: int, height: int, tile: int) -> Pairs:
@@ -144,9 +137,10 @@ def pairs_of(ellipses: NDArray[np.float64], width: int, height: int, tile: int) 
     """
     drawn = np.flatnonzero(ellipses[:, REACH] > 0)
     ranked = drawn[np.argsort(ellipses[drawn, DEPTH], kind="stable")].astype(np.int64)
-    counts = np.zeros(len(ranked), dtype=np.int64)
+    counts, starts = np.zeros(len(ranked), dtype=np.int64), np.zeros(len(ranked) + 1, dtype=np.int64)
+    splats, tiles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32)
     if len(ranked):
-        count(ellipses, ranked, tile, width, height, counts)
+        find_pairs(ellipses, ranked, starts, tile, width, height, 0, counts, splats, tiles)
     # Splats beside the picture take no further part.
     seen = counts > 0
     ranked, counts = ranked[seen], counts[seen]
@@ -159,7 +153,7 @@ def pairs_of(ellipses: NDArray[np.float64], width: int, height: int, tile: int) 
         )
     splats, tiles = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
     if total:
-        fill(ellipses, ranked, starts, tile, width, height, splats, tiles)
+        find_pairs(ellipses, ranked, starts, tile, width, height, 1, counts, splats, tiles)
     tile_count = -(-width // tile) * -(-height // tile)
     ends = np.cumsum(np.bincount(tiles, minlength=tile_count))
     return Pairs(
