@@ -20,6 +20,7 @@ from .projection import ELLIPSE, FURTHEST, LOW_PASS, NEAREST, SUMS, numbers_of, 
 from .tiles import Pairs, pairs_of
 
 MOST_PIXELS = 2**26
+"""Bound of memory: a pixel takes some 60 bytes."""
 
 CPU_TILE, DEVICE_TILE = 16, 8
 """Side of a tile in pixels. A thread does a whole tile: a GPU needs many short ones."""
