@@ -178,11 +178,12 @@ def _fitting(views: Sequence[View], silhouettes: Sequence[Silhouette], lattice: 
     good = [i for i in range(len(views)) if i not in doubtful.tolist()]
     strict, _ = lattice.fields([silhouettes[i] for i in good], 0.0)
     if strict.max() > 0:
-        before = _bare([views[i] for i in good], *lattice.surface(strict))
+        sure = [views[i] for i in good]
+        before = _bare(sure, *lattice.surface(strict))
         for i in doubtful[bare[doubtful] <= OUTLIER]:
             with_it, _ = lattice.fields([silhouettes[j] for j in (*good, i)], 0.0)
             if with_it.max() > 0:
-                after = _bare([views[j] for j in good], *lattice.surface(with_it))
+                after = _bare(sure, *lattice.surface(with_it))
                 if (after - before).mean() < TAKEN:
                     good.append(int(i))
     if len(good) < max(LEAST_VIEWS, 2 * len(views) / 3):
