@@ -82,7 +82,7 @@ def seen(solids, camera, samples=3):
     first = np.where(np.isfinite(depths.min(axis=0)), depths.argmin(axis=0), len(solids))
     blocks = first.reshape(camera.height, samples, camera.width, samples).transpose(0, 2, 1, 3)
     shares = np.stack([(blocks == i).mean(axis=(2, 3)) for i in range(len(solids) + 1)], axis=-1)
-    colours = shares @ np.array([RED, BLUE, *[[1.0, 1.0, 1.0]] * (len(solids) - 1)])[[*range(len(solids)), -1]]
+    colours = shares @ np.array([RED, BLUE, *[[1.0, 1.0, 1.0]] * len(solids)])[[*range(len(solids)), -1]]
     mask = 1 - shares[..., -1]
     labels = np.where(mask >= 0.5, shares[..., :-1].argmax(axis=-1) + 1, -1)
     return colours, mask, labels
