@@ -17,7 +17,7 @@ from physgen.sim.gaussians.fit.parameters import GROUPS, free_gradients, free_va
 from physgen.sim.gaussians.fit.start import pixel_size, start_on_surface
 from physgen.sim.gaussians.fit.target import target_of
 from physgen.sim.gaussians.raster.rasteriser import Rasteriser
-from physgen.sim.gaussians.splats import Splats
+from physgen.sim.gaussians.splats import Splats, joined
 from physgen.sim.gaussians.views.hull import HullOptions
 from physgen.sim.gaussians.views.orbit import orbit_camera
 from physgen.sim.gaussians.views.view import View
@@ -26,7 +26,7 @@ from physgen.sim.mpm.triangles import squared_distances
 from trimesh import Trimesh
 from trimesh.creation import icosphere
 
-from .splat_scenes import BLUE, Ball, Ring, views_of
+from .splat_scenes import BLUE, RED, Ball, Ring, views_of
 
 
 def painted(points):
@@ -121,6 +121,7 @@ def test_what_another_object_hides_does_not_count():
     target = target_of(view, label=2)
     np.testing.assert_array_equal(target.counted, (labels != 1) & (mask != 0.4))
     np.testing.assert_array_equal(target.alpha, labels == 2)
+    np.testing.assert_array_equal(target.others.counted, labels == 1)
     np.testing.assert_allclose(target.before((0.0, 0.5, 1.0))[2], [[0, 0.5, 1], [0, 0.5, 1], [0.2] * 3, [0.2] * 3])
     bare = View(camera=camera, pixels=pixels, name="front")
     with pytest.raises(InputError, match="'front' has no labels"):
@@ -161,6 +162,27 @@ def test_frozen_fields_stay(ball, ball_views):
     np.testing.assert_array_equal(fitted.splats.centres, start.centres)
     np.testing.assert_allclose(fitted.splats.opacities, start.opacities, atol=1e-12)
     assert not np.allclose(fitted.splats.colours, start.colours)
+
+
+def test_nothing_stays_before_the_company():
+    """A shell around the ball that no pixel there owns: unseen it stays, in company it clears away."""
+    view, *_ = views_of([Ball((0, 0, 0), 0.5)], 1)
+    labels = view.labels.copy()
+    labels[:2, :2] = 2
+    mask = view.mask.copy()
+    mask[:2, :2] = 1
+    view = View(camera=view.camera, pixels=view.pixels, mask=mask, labels=labels, name="front")
+    shapes = [icosphere(subdivisions=2, radius=radius) for radius in (0.5, 0.6)]
+    inner, shell = (start_on_surface(Surface(vertices=m.vertices, faces=m.faces), 400, []) for m in shapes)
+    company = inner.changed(colours=np.tile(RED, (400, 1)))
+    frozen = frozenset({"centres", "colours"})
+    options = FitOptions(steps=40, label=2, frozen=frozen, opacity_rate=0.2, alpha_weight=0.0)
+    off = []
+    for beside in (None, company):
+        fitted = fit_splats([view], shell, options, company=beside).splats
+        off.append(np.abs(Rasteriser().render(joined([company, fitted]), view.camera).colour[48, 48] - RED).max())
+    assert off[0] > 0.3, "grey before red"
+    assert off[1] < 0.05
 
 
 def test_a_fit_can_be_stopped_and_says_what_is_wrong(ball, ball_views):

@@ -13,13 +13,13 @@ from ...composite.metrics import psnr
 from ...errors import Cancelled, InputError, SimulationError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...mpm.options import SolverOptions
-from ..raster.rasteriser import Rasteriser
-from ..splats import Splats
+from ..raster.rasteriser import Rasteriser, SplatGradients
+from ..splats import Splats, joined
 from ..views.view import View
 from .adam import Descent
-from .losses import fit_loss
+from .losses import fit_loss, image_loss
 from .options import FitOptions
-from .parameters import free_gradients, free_values, splats_of
+from .parameters import GROUPS, free_gradients, free_values, splats_of
 from .target import RGB, WHITE, Target, target_of
 
 REPORT_EVERY = 25
@@ -48,13 +48,18 @@ def fit_splats(
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
     *,
+    company: Splats | None = None,
     solver: SolverOptions | None = None,
 ) -> Fitted:
     """Move ``start`` until it looks like ``views``: Adam, each step on one view, all views in turn in random order.
 
     Behind each view stands another colour at each step, also behind the splats: what is let through where the object
-    is solid then costs, though the alpha term of the loss is silent there. solver: where Taichi computes. Raises
-    InputError on views or splats that cannot be used, Cancelled, and SimulationError when numbers grow beyond bounds.
+    is solid then costs, though the alpha term of the loss is silent there.
+
+    company: the other objects' splats, which stay as they are. With them, and a label, each step first renders all
+    together and looks at the pixels that show another object: what is fitted may be behind it, but not before it.
+    solver: where Taichi computes. Raises InputError on views or splats that cannot be used, Cancelled, and
+    SimulationError when numbers grow beyond bounds.
     """
     options = options or FitOptions()
     targets = _targets(views, options)
@@ -73,7 +78,10 @@ def fit_splats(
         colour = _some_colour(random)
         rates = _rates(options, radius, step / options.steps)
         try:
-            losses[step], descent = _stepped(descent, targets[next(order)], colour, rates, rasteriser, options)
+            target = targets[next(order)]
+            if company is not None and target.others is not None:
+                descent = _made_room(descent, target.others, company, colour, rates, rasteriser, options)
+            losses[step], descent = _stepped(descent, target, colour, rates, rasteriser, options)
         except FloatingPointError as error:
             raise SimulationError(
                 f"fit: {error} at step {step}: lower centre_rate, scale_rate and colour_rate, or look at the start's "
@@ -144,11 +152,33 @@ def _stepped(
     )
     if not np.isfinite(loss):
         raise FloatingPointError(f"the loss is {loss}")
-    after = descent.stepped(free_gradients(descent.values, rasteriser.gradients(d_colour, d_alpha)), rates)
+    return loss, _descended(descent, rasteriser.gradients(d_colour, d_alpha), rates)
+
+
+def _made_room(
+    descent: Descent,
+    others: Target,
+    company: Splats,
+    colour: RGB,
+    rates: Mapping[str, float],
+    rasteriser: Rasteriser,
+    options: FitOptions,
+) -> Descent:
+    """The descent after a step on how the view shows the others, among which ``company`` is what it is."""
+    together = joined([company, splats_of(descent.values)])
+    seen = rasteriser.render(together, others.camera, background=colour)
+    _, d_colour = image_loss(seen.colour, others.before(colour), ssim_share=options.ssim_share, counted=others.counted)
+    gradients = rasteriser.gradients(d_colour)
+    own = SplatGradients(**{name: getattr(gradients, name)[len(company) :] for name in GROUPS})
+    return _descended(descent, own, rates)
+
+
+def _descended(descent: Descent, gradients: SplatGradients, rates: Mapping[str, float]) -> Descent:
+    after = descent.stepped(free_gradients(descent.values, gradients), rates)
     for name in rates:
         if not np.isfinite(after.values[name]).all():
             raise FloatingPointError(f"the {name} are no longer finite")
-    return loss, after
+    return after
 
 
 def _psnr(splats: Splats, target: Target, rasteriser: Rasteriser) -> float:

@@ -138,6 +138,7 @@ def fit_pair(
         dataclasses.replace(given, frozen=given.frozen | {"centres"}, label=label),
         on_event,
         cancelled,
+        company=first.splats,
         solver=solver,
     )
     notes = (*both.notes, *alone.notes, *votes.notes)

@@ -38,8 +38,11 @@ class Target:
     counted: NDArray[np.bool_] | None
     """(H, W) pixels that say something about the object; None: all."""
 
+    others: Target | None = None
+    """The whole view, of which the pixels count that show another object; None where there are no labels."""
+
     def before(self, background: RGB) -> Picture:
-        """(H, W, 3) the same object before another colour."""
+        """(H, W, 3) the same before another colour."""
         change = np.subtract(background, WHITE).astype(np.float32)
         return np.asarray(self.pixels + (1 - self.alpha[..., None]) * change)
 
@@ -48,8 +51,8 @@ def target_of(view: View, *, label: int | None = None) -> Target:
     """What ``view`` says of all that its mask covers, or of the object of its labels that ``label`` names.
 
     Where another object is seen, the one that is asked for may go on behind it or not: such pixels do not count, and
-    neither do those of the outline of all objects that nobody's label owns. Raises InputError when the view lacks the
-    mask or the labels that are needed.
+    neither do those of the outline of all objects that nobody's label owns. That it does not stand before the other one
+    there is said by ``Target.others``. Raises InputError when the view lacks the mask or the labels that are needed.
     """
     if label is None:
         if view.mask is None:
@@ -64,4 +67,5 @@ def target_of(view: View, *, label: int | None = None) -> Target:
         pixels=np.where(own[..., None], view.pixels, np.float32(1)),
         alpha=np.where(own, covered, np.float32(0)),
         counted=own | ((view.labels < 1) & (covered < CLEAR)),
+        others=Target(camera=view.camera, pixels=view.pixels, alpha=covered, counted=(view.labels > 0) & ~own),
     )
