@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError, SimulationError
+from physgen.sim.gaussians.guidance.clip import ClipScores
+from physgen.sim.gaussians.guidance.diffusers_folder import DiffusersGuidance, DiffusersOptions
 from physgen.sim.gaussians.guidance.ideal import IdealDenoiser
 from physgen.sim.gaussians.guidance.loss import guidance_loss_gradient
 from physgen.sim.gaussians.guidance.protocol import Seen
@@ -265,3 +269,51 @@ def test_the_loss_takes_the_step_to_its_timestep_and_weighs():
     assert not none.any()
     with pytest.raises(InputError, match="weight of the guidance is nan"):
         guidance_loss_gradient(picture, camera(), "frog", step=0, weight=math.nan, **given)
+
+
+def test_a_model_without_the_extra_names_it(tmp_path, monkeypatch):
+    # As where it is not installed; nothing of the folder's weights is looked at before.
+    for name in ("torch", "diffusers", "transformers"):
+        monkeypatch.setitem(sys.modules, name, None)
+    (tmp_path / "model_index.json").write_text('{"_class_name": "DDPMPipeline"}')
+    (tmp_path / "config.json").write_text('{"model_type": "clip"}')
+    for make in (DiffusersGuidance, ClipScores):
+        with pytest.raises(InputError, match=r"needs torch .*pip install 'physgen\[diffusion\]'"):
+            make(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"\xff\xfe", b"[" * 10**5, b'"' + b"a" * 2**21 + b'"', b'{"a": NaN}'])
+def test_an_index_that_is_none_is_told(tmp_path, content):
+    (tmp_path / "model_index.json").write_bytes(content)
+    with pytest.raises(InputError, match="diffusion model"):
+        DiffusersGuidance(tmp_path)
+
+
+@given(
+    st.binary(max_size=200)
+    | st.recursive(
+        st.none() | st.floats() | st.text(max_size=5),
+        lambda inner: st.dictionaries(st.sampled_from(["_class_name", "text_encoder", "x"]), inner) | st.lists(inner),
+    ).map(lambda value: json.dumps(value).encode())
+)
+def test_any_index_is_told(tmp_path_factory, content):
+    folder = tmp_path_factory.mktemp("any")
+    (folder / "model_index.json").write_bytes(content)
+    with pytest.raises(InputError):
+        DiffusersGuidance(folder)
+
+
+@pytest.mark.parametrize(
+    "changes, said",
+    [
+        ({"guidance_scale": 0.5}, "guidance_scale is 0.5"),
+        ({"guidance_scale": math.nan}, "guidance_scale is nan"),
+        ({"size": 5}, "size is 5"),
+        ({"precision": "float8"}, "precision is 'float8'"),
+        ({"weighting": "none"}, "weighting is 'none'"),
+        ({"prompt": "a" * 2001}, "prompt is"),
+    ],
+)
+def test_options_out_of_range_are_named(changes, said):
+    with pytest.raises(InputError, match=said):
+        DiffusersOptions(**changes)
