@@ -10,6 +10,7 @@ import sys
 import tempfile
 
 from ..sim.app.process import NO_WINDOW, child_environment
+from ..sim.gaussians.guidance.local_model import INSTALL, PACKAGES, missing_packages, package_version
 from ..sim.reconstruct.adapters.found import found_adapters, onnxruntime_version
 from ..sim.reconstruct.adapters.names import VARIABLE, adapters_file
 
@@ -51,7 +52,7 @@ def examine() -> list[Finding]:
     findings.append(
         ("temporary space", free > _MINIMUM_FREE_GIB, f"{free:.1f} GiB free; at least {_MINIMUM_FREE_GIB:g} are needed")
     )
-    return findings + adapter_findings()
+    return findings + adapter_findings() + [diffusion_finding()]
 
 
 def adapter_findings() -> list[Finding]:
@@ -65,6 +66,16 @@ def adapter_findings() -> list[Finding]:
         place = adapters_file() or f"{VARIABLE} names no file"
         findings.append(("adapters (optional)", True, f"none has a name ({place}; docs/adapters.md)"))
     return findings
+
+
+def diffusion_finding() -> Finding:
+    """What runs a user's own diffusion and CLIP models. It is optional, and not imported: that takes seconds."""
+    missing = missing_packages()
+    if missing:
+        text = f"no {', '.join(missing)}; your own diffusion or CLIP models need it: {INSTALL}"
+    else:
+        text = ", ".join(f"{name} {package_version(name)}" for name in PACKAGES)
+    return "diffusion (optional)", True, text
 
 
 def _package(name: str) -> Finding:

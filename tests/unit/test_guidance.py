@@ -6,11 +6,13 @@ from __future__ import annotations
 import json
 import math
 import sys
+from importlib import metadata
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from physgen.batch.doctor import diffusion_finding
 from physgen.sim.errors import InputError, SimulationError
 from physgen.sim.gaussians.guidance.clip import ClipScores
 from physgen.sim.gaussians.guidance.diffusers_folder import DiffusersGuidance, DiffusersOptions
@@ -269,6 +271,13 @@ def test_the_loss_takes_the_step_to_its_timestep_and_weighs():
     assert not none.any()
     with pytest.raises(InputError, match="weight of the guidance is nan"):
         guidance_loss_gradient(picture, camera(), "frog", step=0, weight=math.nan, **given)
+
+
+def test_doctor_says_what_a_diffusion_model_needs(monkeypatch):
+    monkeypatch.setattr(metadata, "version", {"torch": "2.9", "diffusers": "0.35", "safetensors": "0.5"}.__getitem__)
+    monkeypatch.setattr(metadata, "PackageNotFoundError", KeyError)
+    _, fine, text = diffusion_finding()
+    assert fine and "no transformers;" in text and "pip install 'physgen[diffusion]'" in text
 
 
 def test_a_model_without_the_extra_names_it(tmp_path, monkeypatch):
