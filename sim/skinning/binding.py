@@ -26,6 +26,9 @@ OUTLIER_SPACINGS = 1.5
 In a smooth deformation predictions differ by second-order terms, a small part of the spacing, whereas a particle
 that has lost its neighbours is at least one spacing away from where they say it is."""
 
+LEAST_VOLUME = 1e-9
+"""Volume over that at rest below which a deformation gradient is taken for broken."""
+
 
 @dataclass(frozen=True)
 class Binding:
@@ -90,6 +93,57 @@ def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray
 
     Particles that are not finite count as floaters. A vertex all of whose particles are lost keeps its rest place.
     """
+    return _votes(binding, positions, gradients).places(binding)
+
+
+def deform_locally(
+    binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]
+) -> tuple[Array, Array]:
+    """Where ``deform`` takes the vertices (V, 3), and the deformation gradient F (V, 3, 3) around each.
+
+    F is the mean of those particles' gradients by which the vertex is placed; gradients that are not finite or turn
+    matter inside out (det F ≤ 0) do not count. It is exact for affine motion. Where none counts, or their mean turns
+    matter inside out, F is that of the heaviest sound one, and the identity where there is none.
+    """
+    votes = _votes(binding, positions, gradients)
+    f = np.asarray(gradients, dtype=np.float64)[binding.particles]
+    sound = np.isfinite(f).all(axis=(2, 3))
+    f = np.where(sound[..., None, None], f, np.eye(3))
+    sound &= np.linalg.det(f) > LEAST_VOLUME
+    weights = np.where(sound, votes.robust, 0.0)
+    total = weights.sum(axis=1)
+    mean = np.einsum("vk,vkij->vij", weights / np.maximum(total, 1e-6)[:, None], f)
+    bad = (total < 1e-6) | ~(np.linalg.det(mean) > LEAST_VOLUME)
+    # The nearest sound particle, for want of agreement: neighbours are sorted by distance.
+    row = np.flatnonzero(bad)
+    heaviest = np.where(sound[row], binding.weights[row], -1.0).argmax(axis=1)
+    mean[row] = np.where(sound[row].any(axis=1)[:, None, None], f[row, heaviest], np.eye(3))
+    return votes.places(binding), mean
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """What each particle says of its vertices. predicted: (V, k, 3); valid: (V, k), finite; robust: (V, k) weights
+    without those of floaters; centre: (V, 3) the median of what is predicted."""
+
+    predicted: Array
+    valid: NDArray[np.bool_]
+    robust: Array
+    centre: Array
+
+    def places(self, binding: Binding) -> Array:
+        """Vertex positions (V, 3)."""
+        total = self.robust.sum(axis=1, keepdims=True)
+        # Where predictions disagree wholly (torn matter) the median itself is the best that can be said.
+        torn = total[:, 0] < 1e-6
+        mean = np.einsum("vk,vki->vi", self.robust / np.maximum(total, 1e-6), self.predicted)
+        mean[torn] = self.centre[torn]
+        lost = ~self.valid.any(axis=1)
+        mean[lost] = binding.rest[lost]
+        return mean
+
+
+def _votes(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> _Votes:
     x = np.asarray(positions, dtype=np.float64)[binding.particles]
     f = np.asarray(gradients, dtype=np.float64)[binding.particles]
     predicted = x + np.einsum("vkij,vkj->vki", f, binding.offsets)
@@ -99,14 +153,7 @@ def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray
     centre = _median(predicted, valid)
     distance = np.linalg.norm(predicted - centre[:, None, :], axis=2) / (OUTLIER_SPACINGS * binding.spacing[:, None])
     robust = weights * np.where(distance < 1.0, (1.0 - np.minimum(distance, 1.0) ** 2) ** 2, 0.0)
-    total = robust.sum(axis=1, keepdims=True)
-    # Where predictions disagree wholly (torn matter) the median itself is the best that can be said.
-    torn = total[:, 0] < 1e-6
-    mean = np.einsum("vk,vki->vi", robust / np.maximum(total, 1e-6), predicted)
-    mean[torn] = centre[torn]
-    lost = ~valid.any(axis=1)
-    mean[lost] = binding.rest[lost]
-    return mean
+    return _Votes(predicted, valid, robust, centre)
 
 
 def _median(values: Array, valid: NDArray[np.bool_]) -> Array:

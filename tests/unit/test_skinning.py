@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.skinning.binding import bind, deform
+from physgen.sim.skinning.binding import bind, deform, deform_locally
 
 
 def a_body(seed=0, count=3000):
@@ -90,3 +90,13 @@ def test_too_few_particles_are_refused():
         bind(np.zeros((2, 3)), np.zeros((3, 3)))
     with pytest.raises(InputError, match="finite"):
         bind(np.full((2, 3), np.nan), np.random.default_rng(0).random((10, 3)))
+
+
+def test_local_gradients_are_those_of_the_motion():
+    """Of a bar rolled onto a circle, at the vertices' own places; the places are those of ``deform``."""
+    particles, vertices = a_body(count=8000)
+    inner = vertices * [1.0, 1.0, 0.5]
+    binding = bind(inner, particles)
+    places, gradients = deform_locally(binding, *bend(particles))
+    assert np.array_equal(places, deform(binding, *bend(particles)))
+    assert np.abs(gradients - bend(inner)[1]).max() < 2 * binding.spacing.max() / 0.15
