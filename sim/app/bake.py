@@ -35,6 +35,7 @@ from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_ch
 from .bake_estimate import disk_bytes, require_disk_space
 from .bake_inputs import BakeOptions, geometry_hash, inputs_hash
 from .bake_samples import ObjectSampler, baked_objects
+from .bake_splats import load_object_splats
 from .setup_world import prepare_world
 
 __all__ = ["CHECKPOINT_FILE", "BakeOptions", "bake", "is_up_to_date"]
@@ -68,6 +69,8 @@ def _complete(folder: SceneFolder, out: Path, options: BakeOptions) -> BakeManif
             cache = Pc2Reader(out / name)
             if cache.sample_count < manifest.frames or cache.vertex_count != count:
                 return None
+        if not all((out / name).is_file() for name in manifest.splat_frames(manifest.frames)):
+            return None
     except InputError:
         return None
     return manifest
@@ -130,9 +133,10 @@ def _bake_locked(
 
     progress.report(0, "sampling particles")
     meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    splats = [load_object_splats(folder, *pair) for pair in zip(folder.scene.objects, meshes, strict=True)]
     go_on()
     prepared = prepare_world(folder, meshes, options)
-    objects = baked_objects(folder, meshes, prepared, options)
+    objects = baked_objects(folder, meshes, splats, prepared, options)
     require_disk_space(out, disk_bytes(objects, prepared.particle_count, options.frames))
     go_on()
     simulation = build_world(prepared, options.arch, progress)
@@ -151,8 +155,10 @@ def _bake_locked(
         objects=objects,
     )
     samplers = [
-        ObjectSampler(slot, baked, mesh, np.asarray(item.world_from_mesh), simulation)
-        for slot, (baked, mesh, item) in enumerate(zip(objects, meshes, folder.scene.objects, strict=True))
+        ObjectSampler(slot, baked, mesh, seen, np.asarray(item.world_from_mesh), simulation)
+        for slot, (baked, mesh, seen, item) in enumerate(
+            zip(objects, meshes, splats, folder.scene.objects, strict=True)
+        )
     ]
     remove_leftovers(out)
     first, metrics = resume(out, manifest, simulation.world)
@@ -250,7 +256,9 @@ class _Run:
         for sampler in self.samplers:
             if cancelled():
                 raise Cancelled("asked to stop")
-            samples |= sampler.samples(index)
+            found = sampler.samples(index)
+            sampler.write_splats(self.out, self.manifest.frame_start + index, found)
+            samples |= found
         for name, sample in samples.items():
             writers[name].append(sample)
         seconds = round(time.monotonic() - self.frame_started, 3)

@@ -64,6 +64,8 @@ def resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[dic
             cache = Pc2Reader(out / name)
             if cache.sample_count < checkpoint.frames_done or cache.vertex_count != count:
                 return 0, []
+        if not all((out / name).is_file() for name in manifest.splat_frames(checkpoint.frames_done)):
+            return 0, []
         world.restore(checkpoint.state)
     except (InputError, OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         # A checkpoint that a crash left unreadable costs a fresh start, never the run.

@@ -15,6 +15,7 @@ from ..scene.folder import SceneFolder
 from ..scene.meshes import load_object_mesh
 from .bake_inputs import BakeOptions
 from .bake_samples import baked_objects
+from .bake_splats import load_object_splats
 from .setup_world import PreparedWorld, prepare_world
 
 STATE_BYTES = 190
@@ -22,6 +23,9 @@ STATE_BYTES = 190
 
 FRAME_BYTES = 512
 """Of ``metrics.json``, a frame, rounded up."""
+
+SPLAT_BYTES = 68
+"""Of a PLY file, a splat: seventeen numbers. Its header is within ``FRAME_BYTES``."""
 
 SPARE_BYTES = 64 * 2**20
 """That stay free, for what else happens on the disk."""
@@ -64,15 +68,19 @@ def estimate_bake(folder: SceneFolder, options: BakeOptions) -> PreparedWorld:
 def bake_cost(folder: SceneFolder, options: BakeOptions) -> BakeCost:
     """What a bake of ``folder`` will take, disk included. Raises InputError as ``estimate_bake`` does."""
     meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    splats = [load_object_splats(folder, *pair) for pair in zip(folder.scene.objects, meshes, strict=True)]
     prepared = prepare_world(folder, meshes, options)
-    objects = baked_objects(folder, meshes, prepared, options)
+    objects = baked_objects(folder, meshes, splats, prepared, options)
     return BakeCost(prepared=prepared, disk_bytes=disk_bytes(objects, prepared.particle_count, options.frames))
 
 
 def disk_bytes(objects: Iterable[BakedObject], particles: int, frames: int) -> int:
     """Bytes of the caches of ``objects``, and of two checkpoints: one is only given up when the next is whole."""
-    points = sum(sum(item.files.values()) for item in objects)
-    return frames * (12 * points + FRAME_BYTES) + 2 * STATE_BYTES * particles
+    a_frame = FRAME_BYTES
+    for item in objects:
+        a_frame += 12 * sum(item.files.values())
+        a_frame += SPLAT_BYTES * item.splats + FRAME_BYTES if item.splats else 0
+    return frames * a_frame + 2 * STATE_BYTES * particles
 
 
 def require_disk_space(out: Path, needed: int) -> None:

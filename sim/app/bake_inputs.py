@@ -65,6 +65,11 @@ def inputs_hash(folder: SceneFolder, options: BakeOptions) -> str:
             del fields[irrelevant]
         fields["material"].pop("preset")
         fields["mesh"] = file_hash(folder.file(item.mesh))
+        if item.splats is None:
+            # As before there were any, so that older bakes stay in use.
+            del fields["splats"]
+        else:
+            fields["splats"] = file_hash(folder.file(item.splats))
         if item.motion is not None and item.motion.vertices_file is not None:
             fields["motion"]["vertices_file"] = file_hash(folder.file(item.motion.vertices_file))
         objects.append(fields)

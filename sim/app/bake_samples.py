@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""What a bake writes at each frame: the vertices of every object, and the particles of those that flow."""
+"""What a bake writes at each frame: the vertices of every object, the particles of those that flow, and splats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cache.manifest import GRAINS, MESH_SPACE, SURFACE, BakedObject
+from ..gaussians.moving import from_points
+from ..gaussians.ply.write import write_splats
+from ..gaussians.splats import Splats
 from ..mpm.materials import FLUID, SAND, SNOW, FluidMaterial, RigidMaterial
 from ..scene.folder import SceneFolder
 from ..scene.meshes import ObjectMesh
 from ..skinning.binding import bind, deform
 from .bake_inputs import BakeOptions
+from .bake_splats import MovingSplats
 from .setup_world import PreparedWorld
 
 if TYPE_CHECKING:
@@ -27,16 +32,22 @@ AS_PARTICLES = frozenset({SAND, FLUID, SNOW})
 
 
 def baked_objects(
-    folder: SceneFolder, meshes: Sequence[ObjectMesh], prepared: PreparedWorld, options: BakeOptions
+    folder: SceneFolder,
+    meshes: Sequence[ObjectMesh],
+    splats: Sequence[Splats | None],
+    prepared: PreparedWorld,
+    options: BakeOptions,
 ) -> tuple[BakedObject, ...]:
     """The caches that a bake of the scene has, one entry an object."""
     return tuple(
-        _baked_object(item.name, len(mesh.vertices), prepared, slot, options)
-        for slot, (item, mesh) in enumerate(zip(folder.scene.objects, meshes, strict=True))
+        _baked_object(item.name, len(mesh.vertices), len(seen or ()), prepared, slot, options)
+        for slot, (item, mesh, seen) in enumerate(zip(folder.scene.objects, meshes, splats, strict=True))
     )
 
 
-def _baked_object(name: str, vertices: int, prepared: PreparedWorld, slot: int, options: BakeOptions) -> BakedObject:
+def _baked_object(
+    name: str, vertices: int, splats: int, prepared: PreparedWorld, slot: int, options: BakeOptions
+) -> BakedObject:
     points = _points(prepared, slot) if options.points else 0
     index = prepared.body_of_object[slot]
     material = None if index is None else prepared.setup.bodies[index].material
@@ -48,6 +59,9 @@ def _baked_object(name: str, vertices: int, prepared: PreparedWorld, slot: int, 
         points_file=f"{name}.points.pc2" if points else None,
         points=points,
         points_as=SURFACE if points and isinstance(material, FluidMaterial) else GRAINS,
+        splats_file=f"{name}.splats.pc2" if splats else None,
+        splats_folder=f"{name}.splats" if splats else None,
+        splats=splats,
     )
 
 
@@ -66,8 +80,15 @@ class ObjectSampler:
     """Samples of object number ``slot`` of the scene, as ``baked`` says, at the present time of ``simulation``."""
 
     def __init__(
-        self, slot: int, baked: BakedObject, mesh: ObjectMesh, world_from_mesh: Array, simulation: Simulation
+        self,
+        slot: int,
+        baked: BakedObject,
+        mesh: ObjectMesh,
+        splats: Splats | None,
+        world_from_mesh: Array,
+        simulation: Simulation,
     ) -> None:
+        """splats: of the object in its mesh file's own coordinates."""
         self._slot = slot
         self._baked = baked
         self._mesh = mesh
@@ -76,6 +97,7 @@ class ObjectSampler:
         self._rest = simulation.rest_positions[slot]
         self._binding = None if self._rest is None else bind(mesh.vertices, self._rest)
         self._mesh_from_world = np.linalg.inv(world_from_mesh) if baked.space == MESH_SPACE else None
+        self._splats = None if splats is None else MovingSplats(splats, world_from_mesh, mesh.vertices, self._rest)
 
     def samples(self, index: int) -> dict[str, Array]:
         """By file name what is appended as sample ``index``, (V, 3) or (N, 3) in the space of the bake.
@@ -90,14 +112,43 @@ class ObjectSampler:
             assert self._body is not None and self._rest is not None
             points = self._rest if index == 0 else self._simulation.world.positions(self._body)
             found[self._baked.points_file] = self._placed(points)
+        if self._splats is not None and self._baked.splats_file is not None:
+            found[self._baked.splats_file] = self._splat_points(index)
         return found
 
+    def write_splats(self, out: Path, frame: int, samples: Mapping[str, Array]) -> None:
+        """Write the PLY file of ``frame`` into the bake folder ``out``; nothing for an object without splats.
+
+        samples: what ``samples`` returned of that frame. Raises InputError when it cannot be written.
+        """
+        file = self._baked.splat_frame(frame)
+        if self._splats is not None and self._baked.splats_file is not None and file is not None:
+            write_splats(out / file, from_points(self._splats.rest, samples[self._baked.splats_file]))
+
     def _vertices(self) -> Array:
+        moved = self._led_vertices()
+        if moved is not None:
+            return moved
         if self._binding is None or self._body is None:
-            moved = self._simulation.collider_vertices(self._slot)
-            return self._mesh.vertices if moved is None else moved
+            return self._mesh.vertices
+        return deform(self._binding, *self._matter(self._body))
+
+    def _led_vertices(self) -> Array | None:
+        """Of a collider that moves."""
+        return self._simulation.collider_vertices(self._slot)
+
+    def _matter(self, body: int) -> tuple[Array, Array]:
+        """Positions and deformation gradients of the body's particles."""
         world = self._simulation.world
-        return deform(self._binding, world.positions(self._body), world.deformation_gradients(self._body))
+        return world.positions(body), world.deformation_gradients(body)
+
+    def _splat_points(self, index: int) -> Array:
+        assert self._splats is not None
+        if index == 0:
+            return self._splats.at_rest(in_world=self._mesh_from_world is None)
+        if self._body is not None:
+            return self._placed(self._splats.with_matter(*self._matter(self._body)))
+        return self._placed(self._splats.with_vertices(self._vertices()))
 
     def _placed(self, points: Array) -> Array:
         """World ``points`` (N, 3) in the space of the bake."""

@@ -15,12 +15,13 @@ from .lock import LOCK_FILE, folder_lock, process_alive
 from .manifest import CHECKPOINT_FILE, MANIFEST_FILE, METRICS_FILE, BakeManifest, load_manifest
 
 _PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-\d+\.(?:json|npz)")
+_PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+\.ply")
 _LOCK_LEFTOVER = re.compile(re.escape(LOCK_FILE) + r"-(?:dead-)?(\d+)-[0-9a-f]{8}")
 
 
 def listed_files(manifest: BakeManifest) -> list[str]:
     """Names of all files of a bake, those that are not there yet or any more among them."""
-    return [*manifest.files, CHECKPOINT_FILE, METRICS_FILE, MANIFEST_FILE]
+    return [*manifest.files, *manifest.splat_frames(manifest.frames), CHECKPOINT_FILE, METRICS_FILE, MANIFEST_FILE]
 
 
 def disk_use(folder: Path) -> int:
@@ -49,8 +50,9 @@ def free_bake(folder: Path) -> int:
         try:
             remove_leftovers(folder)
             remove_listed(folder)
-            with contextlib.suppress(OSError):
-                (folder / CHECKPOINT_FILE).parent.rmdir()
+            for place in (*_splat_folders(folder), (folder / CHECKPOINT_FILE).parent):
+                with contextlib.suppress(OSError):
+                    place.rmdir()
             (folder / MANIFEST_FILE).unlink()
         except OSError as error:
             raise InputError(
@@ -88,3 +90,17 @@ def remove_leftovers(folder: Path) -> None:
             lock = _LOCK_LEFTOVER.fullmatch(path.name)
             if _PARTIAL.fullmatch(path.name) or (lock and not process_alive(int(lock[1]))):
                 path.unlink(missing_ok=True)
+    for place in _splat_folders(folder):
+        for path in place.glob(".*.ply"):
+            if _PARTIAL_SPLATS.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+
+
+def _splat_folders(folder: Path) -> list[Path]:
+    """Folders of splats' PLY files that are there and no links, as the manifest in ``folder`` lists them."""
+    try:
+        names = [item.splats_folder for item in load_manifest(folder).objects if item.splats_folder is not None]
+    except InputError:
+        return []
+    found = [folder / name for name in names]
+    return [place for place in found if place.is_dir() and not place.is_symlink()]

@@ -29,6 +29,10 @@ GRAINS, SURFACE = "grains", "surface"
 """What particles are shown as: each by itself, or the surface that encloses them."""
 
 
+SPLAT_POINTS = 4
+"""Points of a splat in its cache: centre, and the ends of three half axes."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BakedObject:
     """One object's caches, files relative to the bake folder.
@@ -38,6 +42,8 @@ class BakedObject:
     points_file: PC2 of all particles, of which there are ``points``; None and 0 where they were not asked for or the
         object does not flow.
     points_as: what the particles are shown as, ``grains`` or ``surface``.
+    splats_file: PC2 of its ``splats`` Gaussian splats, of each four points: its centre and the ends of its half axes.
+    splats_folder: of their PLY files, one a frame. None, None and 0 for an object without splats.
     """
 
     name: str
@@ -47,6 +53,9 @@ class BakedObject:
     points_file: str | None = None
     points: int = 0
     points_as: str = GRAINS
+    splats_file: str | None = None
+    splats_folder: str | None = None
+    splats: int = 0
 
     def __post_init__(self) -> None:
         if self.points_as not in (GRAINS, SURFACE):
@@ -55,12 +64,22 @@ class BakedObject:
             raise InputError(f"object {self.name}: space is {self.space!r}: choose one of {', '.join(SPACES)}")
         if (self.points_file is None) != (self.points == 0):
             raise InputError(f"object {self.name}: {self.points} points in {self.points_file!r}; bake again")
+        if not (self.splats_file is None) == (self.splats_folder is None) == (self.splats == 0):
+            raise InputError(f"object {self.name}: {self.splats} splats in {self.splats_file!r}; bake again")
 
     @property
     def files(self) -> dict[str, int]:
         """Its PC2 files, and how many points a sample of each has."""
-        mesh = {self.file: self.vertices}
-        return mesh if self.points_file is None else {**mesh, self.points_file: self.points}
+        files = {self.file: self.vertices}
+        if self.points_file is not None:
+            files[self.points_file] = self.points
+        if self.splats_file is not None:
+            files[self.splats_file] = SPLAT_POINTS * self.splats
+        return files
+
+    def splat_frame(self, frame: int) -> str | None:
+        """The PLY file of its splats at ``frame``; None for an object without."""
+        return None if self.splats_folder is None else f"{self.splats_folder}/{frame:04d}.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +111,11 @@ class BakeManifest:
         """All PC2 files, and how many points a sample of each has."""
         return {name: count for item in self.objects for name, count in item.files.items()}
 
+    def splat_frames(self, samples: int) -> list[str]:
+        """All PLY files of splats that belong to the first ``samples`` samples."""
+        frames = range(self.frame_start, self.frame_start + samples)
+        return [name for item in self.objects for frame in frames if (name := item.splat_frame(frame)) is not None]
+
     def __post_init__(self) -> None:
         if self.state not in STATES:
             raise InputError(f"state is {self.state!r}: choose one of {', '.join(STATES)}")
@@ -122,7 +146,7 @@ def load_manifest(folder: Path) -> BakeManifest:
         raise InputError(
             f"{error}; PhysGen {author} wrote it, this is {VERSION}: use that one, or bake again"
         ) from None
-    for name in manifest.files:
+    for name in (*manifest.files, *manifest.splat_frames(1)):
         inside(folder, name)
     return manifest
 

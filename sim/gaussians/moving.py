@@ -118,6 +118,18 @@ def from_half_axes(splats: Splats, centres: NDArray[np.floating], axes: NDArray[
     )
 
 
+def as_points(centres: NDArray[np.floating], axes: NDArray[np.floating]) -> Array:
+    """(4N, 3): of each splat its centre, then the ends of its three half axes. How caches keep splats."""
+    centres = np.asarray(centres, dtype=np.float64)[:, None, :]
+    return np.concatenate([centres, centres + np.swapaxes(axes, 1, 2)], axis=1).reshape(-1, 3)
+
+
+def from_points(splats: Splats, points: NDArray[np.floating]) -> Splats:
+    """``splats`` where ``points`` (4N, 3) of ``as_points`` say; these may have gone through any affine map."""
+    groups = np.asarray(points, dtype=np.float64).reshape(-1, 4, 3)
+    return from_half_axes(splats, groups[:, 0], np.swapaxes(groups[:, 1:] - groups[:, :1], 1, 2))
+
+
 def quaternions(rotations: Array) -> Array:
     """(N, 4) unit quaternions w, x, y, z of ``rotations`` (N, 3, 3), by Shepperd's method: from the largest of them."""
     m = rotations

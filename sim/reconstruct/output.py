@@ -27,6 +27,7 @@ OWN_ENTRIES = frozenset(
         "shadows",
         "holes",
         "meshes",
+        "splats",
         "albedo",
         "light",
         "stages",

@@ -131,6 +131,6 @@ def referenced_files(scene: Scene) -> list[str]:
     names = [name for name in (scene.photo, scene.background) if name is not None]
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None
-        names += [name for name in (item.mesh, item.mask, item.shadow, track) if name is not None]
+        names += [name for name in (item.mesh, item.mask, item.shadow, track, item.splats) if name is not None]
     names += [name for name in (scene.light.environment, scene.depth) if name is not None]
     return names

@@ -40,6 +40,8 @@ class SceneObject:
         ``CONTACT_MODES``. None takes the ground's, or those of ``Ground()`` where there is no ground.
         docs/file-formats.md says how those of two surfaces combine.
     motion: of a collider; None stands still.
+    splats: PLY file of Gaussian splats in the mesh file's own coordinates, relative to the scene folder, or None: what
+        is seen of the object. The mesh is then what is filled with matter and collides, and splats follow that matter.
 
     Of dynamic objects only:
     start_time: s at which the object comes into the simulation; until then it stays in place and touches nothing.
@@ -70,6 +72,7 @@ class SceneObject:
     restitution: float | None = None
     contact_mode: str | None = None
     motion: Motion | None = None
+    splats: str | None = None
     start_time: float = 0.0
     acceleration: Keys = ()
     velocity_keys: Keys = ()
@@ -111,6 +114,19 @@ class SceneObject:
         require_range(f"{where}: start_time", self.start_time, 0.0, 1e6, "seconds")
         require_range(f"{where}: goal_stiffness", self.goal_stiffness, 0.0, 1e6, "1/s²")
         require_range(f"{where}: goal_damping", self.goal_damping, 0.0, 1.0)
+        require(
+            self.splats is None or self.splats.lower().endswith(".ply"),
+            f"{where}: splats",
+            self.splats,
+            "give a PLY file of splats inside the scene folder, or null",
+        )
+        bends = self.motion is not None and self.motion.vertices_file is not None
+        require(
+            self.splats is None or not bends,
+            f"{where}: splats",
+            self.splats,
+            "splats follow matter or a rigid motion, not vertices_file: let the object be dynamic, or give null",
+        )
         for name in ("acceleration", "velocity_keys", "pin_motion"):
             require_rising(f"{where}: {name}", getattr(self, name))
         held = bool(self.pins) or self.goal_stiffness > 0
