@@ -41,7 +41,9 @@ def build_parser() -> argparse.ArgumentParser:
     photos.add_reconstruct(command("reconstruct", photos.run_reconstruct, "photo → scene folder"))
     again = "a reconstructed scene again, with something told that was guessed wrong"
     photos.add_correct(command("correct", photos.run_correct, again))
-    photos.add_import(command("import", photos.run_import, "folder of PhysGen3D or PhysGen → scene folder"))
+    photos.add_import(
+        command("import", photos.run_import, "folder of PhysGen3D or PhysGen, or file of splats → scene folder")
+    )
     varied = "scene folder → the same with other physics and effects, in a folder of its own"
     variants.add_variant(command("variant", variants.run_variant, varied))
     photos.add_light(command("light", photos.run_light, "another light for a scene folder"))

@@ -9,6 +9,7 @@ from pathlib import Path
 from ..physgen_addon.bridge.formats import require_video_name
 from ..sim.app.correct import correct_scene, require_stamp
 from ..sim.app.import_folder import import_folder
+from ..sim.app.import_splats import DEFAULT_UP, UPS
 from ..sim.app.light import set_light
 from ..sim.app.reconstruct import reconstruct_scene, require_physics, set_all_physics
 from ..sim.events import IsCancelled
@@ -72,10 +73,13 @@ def add_correct(parser: argparse.ArgumentParser) -> None:
 
 def add_import(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen import``."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of PhysGen3D or PhysGen (docs/importing.md)")
+    what = "folder of PhysGen3D or PhysGen (docs/importing.md), or PLY file of splats (docs/moving-splats.md)"
+    parser.add_argument("folder", type=Path, metavar="SOURCE", help=what)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
     scale = "largest extent of the first object; sets the scale of the scene (default: as simulated there, else 0.15)"
     parser.add_argument("--size", type=float, metavar="METRES", help=scale)
+    up = f"axis of a file of splats that points up, or down (default: {DEFAULT_UP})"
+    parser.add_argument("--up", choices=UPS, help=up)
     settings = "of PhysGen3D's simulation, with velocities and friction (default: looked for)"
     parser.add_argument("--settings", type=Path, metavar="FILE.yaml", help=settings)
 
@@ -153,6 +157,7 @@ def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
         options.out,
         size_m=options.size,
         settings=options.settings,
+        up=options.up,
         on_event=terminal,
         cancelled=cancelled,
     )
