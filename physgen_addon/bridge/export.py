@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.gaussians.ply.write import write_splats
 from ...sim.scene.folder import SCENE_FILE, SceneFolder, parse_scene, referenced_files, save_scene
 from ...sim.scene.json_fields import read_json
 from ...sim.scene.model import Ground, Scene, SceneObject
 from ..props.body import bodies
-from . import export_world
+from . import export_world, splats
 from .export_colliders import Collider
 from .export_meshes import Triangles, closed, read_triangles, require_sound, write_mesh
 from .export_motion import depsgraph, modifiers_off, sample
@@ -131,6 +132,7 @@ class _Export:
             mesh=file,
             world_from_mesh=_rows(matrix),
             size_m=float(np.ptp(world, axis=0).max()),
+            splats=self._splats(item),
             pins=() if pins is None else pins.boxes(),
             pin_motion=() if pins is None else pins.motion(),
             **physics(item, self._unit, self._clock),
@@ -147,18 +149,30 @@ class _Export:
             self._files[key] = file, mesh
         return self._files[key]
 
+    def _splats(self, item: bpy.types.Object) -> str | None:
+        """The file of the splats of ``item``, in its own space; None without."""
+        found = splats.find(item)
+        if found is None or not len(found.data.vertices):
+            return None
+        file = f"splats/{self._names[item.name]}.ply"
+        write_splats(self._root / file, splats.read(found))
+        return file
+
     def _collider(self, collider: Collider) -> SceneObject:
         item, name = collider.item, self._names[collider.item.name]
         require_sound(collider.mesh, item.name)
         require_placed(collider.matrix, item.name)
         file = f"meshes/{name}.ply"
         write_mesh(self._root / file, collider.mesh.points, collider.mesh.faces)
+        motion = collider.motion(self._root, f"meshes/{name}.npz")
         return SceneObject(
             name=name,
             mesh=file,
             world_from_mesh=_rows(collider.matrix),
             size_m=float(np.ptp(_to_world(collider.mesh, collider.matrix), axis=0).max()),
-            motion=collider.motion(self._root, f"meshes/{name}.npz"),
+            motion=motion,
+            # A collider that bends has no motion that splats could follow.
+            splats=self._splats(item) if motion is None or motion.vertices_file is None else None,
             **physics(item, self._unit, self._clock),
         )
 

@@ -19,6 +19,7 @@ from mathutils import Matrix
 
 from ...sim.errors import InputError
 from ..props.body import bodies
+from . import splats
 from .animation import PLACING, TRANSFORM, Channel, channels, curves, drivers
 from .export_meshes import read_corners, read_points
 from .export_names import export_names
@@ -108,6 +109,10 @@ class _Digest:
         self._seen.discard((item.as_pointer(), True))
         dynamic = item.physgen.role == "dynamic"
         self._object(item, shape=True, as_seen=not dynamic)
+        seen = splats.find(item)
+        if seen is not None:
+            # The motion does not depend on them, but what is baked of it does.
+            self.hash.update(read_points(seen.data))
         if dynamic:
             for pin in item.physgen.pins:
                 self._object(pin.box, shape=True)

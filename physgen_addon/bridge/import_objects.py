@@ -35,7 +35,7 @@ def add_object(
     # As Blender keeps it, or vertices would come back shifted by what rounding took.
     centre = centre_of_mass(vertices, faces).astype(np.float32).astype(np.float64)
     data = made.add(bpy.data.meshes.new(source.name))
-    _fill_mesh(data, vertices - centre, faces)
+    fill_mesh(data, vertices - centre, faces)
     uv, picture, albedo = _appearance(made, folder, source, mesh, vertices)
     data.uv_layers.new(name=UV).data.foreach_set("uv", uv[faces.ravel()].astype(np.float32).ravel())
     data.shade_smooth()
@@ -60,7 +60,8 @@ def centre_of_mass(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     return np.asarray(centre if (low <= centre).all() and (centre <= high).all() else middle)
 
 
-def _fill_mesh(data: bpy.types.Mesh, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
+def fill_mesh(data: bpy.types.Mesh, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
+    """Give the empty mesh ``data`` the ``vertices`` (V, 3) and triangles ``faces`` (T, 3)."""
     data.vertices.add(len(vertices))
     data.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     data.loops.add(faces.size)

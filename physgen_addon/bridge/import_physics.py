@@ -37,7 +37,7 @@ def fill(
     notes: list[str] = []
     _fill_world(scene, source, ground, notes)
     for item, body in zip(items, source.objects, strict=True):
-        _fill_body(scene, collection, item, body, source.ground, notes)
+        fill_body(scene, collection, item, body, source.ground, notes)
     _fill_effects(scene, source, items, notes)
     if source.contacts:
         pairs = ", ".join(" and ".join(contact.between) for contact in source.contacts)
@@ -80,7 +80,7 @@ def _fill_effects(scene: bpy.types.Scene, source: Scene, items: list[bpy.types.O
             line.targets.add().item = by_name[name]
 
 
-def _fill_body(
+def fill_body(
     scene: bpy.types.Scene,
     collection: bpy.types.Collection,
     item: bpy.types.Object,
@@ -88,6 +88,7 @@ def _fill_body(
     ground: Ground,
     notes: list[str],
 ) -> None:
+    """Fill the fields of ``item``; its pins become empties in ``collection``. What has none is told in ``notes``."""
     body = item.physgen
     rate, first = scene.render.fps / scene.render.fps_base, scene.physgen.simulation.frame_start
     body.enabled, body.source, body.role = True, source.name, source.role

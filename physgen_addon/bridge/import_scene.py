@@ -13,9 +13,10 @@ import bpy
 
 from ...sim.effects.registry import effect
 from ...sim.errors import InputError
+from ...sim.gaussians.splats import Splats
 from ...sim.scene.folder import SCENE_FILE, SceneFolder, load_scene
 from ...sim.scene.glb import TexturedMesh, read_textured_mesh
-from . import import_objects, import_physics, import_view
+from . import import_objects, import_physics, import_splats, import_view, splats
 from .import_view import MARK
 
 NOTES = "physgen_notes"
@@ -28,6 +29,7 @@ class _Read:
 
     folder: SceneFolder
     meshes: tuple[TexturedMesh, ...]
+    splats: tuple[Splats | None, ...]
 
 
 def scene_root(path: Path) -> Path:
@@ -57,6 +59,9 @@ def import_scene(scene: bpy.types.Scene, root: Path) -> bpy.types.Collection:
             import_objects.add_object(made, collection, read.folder, source, mesh)
             for source, mesh in zip(read.folder.scene.objects, read.meshes, strict=True)
         ]
+        for item, source, seen in zip(items, read.folder.scene.objects, read.splats, strict=True):
+            if seen is not None:
+                made.add(import_splats.add_splats(item, source, seen))
         view = import_view.build(made, collection, read.folder, items)
     except BaseException:
         made.remove()
@@ -64,6 +69,8 @@ def import_scene(scene: bpy.types.Scene, root: Path) -> bpy.types.Collection:
     old = scene.physgen.photo_root
     scene.collection.children.link(collection)
     import_view.show(scene, collection, view, read.folder.scene.camera)
+    if any(seen is not None for seen in read.splats):
+        splats.allow_transparency(scene)
     notes = import_physics.fill(scene, collection, read.folder.scene, items, view.ground)
     for item in collection.all_objects:
         item[MARK] = True
@@ -112,13 +119,14 @@ def _read(root: Path) -> _Read:
             known.checked({**known.defaults, **dict(entry.parameters)})
         except InputError as error:
             raise InputError(f"effect {entry.name!r}: {error}") from None
-    meshes = []
+    meshes, seen = [], []
     for item in folder.scene.objects:
         try:
             meshes.append(read_textured_mesh(folder.file(item.mesh)))
+            seen.append(import_splats.read_object_splats(folder, item))
         except InputError as error:
             raise InputError(f"object {item.name}: {error}") from None
-    return _Read(folder=folder, meshes=tuple(meshes))
+    return _Read(folder=folder, meshes=tuple(meshes), splats=tuple(seen))
 
 
 def _stored(root: Path) -> str:

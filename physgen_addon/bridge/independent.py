@@ -11,7 +11,7 @@ import bpy
 
 from ...sim.errors import InputError
 from .. import paths
-from . import caches, points
+from . import caches, points, splats
 
 
 def strip() -> list[str]:
@@ -23,6 +23,7 @@ def strip() -> list[str]:
         modifier.filepath = paths.stored(paths.absolute(modifier.filepath))
     for item in bpy.data.objects:
         item.pop(points.POINTS_OF, None)
+        item.pop(splats.SPLATS, None)
         item.property_unset("physgen")
     for scene in bpy.data.scenes:
         scene.property_unset("physgen")

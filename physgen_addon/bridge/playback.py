@@ -13,7 +13,7 @@ from ...sim.errors import InputError
 from .. import paths
 from ..bake_record import GRAINS, MESH, SURFACE, BakeRecord, Look, manifest_of, playable, spacing
 from ..props.body import bodies
-from . import caches, points
+from . import caches, points, splats
 from .export_names import export_names
 
 GRANULAR = ("sand", "snow")
@@ -153,7 +153,11 @@ def repoint(scene: bpy.types.Scene, old: Path, new: Path, blend: Path | None = N
 def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObject, record: BakeRecord) -> None:
     look, file = record.look(baked.name), record.path / baked.file
     caches.attach_as_first(item, Pc2Reader(file), paths.stored(file), record.frame_start)
-    if look.shape == MESH or baked.points_file is None:
+    if baked.splats_file is not None:
+        seen = record.path / baked.splats_file
+        splats.play(item, Pc2Reader(seen), paths.stored(seen), record.frame_start)
+    # Splats show what flows themselves.
+    if look.shape == MESH or baked.points_file is None or splats.find(item) is not None:
         _hide_points(scene, item, baked.name)
         return
     file = record.path / baked.points_file
@@ -172,6 +176,7 @@ def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObj
 
 def _hide_object(scene: bpy.types.Scene, item: bpy.types.Object, name: str) -> None:
     caches.detach(item)
+    splats.rest(item)
     _hide_points(scene, item, name)
 
 

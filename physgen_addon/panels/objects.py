@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from .. import text
+from ..bridge import splats
 from ..operators.body import PHYSGEN_OT_add_bodies, PHYSGEN_OT_remove_body, PHYSGEN_OT_select_bodies
 from ..operators.material import (
     PHYSGEN_OT_copy_material,
@@ -103,6 +104,8 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
             return
         column = settings(layout, context, why=True)
         column.row().prop(item.physgen, "role", expand=True)
+        if splats.find(item) is not None:
+            column.row().prop(item.physgen, "splats_as", expand=True)
         if item.physgen.role == "dynamic":
             _draw_preset(column, context, item.physgen.material)
         if item.physgen.role == "collider":

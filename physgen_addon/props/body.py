@@ -18,6 +18,7 @@ from bpy.props import (
 )
 from mathutils import Vector
 
+from ..bridge import splats
 from .material import PHYSGEN_PG_material
 from .surface import Surface
 
@@ -48,6 +49,10 @@ def _set_speed(self: "PHYSGEN_PG_body", speed: float) -> None:
     velocity = Vector(self.velocity)
     direction = velocity.normalized() if velocity.length > 0 else Vector((1.0, 0.0, 0.0))
     self.velocity = direction * speed
+
+
+def _show_splats(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
+    splats.show_as(self.id_data, self.splats_as)
 
 
 class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
@@ -92,6 +97,17 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
             ("slip", "Slip", "Slides without friction and does not leave"),
             ("sticky", "Stick", "Neither slides nor leaves"),
         ],
+    )
+
+    splats_as: EnumProperty(
+        name="Seen As",
+        description="What an object of Gaussian splats is seen as",
+        items=[
+            ("ELLIPSOIDS", "Splats", "Each splat as a soft ellipsoid, which follows the matter around it"),
+            ("POINTS", "Points", "Each splat as a small ball, quick to draw"),
+            ("MESH", "Mesh", "The closed mesh around them, which is simulated"),
+        ],
+        update=_show_splats,
     )
 
     velocity: FloatVectorProperty(

@@ -30,7 +30,7 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _GARBAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error, RecursionError)
 """What following the references of a damaged file leads to."""
 
@@ -41,12 +41,14 @@ class TexturedMesh:
 
     vertices: (V, 3); faces: (T, 3) vertex indices; uv: (V, 2), the origin at the bottom left, or None.
     picture: bytes of a PNG or JPEG file, the colour of the surface, or None.
+    colours: (V, 3) linear, at the vertices, or None.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     uv: NDArray[np.float64] | None = None
     picture: bytes | None = None
+    colours: NDArray[np.float64] | None = None
 
 
 def read_textured_mesh(path: Path) -> TexturedMesh:
@@ -107,7 +109,8 @@ def _parse(content: bytes) -> TexturedMesh | None:
     faces = index.reshape(-1, 3)
     # As trimesh has it: a mirrored node keeps its outside.
     faces = faces[:, ::-1].copy() if np.linalg.det(matrix[:3, :3]) < 0 else faces
-    return TexturedMesh(vertices=vertices, faces=faces, uv=uv, picture=picture)
+    colours = _colours(document, binary, attributes, len(vertices))
+    return TexturedMesh(vertices=vertices, faces=faces, uv=uv, picture=picture, colours=colours)
 
 
 def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -212,6 +215,18 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, width: int) -
     if accessor.get("normalized") and dtype.kind == "u":
         return np.asarray(values / float(2 ** (8 * dtype.itemsize) - 1))
     return values
+
+
+def _colours(
+    document: dict[str, Any], binary: bytes, attributes: dict[str, Any], count: int
+) -> NDArray[np.float64] | None:
+    if "COLOR_0" not in attributes:
+        return None
+    width = _WIDTHS[_item(document, "accessors", attributes["COLOR_0"])["type"]]
+    colours = _accessor(document, binary, attributes["COLOR_0"], width).astype(np.float64)
+    if width < 3 or len(colours) != count or not np.isfinite(colours).all():
+        raise ValueError("colours that do not fit its vertices")
+    return colours[:, :3]
 
 
 def _texture(
