@@ -19,6 +19,7 @@ MODULES = (
     "jobs",
     "operators.check_python",
     "operators.import_scene",
+    "operators.import_splats",
     "operators.photo",
     "operators.draw_box",
     "operators.paint_mask",

@@ -30,7 +30,7 @@ AS_POINTS, LOOK = "As Points", "Material"
 ELLIPSOIDS, POINTS, MESH = "ELLIPSOIDS", "POINTS", "MESH"
 SIGMAS = 2.0
 """Standard deviations at which an ellipsoid ends; towards there it fades to nothing."""
-DOT = 0.7
+DOT = 1.0
 """Radius of a point over the splat's mean standard deviation: on a surface neighbours just close it."""
 FAINT = 0.1
 """Opacity below which a splat is no point, which would be opaque."""

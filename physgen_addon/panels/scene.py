@@ -10,6 +10,7 @@ import bpy
 from .. import text
 from ..operators.body import PHYSGEN_OT_add_bodies
 from ..operators.import_scene import PHYSGEN_OT_import_scene
+from ..operators.import_splats import PHYSGEN_OT_choose_splats
 from ..operators.photo import PHYSGEN_OT_open_photo
 from ..props.body import bodies
 from . import photo
@@ -49,6 +50,7 @@ def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> N
         ("Meshes: select some in the viewport", PHYSGEN_OT_add_bodies, "Simulate Selected", "PHYSICS"),
         ("A photo: draw a box around each thing in it", PHYSGEN_OT_open_photo, "Open Photo", "IMAGE_DATA"),
         ("A scene folder that was made before", PHYSGEN_OT_import_scene, "Import Scene Folder", "IMPORT"),
+        ("Gaussian splats of an object (PLY)", PHYSGEN_OT_choose_splats, "Import Splats", "POINTCLOUD_DATA"),
     ):
         box = layout.box()
         text.sentences(box, context, title)
