@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.app.import_splats import UPS, import_splats
+from physgen.sim.app.import_splats import import_splats
 from physgen.sim.errors import InputError
 from physgen.sim.gaussians.moving import placed, quaternions
 from physgen.sim.gaussians.ply.read import read_splats
@@ -71,9 +71,9 @@ def test_the_shape_does_not_depend_on_unit_and_place():
 
 def test_floaters_fog_and_holes_do_not_matter():
     ball = trimesh.creation.icosphere(4)
-    splats = on_surface(ball, 12_000)
+    splats = on_surface(ball, 8_000)
     random = np.random.default_rng(1)
-    hole = splats.centres[:, 2] > -0.99
+    hole = splats.centres[:, 2] > -0.98
     floating = Splats(
         centres=random.normal(size=(40, 3)) * 30,
         scales=np.full((40, 3), 0.02),
@@ -109,13 +109,13 @@ def test_what_shows_no_body_is_refused():
         surface_of(splats.changed(opacities=np.full(200, 0.11), scales=np.full((200, 3), 1e-4)), "dust", quiet)
 
 
-@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("up", ["y-down", "x", "z-down"])
 def test_it_stands_upright_on_the_ground(tmp_path, up):
     """A pole with a red top, along any axis of the file: in the world its top is up, and it is not mirrored."""
     direction = np.zeros(3)
     direction["xyz".index(up[0])] = -1.0 if up.endswith("down") else 1.0
     turn = trimesh.geometry.align_vectors([0, 0, 1], direction)
-    pole = on_surface(trimesh.creation.box((0.5, 0.5, 2.0)), 4000)
+    pole = on_surface(trimesh.creation.box((0.5, 0.5, 2.0)), 2000)
     red = np.where(pole.centres[:, 2:] > 0.5, [[0.9, 0.1, 0.1]], [[0.2, 0.3, 0.9]])
     matrix = turn.copy()
     matrix[:3, 3] = 7.0
