@@ -58,6 +58,9 @@ class Reference:
 class StepRecord:
     """What one step of the optimiser found, before it moved anything."""
 
+    piece: str
+    """Name of the one that yields."""
+
     step: int
     loss: float
     """Image loss (eq. 18); NaN where the method does not look."""

@@ -23,16 +23,16 @@ class ComposeOptions:
     """K of Algorithm 1, 1 to 100,000."""
 
     substeps: int = 20
-    """N of Algorithm 1: MPM substeps a step, 1 to 1000; an elastic wave crosses about 0.4 cells in each."""
+    """N of Algorithm 1: MPM substeps a step, 1 to 1000."""
 
-    cells: int = 40
-    """Grid cells across the longest side of the asset, 16 to 256."""
+    cells: int = 32
+    """Grid cells along the longest side of the piece that yields, 8 to 256."""
 
     ssim_share: float = 0.2
     """λ1 of eq. 18, 0 to 1."""
 
     guidance_weight: float = 1e-5
-    """λ3 of eq. 19, 0 to 1; without a guidance it does nothing."""
+    """λ3 of eq. 19 for pictures of 256² pixels, 0 to 1; scaled for others. Without a guidance it does nothing."""
 
     first_timestep: int = 100
     """Noise level of the guidance at the first step, 1 to 999."""
@@ -40,7 +40,7 @@ class ComposeOptions:
     last_timestep: int = 20
     """The same at the last step."""
 
-    first_move: float = 0.25
+    first_move: float = 1.0
     """Cells that the fastest hundredth of the points would move in the first step if they were alone, 0.01 to 1. It
     sets the factor between gradient and velocity, which then stays (but for ``last_rate``)."""
 
@@ -53,7 +53,7 @@ class ComposeOptions:
     first_turn: float = 0.01
     """Radians that a splat turns in the first step, of the fastest hundredth; 0 (held) to 0.1."""
 
-    keep_strain: float = 0.9
+    keep_strain: float = 0.5
     """Share of the strain that lives on from step to step, 0 to 1. 0: every step starts undeformed, as Algorithm 1
     hands over places and velocities only. 1: an elastic body that wants its first shape back."""
 
@@ -69,12 +69,12 @@ class ComposeOptions:
         ranges: dict[str, tuple[float, float]] = {
             "steps": (1, 100_000),
             "substeps": (1, 1000),
-            "cells": (16, 256),
+            "cells": (8, 256),
             "ssim_share": (0, 1),
             "guidance_weight": (0, 1),
             "first_timestep": (1, 999),
             "last_timestep": (1, 999),
-            "first_move": (0.01, 1),
+            "first_move": (0.01, 4),
             "last_rate": (0.001, 1),
             "first_stretch": (0, 0.1),
             "first_turn": (0, 0.1),
