@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .contacts import GROUND_NAME
 from .tracks import Track
+
+if TYPE_CHECKING:
+    from .distance import DistanceLattice
 
 Array = NDArray[np.float64]
 
@@ -50,6 +54,9 @@ class Collider:
         the turn is steady about the axis that leads from one to the next.
     pivot: world point about which it turns; None takes the middle of the surface's bounding box.
     vertices: Track of (V, 3) world metres for a surface that deforms, in place of translations and rotations.
+    lattice: signed distances of the surface at rest in place of those that are worked out of it: finer where it is
+        thin, or with a boundary of the caller's own. What is below 0 is where matter may not be; rigid bodies touch it
+        too, with their own points. Not of a surface that deforms.
     """
 
     name: str
@@ -58,6 +65,7 @@ class Collider:
     rotations: Track | None = None
     pivot: tuple[float, float, float] | None = None
     vertices: Track | None = None
+    lattice: DistanceLattice | None = None
 
     def __post_init__(self) -> None:
         if self.name == GROUND_NAME:
@@ -69,6 +77,8 @@ class Collider:
         if self.vertices is not None:
             if self.translations is not None or self.rotations is not None:
                 raise InputError(f"collider {self.name!r}: give vertices or translations and rotations, not both")
+            if self.lattice is not None:
+                raise InputError(f"collider {self.name!r}: give vertices or a lattice, not both")
             if self.vertices.values.shape[1:] != self.surface.vertices.shape:
                 raise InputError(
                     f"collider {self.name!r}: vertices has values {self.vertices.values.shape}: give (K, V, 3) with "

@@ -192,24 +192,25 @@ class Engine:
         all_keys = [state["keys"].astype(np.int64)]
         control, means = self.control(), self._means.to_numpy()
         for added, wave_speed in groups:
-            base = np.clip(np.floor(added.x - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
+            x, keys = places_in_blocks(added.field, added.x)
+            count = len(x)
             new = {
-                "x": np.rint((added.x - (4 * base - 1)) * FIXED_ONE).astype(np.int32),
+                "x": x,
                 "v": added.v.astype(np.float32),
                 "C": added.C.astype(np.float32),
                 "F": added.F.astype(np.float32),
                 "constants": added.constants.astype(np.float32),
-                "reaction": np.zeros((len(base), 4), dtype=np.float32),
+                "reaction": np.zeros((count, 4), dtype=np.float32),
                 "ids": added.ids.astype(np.int32),
-                "memory": np.zeros(len(base), dtype=np.float32),
+                "memory": np.zeros(count, dtype=np.float32),
                 "material": added.material.astype(np.int32),
                 "volumes": added.volumes.astype(np.float32),
                 "anchors": added.anchors.astype(np.float32),
-                "slopes": np.zeros((len(base), 3), dtype=np.float32),
+                "slopes": np.zeros((count, 3), dtype=np.float32),
             }
             for name in self._names:
                 parts[name].append(new[name])
-            all_keys.append(_block_keys(np.int64(added.field), base))
+            all_keys.append(keys)
             row = control[self._field_world[added.field]]
             row[layout.SPEED] = max(row[layout.SPEED], math.sqrt(float(np.max((added.v**2).sum(axis=1)))))
             row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
@@ -578,6 +579,12 @@ def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64])
     """Keys (n,) of the blocks (n, 3) of the fields, as ``sorting.block_key`` packs them."""
     x, y, z = (blocks + sorting.BIAS).T
     return np.asarray(((fields << 16 | x) << 16 | y) << 16 | z)
+
+
+def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Places (n, 3) in cells as ``state`` has them: "x" (n, 3) from the corner of the block of each, and "keys" (n,)."""
+    block = np.clip(np.floor(cells - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
+    return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), _block_keys(np.int64(field), block)
 
 
 def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

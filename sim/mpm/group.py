@@ -14,7 +14,7 @@ from ..events import IsCancelled, never
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import layout, packing, runtime
 from .checks import check_start
-from .engine import MOST_RETRIES, Diverged, Engine, Stopped
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks
 from .fitting import FittedGradients
 from .options import SolverOptions
 from .setup import WorldSetup
@@ -241,6 +241,48 @@ class Group:
         self._engine.expect(place.world, speed=fastest)
         self._host = None
 
+    def set_motion(
+        self,
+        world: int,
+        index: int,
+        *,
+        velocities: Array,
+        velocity_gradients: Array | None = None,
+        positions: Array | None = None,
+        gradients: Array | None = None,
+    ) -> None:
+        """Give every particle of body ``index`` of world ``world`` a state of its own; see ``World.set_motion``."""
+        number = self.body_number(world, index)
+        place, body = self._places[world], self.setups[world].bodies[index]
+        if body.rigid or not self._started[number]:
+            kind = "is rigid" if body.rigid else "has not started"
+            raise InputError(f"body {body.name!r} {kind}: give motion to bodies of particles that have started")
+        given = _checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
+        state = dict(self.state())
+        mine = np.flatnonzero(self._rows_of(state, number))
+        order = np.asarray(state["ids"])[mine] - self._offsets[number]
+        scale = place.cells.scale
+        still = np.zeros((body.count, 3, 3))
+        new: dict[str, NDArray[np.generic]] = {
+            "v": given["velocities"] * scale,
+            "C": given.get("velocity_gradients", still),
+        }
+        if "gradients" in given:
+            new["F"] = given["gradients"]
+        if "positions" in given:
+            x, keys = places_in_blocks(place.field(index), place.cells.points_to_engine(given["positions"]))
+            new |= {"x": x, "keys": keys}
+        if len(new) > 2:
+            # Impulses of contacts that carried another load, or at another place, say nothing about this one.
+            new["reaction"] = np.zeros((body.count, 4))
+        for name, values in new.items():
+            changed = np.array(state[name])
+            changed[mine] = values[order].astype(changed.dtype)
+            state[name] = changed
+        self._engine.replace(state)
+        self._engine.expect(world, speed=float(np.linalg.norm(given["velocities"], axis=1).max()) * scale)
+        self._host = None
+
     def _lost(self, failure: Diverged) -> SimulationError:
         place = self._places[failure.world]
         time = float(self._times[failure.world])
@@ -356,3 +398,31 @@ class Group:
         self._between = False
         self._host = None
         self._poses = {}
+
+
+def _checked_motion(
+    name: str,
+    count: int,
+    velocities: Array,
+    velocity_gradients: Array | None,
+    positions: Array | None,
+    gradients: Array | None,
+) -> dict[str, Array]:
+    """The arguments that are given, as float64. Raises InputError on a wrong shape or a number that is not finite."""
+    shapes = {
+        "velocities": (velocities, (count, 3)),
+        "velocity_gradients": (velocity_gradients, (count, 3, 3)),
+        "positions": (positions, (count, 3)),
+        "gradients": (gradients, (count, 3, 3)),
+    }
+    given = {}
+    for field, (values, shape) in shapes.items():
+        if values is not None:
+            array = np.asarray(values, dtype=np.float64)
+            if array.shape != shape:
+                raise InputError(f"body {name!r}: {field} have shape {array.shape}: give {shape}, one a particle")
+            if not np.isfinite(array).all():
+                bad = int(np.argmin(np.isfinite(array.reshape(count, -1)).all(axis=1)))
+                raise InputError(f"body {name!r}: {field} of particle {bad} are {array[bad].tolist()}: give numbers")
+            given[field] = array
+    return given

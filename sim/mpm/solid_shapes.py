@@ -85,6 +85,15 @@ def lattice_of(surface: Surface, *, margin: float = 0.0) -> DistanceLattice:
     return _LATTICES.get(surface, reach, lambda: signed_distance(surface, spacing, margin=reach))
 
 
+def reach_of(lattice: DistanceLattice, center: Array) -> float:
+    """Distance in metres from ``center`` (3,) within which lies all that is inside by ``lattice``."""
+    inside = np.argwhere(lattice.distances <= 0)
+    if len(inside) == 0:
+        return 0.0
+    away = np.linalg.norm(lattice.origin + lattice.spacing * inside - center, axis=1)
+    return float(away.max()) + lattice.spacing
+
+
 def points_of(surface: Surface, center: Array) -> PointSet:
     """Points of ``surface`` relative to ``center`` (3,), those of its convex hull first."""
     return _POINTS.get(surface, center.tobytes(), lambda: _points_of(surface, center))

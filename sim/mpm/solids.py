@@ -21,7 +21,7 @@ from .distance import DistanceLattice
 from .mass import mass_properties
 from .rigid import move_worlds, search_worlds
 from .setup import WorldSetup
-from .solid_shapes import NO_POINTS, PointSet, lattice_of, points_of, tables
+from .solid_shapes import NO_POINTS, PointSet, lattice_of, points_of, reach_of, tables
 from .tracks import SAME_TIME
 
 Array = NDArray[np.float64]
@@ -162,7 +162,7 @@ class Solids:
             name=collider.name,
             source=collider,
             center=center,
-            lattices=[lattice_of(collider.surface)],
+            lattices=[collider.lattice or lattice_of(collider.surface)],
             points=points_of(collider.surface, center),
         )
 
@@ -191,6 +191,8 @@ class Solids:
             numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
                 np.array([points.radius, points.spacing, points.bulge]) * scale
             )
+            if isinstance(solid.source, Collider) and solid.source.lattice is not None:
+                numbers[i, at.RADIUS] = max(points.radius, reach_of(solid.source.lattice, solid.center)) * scale
             if isinstance(solid.source, Collider) and solid.source.vertices is not None:
                 farthest = np.linalg.norm(solid.source.vertices.values - solid.center, axis=2).max()
                 numbers[i, at.RADIUS] = float(farthest) * scale

@@ -95,6 +95,36 @@ class World(WorldView):
         """
         self._worlds.advance(duration, stop)
 
+    def set_motion(
+        self,
+        index: int,
+        *,
+        velocities: NDArray[np.float64],
+        velocity_gradients: NDArray[np.float64] | None = None,
+        positions: NDArray[np.float64] | None = None,
+        gradients: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Give every particle of body ``index`` a motion of its own, in the order in which they were given.
+
+        velocities: (N, 3) m/s.
+        velocity_gradients: (N, 3, 3) 1/s, the APIC velocity gradients; None sets them to 0, because those of the old
+            motion do not belong to the new one.
+        positions: (N, 3) world metres; None leaves the particles where they are.
+        gradients: (N, 3, 3) elastic deformation gradients; None keeps them.
+
+        Where positions or gradients are given, the impulses of contacts start anew from 0.
+        Raises InputError on a wrong shape, on numbers that are not finite, and for a body that is rigid or has not
+        started.
+        """
+        self._worlds.set_motion(
+            0,
+            index,
+            velocities=velocities,
+            velocity_gradients=velocity_gradients,
+            positions=positions,
+            gradients=gradients,
+        )
+
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Everything needed to continue, as arrays for ``numpy.savez``; a restored world continues with equal bytes."""
         return self._worlds.checkpoint()

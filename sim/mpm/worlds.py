@@ -118,6 +118,27 @@ class Worlds:
         for group in self._groups:
             group.advance(duration, stop)
 
+    def set_motion(
+        self,
+        world: int,
+        index: int,
+        *,
+        velocities: NDArray[np.float64],
+        velocity_gradients: NDArray[np.float64] | None = None,
+        positions: NDArray[np.float64] | None = None,
+        gradients: NDArray[np.float64] | None = None,
+    ) -> None:
+        """``World.set_motion`` of world ``world``."""
+        group, place = self._place[range(len(self))[world]]
+        group.set_motion(
+            place,
+            index,
+            velocities=velocities,
+            velocity_gradients=velocity_gradients,
+            positions=positions,
+            gradients=gradients,
+        )
+
     def checkpoint(self) -> State:
         """Everything needed to continue, as arrays for ``numpy.savez``; a restored run continues with equal bytes."""
         if len(self._groups) == 1:
