@@ -272,8 +272,7 @@ class Group:
         if "positions" in given:
             x, keys = places_in_blocks(place.field(index), place.cells.points_to_engine(given["positions"]))
             new |= {"x": x, "keys": keys}
-        if len(new) > 2:
-            # Impulses of contacts that carried another load, or at another place, say nothing about this one.
+            # Impulses of contacts at another place say nothing about this one.
             new["reaction"] = np.zeros((body.count, 4))
         for name, values in new.items():
             changed = np.array(state[name])

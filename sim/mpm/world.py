@@ -112,7 +112,7 @@ class World(WorldView):
         positions: (N, 3) world metres; None leaves the particles where they are.
         gradients: (N, 3, 3) elastic deformation gradients; None keeps them.
 
-        Where positions or gradients are given, the impulses of contacts start anew from 0.
+        Where positions are given, the impulses of contacts start anew from 0.
         Raises InputError on a wrong shape, on numbers that are not finite, and for a body that is rigid or has not
         started.
         """

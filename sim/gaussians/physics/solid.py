@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The inside of an object of which a closed surface or only points are known, as signed distances. No Taichi."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes, distance_transform_edt
+from scipy.spatial import cKDTree
+
+from ...errors import InputError
+from ...mpm.colliders import Surface
+from ...mpm.distance import DistanceLattice, signed_distance
+
+Array = NDArray[np.float64]
+
+NODES = 64
+"""Lattice nodes along the longest side of the object."""
+
+CLOSING = 2.5
+"""Distances between neighbouring points that a gap in a skin of points may be wide and still count as closed."""
+
+
+def solid_of_surface(surface: Surface) -> DistanceLattice:
+    """Distances to a closed surface, negative inside. Raises InputError where it is open or flat."""
+    spacing = float(np.ptp(surface.vertices, axis=0).max()) / NODES
+    return signed_distance(surface, spacing, margin=3 * spacing)
+
+
+def solid_of_points(points: Array) -> DistanceLattice:
+    """Distances to what points (N, 3) enclose: they are swollen until gaps close, holes are filled, and it shrinks back.
+
+    A skin whose gaps are wider than 2.5 times the usual distance between neighbours has no inside; what is left then
+    is the skin itself. Raises InputError for fewer than 8 points, or points all in one place.
+    """
+    if len(points) < 8 or not np.ptp(points, axis=0).max() > 0:
+        raise InputError(f"physical body: {len(points)} points have no extent: give at least 8 in different places")
+    tree = cKDTree(points)
+    apart = float(np.median(tree.query(points, k=min(4, len(points)))[0][:, -1]))
+    size = float(np.ptp(points, axis=0).max())
+    spacing = size / NODES
+    reach = max(0.5 * CLOSING * apart, spacing)
+    low = points.min(axis=0) - reach - 3 * spacing
+    shape = np.ceil((np.ptp(points, axis=0) + 2 * reach + 6 * spacing) / spacing).astype(np.int64) + 1
+    nodes = low + spacing * np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
+    gap = tree.query(nodes.reshape(-1, 3), distance_upper_bound=4 * reach)[0].reshape(tuple(shape))
+    swollen = binary_fill_holes(gap <= reach)
+    # Inside, the distance to the swollen skin is measured on nodes; outside, to the points themselves.
+    depth = distance_transform_edt(swollen) * spacing - 0.5 * spacing - reach
+    distances = np.where(swollen, -depth, np.minimum(gap, 4 * reach) + 0.0)
+    return DistanceLattice(origin=low, spacing=spacing, distances=distances.astype(np.float32))
+
+
+def filling(solid: DistanceLattice, spacing: float, points: Array) -> Array:
+    """Places (M, 3) ``spacing`` metres apart in the inside, none within 0.6 spacings of one of ``points`` (N, 3)."""
+    first = solid.origin + 0.5 * spacing
+    counts = np.maximum(1, np.floor((solid.high - first) / spacing)).astype(np.int64)
+    lattice = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    places = first + spacing * lattice
+    places = places[solid.at(places)[0] < -0.25 * spacing]
+    if len(places) == 0:
+        return places
+    beside = cKDTree(points).query(places, distance_upper_bound=0.6 * spacing)[0]
+    return np.asarray(places[~np.isfinite(beside)])
+
+
+def volumes_of(solid: DistanceLattice, spacing: float, particles: Array) -> Array:
+    """Volume (N,) in m³ of the inside that is nearest to each particle (N, 3), looked at in places ``spacing`` apart.
+
+    A particle to which no place is nearest gets an eighth of one place's share.
+    """
+    counts = np.maximum(1, np.floor((solid.high - solid.origin) / spacing)).astype(np.int64)
+    lattice = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    places = solid.origin + spacing * (lattice + 0.5)
+    places = places[solid.at(places)[0] < 0]
+    owners = cKDTree(particles).query(places)[1]
+    return np.maximum(np.bincount(owners, minlength=len(particles)), 0.125) * spacing**3
