@@ -9,15 +9,16 @@ closed to the body is
 
     U = W ∪ S,     S = { x : the path of steepest ascent of the depth of B from x crosses W and leaves it within B }
 
-and the distance to U, in place of that to W, leads everything out on the side of the body's middle. Where the obstacle
-reaches the middle itself, no path leaves it, S is empty there, and the nearest side is as good as any other.
+and the length of the path to where it leaves W takes the place of the distance to W's surface: everything is led out on
+the side of the body's middle, unless the rim of U is much nearer. Where the obstacle reaches the middle itself, no path
+leaves it, S is empty there, and the nearest side is as good as any other.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, distance_transform_edt
+from scipy.ndimage import distance_transform_edt
 
 from ...mpm.colliders import Surface
 from ...mpm.distance import DistanceLattice, signed_distance
@@ -34,8 +35,14 @@ NODES_IN_WALL = 3.0
 PACE = 0.6
 """Lattice spacings by which a path is followed at a time."""
 
+SHELL = 2.5
+"""Lattice spacings around the obstacle in which paths are followed."""
+
+SIDEWAYS = 2.5
+"""Times that the way to the rim of the closed region must be shorter than the way inward to be taken instead."""
+
 AROUND = 4.0
-"""Lattice spacings around the obstacle in which its shadow is looked for, besides the depth of what it is in."""
+"""Lattice spacings around the obstacle that the lattice spans, besides the depth of what it is in."""
 
 
 def obstacle_lattice(surface: Surface, body: DistanceLattice, *, exit_side: str) -> DistanceLattice:
@@ -49,7 +56,7 @@ def obstacle_lattice(surface: Surface, body: DistanceLattice, *, exit_side: str)
     lattice = signed_distance(surface, spacing, margin=(depth + AROUND * spacing) if depth > 0 else 3 * spacing)
     if depth <= 0:
         return lattice
-    return _with_shadow(lattice, _shadow(lattice, body, depth))
+    return _with_shadow(lattice, _inward(lattice, body, depth))
 
 
 def lattice_spacing(surface: Surface) -> float:
@@ -76,52 +83,59 @@ def _deepest(surface: Surface, body: DistanceLattice, spacing: float) -> float:
     return depth + spacing if depth > 0 else 0.0
 
 
-def _shadow(lattice: DistanceLattice, body: DistanceLattice, deepest: float) -> NDArray[np.bool_]:
-    """Nodes (nx, ny, nz) outside of the obstacle that are behind it, seen from the body's middle."""
-    shape, step = lattice.distances.shape, lattice.spacing
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+def _inward(lattice: DistanceLattice, body: DistanceLattice, deepest: float) -> Array:
+    """Metres (nx, ny, nz) along the path from each node to where it leaves the obstacle for good; inf: not in U."""
+    step, own = lattice.spacing, lattice.distances
+    near = own < SHELL * step
+    index = np.argwhere(near)
     places = lattice.origin + step * index
-    own = lattice.distances.reshape(-1)
+    entered = own[near] < 0
     depth, uphill = body.at(places)
     depth, uphill = -depth, -uphill
-    climbing = (own >= 0) & (depth < deepest)
-    index, places, depth, uphill = index[climbing], places[climbing], depth[climbing], uphill[climbing]
-    behind = np.zeros(len(index), dtype=np.bool_)
-    entered = np.zeros(len(index), dtype=np.bool_)
-    walking = np.arange(len(index))
+    left_after = np.full(len(index), np.inf)
+    length = np.zeros(len(index))
+    distance = own[near].astype(np.float64)
+    walking = np.flatnonzero(depth < deepest)
+    places, depth, uphill = places[walking], depth[walking], uphill[walking]
     pace = PACE * step
     while len(walking):
+        before = distance[walking]
         # Far from the obstacle and outside of the body nothing is missed by long strides.
-        distance = lattice.at(places)[0]
-        stride = np.maximum(pace, 0.5 * np.where(depth < 0, np.minimum(np.abs(distance), -depth), 0.0))
-        direction = uphill / np.maximum(np.linalg.norm(uphill, axis=1), 1e-12)[:, None]
-        places = places + stride[:, None] * direction
+        stride = np.where(depth < 0, np.maximum(pace, 0.5 * np.minimum(np.abs(before), -depth)), pace)
+        places = places + (stride / np.maximum(np.linalg.norm(uphill, axis=1), 1e-12))[:, None] * uphill
         higher, uphill = body.at(places)
         higher, uphill = -higher, -uphill
-        distance = lattice.at(places)[0]
-        left = entered[walking] & (distance > 0) & (higher > 0)
-        behind[walking[left]] = True
-        entered[walking[distance < 0]] = True
+        now = lattice.at(places)[0]
+        leaves = entered[walking] & (before <= 0) & (now > 0) & (higher > 0)
+        share = before[leaves] / (before[leaves] - now[leaves])
+        left_after[walking[leaves]] = length[walking[leaves]] + share * stride[leaves]
+        entered[walking] |= now < 0
+        distance[walking] = now
+        length[walking] += stride
         # Beyond the obstacle's deepest place nothing is entered any more; on the middle the depth no longer grows.
-        goes_on = ~left & (higher > depth + 0.1 * stride) & (entered[walking] | (higher < deepest))
+        goes_on = (higher > depth + 0.1 * stride) & ((now < 0) | (higher < deepest))
+        # What ends in the obstacle has no side to leave on.
+        left_after[walking[~goes_on & (now < 0)]] = np.inf
         walking, places, depth, uphill = walking[goes_on], places[goes_on], higher[goes_on], uphill[goes_on]
-    shadow = np.zeros(shape, dtype=np.bool_)
-    shadow[tuple(index[behind].T)] = True
-    return shadow
+    result = np.full(own.shape, np.inf)
+    result[near] = left_after
+    # Farther away, a place is on the side of the obstacle that is nearest to it.
+    away, nearest = distance_transform_edt(~near, return_indices=True)
+    deep = -body.at(lattice.origin + step * np.indices(own.shape).reshape(3, -1).T)[0].reshape(own.shape)
+    return np.where(near | (deep < deepest), result[tuple(nearest)] + step * away, np.inf)
 
 
-def _with_shadow(lattice: DistanceLattice, shadow: NDArray[np.bool_]) -> DistanceLattice:
-    """Distances to the union of the obstacle and the shadow, exact to a lattice spacing in the shadow."""
-    if not shadow.any():
-        return lattice
+def _with_shadow(lattice: DistanceLattice, inward: Array) -> DistanceLattice:
+    """Distances to U; within it the way inward, or ``SIDEWAYS`` times the way to its nearest rim if that is less."""
     own, step = lattice.distances.astype(np.float64), lattice.spacing
-    closed = binary_closing(np.pad(shadow | (own < 0), 2), np.ones((3, 3, 3)))[2:-2, 2:-2, 2:-2] | shadow | (own < 0)
-    # What the closing added where the body's middle lies is a rounded corner of a wall: it stays free.
-    closed &= (own < 0) | shadow | (distance_transform_edt(~shadow) <= 1.5)
+    covered = np.isfinite(inward)
+    closed = covered | (own < 0)
+    if not (covered & (own >= 0)).any():
+        return lattice
     inner, nearest = distance_transform_edt(closed, return_indices=True)
     # The way to a free node leads beyond the surface by as much as that node is away from it.
-    beyond = np.minimum(own[tuple(nearest)], 0.5 * step)
-    inside = np.maximum(step * inner - np.maximum(beyond, 0.0), np.maximum(-own, 1e-3 * step))
-    outer = np.minimum(own, step * distance_transform_edt(~(closed & (own >= 0))) - 0.5 * step)
-    distances = np.where(closed, -inside, np.maximum(outer, np.minimum(own, 1e-3 * step)))
+    rim = np.maximum(step * inner - np.clip(own[tuple(nearest)], 0.0, 0.5 * step), 0.01 * step)
+    inside = np.where(covered, np.minimum(inward, SIDEWAYS * np.maximum(rim, -own)), -own)
+    outer = np.minimum(own, step * (distance_transform_edt(~(closed & (own >= 0))) - 0.5))
+    distances = np.where(closed, -inside, outer)
     return DistanceLattice(origin=lattice.origin, spacing=step, distances=distances.astype(np.float32))

@@ -43,8 +43,15 @@ LEAST_STRETCH, MOST_STRETCH = 0.6, 1.6
 """Principal stretches that strain is kept within from step to step. What was pulled or pushed beyond, as at the edge of
 an obstacle, has torn or yielded; kept, it would stiffen the body and shorten its substeps."""
 
+LEAST_SEEN, MOST_SEEN = 0.3, 3.0
+"""Principal stretches since the start that are reported at most."""
+
 NEIGHBOURS = 8
 """Points from which a filling particle takes its velocity."""
+
+CLEARANCE = 0.01
+"""Grid cells that points keep from a surface besides the margin: contact is right to about half of that, and a point
+that rests on a surface should not count as being in it."""
 
 GRID = 256
 """Cells to count from; the engine has no walls."""
@@ -95,9 +102,6 @@ class PhysicalBody:
         fill = filling(solid, spacing, own) if self.options.fill else np.zeros((0, 3))
         self._rest = np.concatenate([own, fill])
         self._volumes = volumes_of(solid, 0.5 * spacing, self._rest)
-        depth = np.maximum(0.0, -solid.at(fill)[0]) if len(fill) else np.zeros(0)
-        radii = np.concatenate([np.zeros(len(own)), np.minimum(0.5 * spacing, depth)])
-        self._radii = radii + self.options.margin
         self._extension = _extension(own, fill)
         self._gradients = np.broadcast_to(np.eye(3), (len(self._rest), 3, 3)).copy()
         self._lattices: list[tuple[Surface, DistanceLattice]] = []
@@ -129,8 +133,16 @@ class PhysicalBody:
 
     @property
     def particle_gradients(self) -> Array:
-        """Deformation gradients (M, 3, 3) of points and filling particles since the start."""
-        return self._gradients.copy()
+        """Deformation gradients (M, 3, 3) of points and filling particles since the start.
+
+        The product over all steps, as the engine's own hold only the strain that was kept; its principal stretches
+        within 0.3 and 3, beyond which matter is torn and the number says nothing.
+        """
+        far = np.flatnonzero(~_within(self._gradients @ self._gradients.transpose(0, 2, 1), LEAST_SEEN, MOST_SEEN))
+        result = self._gradients.copy()
+        turned, stretches, axes = np.linalg.svd(result[far])
+        result[far] = (turned * np.clip(stretches, LEAST_SEEN, MOST_SEEN)[:, None, :]) @ axes
+        return result
 
     @property
     def volumes(self) -> Array:
@@ -163,8 +175,7 @@ class PhysicalBody:
         if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"physical step: duration is {duration!r}: give a pseudo-time above 0")
         everything = (duration / self._seconds) * np.concatenate([given, self._extension @ given])
-        before = self._world.elastic_gradients(0)
-        kept = _kept(before, self.options.keep_strain)
+        kept = _kept(self._world.elastic_gradients(0), self.options.keep_strain)
         self._world.set_motion(0, velocities=everything, gradients=kept)
         self._world.advance(self._seconds, stop)
         self._gradients = self._world.elastic_gradients(0) @ np.linalg.solve(kept, self._gradients)
@@ -208,7 +219,7 @@ class PhysicalBody:
             positions=positions,
             volumes=self._volumes,
             material=self._material(),
-            contact_radii=self._radii,
+            contact_radii=np.full(len(positions), self.options.margin + CLEARANCE * self.cell),
         )
         return World(
             bodies=[body],
@@ -273,12 +284,19 @@ def _kept(gradients: Array, share: float) -> Array:
         return np.broadcast_to(np.eye(3), gradients.shape).copy()
     kept = gradients.copy()
     squares = gradients @ gradients.transpose(0, 2, 1)
-    # The largest stretch is at most the root of the trace, the least no less than the determinant over the others'.
-    most = np.sqrt(np.trace(squares, axis1=1, axis2=2))
-    which = np.flatnonzero((most > MOST_STRETCH) | (np.linalg.det(gradients) < LEAST_STRETCH))
-    if share < 1:
-        which = np.arange(len(gradients))
+    held = _within(squares, LEAST_STRETCH, MOST_STRETCH)
+    which = np.flatnonzero(~held) if share == 1 else np.arange(len(gradients))
     values, axes = np.linalg.eigh(squares[which])
     stretches = np.clip(np.maximum(values, 1e-12) ** (0.5 * share), LEAST_STRETCH, MOST_STRETCH)
     kept[which] = (axes * stretches[:, None, :]) @ axes.transpose(0, 2, 1)
     return kept
+
+
+def _within(squares: Array, least: float, most: float) -> NDArray[np.bool_]:
+    """Which of F Fᵀ (M, 3, 3) surely have principal stretches from ``least`` to ``most``.
+
+    By Gershgorin's theorem their squares lie within the off-diagonal sums around the diagonal.
+    """
+    diagonal = np.diagonal(squares, axis1=1, axis2=2)
+    beside = np.abs(squares).sum(axis=2) - diagonal
+    return np.asarray(((diagonal + beside < most**2) & (diagonal - beside > least**2)).all(axis=1))
