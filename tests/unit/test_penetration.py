@@ -22,7 +22,7 @@ def lens(a: float, b: float, apart: float) -> float:
     return np.pi * (a + b - apart) ** 2 * (apart**2 + 2 * apart * (a + b) - 3 * (a - b) ** 2) / (12 * apart)
 
 
-@pytest.mark.parametrize("apart", [0.08, 0.12, 0.145])
+@pytest.mark.parametrize("apart", [0.06, 0.1, 0.13])
 def test_two_balls_share_a_lens(apart):
     """Volume within 2 % (the meshes are 0.4 % smaller than balls), depth within 1 %."""
     found = penetration_of_meshes(ball(0.05, apart), ball(0.1))
@@ -37,7 +37,7 @@ def test_one_inside_the_other():
     assert inner.contained == "background"
     assert inner.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.02)
     assert inner.share == pytest.approx(1.0, abs=0.01)
-    assert inner.deepest == pytest.approx(0.1 - 0.02 + 0.03, rel=0.3)
+    assert inner.deepest == pytest.approx(0.1, rel=0.02)
     outer = penetration_of_meshes(ball(0.1), ball(0.03, 0.02))
     assert outer.contained == "foreground"
     assert "foreground lies wholly inside the background" in outer.describe()
