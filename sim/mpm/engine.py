@@ -582,7 +582,7 @@ def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64])
 
 
 def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Places (n, 3) in cells as ``state`` has them: "x" (n, 3) from the corner of the block of each, and "keys" (n,)."""
+    """Places (n, 3) in cells as ``state`` has them: "x" (n, 3) from the corner of the block of each, "keys" (n,)."""
     block = np.clip(np.floor(cells - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
     return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), _block_keys(np.int64(field), block)
 

@@ -14,7 +14,7 @@ from physgen.sim.mpm.distance import signed_distance
 
 def ball(radius: float, x: float = 0.0) -> Surface:
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return Surface(vertices=np.asarray(mesh.vertices) + [x, 0.0, 0.0], faces=np.asarray(mesh.faces))
+    return Surface(vertices=np.asarray(mesh.vertices) + np.array([x, 0.0, 0.0]), faces=np.asarray(mesh.faces))
 
 
 def lens(a: float, b: float, apart: float) -> float:

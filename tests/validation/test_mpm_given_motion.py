@@ -29,10 +29,11 @@ def test_given_velocities_carry_each_particle(box, options, similarity, cell):
 
 
 def test_given_places_and_gradients_are_taken(box, options, similarity, cell):
-    """Moved by 40 cells and stretched by 5 % a body is there, keeps its order and swings back as an elastic one does."""
+    """Moved by 40 cells and stretched by 5 %, a body is there, keeps its order and swings back as an elastic one."""
     body = box(youngs_modulus=1e5)
-    world = World(bodies=[body, box(name="other", bottom=(0.5, 0, 0))], gravity=(0, 0, 0), similarity=similarity,
-                  options=options)
+    world = World(
+        bodies=[body, box(name="other", bottom=(0.5, 0, 0))], gravity=(0, 0, 0), similarity=similarity, options=options
+    )
     stretched = body.positions * [1.05, 1, 1] + [0.0, 40 * cell, 0.0]
     gradients = np.broadcast_to(np.diag([1.05, 1.0, 1.0]), (body.count, 3, 3))
     world.set_motion(0, velocities=np.zeros((body.count, 3)), positions=stretched, gradients=gradients)

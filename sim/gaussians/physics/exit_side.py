@@ -38,7 +38,7 @@ PACE = 0.6
 SHELL = 2.5
 """Lattice spacings around the obstacle in which paths are followed."""
 
-SIDEWAYS = 2.5
+SIDEWAYS = 4.0
 """Times that the way to the rim of the closed region must be shorter than the way inward to be taken instead."""
 
 AROUND = 4.0

@@ -35,7 +35,7 @@ class StepOptions:
     ``substeps * wave_cells`` cells."""
 
     recovery_cells: float = 0.25
-    """Grid cells by which a step leads matter out of an obstacle at most, 0.01 to 1: gently, so that neighbours come."""
+    """Grid cells by which a step leads matter out of an obstacle at most, 0.01 to 1: gently, as neighbours come."""
 
     keep_strain: float = 1.0
     """Share of the strain that lives on from step to step; 0 to 1. 1: an elastic body, which wants its shape back.

@@ -125,7 +125,9 @@ def penetration_of_meshes(background: Surface, foreground: Surface, *, spacing: 
     contained = ""
     for i, one in enumerate(checked):
         other = checked[1 - i]
-        wholly = bool(((one.low >= other.low) & (one.high <= other.high)).all()) and bool(inside[1 - i][inside[i]].all())
+        wholly = bool(((one.low >= other.low) & (one.high <= other.high)).all()) and bool(
+            inside[1 - i][inside[i]].all()
+        )
         contained = contained or (one.name if wholly else "")
     return Penetration(
         volume=volume,

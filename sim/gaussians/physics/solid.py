@@ -42,7 +42,7 @@ def solid_of_surface(surface: Surface) -> DistanceLattice:
 
 
 def solid_of_points(points: Array) -> DistanceLattice:
-    """Distances to what points (N, 3) enclose: they are swollen until gaps close, holes are filled, and it shrinks back.
+    """Distances to what points (N, 3) enclose: they swell until gaps close, holes are filled, and all shrinks back.
 
     A skin whose gaps are wider than 2.5 times the usual distance between neighbours has no inside; what is left then
     is the skin itself. Raises InputError for fewer than 8 points, or points all in one place.

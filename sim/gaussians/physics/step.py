@@ -16,8 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ...errors import InputError
@@ -29,8 +27,11 @@ from ...mpm.distance import DistanceLattice
 from ...mpm.materials import ElasticMaterial
 from ...mpm.options import SolverOptions
 from ...mpm.placement import centred
+from ...mpm.tracks import Track
 from ...mpm.world import World
 from .exit_side import obstacle_lattice
+from .extension import Extension
+from .gradients import BodyGradients
 from .options import StepOptions
 from .solid import filling, solid_of_points, solid_of_surface, volumes_of
 
@@ -42,12 +43,6 @@ DENSITY = 1000.0
 LEAST_STRETCH, MOST_STRETCH = 0.6, 1.6
 """Principal stretches that strain is kept within from step to step. What was pulled or pushed beyond, as at the edge of
 an obstacle, has torn or yielded; kept, it would stiffen the body and shorten its substeps."""
-
-LEAST_SEEN, MOST_SEEN = 0.3, 3.0
-"""Principal stretches since the start that are reported at most."""
-
-NEIGHBOURS = 8
-"""Points from which a filling particle takes its velocity."""
 
 CLEARANCE = 0.01
 """Grid cells that points keep from a surface besides the margin: contact is right to about half of that, and a point
@@ -67,9 +62,9 @@ class PhysicalBody:
 
     Filling particles make a body out of a skin of points. They have no loss of their own; if they were given velocity
     0, the grid, which shares momentum, would slow every point down by the mass behind it, and the more the finer the
-    filling is. So v⁰ is extended to them: each takes the mean of its 8 nearest points at the start, weighted by
-    1/distance². A shift of all points then is a shift of the body whatever its filling is; what differs between
-    neighbouring points is evened out by mass, which is of one density: a particle's is that of the space around it.
+    filling is. So v⁰ is extended to them harmonically (``extension``). A shift, turn or stretch of all points then is
+    one of the body, whatever its filling is; what differs between neighbouring points is evened out by mass, which is
+    of one density: a particle's is that of the space around it.
 
     Raises InputError on bad points, and for obstacles that are open.
     """
@@ -102,8 +97,8 @@ class PhysicalBody:
         fill = filling(solid, spacing, own) if self.options.fill else np.zeros((0, 3))
         self._rest = np.concatenate([own, fill])
         self._volumes = volumes_of(solid, 0.5 * spacing, self._rest)
-        self._extension = _extension(own, fill)
-        self._gradients = np.broadcast_to(np.eye(3), (len(self._rest), 3, 3)).copy()
+        self._extension = Extension(own, fill)
+        self._gradients = BodyGradients(self._rest, self.cell)
         self._lattices: list[tuple[Surface, DistanceLattice]] = []
         self._solid: DistanceLattice | None = solid
         self._obstacles: tuple[Collider, ...] = ()
@@ -133,16 +128,8 @@ class PhysicalBody:
 
     @property
     def particle_gradients(self) -> Array:
-        """Deformation gradients (M, 3, 3) of points and filling particles since the start.
-
-        The product over all steps, as the engine's own hold only the strain that was kept; its principal stretches
-        within 0.3 and 3, beyond which matter is torn and the number says nothing.
-        """
-        far = np.flatnonzero(~_within(self._gradients @ self._gradients.transpose(0, 2, 1), LEAST_SEEN, MOST_SEEN))
-        result = self._gradients.copy()
-        turned, stretches, axes = np.linalg.svd(result[far])
-        result[far] = (turned * np.clip(stretches, LEAST_SEEN, MOST_SEEN)[:, None, :]) @ axes
-        return result
+        """Deformation gradients (M, 3, 3) of points and filling particles since the start (``gradients``)."""
+        return self._gradients.at(self.particles)
 
     @property
     def volumes(self) -> Array:
@@ -156,9 +143,7 @@ class PhysicalBody:
 
     # ---- moving it ----------------------------------------------------------------------------------------------
 
-    def step(
-        self, velocities: NDArray[np.floating], *, duration: float = 1.0, stop: IsCancelled = never
-    ) -> None:
+    def step(self, velocities: NDArray[np.floating], *, duration: float = 1.0, stop: IsCancelled = never) -> None:
         """Advance by γ = ``duration`` of pseudo-time from v⁰ = ``velocities`` (N, 3), metres per pseudo-time.
 
         v⁰ = −P ∇L descends. Velocities of the end are dropped, as in the paper: the next step brings its own. Stiffness
@@ -174,11 +159,10 @@ class PhysicalBody:
             )
         if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"physical step: duration is {duration!r}: give a pseudo-time above 0")
-        everything = (duration / self._seconds) * np.concatenate([given, self._extension @ given])
+        everything = (duration / self._seconds) * np.concatenate([given, self._extension(given)])
         kept = _kept(self._world.elastic_gradients(0), self.options.keep_strain)
         self._world.set_motion(0, velocities=everything, gradients=kept)
         self._world.advance(self._seconds, stop)
-        self._gradients = self._world.elastic_gradients(0) @ np.linalg.solve(kept, self._gradients)
 
     def place(self, points: NDArray[np.floating]) -> None:
         """Put the points at (N, 3) world metres, without physics; filling particles go along with their neighbours."""
@@ -187,7 +171,7 @@ class PhysicalBody:
             raise InputError(f"physical body: points have shape {given.shape}: give finite ({self._count}, 3)")
         now = self.particles
         way = given - now[: self._count]
-        positions = now + np.concatenate([way, self._extension @ way])
+        positions = now + np.concatenate([way, self._extension(way)])
         self._world.set_motion(0, velocities=np.zeros_like(positions), positions=positions)
 
     def move_obstacles(self, obstacles: Sequence[Collider]) -> None:
@@ -237,7 +221,16 @@ class PhysicalBody:
         modulus = DENSITY * speed**2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
         return ElasticMaterial(density=DENSITY, youngs_modulus=modulus, poisson_ratio=nu)
 
+    def _in_seconds(self, collider: Collider) -> Collider:
+        return dataclasses.replace(
+            collider,
+            translations=_slowed(collider.translations, self._seconds),
+            rotations=_slowed(collider.rotations, self._seconds),
+            vertices=_slowed(collider.vertices, self._seconds),
+        )
+
     def _with_lattice(self, collider: Collider, positions: Array) -> Collider:
+        collider = self._in_seconds(collider)
         if collider.lattice is not None or collider.vertices is not None:
             return collider
         for surface, lattice in self._lattices:
@@ -245,13 +238,16 @@ class PhysicalBody:
                 return dataclasses.replace(collider, lattice=lattice)
         # The lattice is of the surface at rest, so the body is looked at from there.
         moved = collider.translations is not None or collider.rotations is not None
-        if self._solid is None or moved:
-            solid = solid_of_points(_from_rest(collider, positions))
-        else:
-            solid = self._solid
+        known = None if moved else self._solid
+        solid = known or solid_of_points(_from_rest(collider, positions))
         lattice = obstacle_lattice(collider.surface, solid, exit_side=self.options.exit_side)
         self._lattices = [*self._lattices[-7:], (collider.surface, lattice)]
         return dataclasses.replace(collider, lattice=lattice)
+
+
+def _slowed(track: Track | None, seconds: float) -> Track | None:
+    """The track with times in steps of ``seconds`` as one in seconds."""
+    return None if track is None else Track(times=track.times * seconds, values=track.values)
 
 
 def _from_rest(collider: Collider, positions: Array) -> Array:
@@ -264,17 +260,6 @@ def _from_rest(collider: Collider, positions: Array) -> Array:
     return np.asarray(local + collider.middle)
 
 
-def _extension(points: Array, fill: Array) -> csr_matrix:
-    """The matrix (M, N) that gives each filling particle the mean of its nearest points, by 1/distance²."""
-    if len(fill) == 0:
-        return csr_matrix((0, len(points)))
-    distance, nearest = cKDTree(points).query(fill, k=min(NEIGHBOURS, len(points)))
-    weights = 1.0 / np.maximum(distance, 1e-12) ** 2
-    weights /= weights.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(fill)), weights.shape[1])
-    return csr_matrix((weights.ravel(), (rows, nearest.ravel())), shape=(len(fill), len(points)))
-
-
 def _kept(gradients: Array, share: float) -> Array:
     """Gradients (M, 3, 3) with the ``share`` of their strain ln V, held within ``LEAST_STRETCH`` and ``MOST_STRETCH``.
 
@@ -284,19 +269,12 @@ def _kept(gradients: Array, share: float) -> Array:
         return np.broadcast_to(np.eye(3), gradients.shape).copy()
     kept = gradients.copy()
     squares = gradients @ gradients.transpose(0, 2, 1)
-    held = _within(squares, LEAST_STRETCH, MOST_STRETCH)
+    # By Gershgorin's theorem the squares of the stretches lie within the off-diagonal sums around the diagonal.
+    diagonal = np.diagonal(squares, axis1=1, axis2=2)
+    beside = np.abs(squares).sum(axis=2) - diagonal
+    held = ((diagonal + beside < MOST_STRETCH**2) & (diagonal - beside > LEAST_STRETCH**2)).all(axis=1)
     which = np.flatnonzero(~held) if share == 1 else np.arange(len(gradients))
     values, axes = np.linalg.eigh(squares[which])
     stretches = np.clip(np.maximum(values, 1e-12) ** (0.5 * share), LEAST_STRETCH, MOST_STRETCH)
     kept[which] = (axes * stretches[:, None, :]) @ axes.transpose(0, 2, 1)
     return kept
-
-
-def _within(squares: Array, least: float, most: float) -> NDArray[np.bool_]:
-    """Which of F Fᵀ (M, 3, 3) surely have principal stretches from ``least`` to ``most``.
-
-    By Gershgorin's theorem their squares lie within the off-diagonal sums around the diagonal.
-    """
-    diagonal = np.diagonal(squares, axis1=1, axis2=2)
-    beside = np.abs(squares).sum(axis=2) - diagonal
-    return np.asarray(((diagonal + beside < most**2) & (diagonal - beside > least**2)).all(axis=1))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from ...skinning.binding import bind, deform
 from .penetration import penetration_of_meshes
 
 Array = NDArray[np.float64]
+
+RIGID = RigidMaterial(density=1000.0)
 
 MOST_SLIP = 0.1
 """Share of the pair's size by which the foreground may move on the background."""
@@ -50,10 +52,10 @@ class HoldOptions:
     friction: float = 0.5
     """Coulomb's coefficient of all surfaces, 0 to 10."""
 
-    background: ElasticMaterial | RigidMaterial = RigidMaterial(density=1000.0)
+    background: ElasticMaterial | RigidMaterial = RIGID
     """What the background is made of."""
 
-    foreground: ElasticMaterial | RigidMaterial = RigidMaterial(density=1000.0)
+    foreground: ElasticMaterial | RigidMaterial = RIGID
     """What the foreground is made of."""
 
     background_fixed: bool = False
@@ -62,7 +64,7 @@ class HoldOptions:
     cells_across: int = 32
     """Grid cells along the longest side of the larger object, 8 to 128."""
 
-    solver: SolverOptions = SolverOptions()
+    solver: SolverOptions = field(default_factory=SolverOptions)
     """Where to compute (arch, threads, cache_folder)."""
 
     def __post_init__(self) -> None:
