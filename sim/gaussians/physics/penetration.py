@@ -189,14 +189,17 @@ def _deepest(places: Array, corners: Array, foreground: _Closed) -> float:
     """Distance to the foreground's surface of the deepest of places in it, and of those of corners that are in it."""
     held = corners[foreground.holds(corners)]
     deepest = float(foreground.distances(held[:: max(1, len(held) // LOOKED_AT)]).max()) if len(held) else 0.0
-    every = max(1, len(places) // LOOKED_AT)
-    some = places[::every]
-    distance = foreground.distances(some)
-    # Around the deepest of a few, the deepest of all.
-    around = 3.0 * float(np.cbrt(np.ptp(places, axis=0).prod() / len(some)))
-    near = places[np.linalg.norm(places - some[distance.argmax()], axis=1) < around]
-    near = near[:: max(1, len(near) // LOOKED_AT)]
-    return max(deepest, float(distance.max()), float(foreground.distances(near).max()) if len(near) else 0.0)
+    # Around the deepest of a few, the deepest of a few nearer ones, until all that are near have been looked at.
+    while len(places):
+        some = places[:: max(1, len(places) // LOOKED_AT)]
+        distance = foreground.distances(some)
+        deepest = max(deepest, float(distance.max()))
+        if len(some) == len(places):
+            break
+        around = 2.0 * float(np.cbrt(np.maximum(np.ptp(places, axis=0), 1e-300).prod() / len(some)))
+        nearer = places[np.linalg.norm(places - some[distance.argmax()], axis=1) < around]
+        places = nearer if len(nearer) < len(places) else places[:0]
+    return deepest
 
 
 def _apart(a: _Closed, b: _Closed) -> Penetration:
