@@ -83,14 +83,14 @@ def _read_glb(path: Path) -> TexturedMesh | None:
 
 
 def _parse(content: bytes) -> TexturedMesh | None:
-    document, binary = _chunks(content)
+    document, binary = glb_chunks(content)
     if document.get("extensionsRequired"):
         return None
-    instances = _instances(document)
+    instances = mesh_instances(document)
     if len(instances) != 1:
         return None
     (mesh_index, matrix) = instances[0]
-    primitives = _item(document, "meshes", mesh_index)["primitives"]
+    primitives = listed_item(document, "meshes", mesh_index)["primitives"]
     if len(primitives) != 1 or primitives[0].get("mode", _TRIANGLES) != _TRIANGLES:
         return None
     primitive = primitives[0]
@@ -113,7 +113,8 @@ def _parse(content: bytes) -> TexturedMesh | None:
     return TexturedMesh(vertices=vertices, faces=faces, uv=uv, picture=picture, colours=colours)
 
 
-def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
+def glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Description and binary data of a GLB file. Raises ValueError, struct.error or KeyError for what is none."""
     magic, version, _ = struct.unpack_from("<4sII", content, 0)
     if magic != _MAGIC or version != 2:
         raise ValueError("it is no binary glTF 2.0")
@@ -133,7 +134,7 @@ def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     return document, found.get(_BINARY, b"")
 
 
-def _item(document: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
+def listed_item(document: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
     """An entry of a list of the file; a negative index would count from the end."""
     if isinstance(index, bool) or not isinstance(index, int) or index < 0:
         raise ValueError(f"{kind}[{index!r}]")
@@ -143,9 +144,9 @@ def _item(document: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
     return found
 
 
-def _instances(document: dict[str, Any]) -> list[tuple[int, NDArray[np.float64]]]:
+def mesh_instances(document: dict[str, Any]) -> list[tuple[int, NDArray[np.float64]]]:
     """Each mesh of the file's scene with its place (4, 4)."""
-    scene = _item(document, "scenes", document.get("scene", 0))
+    scene = listed_item(document, "scenes", document.get("scene", 0))
     waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
     found: list[tuple[int, NDArray[np.float64]]] = []
     visits = 0
@@ -154,7 +155,7 @@ def _instances(document: dict[str, Any]) -> list[tuple[int, NDArray[np.float64]]
         visits += 1
         if visits > MAX_NODES:
             raise ValueError("its nodes go in circles, or are too many")
-        node = _item(document, "nodes", index)
+        node = listed_item(document, "nodes", index)
         matrix = above @ _local(node)
         if "mesh" in node:
             found.append((node["mesh"], matrix))
@@ -190,9 +191,9 @@ def _numbers(values: Any, count: int) -> NDArray[np.float64]:
 
 def _view(document: dict[str, Any], binary: bytes, index: Any) -> tuple[bytes, int]:
     """The bytes of a buffer view, and its stride (0: packed)."""
-    view = _item(document, "bufferViews", index)
+    view = listed_item(document, "bufferViews", index)
     start, length, stride = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 0)
-    buffer = _item(document, "buffers", view["buffer"])
+    buffer = listed_item(document, "buffers", view["buffer"])
     if "uri" in buffer or view["buffer"] != 0:
         raise ValueError("it keeps its data in another file")
     if min(start, length, stride) < 0 or start + length > len(binary):
@@ -202,7 +203,7 @@ def _view(document: dict[str, Any], binary: bytes, index: Any) -> tuple[bytes, i
 
 def _accessor(document: dict[str, Any], binary: bytes, index: Any, width: int) -> NDArray[Any]:
     """The values (count, width) of an accessor."""
-    accessor = _item(document, "accessors", index)
+    accessor = listed_item(document, "accessors", index)
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
         raise ValueError(f"an accessor of {accessor['type']}")
     dtype, count = _COMPONENTS[accessor["componentType"]], accessor["count"]
@@ -235,11 +236,11 @@ def _texture(
     """Texture coordinates and the picture; both None where either is missing or of a kind that is not covered."""
     if "material" not in primitive or "TEXCOORD_0" not in primitive["attributes"]:
         return None, None
-    material = _item(document, "materials", primitive["material"])
+    material = listed_item(document, "materials", primitive["material"])
     slot = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if slot is None or slot.get("texCoord", 0) != 0:
         return None, None
-    image = _item(document, "images", _item(document, "textures", slot["index"]).get("source"))
+    image = listed_item(document, "images", listed_item(document, "textures", slot["index"]).get("source"))
     if image.get("mimeType") not in PICTURES or "bufferView" not in image:
         return None, None
     uv = _accessor(document, binary, primitive["attributes"]["TEXCOORD_0"], 2).astype(np.float64)
