@@ -84,3 +84,11 @@ def number(value: float, unit: str) -> str:
     if not math.isfinite(value):
         return "–"
     return f"{value:.3g}" if unit in ("", "1") else f"{value:.3g} {unit}"
+
+
+def volume(cubic_metres: float) -> str:
+    """Such as ``2.4 cm³`` or ``0.13 m³``."""
+    for unit, size in (("m³", 1.0), ("dm³", 1e-3), ("cm³", 1e-6)):
+        if cubic_metres >= 0.1 * size:
+            return f"{cubic_metres / size:.3g} {unit}"
+    return f"{cubic_metres / 1e-9:.2g} mm³"

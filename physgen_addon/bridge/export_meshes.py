@@ -160,3 +160,17 @@ def write_mesh(path: Path, points: Points, faces: Indices) -> None:
         file.write(header.encode("ascii"))
         file.write(points.astype("<f4", copy=False).tobytes())
         file.write(rows.tobytes())
+
+
+def read_points_file(path: Path) -> NDArray[np.float64]:
+    """Coordinates (V, 3) in a file that ``write_mesh`` wrote. Raises InputError for any other."""
+    try:
+        content = path.read_bytes()
+        head, _, data = content.partition(b"end_header\n")
+        count = int(head.split(b"element vertex ", 1)[1].split(b"\n", 1)[0])
+        points = np.frombuffer(data, "<f4", 3 * count).reshape(count, 3).astype(np.float64)
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); fit again") from error
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: has places that are not finite; fit again")
+    return points

@@ -13,7 +13,7 @@ from ..props.body import is_body
 from ..props.preferences import PHYSGEN_AP_preferences
 from ..views import TAB
 
-SCENE, OBJECTS, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(7)
+SCENE, OBJECTS, TOGETHER, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(8)
 """``bl_order``: the order of work."""
 
 COMMAND = f" In {TERMINAL}:"

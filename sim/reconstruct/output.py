@@ -29,6 +29,8 @@ OWN_ENTRIES = frozenset(
         "meshes",
         "splats",
         "albedo",
+        "splats",
+        "compose.json",
         "light",
         "stages",
         "report.html",

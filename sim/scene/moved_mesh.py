@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
 from ..errors import InputError
-from .glb import glb_chunks, listed_item, mesh_instances
+from .glb import glb_chunks, listed_item, mesh_instances, read_textured_mesh
 from .meshes import read_mesh
 
 Array = NDArray[np.float64]
@@ -21,6 +21,18 @@ Array = NDArray[np.float64]
 _FLOAT, _TRIANGLES = 5126, 4
 _GARBAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_PLY_START = b"ply\nformat binary_little_endian 1.0\n"
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+_MOST_HEADER_BYTES = 65_536
 
 AGREES = 1e-5
 """Share of a mesh's size by which vertices may differ after writing and reading: coordinates of files have 32 bits."""
@@ -35,14 +47,20 @@ def moved_suffix(source: Path) -> str:
 def write_moved_mesh(source: Path, target: Path, vertices: Array, faces: NDArray[np.integer]) -> None:
     """Write the mesh file ``source`` as ``target`` with other ``vertices`` (V, 3), in the file's own coordinates.
 
-    A GLB with one mesh is copied byte by byte but for places and normals; others are written anew from what
-    ``read_mesh`` finds in them. faces: (T, 3), for the normals. target: with the suffix of ``moved_suffix``.
+    A GLB with one mesh, and a binary PLY without normals, are copied byte by byte but for places (and a GLB's normals);
+    others are written anew from what ``read_mesh`` finds in them. faces: (T, 3), for the normals. target: with the suffix
+    of ``moved_suffix``.
 
     Raises InputError when ``source`` cannot be read, has another number of vertices, or when what was written does not
     read back with its vertices where they were put.
     """
-    content = source.read_bytes() if source.suffix.lower() == ".glb" else b""
-    moved = _glb_moved(content, vertices, faces) if content else None
+    kind = source.suffix.lower()
+    moved = None
+    if kind in (".glb", ".ply"):
+        # Read before, so that what is missing or too large is said as everywhere.
+        read_textured_mesh(source)
+        content = source.read_bytes()
+        moved = _glb_moved(content, vertices, faces) if kind == ".glb" else _ply_moved(content, vertices)
     if moved is not None:
         write_bytes(target, moved)
     else:
@@ -52,7 +70,7 @@ def write_moved_mesh(source: Path, target: Path, vertices: Array, faces: NDArray
         mesh.vertices = vertices
         with replacing(target) as partial:
             mesh.export(partial)
-    found = np.asarray(read_mesh(target).vertices, dtype=np.float64)
+    found = read_textured_mesh(target).vertices
     size = float(np.abs(vertices).max())
     if found.shape != vertices.shape or float(np.abs(found - vertices).max()) > AGREES * size:
         raise InputError(f"{source}: its vertices cannot be moved in a file of this kind; export it as GLB")
@@ -108,6 +126,32 @@ def _overwrite(document: dict[str, Any], buffer: bytearray, index: Any, values: 
         return False
     np.ndarray((len(values), 3), "<f4", buffer, offset=start, strides=(stride, 4))[:] = values
     return True
+
+
+def _ply_moved(content: bytes, vertices: Array) -> bytes | None:
+    """None where it is text, or its vertices have lists or normals, which would no longer be right."""
+    end = content.find(b"end_header\n", 0, _MOST_HEADER_BYTES)
+    if end < 0 or not content.startswith(_PLY_START):
+        return None
+    lines = [line.split() for line in content[:end].decode("ascii", "replace").splitlines()[2:]]
+    words = [line for line in lines if line and line[0] in ("element", "property")]
+    if not words or words[0][:2] != ["element", "vertex"] or words[0][2] != str(len(vertices)):
+        return None
+    fields = []
+    for line in words[1:]:
+        if line[0] == "element":
+            break
+        if len(line) != 3 or line[1] not in _PLY_TYPES or line[2] == "nx":
+            return None
+        fields.append((line[2], _PLY_TYPES[line[1]]))
+    try:
+        rows = np.frombuffer(content, np.dtype(fields), len(vertices), end + len(b"end_header\n")).copy()
+        for axis, name in enumerate("xyz"):
+            rows[name] = vertices[:, axis]
+    except ValueError:
+        return None
+    start = end + len(b"end_header\n")
+    return content[:start] + rows.tobytes() + content[start + rows.nbytes :]
 
 
 def _normals(vertices: Array, faces: NDArray[np.integer]) -> Array:

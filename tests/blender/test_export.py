@@ -249,7 +249,14 @@ def test_shape_keys_are_refused(scene, tmp_path):
     item = add()
     item.shape_key_add(name="Basis")
     exported(scene, tmp_path, "one")
-    item.shape_key_add(name="fat")
+    fat = item.shape_key_add(name="fat")
+    fat.value = 0.0
+    exported(scene, tmp_path, "two")
+    fat.value = 0.5
+    refused(scene, tmp_path, "'Cube'", "shape keys")
+    fat.mute = True
+    exported(scene, tmp_path, "three")
+    animate(item.data.shape_keys.key_blocks["fat"], "value", 0.0, 1.0)
     refused(scene, tmp_path, "'Cube'", "shape keys")
 
 

@@ -90,8 +90,10 @@ def test_panels_are_in_the_order_of_work():
     panels = [p for p in bpy.types.Panel.__subclasses__() if p.__name__.startswith("PHYSGEN_PT") and p.is_registered]
     mine = [p for p in panels if p.bl_space_type == "VIEW_3D" and not getattr(p, "bl_parent_id", "")]
     tops = {p.bl_label: p.bl_order for p in mine}
-    assert sorted(tops, key=tops.get) == ["Scene", "Objects", "Motion", "World", "Simulate", "Render", "Diagnose"]
-    assert len(set(tops.values())) == 7
+    assert sorted(tops, key=tops.get) == [
+        *("Scene", "Objects", "Fit Together", "Motion", "World", "Simulate", "Render", "Diagnose")
+    ]
+    assert len(set(tops.values())) == 8
 
 
 def registered_groups():

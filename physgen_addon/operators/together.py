@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fit Together: selected objects that pass through each other are moved and bent until they no longer do."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...sim.app.process import run_stage
+from ...sim.errors import InputError, PhysGenError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.folder import SceneFolder, load_scene
+from ...sim.scene.json_fields import read_json
+from ..bridge.export_together import ORIGINAL, Fitted, export_together, photo_scene, read_fitted
+from ..chosen import active, selected
+from ..interpreter import cli_command, find_python
+from ..jobs import JobOperator, Work
+from ..props.preferences import python
+from ..text import count, length, volume
+
+LEAST_MOVE = 1e-6
+"""Share of an object's size below which it has not moved."""
+
+
+def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """The selected meshes: the active one, which stays, then the others by name."""
+    found = sorted((item for item in selected(context) if item.type == "MESH"), key=lambda item: item.name)
+    first = active(context)
+    return sorted(found, key=lambda item: item != first)
+
+
+class PHYSGEN_OT_fit_together(JobOperator, bpy.types.Operator):
+    """Resolve where the selected objects pass through each other. The active object stays, the others yield to it"""
+
+    bl_idname = "physgen.fit_together"
+    bl_label = "Fit Together"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Fit Together"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Two meshes, in Object Mode."""
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Leave Edit Mode first")
+            return False
+        if len(chosen_meshes(context)) < 2:
+            cls.poll_message_set("Select two or more meshes; the active one stays")
+            return False
+        return super().poll(context)
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """The objects as they are now, in a folder of their own; the composition as a child process."""
+        scene, items = context.scene, chosen_meshes(context)
+        if len(items) < 2:
+            raise InputError(f"{count(len(items), 'mesh')} selected: select two or more meshes; the active one stays")
+        settings = scene.physgen_together
+        photo = photo_scene(scene) if settings.method != "ppps" else None
+        if photo is None and settings.method != "ppps":
+            raise InputError(
+                "there is no photo that says where the objects belong: choose the method Physics, or import the scene "
+                "of a photo"
+            )
+        self._folder = Path(tempfile.mkdtemp(prefix="fit-together-", dir=bpy.app.tempdir or None))
+        try:
+            self._fitted = export_together(scene, items, self._folder / "scene", photo=photo)
+        except PhysGenError:
+            self._remove()
+            raise
+        source, out, preferred = self._folder / "scene", self._folder / "fitted", python(context)
+        arguments = ["--objects", ",".join(item.name for item in self._fitted), "--method", settings.method]
+        arguments += ["--steps", str(settings.steps), *([] if photo is not None else ["--no-picture"])]
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "compose", str(source), "--out", str(out), *arguments)
+            return run_stage(command, on_event, cancelled)
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Give the meshes their new shape, and the panel its numbers."""
+        try:
+            folder = load_scene(self._folder / "fitted")
+            pairs = _pairs(folder, self._fitted)
+            # All are looked up before any is changed.
+            changes = [(_found(scene, item), read_fitted(folder, item.name)) for item in self._fitted]
+            for item, vertices in changes:
+                if len(item.data.vertices) != len(vertices):
+                    raise InputError(f"object {item.name!r}: its mesh was changed meanwhile; fit again")
+            moved = [item.name for item, vertices in changes if _reshape(scene, item, vertices)]
+        finally:
+            self._remove()
+        _show(scene, pairs)
+        for item, _ in changes:
+            item.update_tag(refresh={"DATA"})
+        if not moved:
+            return "nothing had to move"
+        before, after = (sum(float(pair[f"volume_{when}"]) for pair in pairs) for when in ("before", "after"))
+        deepest = max(float(pair["deepest_after"]) for pair in pairs)
+        return (
+            f"{', '.join(moved)} moved: penetration {volume(before)} before, {volume(after)} after, "
+            f"deepest {length(deepest)}"
+        )
+
+    def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
+        """Nothing was changed."""
+        self._remove()
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator."""
+        super().cancel(context)
+        self._remove()
+
+    def _remove(self) -> None:
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _found(scene: bpy.types.Scene, fitted: Fitted) -> bpy.types.Object:
+    """The object that was exported. Undo and renaming keep its ``session_uid``."""
+    for item in scene.objects:
+        if item.session_uid == fitted.uid:
+            return item
+    raise InputError(f"object {fitted.name!r} is no longer in the scene; nothing was changed")
+
+
+def _reshape(scene: bpy.types.Scene, item: bpy.types.Object, vertices: np.ndarray) -> bool:
+    """Give the mesh of ``item`` its new ``vertices`` (V, 3); whether anything moved."""
+    before = np.empty(3 * len(vertices), dtype=np.float32)
+    item.data.vertices.foreach_get("co", before)
+    size = float(np.ptp(before.reshape(-1, 3), axis=0).max())
+    if float(np.abs(vertices.ravel() - before).max()) <= LEAST_MOVE * size:
+        return False
+    if item.data.users > 1:
+        # The others that share the mesh are somewhere else.
+        item.data = item.data.copy()
+    mesh = item.data
+    if scene.physgen_together.keep_original and mesh.shape_keys is None:
+        item.shape_key_add(name="Fit Together", from_mix=False)
+        item.shape_key_add(name=ORIGINAL, from_mix=False).value = 0.0
+        # Edit Mode edits the active one.
+        item.active_shape_key_index = 0
+    new = vertices.astype(np.float32).ravel()
+    mesh.vertices.foreach_set("co", new)
+    if mesh.shape_keys is not None:
+        mesh.shape_keys.key_blocks[0].data.foreach_set("co", new)
+    mesh.update()
+    return True
+
+
+def _pairs(folder: SceneFolder, fitted: tuple[Fitted, ...]) -> list[dict[str, Any]]:
+    """Penetration of each pair from ``compose.json``, by Blender's names."""
+    record = read_json(folder.root / "compose.json")
+    names = {item.name: item.label for item in fitted}
+    found = []
+    with contextlib.suppress(KeyError, TypeError):
+        for pair in record["pairs"]:
+            entry: dict[str, Any] = {"name": " – ".join(names.get(name, name) for name in pair["objects"])}
+            for when in ("before", "after"):
+                entry |= _numbers(pair[when], when)
+            found.append(entry)
+    return found
+
+
+def _numbers(state: Mapping[str, Any], when: str) -> dict[str, float]:
+    return {
+        f"volume_{when}": float(state["volume_m3"]),
+        f"share_{when}": float(state["share"]),
+        f"deepest_{when}": float(state["deepest_m"]),
+    }
+
+
+def _show(scene: bpy.types.Scene, pairs: list[dict[str, Any]]) -> None:
+    shown = scene.physgen_together.pairs
+    shown.clear()
+    for pair in pairs:
+        entry = shown.add()
+        for name, value in pair.items():
+            setattr(entry, name, value)
+
+
+def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    self.layout.separator()
+    self.layout.operator(PHYSGEN_OT_fit_together.bl_idname)
+
+
+CLASSES = (PHYSGEN_OT_fit_together,)
+
+
+def register() -> None:
+    """Into the Object menu, and by that into the search (F3)."""
+    bpy.types.VIEW3D_MT_object.append(_draw_menu)
+
+
+def unregister() -> None:
+    """Out of it again."""
+    bpy.types.VIEW3D_MT_object.remove(_draw_menu)
