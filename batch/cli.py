@@ -14,7 +14,7 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.version import VERSION
-from . import bakes, diagnosis, doctor, photos, pipeline, variants, videos
+from . import bakes, compositions, diagnosis, doctor, photos, pipeline, variants, videos
 from .farm import command as farm_command
 from .terminal import Terminal
 
@@ -46,6 +46,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     varied = "scene folder → the same with other physics and effects, in a folder of its own"
     variants.add_variant(command("variant", variants.run_variant, varied))
+    fitted = "scene folder → the same with objects that no longer pass through each other"
+    compositions.add_compose(command("compose", compositions.run_compose, fitted))
     photos.add_light(command("light", photos.run_light, "another light for a scene folder"))
     bakes.add_bake(command("bake", bakes.run_bake, "scene folder → bake folder"))
     cost = "what a bake would cost in time, memory and disk; nothing is written"

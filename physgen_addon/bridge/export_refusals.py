@@ -79,8 +79,8 @@ def require_simulable(item: bpy.types.Object) -> None:
     keys = item.data.shape_keys
     if keys is not None and (channels(keys) or any(key.value != 0 and not key.mute for key in keys.key_blocks[1:])):
         raise InputError(
-            f"{where}: has shape keys in effect, and what is simulated is the mesh without them: set their values to 0, "
-            "or apply or remove them (Properties > Data > Shape Keys)"
+            f"{where}: has shape keys in effect, and what is simulated is the mesh without them: set their values to "
+            "0, or apply or remove them (Properties > Data > Shape Keys)"
         )
     reason = why_it_moves(item)
     if reason is not None:

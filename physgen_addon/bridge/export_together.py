@@ -32,7 +32,7 @@ ORIGINAL = "Before Fit Together"
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """One exported object. uid: Blender's ``session_uid`` of it; label: its name there; name: that in the scene folder."""
+    """One exported object. uid: Blender's ``session_uid``; label: its name there; name: that in the scene folder."""
 
     uid: int
     label: str
@@ -53,7 +53,9 @@ def require_fittable(item: bpy.types.Object) -> None:
     keys = item.data.shape_keys
     others = [key.name for key in keys.key_blocks[1:] if key.name != ORIGINAL] if keys is not None else []
     if others:
-        raise InputError(f"{where}: has the shape key {others[0]!r}: apply or remove it (Properties > Data > Shape Keys)")
+        raise InputError(
+            f"{where}: has the shape key {others[0]!r}: apply or remove it (Properties > Data > Shape Keys)"
+        )
     if keys is not None and any(key.value != 0 and not key.mute for key in keys.key_blocks[1:]):
         raise InputError(f"{where}: its shape key {ORIGINAL!r} is in effect: set its value to 0, or apply it")
 
@@ -76,8 +78,8 @@ def export_together(
 
     photo: the scene folder that they were imported from, for its photo and their textures; None: without a picture.
 
-    Raises InputError for an object whose mesh is open, flat, hidden behind modifiers or shape keys; with ``photo``, also
-    for one that was not imported from it or has another number of vertices by now.
+    Raises InputError for an object whose mesh is open, flat, hidden behind modifiers or shape keys; with ``photo``,
+    also for one that was not imported from it or has another number of vertices by now.
     """
     unit, graph = metres_per_unit(scene), depsgraph(scene)
     exported = []

@@ -50,8 +50,8 @@ class PHYSGEN_PG_together(bpy.types.PropertyGroup):
     keep_original: BoolProperty(
         name="Keep Original",
         description=(
-            "Add the shape from before as the shape key 'Before Fit Together': raise its value to dial the change back, "
-            "remove it when you are content"
+            "Add the shape from before as the shape key 'Before Fit Together': raise its value to dial the change "
+            "back, remove it when you are content"
         ),
         default=True,
     )

@@ -17,7 +17,7 @@ from ..mpm.colliders import Surface
 from ..mpm.soundness import check_surface
 from ..mpm.triangles import check_closed, face_normals, validated, winding_numbers
 from ..scene.folder import SceneFolder
-from ..scene.glb import TexturedMesh, read_textured_mesh
+from ..scene.glb import TexturedMesh, read_textured_mesh, transformed
 from ..scene.model import SceneObject
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def read_body(folder: SceneFolder, item: SceneObject) -> Body:
     return Body(
         item=item,
         mesh=mesh,
-        surface=Surface(vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], faces=faces),
+        surface=Surface(vertices=transformed(mesh.vertices, matrix), faces=faces),
     )
 
 

@@ -19,7 +19,8 @@ from ..errors import InputError
 from ..gaussians.ply.write import write_splats
 from ..gaussians.splats import Splats
 from ..reconstruct.output import replacing_folder
-from ..scene.folder import SCENE_FILE, SceneFolder, inside, load_scene, referenced_files, save_scene
+from ..scene.folder import SceneFolder, inside, referenced_files, save_scene
+from ..scene.glb import transformed
 from ..scene.model import SceneObject
 from ..scene.moved_mesh import moved_suffix, write_moved_mesh
 
@@ -33,7 +34,11 @@ came from, so ``reconstruct.json``, stages and report stay behind."""
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Moved:
-    """What became of an object. vertices: (V, 3) world metres, in the order of its mesh file; splats: its own, if any."""
+    """What became of an object.
+
+    vertices: (V, 3) world metres, in the order of its mesh file; faces: (T, 3); splats: its own, in its mesh file's
+    coordinates, or None where it has none.
+    """
 
     vertices: Array
     faces: NDArray[np.int64]
@@ -79,9 +84,7 @@ def write_composition(
     return save_scene(target, scene)
 
 
-def _write_moved(
-    source: SceneFolder, target: Path, item: SceneObject, moved: Moved, taken: set[str]
-) -> SceneObject:
+def _write_moved(source: SceneFolder, target: Path, item: SceneObject, moved: Moved, taken: set[str]) -> SceneObject:
     """``item`` with files of its own; objects that shared a mesh have moved differently."""
     path = source.file(item.mesh)
     name = f"{item.mesh.rpartition('.')[0]}{moved_suffix(path)}"
@@ -89,8 +92,7 @@ def _write_moved(
     if users > 1 or (name != item.mesh and name.casefold() in taken):
         name = f"meshes/{item.name} fitted{moved_suffix(path)}"
     matrix = np.linalg.inv(np.asarray(item.world_from_mesh, dtype=np.float64))
-    in_file = moved.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    write_moved_mesh(path, inside(target, name), in_file, moved.faces)
+    write_moved_mesh(path, inside(target, name), transformed(moved.vertices, matrix), moved.faces)
     albedo = f"albedo/{Path(item.mesh).stem}.png"
     if Path(name).stem != Path(item.mesh).stem and (source.root / albedo).is_file():
         _share(source.file(albedo), inside(target, f"albedo/{Path(name).stem}.png"))

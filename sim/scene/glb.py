@@ -95,12 +95,12 @@ def _parse(content: bytes) -> TexturedMesh | None:
         return None
     primitive = primitives[0]
     attributes = primitive["attributes"]
-    vertices = _accessor(document, binary, attributes["POSITION"], 3).astype(np.float64)
-    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = accessor_values(document, binary, attributes["POSITION"], 3).astype(np.float64)
+    vertices = transformed(vertices, matrix)
     if not len(vertices) or not np.isfinite(vertices).all():
         raise ValueError("vertices that are not finite, or none")
     if "indices" in primitive:
-        index = _accessor(document, binary, primitive["indices"], 1).astype(np.int64).ravel()
+        index = accessor_values(document, binary, primitive["indices"], 1).astype(np.int64).ravel()
     else:
         index = np.arange(len(vertices))
     if not len(index) or len(index) % 3 or index.max() >= len(vertices):
@@ -201,7 +201,7 @@ def _view(document: dict[str, Any], binary: bytes, index: Any) -> tuple[bytes, i
     return binary[start : start + length], stride
 
 
-def _accessor(document: dict[str, Any], binary: bytes, index: Any, width: int) -> NDArray[Any]:
+def accessor_values(document: dict[str, Any], binary: bytes, index: Any, width: int) -> NDArray[Any]:
     """The values (count, width) of an accessor."""
     accessor = listed_item(document, "accessors", index)
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
@@ -243,7 +243,18 @@ def _texture(
     image = listed_item(document, "images", listed_item(document, "textures", slot["index"]).get("source"))
     if image.get("mimeType") not in PICTURES or "bufferView" not in image:
         return None, None
-    uv = _accessor(document, binary, primitive["attributes"]["TEXCOORD_0"], 2).astype(np.float64)
+    uv = accessor_values(document, binary, primitive["attributes"]["TEXCOORD_0"], 2).astype(np.float64)
     if len(uv) != count or not np.isfinite(uv).all() or not math.isfinite(float(np.abs(uv).max())):
         raise ValueError("texture coordinates that do not fit its vertices")
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]), _view(document, binary, image["bufferView"])[0]
+
+
+def transformed(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``points`` (N, 3) under the affine ``matrix`` (4, 4), equal ones to the same bits.
+
+    A matrix product may round the last rows otherwise than the others, and a mesh whose seams no longer meet is open.
+    """
+    columns = np.ascontiguousarray(matrix[:3, :3].T)
+    return np.asarray(
+        points[:, :1] * columns[0] + points[:, 1:2] * columns[1] + points[:, 2:3] * columns[2] + matrix[:3, 3]
+    )

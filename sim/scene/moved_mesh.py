@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A mesh file again with its vertices in other places: same number and order, same faces, texture and its coordinates."""
+"""A mesh file again with its vertices in other places: same number and order, same faces, same texture."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
 from ..errors import InputError
-from .glb import glb_chunks, listed_item, mesh_instances, read_textured_mesh
+from .glb import accessor_values, glb_chunks, listed_item, mesh_instances, read_textured_mesh, transformed
 from .meshes import read_mesh
 
 Array = NDArray[np.float64]
@@ -47,9 +47,9 @@ def moved_suffix(source: Path) -> str:
 def write_moved_mesh(source: Path, target: Path, vertices: Array, faces: NDArray[np.integer]) -> None:
     """Write the mesh file ``source`` as ``target`` with other ``vertices`` (V, 3), in the file's own coordinates.
 
-    A GLB with one mesh, and a binary PLY without normals, are copied byte by byte but for places (and a GLB's normals);
-    others are written anew from what ``read_mesh`` finds in them. faces: (T, 3), for the normals. target: with the suffix
-    of ``moved_suffix``.
+    A GLB with one mesh, and a binary PLY without normals, are copied byte by byte but for places (and a GLB's
+    normals); others are written anew from what ``read_mesh`` finds in them. faces: (T, 3), for the normals. target:
+    with the suffix of ``moved_suffix``.
 
     Raises InputError when ``source`` cannot be read, has another number of vertices, or when what was written does not
     read back with its vertices where they were put.
@@ -91,8 +91,13 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
         buffer = bytearray(binary)
         if "TANGENT" in attributes or primitives[0].get("targets"):
             return None
-        inverse = np.linalg.inv(matrix)
-        local = vertices @ inverse[:3, :3].T + inverse[:3, 3]
+        # Along a texture's seam there are two vertices in one place; they stay in one, to the last bit.
+        before = accessor_values(document, binary, attributes["POSITION"], 3)
+        _, first, place = np.unique(before, axis=0, return_index=True, return_inverse=True)
+        place = place.reshape(-1)
+        if len(place) != len(vertices):
+            return None
+        local = transformed(vertices[first][place], np.linalg.inv(matrix))
         if not _overwrite(document, buffer, attributes["POSITION"], local):
             return None
         accessor = listed_item(document, "accessors", attributes["POSITION"])
@@ -100,7 +105,7 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
         accessor["min"], accessor["max"] = written.min(axis=0).tolist(), written.max(axis=0).tolist()
         if "NORMAL" in attributes:
             turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
-            if not _overwrite(document, buffer, attributes["NORMAL"], _normals(local, turned)):
+            if not _overwrite(document, buffer, attributes["NORMAL"], _normals(local, turned, place)):
                 return None
     except _GARBAGE:
         return None
@@ -154,12 +159,10 @@ def _ply_moved(content: bytes, vertices: Array) -> bytes | None:
     return content[:start] + rows.tobytes() + content[start + rows.nbytes :]
 
 
-def _normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
-    """Unit normals (V, 3), weighted by area; of vertices in the same place (a texture's seam) the same."""
+def _normals(vertices: Array, faces: NDArray[np.integer], place: NDArray[np.integer]) -> Array:
+    """Unit normals (V, 3), weighted by area; the same for vertices of the same number in ``place`` (V,)."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    _, place = np.unique(vertices, axis=0, return_inverse=True)
-    place = place.reshape(-1)
     total = np.zeros((int(place.max()) + 1, 3))
     np.add.at(total, place[faces].ravel(), np.repeat(across, 3, axis=0))
     length = np.linalg.norm(total, axis=1, keepdims=True)
