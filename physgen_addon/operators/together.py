@@ -36,12 +36,10 @@ def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
     return sorted(found, key=lambda item: item != first)
 
 
-class PHYSGEN_OT_fit_together(JobOperator, bpy.types.Operator):
-    """Resolve where the selected objects pass through each other. The active object stays, the others yield to it"""
+class FitTogether(JobOperator):
+    """The context's selected objects, step by step: ``begin``, ``tick`` until it returns something."""
 
     bl_idname = "physgen.fit_together"
-    bl_label = "Fit Together"
-    bl_options = {"UNDO"}  # noqa: RUF012
     job_title = "Fit Together"
 
     @classmethod
@@ -71,15 +69,19 @@ class PHYSGEN_OT_fit_together(JobOperator, bpy.types.Operator):
         try:
             self._fitted = export_together(scene, items, self._folder / "scene", photo=photo)
         except PhysGenError:
-            self._remove()
+            _remove(self._folder)
             raise
         source, out, preferred = self._folder / "scene", self._folder / "fitted", python(context)
         arguments = ["--objects", ",".join(item.name for item in self._fitted), "--method", settings.method]
         arguments += ["--steps", str(settings.steps), *([] if photo is not None else ["--no-picture"])]
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
-            command = cli_command(find_python(preferred), "compose", str(source), "--out", str(out), *arguments)
-            return run_stage(command, on_event, cancelled)
+            try:
+                command = cli_command(find_python(preferred), "compose", str(source), "--out", str(out), *arguments)
+                return run_stage(command, on_event, cancelled)
+            except PhysGenError:
+                _remove(source.parent)
+                raise
 
         return work
 
@@ -95,7 +97,7 @@ class PHYSGEN_OT_fit_together(JobOperator, bpy.types.Operator):
                     raise InputError(f"object {item.name!r}: its mesh was changed meanwhile; fit again")
             moved = [item.name for item, vertices in changes if _reshape(scene, item, vertices)]
         finally:
-            self._remove()
+            _remove(self._folder)
         _show(scene, pairs)
         for item, _ in changes:
             item.update_tag(refresh={"DATA"})
@@ -108,17 +110,17 @@ class PHYSGEN_OT_fit_together(JobOperator, bpy.types.Operator):
             f"deepest {length(deepest)}"
         )
 
-    def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
-        """Nothing was changed."""
-        self._remove()
 
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator."""
-        super().cancel(context)
-        self._remove()
+class PHYSGEN_OT_fit_together(FitTogether, bpy.types.Operator):
+    """Resolve where the selected objects pass through each other. The active object stays, the others yield to it"""
 
-    def _remove(self) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+    bl_idname = FitTogether.bl_idname
+    bl_label = "Fit Together"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _found(scene: bpy.types.Scene, fitted: Fitted) -> bpy.types.Object:
