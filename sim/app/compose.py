@@ -88,7 +88,7 @@ def _fit(source: SceneFolder, group: Group, request: ComposeRequest, on_event: O
     composed = compose(
         (first, *pieces[1:]),
         reference=reference,
-        guidance=guidance_of(request.guidance, request.prompt, reference, [body.name for body in group.bodies]),
+        guidance=guidance_of(request.guidance, request.prompt),
         options=options,
         on_event=on_event,
         cancelled=cancelled,
