@@ -19,7 +19,7 @@ class PHYSGEN_PG_fitted_pair(bpy.types.PropertyGroup):
     """m³ that both take up."""
     volume_after: FloatProperty()
     share_before: FloatProperty()
-    """Of the smaller object's volume, 0 to 1."""
+    """Of the volume of the one that yields, 0 to 1."""
     share_after: FloatProperty()
     deepest_before: FloatProperty()
     """m"""

@@ -13,6 +13,7 @@ from ..errors import Cancelled
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..gaussians.compose.asset import Piece, Reference
 from ..gaussians.compose.compose import compose
+from ..gaussians.guidance.protocol import Guidance
 from ..gaussians.moving import placed
 from ..gaussians.physics.penetration import Penetration, penetration_of_meshes
 from ..gaussians.ply.read import read_splats
@@ -29,9 +30,6 @@ from .compose_record import Fit, penetration_json, record_of
 from .compose_request import ComposeRequest
 
 STAGE = "compose"
-
-PER_SIDE = 64
-"""Places along the shorter of two objects at which penetration is measured."""
 
 LEAST_PER_OBJECT = 50
 """Splats of an object however small it is beside the others."""
@@ -54,10 +52,11 @@ def compose_scene(
     lists them; SimulationError when the simulation or the guidance fails; Cancelled.
     """
     request = request or ComposeRequest()
+    guidance = guidance_of(request.guidance, request.prompt)
     with composition_folder(root, out) as partial:
         source = load_scene(root)
         found = groups(source, request.objects, cells=request.options.cells)
-        fits = [_fit(source, group, request, on_event, cancelled) for group in found]
+        fits = [_fit(source, group, request, guidance, on_event, cancelled) for group in found]
         moved: dict[str, Moved] = {}
         for fit in fits:
             moved |= _moved(fit)
@@ -67,7 +66,14 @@ def compose_scene(
     return SceneFolder(root=out, scene=scene.scene)
 
 
-def _fit(source: SceneFolder, group: Group, request: ComposeRequest, on_event: OnEvent, cancelled: IsCancelled) -> Fit:
+def _fit(
+    source: SceneFolder,
+    group: Group,
+    request: ComposeRequest,
+    guidance: Guidance | None,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> Fit:
     options, ground = request.options, source.scene.ground
     notes = list(group.notes)
     reference = _reference(source, group, request, notes)
@@ -88,7 +94,7 @@ def _fit(source: SceneFolder, group: Group, request: ComposeRequest, on_event: O
     composed = compose(
         (first, *pieces[1:]),
         reference=reference,
-        guidance=guidance_of(request.guidance, request.prompt),
+        guidance=guidance,
         options=options,
         on_event=on_event,
         cancelled=cancelled,
@@ -171,8 +177,7 @@ def _penetrations(pieces: Sequence[Piece]) -> dict[tuple[str, str], Penetration]
     found = {}
     for i, a in enumerate(pieces):
         for b in pieces[i + 1 :]:
-            size = min(float(np.ptp(piece.surface.vertices, axis=0).max()) for piece in (a, b))
-            found[a.name, b.name] = penetration_of_meshes(a.surface, b.surface, spacing=size / PER_SIDE)
+            found[a.name, b.name] = penetration_of_meshes(b.surface, a.surface)
     return found
 
 

@@ -186,7 +186,8 @@ def _is_inside(inner: Surface, outer: Surface) -> bool:
 def _apart(bodies: Sequence[Body], gaps: Array, which: int | None) -> str:
     """What to say of objects that touch nothing: ``which`` of them, or the two that are nearest."""
     away = gaps + np.diag(np.full(len(bodies), np.inf))
-    i, j = (which, int(away[which].argmin())) if which is not None else np.unravel_index(away.argmin(), away.shape)
+    i = int(away.min(axis=1).argmin()) if which is None else which
+    j = int(away[i].argmin())
     return (
         f"objects {bodies[i].name!r} and {bodies[j].name!r} do not touch: they are {length(float(away[i, j]))} apart; "
         "there is nothing to fit. Move them until they touch, or name others (--objects)"
