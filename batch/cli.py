@@ -48,6 +48,8 @@ def build_parser() -> argparse.ArgumentParser:
     variants.add_variant(command("variant", variants.run_variant, varied))
     fitted = "scene folder → the same with objects that no longer pass through each other"
     compositions.add_compose(command("compose", compositions.run_compose, fitted))
+    views = "pictures of one or two objects from all around → scene folder with their splats"
+    compositions.add_fit_splats(command("fit-splats", compositions.run_fit_splats, views))
     photos.add_light(command("light", photos.run_light, "another light for a scene folder"))
     bakes.add_bake(command("bake", bakes.run_bake, "scene folder → bake folder"))
     cost = "what a bake would cost in time, memory and disk; nothing is written"

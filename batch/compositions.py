@@ -15,6 +15,7 @@ from .diagnosis import names
 from .terminal import Terminal
 
 DEFAULTS = ComposeOptions()
+_LAYOUTS = ("syncdreamer", "zero123++1.1", "zero123++1.2")
 
 
 def add_compose(parser: argparse.ArgumentParser) -> None:
@@ -100,3 +101,45 @@ def _lines(record: dict[str, Any]) -> list[str]:
 
 def _decibels(likeness: dict[str, Any]) -> str:
     return "∞" if likeness["psnr_db"] is None else f"{likeness['psnr_db']:.2f}"
+
+
+def add_fit_splats(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen fit-splats``."""
+    views = "folder with transforms.json and pictures, or with --layout one picture of views side by side"
+    parser.add_argument("views", type=Path, metavar="VIEWS", help=views)
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+    behind = "the same views without the object in front, what it hid filled in: makes it two objects"
+    parser.add_argument("--background-views", type=Path, metavar="VIEWS", help=behind)
+    layout = "whose cameras the views have (default transforms: those of transforms.json)"
+    parser.add_argument("--layout", default="transforms", metavar="LAYOUT", help=f"{layout}; {', '.join(_LAYOUTS)}")
+    parser.add_argument("--objects", type=names, default=(), metavar="BEHIND,FRONT", help="names of the masks' folders")
+    for flag, default, text in (
+        ("--splats", 20_000, "of all objects together"),
+        ("--steps", 600, "of each object's fit"),
+        ("--seed", 0, "of the splats' places and the order of the views"),
+    ):
+        parser.add_argument(flag, type=int, default=default, metavar="N", help=f"{text} (default {default})")
+    parser.add_argument(
+        "--reference", default="", metavar="NAME", help="view that becomes the photo (default: the first)"
+    )
+
+
+def run_fit_splats(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen fit-splats``; the exit code."""
+    # Late: Taichi takes seconds, and the command has other verbs.
+    from ..sim.app.fit_splats import FitRequest, fit_splats_scene
+
+    request = FitRequest(
+        background_views=options.background_views,
+        layout=options.layout,
+        objects=options.objects,
+        splats=options.splats,
+        steps=options.steps,
+        reference=options.reference,
+        seed=options.seed,
+    )
+    folder = fit_splats_scene(options.views, options.out, request, terminal, cancelled)
+    found = [item.name for item in folder.scene.objects]
+    terminal({"event": "done", "scene": str(options.out), "objects": found})
+    terminal.line(f"scene: {options.out} ({', '.join(found)})")
+    return 0

@@ -17,7 +17,7 @@ from ..gaussians.guidance.protocol import Guidance
 from ..gaussians.moving import placed
 from ..gaussians.physics.penetration import Penetration, penetration_of_meshes
 from ..gaussians.ply.read import read_splats
-from ..gaussians.sample import splats_on_mesh
+from ..gaussians.sample import Texture, splats_on_mesh
 from ..gaussians.splats import Splats, joined
 from ..mpm.colliders import Surface
 from ..scene.folder import SceneFolder, load_scene
@@ -30,6 +30,8 @@ from .compose_record import Fit, penetration_json, record_of
 from .compose_request import ComposeRequest
 
 STAGE = "compose"
+GREY = 0.5
+"""sRGB of a surface without a texture, where no photo is looked at."""
 
 LEAST_PER_OBJECT = 50
 """Splats of an object however small it is beside the others."""
@@ -163,7 +165,8 @@ def _own_splats(
 
 
 def _sampled(body: Body, count: int, seed: int) -> Splats:
-    return splats_on_mesh(body.surface, count=count, uv=body.mesh.uv, picture=body.mesh.picture, seed=seed)
+    colours = Texture.of(body.mesh) or np.full(body.surface.vertices.shape, GREY)
+    return splats_on_mesh(body.surface.vertices, body.surface.faces, colours, count, seed=seed)
 
 
 def _area(surface: Surface) -> float:

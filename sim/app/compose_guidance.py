@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The guidance that a user names: a set of pictures, or a diffusion model in a folder. Torch only where it is asked for."""
+"""The guidance that a user names: a set of pictures, or a diffusion model. PyTorch only where it is asked for."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def scene(tmp_path):
     (root / "reconstruct.json").write_text("{}")
     ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
     surface = Surface(vertices=np.asarray(ball.vertices) + shift, faces=np.asarray(ball.faces))
-    splats = splats_on_mesh(surface, count=300, seed=1)
+    splats = splats_on_mesh(surface.vertices, surface.faces, np.full((len(ball.vertices), 3), 0.3), 300, seed=1)
     write_splats(root / "splats/right.ply", placed(splats, np.linalg.inv(np.asarray(TURNED))))
     items = tuple(
         SceneObject(
