@@ -43,8 +43,8 @@ def add_compose(parser: argparse.ArgumentParser) -> None:
     splats = "of all objects together that have none of their own (default 20000)"
     parser.add_argument("--splats", type=int, default=20_000, metavar="COUNT", help=splats)
     parser.add_argument("--no-picture", action="store_true", help="leave the photo aside: physics alone (method ppps)")
-    guidance = "exact:VIEWS (a folder of pictures with cameras) or diffusers:FOLDER (a model of yours)"
-    parser.add_argument("--guidance", default="", metavar="KIND:FOLDER", help=guidance)
+    guidance = "exact:VIEWS (pictures of what yields, with cameras) or diffusers:FOLDER (a model of yours)"
+    parser.add_argument("--guidance", default="", metavar="[OBJECT=]KIND:FOLDER", help=guidance)
     parser.add_argument("--prompt", default="", metavar="TEXT", help="what a diffusers model is told that it sees")
     weight = f"λ3, weight of the guidance, 0 to 1 (default {DEFAULTS.guidance_weight:g})"
     parser.add_argument("--guidance-weight", type=float, default=DEFAULTS.guidance_weight, metavar="W", help=weight)

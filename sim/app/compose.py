@@ -13,7 +13,6 @@ from ..errors import Cancelled
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..gaussians.compose.asset import Piece, Reference
 from ..gaussians.compose.compose import compose
-from ..gaussians.guidance.protocol import Guidance
 from ..gaussians.moving import placed
 from ..gaussians.physics.penetration import Penetration, penetration_of_meshes
 from ..gaussians.ply.read import read_splats
@@ -22,7 +21,7 @@ from ..gaussians.splats import Splats, joined
 from ..mpm.colliders import Surface
 from ..scene.folder import SceneFolder, load_scene
 from .compose_ground import depth_below, holds, with_ground
-from .compose_guidance import guidance_of
+from .compose_guidance import Named, guidance_of
 from .compose_objects import Body, Group, groups, length
 from .compose_output import Moved, composition_folder, write_composition
 from .compose_picture import likeness, reference_of, seen_colours
@@ -54,7 +53,7 @@ def compose_scene(
     lists them; SimulationError when the simulation or the guidance fails; Cancelled.
     """
     request = request or ComposeRequest()
-    guidance = guidance_of(request.guidance, request.prompt)
+    guidance = guidance_of(request.guidance, request.prompt, size=request.options.size)
     with composition_folder(root, out) as partial:
         source = load_scene(root)
         found = groups(source, request.objects, cells=request.options.cells)
@@ -72,7 +71,7 @@ def _fit(
     source: SceneFolder,
     group: Group,
     request: ComposeRequest,
-    guidance: Guidance | None,
+    guidance: Named | None,
     on_event: OnEvent,
     cancelled: IsCancelled,
 ) -> Fit:
@@ -96,7 +95,8 @@ def _fit(
     composed = compose(
         (first, *pieces[1:]),
         reference=reference,
-        guidance=guidance,
+        guidance={} if guidance is None else guidance.by_object([piece.name for piece in pieces[1:]]),
+        cameras=() if guidance is None else guidance.cameras,
         options=options,
         on_event=on_event,
         cancelled=cancelled,

@@ -27,7 +27,7 @@ class ComposeRequest:
     """Whether the scene's photo is looked at."""
 
     guidance: str = ""
-    """``exact:FOLDER`` or ``diffusers:FOLDER``; empty: none."""
+    """``exact:FOLDER`` or ``diffusers:FOLDER`` for all objects that yield, ``OBJECT=KIND:FOLDER`` for one; empty: none."""
 
     prompt: str = ""
     """What a diffusion model is told that it sees."""
@@ -40,5 +40,5 @@ class ComposeRequest:
                 f"method {self.options.method} looks at the picture, and there shall be none: choose method ppps, "
                 "which is physics alone, or do without --no-picture"
             )
-        if self.prompt and not self.guidance.startswith("diffusers:"):
+        if self.prompt and "diffusers:" not in self.guidance:
             raise InputError(f"prompt is {self.prompt!r}: only a guidance diffusers:FOLDER is told one")
