@@ -22,8 +22,7 @@ KINDS = ("exact", "diffusers")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Named:
-    """A guidance. subject: the object that it is for, empty: all that yield; cameras: from where it looks, () if it does
-    not care."""
+    """A guidance. subject: the object that it is for, empty: all that yield; cameras: from where it looks, () anywhere."""
 
     guidance: Guidance
     subject: str

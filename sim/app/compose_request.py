@@ -27,7 +27,7 @@ class ComposeRequest:
     """Whether the scene's photo is looked at."""
 
     guidance: str = ""
-    """``exact:FOLDER`` or ``diffusers:FOLDER`` for all objects that yield, ``OBJECT=KIND:FOLDER`` for one; empty: none."""
+    """``exact:FOLDER`` or ``diffusers:FOLDER``, for all that yield; ``OBJECT=KIND:FOLDER`` for one; empty: none."""
 
     prompt: str = ""
     """What a diffusion model is told that it sees."""
