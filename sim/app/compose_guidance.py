@@ -22,7 +22,7 @@ KINDS = ("exact", "diffusers")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Named:
-    """A guidance. subject: the object that it is for, empty: all that yield; cameras: from where it looks, () anywhere."""
+    """A guidance. subject: the object that it is for, empty: all that yield; cameras: whence it looks, () anywhere."""
 
     guidance: Guidance
     subject: str
