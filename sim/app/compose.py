@@ -28,7 +28,7 @@ from .compose_picture import likeness, reference_of, seen_colours
 from .compose_record import Fit, penetration_json, record_of
 from .compose_request import ComposeRequest
 
-STAGE = "compose"
+STAGE = "composing"
 GREY = 0.5
 """sRGB of a surface without a texture, where no photo is looked at."""
 

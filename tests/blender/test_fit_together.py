@@ -15,7 +15,7 @@ from physgen.physgen_addon.operators.together import FitTogether, PHYSGEN_OT_fit
 from physgen.sim.scene.folder import load_scene  # noqa: E402
 from physgen.sim.scene.meshes import load_object_mesh  # noqa: E402
 
-STEPS = 12
+STEPS = 40
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +71,7 @@ def test_the_active_object_stays_and_the_others_yield():
     sunk = deepest_in_ball(yields, (0, 0, 0.2))
     assert bpy.ops.physgen.fit_together() == {"FINISHED"}
     assert np.array_equal(points(stays), before) and stays.data.shape_keys is None
-    assert sunk > 0.015 and deepest_in_ball(yields, (0, 0, 0.2)) < 0.15 * sunk
+    assert sunk > 0.015 and deepest_in_ball(yields, (0, 0, 0.2)) < 0.05 * sunk
     assert len(points(yields)) == len(rest) and not np.allclose(points(yields), rest)
     # The shape from before can be dialled back.
     key = yields.data.shape_keys.key_blocks[ORIGINAL]
@@ -82,7 +82,7 @@ def test_the_active_object_stays_and_the_others_yield():
     assert np.allclose(points(shown), points(yields))
     pair = bpy.context.scene.physgen_together.pairs[0]
     assert pair.name == "Stays.001 – Yields"
-    assert pair.volume_before > 1e-6 and pair.volume_after < 0.1 * pair.volume_before
+    assert pair.volume_before > 1e-6 and pair.volume_after < 0.01 * pair.volume_before
     assert pair.deepest_before == pytest.approx(0.02, abs=0.003)
     assert not jobs.running()
 

@@ -109,7 +109,7 @@ def test_what_passes_through_is_pushed_out_and_the_rest_stays(scene, tmp_path):
     way = (moved - world(scene, "right")).mean(axis=0)
     assert (new.centres - old.centres).mean(axis=0) == pytest.approx(way, abs=0.3 * np.linalg.norm(way))
     assert np.array_equal(new.colours, old.colours)
-    assert {event["stage"] for event in said} == {"compose"}
+    assert {event["stage"] for event in said} == {"composing"}
     # The same again, over the first, comes out the same.
     compose_scene(scene.root, out, request)
     assert json.loads((out / "compose.json").read_text()) == record
