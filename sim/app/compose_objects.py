@@ -125,7 +125,7 @@ def _checked(bodies: list[Body]) -> Group:
                 if _is_inside(inner.surface, outer.surface):
                     raise InputError(
                         f"object {inner.name!r}: is wholly inside {outer.name!r}, and nothing says on which side it "
-                        "belongs; move it until it shows, or leave it out (--objects)"
+                        "belongs; move it until it shows, or leave it out"
                     )
     return Group(bodies=tuple(bodies), notes=tuple(notes))
 
@@ -190,7 +190,7 @@ def _apart(bodies: Sequence[Body], gaps: Array, which: int | None) -> str:
     j = int(away[i].argmin())
     return (
         f"objects {bodies[i].name!r} and {bodies[j].name!r} do not touch: they are {length(float(away[i, j]))} apart; "
-        "there is nothing to fit. Move them until they touch, or name others (--objects)"
+        "there is nothing to fit. Move them until they touch, or choose others"
     )
 
 
