@@ -24,6 +24,7 @@ from ..interpreter import cli_command, find_python
 from ..jobs import JobOperator, Work
 from ..props.preferences import python
 from ..text import count, length, volume
+from ..typed import decimal
 
 LEAST_MOVE = 1e-6
 """Share of an object's size below which it has not moved."""
@@ -73,7 +74,8 @@ class FitTogether(JobOperator):
             raise
         source, out, preferred = self._folder / "scene", self._folder / "fitted", python(context)
         arguments = ["--objects", ",".join(item.name for item in self._fitted), "--method", settings.method]
-        arguments += ["--steps", str(settings.steps), *([] if photo is not None else ["--no-picture"])]
+        arguments += ["--steps", str(settings.steps), "--keep-strain", repr(decimal(settings.keep_strain))]
+        arguments += [] if photo is not None else ["--no-picture"]
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             try:

@@ -33,6 +33,7 @@ class PHYSGEN_PT_together(Sidebar, bpy.types.Panel):
         column.use_property_split, column.use_property_decorate = True, False
         column.prop(state, "method")
         column.prop(state, "steps")
+        column.prop(state, "keep_strain")
         column.prop(state, "keep_original")
         if running() is not None:
             draw_job(layout)

@@ -47,6 +47,14 @@ class PHYSGEN_PG_together(bpy.types.PropertyGroup):
         max=100_000,
         soft_max=1000,
     )
+    keep_strain: FloatProperty(
+        name="Keep Shape",
+        description="How much what yields wants its first shape back: 1 like rubber, 0 like dough",
+        default=DEFAULTS.keep_strain,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
     keep_original: BoolProperty(
         name="Keep Original",
         description=(

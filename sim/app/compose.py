@@ -24,7 +24,7 @@ from .compose_ground import depth_below, holds, with_ground
 from .compose_guidance import Named, guidance_of
 from .compose_objects import Body, Group, groups, length
 from .compose_output import Moved, composition_folder, write_composition
-from .compose_picture import likeness, reference_of, seen_colours
+from .compose_picture import likeness, reference_of, require_picture, seen_colours
 from .compose_record import Fit, penetration_json, record_of
 from .compose_request import ComposeRequest
 
@@ -56,6 +56,8 @@ def compose_scene(
     guidance = guidance_of(request.guidance, request.prompt, size=request.options.size)
     with composition_folder(root, out) as partial:
         source = load_scene(root)
+        if request.picture:
+            require_picture(source)
         found = groups(source, request.objects, cells=request.options.cells)
         fits = [_fit(source, group, request, guidance, on_event, cancelled) for group in found]
         moved: dict[str, Moved] = {}

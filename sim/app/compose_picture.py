@@ -33,6 +33,15 @@ class Likeness:
     ssim: float
 
 
+def require_picture(folder: SceneFolder) -> None:
+    """Raise InputError, with the way out, where ``folder`` has no photo to look at."""
+    if folder.scene.photo is None:
+        raise InputError(
+            f"{folder.root}: this scene has no photo, so there is nothing to look like; give --no-picture, which "
+            "leaves the objects to physics alone (method ppps)"
+        )
+
+
 def reference_of(folder: SceneFolder, items: Sequence[SceneObject], *, size: int) -> Reference:
     """The scene's photo, its longer side ``size`` pixels or less, for the objects ``items``.
 
@@ -41,12 +50,9 @@ def reference_of(folder: SceneFolder, items: Sequence[SceneObject], *, size: int
 
     Raises InputError when the scene has no photo, or pictures of another size than its camera's.
     """
+    require_picture(folder)
     scene = folder.scene
-    if scene.photo is None or scene.background is None:
-        raise InputError(
-            f"{folder.root}: this scene has no photo, so there is nothing to look like; give --no-picture, which "
-            "leaves the objects to physics alone (method ppps)"
-        )
+    assert scene.photo is not None and scene.background is not None
     photo, background = (read_rgb(folder.file(name)) for name in (scene.photo, scene.background))
     wanted = (scene.camera.height, scene.camera.width, 3)
     for name, picture in ((scene.photo, photo), (scene.background, background)):
