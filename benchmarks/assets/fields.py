@@ -18,9 +18,14 @@ Field = Callable[[Array], Array]
 Triple = tuple[float, float, float]
 
 
+def lengths(vectors: Array) -> Array:
+    """(N,) of vectors (N, 3); several times faster than ``np.linalg.norm`` along short rows."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
 def ball(centre: Triple, radius: float) -> Field:
     """A sphere."""
-    return lambda p: np.linalg.norm(p - np.array(centre), axis=1) - radius
+    return lambda p: lengths(p - np.array(centre)) - radius
 
 
 def ellipsoid(centre: Triple, radii: Triple) -> Field:
@@ -29,7 +34,7 @@ def ellipsoid(centre: Triple, radii: Triple) -> Field:
 
     def field(p: Array) -> Array:
         scaled = (p - np.array(centre)) / size
-        first, second = np.linalg.norm(scaled, axis=1), np.linalg.norm(scaled / size, axis=1)
+        first, second = lengths(scaled), lengths(scaled / size)
         return first * (first - 1.0) / np.maximum(second, 1e-9 / size.min())
 
     return field
@@ -44,7 +49,7 @@ def cone(a: Triple, b: Triple, radius_a: float, radius_b: float) -> Field:
 
     def field(p: Array) -> Array:
         height = (p - start) @ unit
-        radius = np.linalg.norm(p - start - height[:, None] * unit, axis=1)
+        radius = lengths(p - start - height[:, None] * unit)
         # Which of three parts is nearest is told along the mantle's own direction.
         place = height * rise - radius * slope
         low, high = np.hypot(radius, height) - radius_a, np.hypot(radius, height - length) - radius_b
@@ -65,7 +70,7 @@ def block(centre: Triple, half: Triple, rounding: float) -> Field:
 
     def field(p: Array) -> Array:
         beyond = np.abs(p - np.array(centre)) - (np.array(half) - rounding)
-        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+        outside = lengths(np.maximum(beyond, 0.0))
         return outside + np.minimum(beyond.max(axis=1), 0.0) - rounding
 
     return field
@@ -77,7 +82,7 @@ def tyre(centre: Triple, radius: float, tube: float, axis: Triple = (0.0, 0.0, 1
 
     def field(p: Array) -> Array:
         height = (p - np.array(centre)) @ unit
-        across = np.linalg.norm(p - np.array(centre) - height[:, None] * unit, axis=1)
+        across = lengths(p - np.array(centre) - height[:, None] * unit)
         return np.hypot(across - radius, height) - tube
 
     return field

@@ -11,9 +11,10 @@ from .fields import Array, Field, Triple
 
 BLOCK = 4
 """Lattice points along a side of what is looked at together: far from the surface one value stands for all."""
-SLACK = 1.6
-"""Fields may overstate distances by so much."""
-POLISH = 3
+SLACK = 1.2
+"""Blocks whose middle is within so many of their sides of the surface are looked at: the farthest point of a block and
+one lattice step beyond are 0.9 away, and fields may overstate distances a little."""
+POLISH = 2
 
 
 def meshed(field: Field, low: Triple, high: Triple, spacing: float) -> tuple[Array, NDArray[np.int64]]:
@@ -46,12 +47,14 @@ def gradient(field: Field, points: Array, step: float) -> Array:
 
 
 def _polished(field: Field, points: Array, spacing: float) -> Array:
-    """Newton's steps onto the surface, no farther than a third of a lattice cell, lest triangles fold."""
-    start = points
+    """Newton's steps onto the surface along the slope found first, no farther than a third of a lattice cell.
+
+    Farther, triangles would fold where the slope has a crease.
+    """
+    slope = gradient(field, points, 0.05 * spacing)
+    slope /= np.maximum((slope**2).sum(axis=1, keepdims=True), 0.25)
+    reach = spacing / 3 / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)
+    moved = np.zeros(len(points))
     for _ in range(POLISH):
-        slope = gradient(field, points, 0.05 * spacing)
-        points = points - (field(points) / np.maximum((slope**2).sum(axis=1), 0.25))[:, None] * slope
-        away = points - start
-        length = np.linalg.norm(away, axis=1, keepdims=True)
-        points = start + away * np.minimum(1.0, spacing / 3 / np.maximum(length, 1e-12))
-    return points
+        moved = np.clip(moved - field(points + moved[:, None] * slope), -reach, reach)
+    return points + moved[:, None] * slope

@@ -38,24 +38,29 @@ def volume(part: Part) -> float:
     return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
-def overlap(a: Part, b: Part, *, cells: int = 96) -> Overlap:
-    """What ``a`` and ``b`` have in common.
+def common_volume(a: Part, b: Part, *, cells: int = 96) -> float:
+    """Cubic metres that both fill.
 
-    cells: along the longest side of the box that holds their common part; the middle of each tells for all of it.
+    cells: along the longest side of the box that holds what they share; the middle of each tells for all of it.
     """
     low = np.maximum(a.vertices.min(axis=0), b.vertices.min(axis=0))
     high = np.minimum(a.vertices.max(axis=0), b.vertices.max(axis=0))
-    common = 0.0
-    if (high > low).all():
-        step = float((high - low).max()) / cells
-        counts = np.ceil((high - low) / step).astype(np.int64)
-        both = _filled(a, low, step, counts) & _filled(b, low, step, counts)
-        common = float(both.sum()) * step**3
+    if not (high > low).all():
+        return 0.0
+    step = float((high - low).max()) / cells
+    counts = np.ceil((high - low) / step).astype(np.int64)
+    return float((_filled(a, low, step, counts) & _filled(b, low, step, counts)).sum()) * step**3
+
+
+def overlap(a: Part, b: Part) -> Overlap:
+    """What ``a`` and ``b`` have in common. Takes some seconds for the distances."""
     lattice = signed_distance(
         Surface(vertices=b.vertices, faces=b.faces), float(np.ptp(b.vertices, axis=0).max()) / 80, margin=0.0
     )
     nearest = float(lattice.at(a.vertices)[0].min())
-    return Overlap(volume=common, volumes=(volume(a), volume(b)), depth=max(0.0, -nearest), gap=max(0.0, nearest))
+    return Overlap(
+        volume=common_volume(a, b), volumes=(volume(a), volume(b)), depth=max(0.0, -nearest), gap=max(0.0, nearest)
+    )
 
 
 def at_truth(asset: Asset) -> list[Overlap]:

@@ -195,13 +195,12 @@ def sock() -> Asset:
         return last(p - (0.0, 0.0, lift))
 
     top = 0.185
-    ribs = worn(
-        form,
-        thickness=lambda p: 0.0098 + 0.0008 * np.cos(26 * np.arctan2(p[:, 0], p[:, 1] - 0.05)),
-        where=common(above(top - 0.035), below(top), blend=0.006),
-        blend=0.006,
-    )
-    knit = union(worn(form, thickness=0.0075, where=below(top - 0.004), blend=0.004), ribs, blend=0.004)
+
+    def thickness(p: Array) -> Array:
+        ribs = 0.0098 + 0.0008 * np.cos(26 * np.arctan2(p[:, 0], p[:, 1] - 0.05))
+        return 0.0075 + inside(top - 0.033 - p[:, 2], 0.006) * (ribs - 0.0075)
+
+    knit = worn(form, thickness=thickness, where=below(top), blend=0.006)
     sock_shape = without(knit, grown(foot, GAP * size), blend=0.002)
 
     def skin(p: Array) -> Array:

@@ -34,7 +34,7 @@ class Look:
     neighbours hide; the rest is emitted, between ``shade`` (where the surface is turned from ``key``) and 1.
     """
 
-    samples: int = 12
+    samples: int = 8
     ambient: float = 0.35
     shade: float = 0.45
     key: tuple[float, float, float] = (-0.35, -0.55, 0.76)

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 from physgen.physgen_addon.bridge import camera as bridge_camera
 from physgen.physgen_addon.bridge import compat, cycles, passes
 from physgen.physgen_addon.bridge.options import RenderOptions

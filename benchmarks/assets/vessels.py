@@ -77,7 +77,10 @@ def sleeve() -> Asset:
 
 
 def bowl() -> Asset:
-    """A beach ball in a bowl, 22 cm wide. The ball yields: it is soft, and what the bowl hides of it must be guessed."""
+    """A beach ball in a bowl, 21 cm wide.
+
+    The ball yields: it is the soft one, and the one that is hidden in part, so that its picture has to be completed.
+    """
     size, radius = 0.22, 0.075
     middle = (0.0, 0.0, 0.0965)
     toy = ball(middle, radius)
