@@ -8,6 +8,7 @@ import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -75,13 +76,11 @@ def _ways(fit: Fit) -> dict[str, dict[str, float]]:
 
 
 def _versions() -> Mapping[str, str]:
-    import taichi
-
     return {
         "physgen": VERSION,
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "taichi": ".".join(str(part) for part in taichi.__version__),
+        "taichi": version("taichi"),
     }
 
 

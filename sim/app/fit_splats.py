@@ -20,7 +20,7 @@ from ..events import IsCancelled, OnEvent, ignore, never
 from ..gaussians.fit.fit import fit_splats
 from ..gaussians.fit.options import FitOptions
 from ..gaussians.fit.pair import PairOptions, fit_pair
-from ..gaussians.fit.start import splats_on_surface
+from ..gaussians.fit.start import pixel_size, start_on_surface
 from ..gaussians.fit.target import target_of
 from ..gaussians.ply.write import write_splats
 from ..gaussians.splats import Splats
@@ -139,7 +139,9 @@ def _single(views: Sequence[View], request: FitRequest, on_event: OnEvent, cance
     for note in hull.notes:
         on_event({"event": "notice", "stage": "fit", "message": note})
     surface = Surface(vertices=hull.vertices, faces=hull.faces)
-    start = splats_on_surface(surface, request.splats, [target_of(view) for view in views], seed=request.seed)
+    inset = pixel_size([view.camera for view in views], surface)
+    targets = [target_of(view) for view in views]
+    start = start_on_surface(surface, request.splats, targets, inset=inset, seed=request.seed)
     fitted = fit_splats(views, start, FitOptions(steps=request.steps, seed=request.seed), on_event, cancelled)
     return _Made(name="object", label=0, surface=surface, splats=fitted.splats)
 

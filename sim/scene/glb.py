@@ -223,8 +223,8 @@ def _colours(
 ) -> NDArray[np.float64] | None:
     if "COLOR_0" not in attributes:
         return None
-    width = _WIDTHS[_item(document, "accessors", attributes["COLOR_0"])["type"]]
-    colours = _accessor(document, binary, attributes["COLOR_0"], width).astype(np.float64)
+    width = _WIDTHS[listed_item(document, "accessors", attributes["COLOR_0"])["type"]]
+    colours = accessor_values(document, binary, attributes["COLOR_0"], width).astype(np.float64)
     if width < 3 or len(colours) != count or not np.isfinite(colours).all():
         raise ValueError("colours that do not fit its vertices")
     return colours[:, :3]
