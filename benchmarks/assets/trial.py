@@ -53,6 +53,9 @@ class Budget:
     steps: int = 500
 
 
+FREE, HELD = frozenset[str](), frozenset({"centres"})
+"""What of a fit is frozen: the foreground's centres stay on its surface (eq. 16)."""
+
 QUICK = Budget(size=128, splats=5_000, fit_steps=300, steps=80)
 """Minutes for all assets."""
 
@@ -74,7 +77,7 @@ def start(asset: Asset, pictures: AssetPictures, budget: Budget, cache: Path) ->
     counts = [max(500, round(budget.splats * own / sum(area))) for own in area]
     views = (pictures.background_views, *pictures.foreground_views)
     fitted = [
-        _fitted(asset, part, seen, count, budget, cache)
+        _fitted(asset, part, seen, count, budget, cache, frozen=FREE if part is asset.background else HELD)
         for part, seen, count in zip(asset.parts, views, counts, strict=True)
     ]
     true = [
@@ -185,7 +188,7 @@ def _fitted(asset: Asset, part: Part, views: tuple[View, ...], count: int, budge
     surface = _surface(part)
     inset = pixel_size([view.camera for view in views], surface)
     begin = start_on_surface(surface, count, [target_of(view) for view in views], inset=inset)
-    fitted = fit_splats(views, begin, FitOptions(steps=budget.fit_steps)).splats
+    fitted = fit_splats(views, begin, FitOptions(steps=budget.fit_steps, frozen=frozen)).splats
     write_splats(file, fitted)
     return fitted
 

@@ -40,11 +40,11 @@ class ComposeOptions:
     last_timestep: int = 20
     """The same at the last step."""
 
-    first_move: float = 1.0
-    """Cells that the fastest hundredth of the points would move in the first step if they were alone, 0.01 to 1. It
+    first_move: float = 2.0
+    """Cells that the fastest hundredth of the points would move in the first step if they were alone, 0.01 to 4. It
     sets the factor between gradient and velocity, which then stays (but for ``last_rate``)."""
 
-    last_rate: float = 0.1
+    last_rate: float = 0.3
     """What is left of that factor at the last step, 0.001 to 1: the gradient of an L1 loss does not fade by itself."""
 
     first_stretch: float = 0.01
