@@ -44,6 +44,14 @@ Picture = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How a part's splats are fitted: ``count`` of them."""
+
+    count: int
+    options: FitOptions
+
+
+@dataclass(frozen=True, kw_only=True)
 class Budget:
     """What a trial may take; the defaults are the issue's: 500 steps, 20,000 splats, 256²."""
 
@@ -52,9 +60,11 @@ class Budget:
     fit_steps: int = 400
     steps: int = 500
 
+    def fit(self, count: int, *, free: bool) -> Fit:
+        """A foreground's centres stay on its surface (eq. 16); those of O1 are ``free``."""
+        frozen = frozenset[str]() if free else frozenset({"centres"})
+        return Fit(count=count, options=FitOptions(steps=self.fit_steps, frozen=frozen))
 
-FREE, HELD = frozenset[str](), frozenset({"centres"})
-"""What of a fit is frozen: the foreground's centres stay on its surface (eq. 16)."""
 
 QUICK = Budget(size=128, splats=5_000, fit_steps=300, steps=80)
 """Minutes for all assets."""
@@ -77,7 +87,7 @@ def start(asset: Asset, pictures: AssetPictures, budget: Budget, cache: Path) ->
     counts = [max(500, round(budget.splats * own / sum(area))) for own in area]
     views = (pictures.background_views, *pictures.foreground_views)
     fitted = [
-        _fitted(asset, part, seen, count, budget, cache, frozen=FREE if part is asset.background else HELD)
+        _fitted(asset, part, seen, budget.fit(count, free=part is asset.background), cache)
         for part, seen, count in zip(asset.parts, views, counts, strict=True)
     ]
     true = [
@@ -180,15 +190,16 @@ def _quality(splats: Splats, view: View) -> tuple[float, float]:
     return psnr(seen, wanted, peak=1.0), ssim(seen, wanted)
 
 
-def _fitted(asset: Asset, part: Part, views: tuple[View, ...], count: int, budget: Budget, cache: Path) -> Splats:
+def _fitted(asset: Asset, part: Part, views: tuple[View, ...], fit: Fit, cache: Path) -> Splats:
     """The part's splats, from ``cache`` if they were fitted before."""
-    file = cache / f"{kept_as(asset, budget.size)}-{part.name}-{count}-{budget.fit_steps}.ply"
+    name = f"{part.name}-{fit.count}-{fit.options.steps}{'-held' * bool(fit.options.frozen)}.ply"
+    file = cache / f"{kept_as(asset, views[0].camera.width)}-{name}"
     if file.is_file():
         return read_splats(file)
     surface = _surface(part)
     inset = pixel_size([view.camera for view in views], surface)
-    begin = start_on_surface(surface, count, [target_of(view) for view in views], inset=inset)
-    fitted = fit_splats(views, begin, FitOptions(steps=budget.fit_steps, frozen=frozen)).splats
+    begin = start_on_surface(surface, fit.count, [target_of(view) for view in views], inset=inset)
+    fitted = fit_splats(views, begin, fit.options).splats
     write_splats(file, fitted)
     return fitted
 
