@@ -40,7 +40,7 @@ class ComposeOptions:
     last_timestep: int = 20
     """The same at the last step."""
 
-    first_move: float = 2.0
+    first_move: float = 1.0
     """Cells that the fastest hundredth of the points would move in the first step if they were alone, 0.01 to 4. It
     sets the factor between gradient and velocity, which then stays (but for ``last_rate``)."""
 
