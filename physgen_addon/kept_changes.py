@@ -31,6 +31,7 @@ OF_BODY = (
     ("spin",),
     ("start_frame",),
     ("goal_stiffness", "goal_damping"),
+    ("splats_as",),
 )
 """Fields of a body; those that say one thing together stay together."""
 OF_MATERIAL = (("preset_name", *NUMBERS),)
