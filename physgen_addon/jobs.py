@@ -321,6 +321,23 @@ class PHYSGEN_OT_cancel_job(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def start_chosen(
+    operator: bpy.types.Operator, context: bpy.types.Context, job_operator: Callable[..., Any], given: dict[str, Any]
+) -> set[str]:
+    """What ``operator`` does with what a file browser gave it: call ``job_operator`` (one of ``bpy.ops``) with it.
+
+    An operator that a file browser runs cannot go on beside Blender itself, so a job needs one of its own.
+    """
+    mode = "EXEC_DEFAULT" if context.window is None else "INVOKE_DEFAULT"
+    try:
+        job_operator(mode, **given)
+    except RuntimeError as error:
+        # What the other one has reported as an error.
+        operator.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
+        return {"CANCELLED"}
+    return {"FINISHED"}
+
+
 def progress_text(job: Job) -> str:
     """Such as ``Diagnose: fits 40 %, 12 s left``; seconds so far while the share is not known."""
     text = f"{job.title}: {job.stage}" if job.stage else job.title

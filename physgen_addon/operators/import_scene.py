@@ -16,7 +16,7 @@ from ...sim.importers.physgen3d import read_physgen3d
 from ...sim.scene.folder import SCENE_FILE
 from ..bridge.import_scene import import_notes, import_scene
 from ..interpreter import cli_command, find_python
-from ..jobs import JobOperator, Work
+from ..jobs import JobOperator, Work, start_chosen
 from ..paths import folder_beside, require_folder
 from ..props.body import bodies
 from ..props.preferences import python
@@ -155,15 +155,9 @@ class PHYSGEN_OT_choose_physgen3d(_OfPhysgen3d, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start the job: an operator that a file browser runs cannot go on beside Blender itself."""
-        mode = "EXEC_DEFAULT" if context.window is None else "INVOKE_DEFAULT"
-        try:
-            bpy.ops.physgen.import_physgen3d(mode, directory=self.directory, size_m=self.size_m)
-        except RuntimeError as error:
-            # What the other one has reported as an error.
-            self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        """Start the job."""
+        given = {"directory": self.directory, "size_m": self.size_m}
+        return start_chosen(self, context, bpy.ops.physgen.import_physgen3d, given)
 
 
 class PHYSGEN_FH_scene(bpy.types.FileHandler):

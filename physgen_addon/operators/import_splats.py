@@ -11,7 +11,7 @@ from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ..bridge.import_splats import import_splats
 from ..interpreter import cli_command, find_python
-from ..jobs import JobOperator, Work
+from ..jobs import JobOperator, Work, start_chosen
 from ..paths import folder_beside
 from ..props.preferences import python
 
@@ -101,15 +101,9 @@ class PHYSGEN_OT_choose_splats(_OfSplats, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start the job: an operator that a file browser runs cannot go on beside Blender itself."""
-        mode = "EXEC_DEFAULT" if context.window is None else "INVOKE_DEFAULT"
-        try:
-            bpy.ops.physgen.import_splats(mode, filepath=self.filepath, size_m=self.size_m, up=self.up)
-        except RuntimeError as error:
-            # What the other one has reported as an error.
-            self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        """Start the job."""
+        given = {"filepath": self.filepath, "size_m": self.size_m, "up": self.up}
+        return start_chosen(self, context, bpy.ops.physgen.import_splats, given)
 
 
 CLASSES = (PHYSGEN_OT_import_splats, PHYSGEN_OT_choose_splats)

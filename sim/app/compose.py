@@ -19,6 +19,7 @@ from ..gaussians.ply.read import read_splats
 from ..gaussians.sample import Texture, splats_on_mesh
 from ..gaussians.splats import Splats, joined
 from ..mpm.colliders import Surface
+from ..mpm.triangles import face_normals
 from ..scene.folder import SceneFolder, load_scene
 from .compose_ground import depth_below, holds, with_ground
 from .compose_guidance import Named, guidance_of
@@ -172,9 +173,7 @@ def _sampled(body: Body, count: int, seed: int) -> Splats:
 
 
 def _area(surface: Surface) -> float:
-    corners = surface.vertices[surface.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return float(0.5 * np.linalg.norm(across, axis=1).sum())
+    return float(face_normals(surface.vertices[surface.faces])[1].sum())
 
 
 def _penetrations(pieces: Sequence[Piece]) -> dict[tuple[str, str], Penetration]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...mpm.colliders import Collider
+from ...mpm.distance import DistanceLattice
 from ...mpm.options import SolverOptions
 from ...scene.model import Camera
 from ..guidance.protocol import Guidance
@@ -69,6 +70,7 @@ def compose(
     if strange:
         raise InputError(f"guidance is given for {strange[0]!r}: no piece of that name yields")
     staying: list[Piece] = [pieces[0]]
+    lattices: list[DistanceLattice] = []
     history: list[StepRecord] = []
     progress = StageProgress(on_event, "composing", options.steps * (len(pieces) - 1))
     for index, piece in enumerate(pieces[1:]):
@@ -83,7 +85,7 @@ def compose(
             options=options,
         )
         boundaries = [Collider(name=f"{other.name} (stays)", surface=other.surface) for other in staying]
-        lattices = [lattice_of(other) for other in staying]
+        lattices.append(lattice_of(staying[-1]))
         matter = Matter(
             piece,
             boundaries,

@@ -46,6 +46,8 @@ class Walk:
         """matter: holds ``splats.centres`` as its points."""
         self.splats = splats
         self._matter = matter
+        # Of the last physical step, because they are dear; None once points were placed.
+        self._gradients: Array | None = None
         self._options = options
         last, steps = options.last_rate, options.steps
         share = 1.0 if options.method == "pse-sds" else STRAIGHT
@@ -82,10 +84,12 @@ class Walk:
         down = still if descent is None else self._move.steps_down(descent.gradients.centres, number)
         if self._straight(number):
             self._matter.place(self.splats.centres + down)
+            self._gradients = None
             return self.splats.changed(centres=self.splats.centres + down)
-        before = self._matter.gradients
+        before = self._matter.gradients if self._gradients is None else self._gradients
         self._matter.step(down)
-        part = _sound(self._matter.gradients @ np.linalg.inv(before))
+        self._gradients = self._matter.gradients
+        part = _sound(self._gradients @ np.linalg.inv(before))
         return from_half_axes(self.splats, self._matter.points, part @ half_axes(self.splats))
 
     def _reshaped(self, splats: Splats, gradients: SplatGradients, number: int) -> Splats:
