@@ -63,7 +63,7 @@ def main() -> int:
             Line(
                 title=name,
                 truth=seen.held_out[0].pixels,
-                start=picture_of(begin.pieces, seen.held_out[0]),
+                start=picture_of(begin, seen.held_out[0]),
                 methods=shown,
                 captions=captions,
             )

@@ -35,6 +35,7 @@ from physgen.sim.gaussians.raster.rasteriser import Rasteriser
 from physgen.sim.gaussians.splats import Splats, joined
 from physgen.sim.gaussians.views.view import View
 from physgen.sim.mpm.colliders import Surface
+from physgen.sim.mpm.triangles import face_normals
 
 from .asset import Asset, Part
 from .pictures import AssetPictures, kept_as
@@ -70,19 +71,11 @@ QUICK = Budget(size=128, splats=5_000, fit_steps=300, steps=80)
 """Minutes for all assets."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Start:
-    """What every method is given, and what it costs to come there."""
+def start(asset: Asset, pictures: AssetPictures, budget: Budget, cache: Path) -> tuple[Piece, ...]:
+    """What every method is given: the foregrounds, which stay, then O1.
 
-    pieces: tuple[Piece, ...]
-    """The foregrounds, which stay, then O1."""
-
-    truth: tuple[Piece, ...]
-    """The same, undistorted: how well splats can look at best."""
-
-
-def start(asset: Asset, pictures: AssetPictures, budget: Budget, cache: Path) -> Start:
-    """Splats of each part fitted to the pictures of it alone, O1 then distorted with its surface."""
+    Splats of each part are fitted to the pictures of it alone; O1's are then distorted with its surface.
+    """
     area = [_area(part) for part in asset.parts]
     counts = [max(500, round(budget.splats * own / sum(area))) for own in area]
     views = (pictures.background_views, *pictures.foreground_views)
@@ -97,11 +90,16 @@ def start(asset: Asset, pictures: AssetPictures, budget: Budget, cache: Path) ->
     centres = fitted[0].centres
     bent = from_half_axes(fitted[0], asset.warp(centres), asset.warp.jacobian(centres) @ half_axes(fitted[0]))
     background = dataclasses.replace(true[0], splats=bent, surface=_surface(asset.start))
-    return Start(pieces=(*true[1:], background), truth=(*true[1:], true[0]))
+    return (*true[1:], background)
 
 
 def composed(
-    asset: Asset, pictures: AssetPictures, begin: Start, method: str, budget: Budget, options: ComposeOptions | None
+    asset: Asset,
+    pictures: AssetPictures,
+    begin: tuple[Piece, ...],
+    method: str,
+    budget: Budget,
+    options: ComposeOptions | None,
 ) -> tuple[Composed, float]:
     """What ``method`` makes of the start, and the CPU seconds of it."""
     view = pictures.reference
@@ -114,7 +112,7 @@ def composed(
     chosen = dataclasses.replace(options or ComposeOptions(), method=method, steps=budget.steps, size=budget.size)
     before = time.process_time()
     result = compose(
-        begin.pieces,
+        begin,
         reference=reference,
         guidance={asset.background.name: guidance},
         cameras=tuple(view.camera for view in views),
@@ -126,16 +124,15 @@ def composed(
 def judged(
     asset: Asset,
     pictures: AssetPictures,
-    begin: Start,
+    begin: tuple[Piece, ...],
     result: Composed,
     method: str,
     cpu_s: float,
     clip: ClipScores | None,
 ) -> Row:
     """The row of the table."""
-    splats = joined([piece.splats for piece in result.pieces])
-    quality = [_quality(splats, view) for view in (pictures.reference, *pictures.held_out)]
-    before, after = penetrations(begin.pieces), penetrations(result.pieces)
+    quality = [_quality(result.pieces, view) for view in (pictures.reference, *pictures.held_out)]
+    before, after = penetrations(begin), penetrations(result.pieces)
     held = np.mean(quality[1:], axis=0)
     return Row(
         asset=asset.name,
@@ -146,7 +143,7 @@ def judged(
         ssim_held_out=float(held[1]),
         penetration_before=sum(p.volume for p in before),
         penetration_after=sum(p.volume for p in after),
-        penetrating_before=points_inside(begin.pieces),
+        penetrating_before=points_inside(begin),
         penetrating_after=points_inside(result.pieces),
         stays_together=stay_together(result.pieces),
         cpu_s=cpu_s,
@@ -183,10 +180,9 @@ def picture_of(pieces: tuple[Piece, ...], view: View) -> Picture:
     return np.clip(seen.colour.astype(np.float64), 0.0, 1.0)
 
 
-def _quality(splats: Splats, view: View) -> tuple[float, float]:
+def _quality(pieces: tuple[Piece, ...], view: View) -> tuple[float, float]:
     """PSNR in dB and SSIM against ``view``, the whole picture."""
-    seen = np.clip(Rasteriser().render(splats, view.camera).colour.astype(np.float64), 0.0, 1.0)
-    wanted = _over_white(view)
+    seen, wanted = picture_of(pieces, view), _over_white(view)
     return psnr(seen, wanted, peak=1.0), ssim(seen, wanted)
 
 
@@ -194,14 +190,13 @@ def _fitted(asset: Asset, part: Part, views: tuple[View, ...], fit: Fit, cache: 
     """The part's splats, from ``cache`` if they were fitted before."""
     name = f"{part.name}-{fit.count}-{fit.options.steps}{'-held' * bool(fit.options.frozen)}.ply"
     file = cache / f"{kept_as(asset, views[0].camera.width)}-{name}"
-    if file.is_file():
-        return read_splats(file)
-    surface = _surface(part)
-    inset = pixel_size([view.camera for view in views], surface)
-    begin = start_on_surface(surface, fit.count, [target_of(view) for view in views], inset=inset)
-    fitted = fit_splats(views, begin, fit.options).splats
-    write_splats(file, fitted)
-    return fitted
+    if not file.is_file():
+        surface = _surface(part)
+        inset = pixel_size([view.camera for view in views], surface)
+        begin = start_on_surface(surface, fit.count, [target_of(view) for view in views], inset=inset)
+        write_splats(file, fit_splats(views, begin, fit.options).splats)
+    # Also the first time: a file keeps 32 bits, and a second run should find what the first did.
+    return read_splats(file)
 
 
 def _over_white(view: View) -> Picture:
@@ -213,5 +208,4 @@ def _surface(part: Part) -> Surface:
 
 
 def _area(part: Part) -> float:
-    corners = part.vertices[part.faces]
-    return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+    return float(face_normals(part.vertices[part.faces])[1].sum())
