@@ -1,16 +1,22 @@
-# make demo | test | test-all | lint | benchmark | extension | test-blender-app | clean   (make setup is part of each)
-# PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what `make test` runs,
+# make demo | test | test-all | test-explore | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
+# PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on,
+# WORKERS=… how many processes share the tests,
+# NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
 # ZIPS=… which zips `make extension` builds (all, or names), BLENDER=… the program that `make test-blender-app` drives.
 SHELL := /bin/sh
 VENV ?= .venv
 TESTS ?= tests
+WORKERS ?= auto
 DEMO_OUT ?= demo_out
 PYTHON ?= $(shell setup/pick_python.sh)
 BIN := $(VENV)/bin
 ZIPS ?=
+NAMES ?= mpm worlds demo
 BLENDER ?= blender
+# Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup demo test test-all lint benchmark extension test-blender-app clean
+.PHONY: setup demo test test-all test-explore lint docs benchmark extension test-blender-app clean
 
 setup:
 	@test -n "$(PYTHON)" || exit 1
@@ -21,20 +27,26 @@ demo: setup
 	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT)
 
 test: setup
-	$(BIN)/python -m pytest -m "not slow" $(TESTS)
+	$(PYTEST) -m "not slow" $(TESTS)
 
 test-all: setup
-	$(BIN)/python -m pytest $(TESTS)
+	$(PYTEST) $(TESTS)
+
+# Examples that no run has drawn before, for the tests that draw any. Failing ones are kept in .hypothesis/.
+test-explore: setup
+	HYPOTHESIS_PROFILE=explore $(PYTEST) -m "hypothesis and not slow" $(TESTS)
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy sim batch
+	$(BIN)/mypy sim batch blind_check physgen_addon
+
+docs: setup
+	@$(BIN)/python -m mkdocs --version >/dev/null 2>&1 || $(BIN)/python -m pip install --quiet -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 benchmark: setup
-	$(BIN)/python benchmarks/mpm.py
-	$(BIN)/python benchmarks/worlds.py
-	$(BIN)/python benchmarks/demo.py
+	$(BIN)/python -m physgen.benchmarks $(NAMES) $(if $(QUICK),--quick)
 
 extension: setup
 	@$(BIN)/python setup/extension.py $(if $(ZIPS),--zips $(ZIPS))
@@ -43,4 +55,4 @@ test-blender-app: extension
 	$(BIN)/python tests/real_blender/run.py --blender "$(BLENDER)" --python "$(abspath $(BIN)/python)"
 
 clean:
-	rm -rf build dist .venv .venv-* demo_out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build dist site .venv .venv-* demo_out .pytest_cache .mypy_cache .ruff_cache

@@ -1,9 +1,121 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Entry of the Blender extension; everything is delegated to ``physgen_addon``.
+"""One photo becomes a small physical world; a recording tells where simulation and reality part.
 
-The same folder is the Python package ``physgen`` after ``pip install -e .``. Importing it costs nothing and needs
-no Blender.
+    import physgen
+
+    objects = [physgen.ObjectRequest(name="cup", box=(215, 960, 475, 1190), preset="medium", velocity=(0, 0, 1.5))]
+    scene = physgen.reconstruct("photo.jpg", objects, out="work/scene")
+    bake = physgen.bake(scene, out="work/bake", options=physgen.BakeOptions(frames=48))
+    frames = physgen.render(scene, bake, out="work/frames", video="video.mp4")
+
+    capture = physgen.track(scene, ["recording.mp4"], out="work/capture")
+    diagnosis = physgen.diagnose(capture, out="work/diagnosis")
+    print(diagnosis.verdict.effect, diagnosis.summary)
+
+Every name of ``__all__`` is loaded when it is first used: importing the package needs neither Blender nor Taichi, SciPy
+or OpenCV. The same folder is a Blender extension; ``register`` and ``unregister`` are its entry.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .batch.stages import render
+    from .physgen_addon.render.render_options import RenderOptions
+    from .sim.app.bake import bake
+    from .sim.app.bake_options import BakeOptions
+    from .sim.app.compose_scene import compose
+    from .sim.app.diagnose import diagnose
+    from .sim.app.reconstruct import Physics, reconstruct
+    from .sim.cache.bake_folder import Bake, load_bake
+    from .sim.diagnose.capture import Capture, load_capture
+    from .sim.diagnose.diagnosis import Diagnosis
+    from .sim.diagnose.run_diagnosis import DiagnoseOptions
+    from .sim.diagnose.track.track_command import track
+    from .sim.diagnose.track.track_input import TrackOptions, VideoTrial
+    from .sim.errors import PhysGenError
+    from .sim.gaussians.compose.compose_options import ComposeRequest
+    from .sim.importers.mesh_scene import scene_from_meshes
+    from .sim.mpm.world import World
+    from .sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+    from .sim.scene.folder import Scene, load_scene
+    from .sim.version import VERSION as __version__
+
+__all__ = [
+    "Bake",
+    "BakeOptions",
+    "Capture",
+    "ComposeRequest",
+    "DiagnoseOptions",
+    "Diagnosis",
+    "ObjectRequest",
+    "PhysGenError",
+    "Physics",
+    "ReconstructOptions",
+    "RenderOptions",
+    "Scene",
+    "TrackOptions",
+    "VideoTrial",
+    "World",
+    "__version__",
+    "bake",
+    "compose",
+    "diagnose",
+    "load_bake",
+    "load_capture",
+    "load_scene",
+    "reconstruct",
+    "render",
+    "scene_from_meshes",
+    "track",
+]
+
+_HOMES = {
+    "Bake": ".sim.cache.bake_folder",
+    "BakeOptions": ".sim.app.bake_options",
+    "Capture": ".sim.diagnose.capture",
+    "ComposeRequest": ".sim.gaussians.compose.compose_options",
+    "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
+    "Diagnosis": ".sim.diagnose.diagnosis",
+    "ObjectRequest": ".sim.reconstruct.reconstruct_options",
+    "PhysGenError": ".sim.errors",
+    "Physics": ".sim.app.reconstruct",
+    "ReconstructOptions": ".sim.reconstruct.reconstruct_options",
+    "RenderOptions": ".physgen_addon.render.render_options",
+    "Scene": ".sim.scene.folder",
+    "TrackOptions": ".sim.diagnose.track.track_input",
+    "VideoTrial": ".sim.diagnose.track.track_input",
+    "World": ".sim.mpm.world",
+    "bake": ".sim.app.bake",
+    "compose": ".sim.app.compose_scene",
+    "diagnose": ".sim.app.diagnose",
+    "load_bake": ".sim.cache.bake_folder",
+    "load_capture": ".sim.diagnose.capture",
+    "load_scene": ".sim.scene.folder",
+    "reconstruct": ".sim.app.reconstruct",
+    "render": ".batch.stages",
+    "scene_from_meshes": ".sim.importers.mesh_scene",
+    "track": ".sim.diagnose.track.track_command",
+}
+"""Public name → module that defines it."""
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name on first use (PEP 562)."""
+    if name == "__version__":
+        return import_module(".sim.version", __name__).VERSION
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(home, __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "register", "unregister"])
 
 
 def register() -> None:

@@ -4,7 +4,8 @@
     python batch/bake.py SCENE --out BAKE --frames 48
     blender -b --factory-startup --python-exit-code 1 -P batch/bake.py -- SCENE --out BAKE --frames 48
 
-Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it runs as another Python (docs/headless.md).
+Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it continues in
+another Python (docs/farm.md).
 """
 
 import runpy

@@ -14,15 +14,16 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.version import VERSION
-from . import bakes, compositions, diagnosis, doctor, photos, pipeline, variants, videos
-from .farm import command as farm_command
+from . import stages
+from .commands import compose_commands, diagnosis_commands, doctor, photo_commands, render_commands, scene_commands
+from .farm import batch_command as farm_command
 from .terminal import Terminal
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+    """Return the parser of the ``physgen`` command."""
     parser = argparse.ArgumentParser(
         prog="physgen",
         description="One photo becomes a small physical world: reconstruct, simulate, render.",
@@ -37,39 +38,43 @@ def build_parser() -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
         return sub
 
-    photos.add_run(command("run", photos.run_run, "photo → video: all stages"))
-    photos.add_reconstruct(command("reconstruct", photos.run_reconstruct, "photo → scene folder"))
-    again = "a reconstructed scene again, with something told that was guessed wrong"
-    photos.add_correct(command("correct", photos.run_correct, again))
-    photos.add_import(
-        command("import", photos.run_import, "folder of PhysGen3D or PhysGen, or file of splats → scene folder")
+    photo_commands.add_run(command("run", photo_commands.run_run, "photo → video: all stages"))
+    photo_commands.add_reconstruct(command("reconstruct", photo_commands.run_reconstruct, "photo → scene folder"))
+    again = "reconstruct a scene's photo again with corrected inputs"
+    photo_commands.add_correct(command("correct", photo_commands.run_correct, again))
+    photo_commands.add_import(
+        command("import", photo_commands.run_import, "PhysGen3D or PhysGen folder, or splat file → scene folder")
     )
-    varied = "scene folder → the same with other physics and effects, in a folder of its own"
-    variants.add_variant(command("variant", variants.run_variant, varied))
-    fitted = "scene folder → the same with objects that no longer pass through each other"
-    compositions.add_compose(command("compose", compositions.run_compose, fitted))
-    views = "pictures of one or two objects from all around → scene folder with their splats"
-    compositions.add_fit_splats(command("fit-splats", compositions.run_fit_splats, views))
-    photos.add_light(command("light", photos.run_light, "another light for a scene folder"))
-    bakes.add_bake(command("bake", bakes.run_bake, "scene folder → bake folder"))
-    cost = "what a bake would cost in time, memory and disk; nothing is written"
-    bakes.add_estimate(command("estimate", bakes.run_estimate, cost))
-    bakes.add_free(command("free", bakes.run_free, "delete a bake: what its manifest lists, and nothing else"))
-    previews = "coarse runs as they are asked for on standard input (docs/cli.md)"
-    bakes.add_preview(command("preview", bakes.run_preview, previews))
-    photos.add_render(command("render", photos.run_render, "scene and bake → frames, video"))
+    varied = "scene folder → new scene folder with other physics and effects"
+    scene_commands.add_variant(command("variant", scene_commands.run_variant, varied))
+    fitted = "scene folder → new scene folder whose objects no longer intersect"
+    compose_commands.add_compose(command("compose", compose_commands.run_compose, fitted))
+    views = "multi-view images of one or two objects → scene folder with their splats"
+    compose_commands.add_fit_splats(command("fit-splats", compose_commands.run_fit_splats, views))
+    photo_commands.add_light(command("light", photo_commands.run_light, "change the lighting of a scene folder"))
+    scene_commands.add_bake(command("bake", scene_commands.run_bake, "scene folder → bake folder"))
+    cost = "estimate time, memory and disk space of a bake; writes nothing"
+    scene_commands.add_estimate(command("estimate", scene_commands.run_estimate, cost))
+    scene_commands.add_free(
+        command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
+    )
+    previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
+    scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
+    photo_commands.add_render(
+        command("render", photo_commands.run_render, "scene folder and bake folder → frames, video")
+    )
     sheet = "frames → video or animated contact sheet"
-    videos.add_encode(command("encode", videos.run_encode, sheet))
-    many = "job file → scenes, bakes and videos of all its variants, on one machine or many"
+    render_commands.add_encode(command("encode", render_commands.run_encode, sheet))
+    many = "job file → scenes, bakes and videos of all variants, on one or many machines"
     farm_command.add_batch(command("batch", farm_command.run_batch, many))
-    lack = "capture of a real motion → which effect the simulation lacks"
-    diagnosis.add_diagnose(command("diagnose", diagnosis.run_diagnose, lack))
-    diagnosis.add_track(command("track", diagnosis.run_track, "videos of a scene → capture folder"))
-    examined = "the diagnosis examines itself on motion of withheld cause"
-    diagnosis.add_blind_check(command("blind-check", diagnosis.run_blind_check, examined))
-    listing = command("effects", _effects, "physical effects that a scene can have, with their parameters")
-    listing.add_argument("name", nargs="*", metavar="NAME", help="these only (default: all)")
-    command("doctor", _doctor, "what is installed and what is missing")
+    lack = "capture of a real motion → effects missing from its simulation"
+    diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
+    diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
+    examined = "test the diagnosis on simulated motion with withheld labels"
+    diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
+    listing = command("effects", _effects, "list physical effects with their equations and parameters")
+    listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
+    command("doctor", _doctor, "check the installation and name what is missing")
     return parser
 
 
@@ -97,17 +102,17 @@ def _doctor(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
 
 
 def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
-    """``--velocity -1,0,2`` looks like a flag to argparse; a leading blank tells it otherwise."""
+    """Return ``arguments`` with a leading space before negative vectors, which argparse takes for flags."""
     return [f" {a}" if re.match(r"-[\d.][\d.,eE+-]*$", a) else a for a in arguments]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry of ``physgen``; the exit code, as docs/cli.md lists them."""
+    """Entry point of ``physgen``; returns the exit code (docs/cli.md)."""
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    expected = pipeline.expected_seconds(options.frames) if options.command == "run" else None
+    expected = stages.expected_seconds(options.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
     try:
         run: Command = options.run

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``make demo``: the coffee photo of scikit-image becomes a video, by the same path as any other photo."""
+"""``make demo``: a video from the coffee photo of scikit-image, made like that of any other photo."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..physgen_addon.bridge.options import RenderOptions
-from ..sim.app.bake_inputs import BakeOptions
+from ..physgen_addon.render.render_options import RenderOptions
+from ..sim.app.bake_options import BakeOptions
+from ..sim.app.reconstruct import Physics
 from ..sim.errors import InputError, PhysGenError
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
-from ..sim.scene.json_fields import parse
 from ..sim.scene.model import Vector
-from . import pipeline
+from ..sim.validation import parse
+from . import stages
 from .terminal import Terminal
 
 CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml"
@@ -26,7 +27,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig:
-    """A photo that scikit-image ships and what happens in it; units as on the command line (docs/cli.md)."""
+    """A photo from scikit-image and its physics; units as on the command line (docs/cli.md)."""
 
     description: str
     photo: str
@@ -42,7 +43,7 @@ class DemoConfig:
 
 
 def load_config(path: Path = CONFIG) -> DemoConfig:
-    """Read the demo's configuration. Raises InputError when it is not readable."""
+    """Return the demo's configuration. Raises InputError when it cannot be read."""
     try:
         return parse(DemoConfig, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except (OSError, tomllib.TOMLDecodeError) as error:
@@ -50,7 +51,7 @@ def load_config(path: Path = CONFIG) -> DemoConfig:
 
 
 def shipped_photo(name: str) -> Path:
-    """The file of a photo that scikit-image ships."""
+    """Return the path of a photo that scikit-image ships."""
     import skimage.data
 
     path = Path(skimage.data.__file__).with_name(f"{name}.png")
@@ -59,19 +60,18 @@ def shipped_photo(name: str) -> Path:
     return path
 
 
-def request(config: DemoConfig, out: Path) -> pipeline.RunRequest:
-    """The demo as a job like any other."""
+def request(config: DemoConfig, out: Path) -> stages.RunRequest:
+    """Return the demo as a request from photo to video."""
     objects = tuple(
         ObjectRequest(box=box, name=name, size_m=size)
         for box, name, size in zip(config.boxes, config.names, config.sizes, strict=True)
     )
-    return pipeline.RunRequest(
+    return stages.RunRequest(
         photo=shipped_photo(config.photo),
         objects=objects,
         video=out / f"{config.photo}.mp4",
         work=out,
-        presets=config.presets,
-        velocities=config.velocities,
+        physics=Physics(presets=config.presets, velocities=config.velocities),
         reconstruct=ReconstructOptions(pitch_deg=config.pitch),
         bake=BakeOptions(frames=config.frames, fps=config.fps),
         render=RenderOptions(samples=config.samples),
@@ -79,7 +79,7 @@ def request(config: DemoConfig, out: Path) -> pipeline.RunRequest:
 
 
 def main() -> int:
-    """Entry of ``python -m physgen.batch.demo``."""
+    """Entry point of ``python -m physgen.batch.demo``; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("demo_out"))
     parser.add_argument("--json", action="store_true")
@@ -89,10 +89,10 @@ def main() -> int:
         signal.signal(number, lambda *_: stop.set())
     started = time.monotonic()
     config = load_config()
-    terminal = Terminal(as_json=options.json, expected_s=pipeline.expected_seconds(config.frames))
+    terminal = Terminal(as_json=options.json, expected_s=stages.expected_seconds(config.frames))
     terminal.line(config.description)
     try:
-        video = pipeline.run(request(config, options.out), terminal, stop.is_set)
+        video = stages.photo_to_video(request(config, options.out), terminal, stop.is_set)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code

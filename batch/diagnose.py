@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the simulation of a recorded motion lacks, as ``physgen diagnose`` does, started by Python or by Blender:
+"""Diagnose a recorded motion: capture → missing effects, as ``physgen diagnose`` does, in Python or in Blender:
 
     python batch/diagnose.py CAPTURE --out DIR
     blender -b --factory-startup --python-exit-code 1 -P batch/diagnose.py -- CAPTURE --out DIR
 
-Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it runs as another Python (docs/headless.md).
+Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it continues in
+another Python (docs/farm.md).
 """
 
 import runpy

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What ``batch/render.py``, ``bake.py``, ``reconstruct.py`` and ``diagnose.py`` share: work in a process that may be
-Blender's (docs/headless.md).
+"""Shared by the scripts of ``batch/``: work in a process that may be Blender's (docs/farm.md).
 
-Started through ``sim/app/launch.py``, so that a plain file is a module of the tree that it lies in.
+Started through ``sim/app/launch.py``, which makes a script a module of its tree.
 """
 
 from __future__ import annotations
@@ -24,29 +23,29 @@ from typing import Any, NoReturn, TextIO
 from ..physgen_addon.interpreter import find_python, wheels_for
 from ..sim.app import requirements
 from ..sim.app.launch import PACKAGES_VARIABLE
-from ..sim.app.process import child_environment, own_command
+from ..sim.app.stage_process import child_environment, own_command
 from ..sim.errors import Cancelled, InputError, PhysGenError
 from .terminal import Terminal
 
 STOP_GRACE_S = 6.0
-"""How long a frame that is being rendered may take to be finished when the process is asked to stop; whoever asks for
-it waits a little longer (``sim/app/process.py``), and then kills."""
+"""Time for the current frame to finish when the process is asked to stop; the caller waits a little longer
+ (``sim/app/stage_process.py``), and then kills."""
 
 ECHO_S = 1.0
-"""Signals that come so soon after the first are the same wish."""
+"""Signals within this time of the first count as one request."""
 
 _FAULT = 1
-"""Exit code of a fault in the program itself, as Python has it."""
+"""Exit code of a bug in the program, as in Python."""
 
 
 def in_blender() -> bool:
-    """Whether this is Blender's own process, and not a Python that has Blender as a module."""
+    """Return whether this is Blender's own process, not a Python with Blender as a module."""
     bpy: Any = sys.modules.get("bpy")
     return bpy is not None and bool(bpy.app.binary_path)
 
 
 def script_arguments(argv: Sequence[str]) -> list[str]:
-    """The script's own of the arguments ``argv`` of the process: what follows ``--``, else all but Blender's."""
+    """Return the script's part of the process's ``argv``: what follows ``--``, otherwise all except Blender's."""
     if "--" in argv:
         return list(argv[argv.index("--") + 1 :])
     return [] if in_blender() else list(argv[1:])
@@ -54,7 +53,7 @@ def script_arguments(argv: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def events_apart_from_chatter() -> Iterator[TextIO]:
-    """The real standard output, while everything that Blender's C code prints there goes to standard error."""
+    """Yield the real standard output, while output of Blender's C code is redirected to standard error."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
@@ -69,7 +68,7 @@ def events_apart_from_chatter() -> Iterator[TextIO]:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Everything temporary of this process lies in one folder, so that it can go whatever the process is doing."""
+    """Yield one folder for all temporary files of this process, so that it can be removed at any time."""
     with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
         tempfile.tempdir = folder
         try:
@@ -79,39 +78,39 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def start_empty() -> None:
-    """Inside Blender, put whatever file, add-ons and settings it was started with out of memory; nothing is saved.
+    """Inside Blender, unload the file, add-ons and settings that it was started with, without saving.
 
-    What renders into a photo then meets no scenes, handlers or preferences but Blender's own.
+    Rendering into a photo then sees no scenes, handlers or preferences but Blender's own.
     """
     if in_blender():
         import bpy
 
         bpy.ops.wm.read_factory_settings(use_empty=True)
-        # Those that are marked persistent outlive their file.
+        # Persistent handlers survive loading.
         for name in dir(bpy.app.handlers):
             if name.startswith(("render_", "frame_change_", "depsgraph_update_", "composite_")):
                 getattr(bpy.app.handlers, name).clear()
 
 
 class Stop:
-    """Whether this process is to stop: SIGINT and SIGTERM ask for it, and so does the end of its parent."""
+    """Whether this process should stop: after SIGINT, SIGTERM or the end of its parent."""
 
     def __init__(self, parent: int | None = None) -> None:
-        """parent: process that this one works for; None for nobody."""
+        """parent: process that this one works for, or None."""
         self._asked, self._insisted = threading.Event(), threading.Event()
         self._parent = parent
 
     def __call__(self) -> bool:
-        """What the work asks itself between two steps."""
+        """Return whether to stop; the work checks it between steps."""
         return self._asked.is_set() or (self._parent is not None and os.getppid() != self._parent)
 
     def listen(self, at_last: Callable[[], object]) -> None:
-        """Take the signals; the main thread calls this.
+        """Install the signal handlers; called by the main thread.
 
-        Work that has not ended ``STOP_GRACE_S`` after it was asked to is inside a long render: ``at_last`` is called
-        then, by another thread, and the process ends as cancelled. A second signal does not wait.
+        Work that has not ended ``STOP_GRACE_S`` after the request is inside a long render: another thread then calls
+        ``at_last`` and ends the process as cancelled. A second signal does not wait.
         """
-        # Python's own handlers run when the main thread comes back from Blender; the pipe is written at once.
+        # Python's handlers run when the main thread returns from Blender; the pipe is written at once.
         reading, writing = os.pipe()
         if os.name != "nt":
             os.set_blocking(writing, False)
@@ -127,7 +126,7 @@ class Stop:
             now = time.monotonic()
             self._asked.set()
             heard_at = heard_at or now
-            # ``timeout`` and schedulers signal the process and then its group, which is one wish and not two.
+            # ``timeout`` and schedulers signal the process and then its group: one request, not two.
             if now - heard_at > ECHO_S:
                 self._insisted.set()
 
@@ -145,9 +144,9 @@ class Stop:
 def leave(work: Callable[[], int]) -> NoReturn:
     """Do ``work`` and end the process with the exit code that it returns.
 
-    In Blender a script that raises SystemExit ends in whatever ``--python-exit-code`` says, or in 0; and Blender
-    crashes now and then while it is taken down, after all work is done and said, which a farm would take for a failed
-    render. So where Blender is loaded nobody takes it down.
+    In Blender a script that raises SystemExit ends with ``--python-exit-code``, or 0; and Blender occasionally crashes
+    during shutdown, after all work is done, which a farm would take for a failed render. So where Blender is loaded it
+    is not shut down.
     """
     try:
         code = work()
@@ -164,7 +163,7 @@ def leave(work: Callable[[], int]) -> NoReturn:
 
 
 def _end(code: int) -> NoReturn:
-    """End at once, with nothing of Blender's left on the disk."""
+    """End at once, leaving no temporary files of Blender."""
     _remove_blenders_folder()
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.flush()
@@ -180,22 +179,22 @@ def _remove_blenders_folder() -> None:
 
 
 def run_verb(verb: str, given: Sequence[str]) -> int:
-    """``physgen VERB`` with the arguments ``given``; the exit code, unless the process has become another.
+    """Run ``physgen VERB`` with the arguments ``given``; return the exit code, unless this process was replaced.
 
-    Here where everything is installed, else in the Python that simulates; never in Blender's own process.
+    Runs here if everything is installed, otherwise in the Python that simulates; never in Blender's own process.
     """
     asks = "-h" in given or "--help" in given
     if asks or not (in_blender() or requirements.missing()):
         try:
             from . import cli
         except ModuleNotFoundError:
-            # Blender's Python lacks something; the other one knows the arguments too.
+            # Blender's Python lacks a package; the other one prints the same help.
             pass
         else:
             return cli.main([verb, *given])
-    # Blender's own handler would only note it, and the other Python would begin.
+    # Blender's own handler would ignore it, and the other Python would start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    # What is meant for Blender's Python does not fit another; its own is told below.
+    # Packages for Blender's Python do not fit another; its own are passed below.
     os.environ.pop(PACKAGES_VARIABLE, None)
     try:
         python = find_python()
@@ -207,14 +206,14 @@ def run_verb(verb: str, given: Sequence[str]) -> int:
 
 
 def _become(command: Sequence[str]) -> NoReturn:
-    """Go on as ``command``: the same process for whoever waits for it, signals it or reads what it prints."""
+    """Replace this process with ``command``: the same process for callers that wait for it, signal it or read it."""
     _remove_blenders_folder()
     sys.stdout.flush()
     sys.stderr.flush()
     try:
         if os.name != "nt":
             os.execve(command[0], list(command), child_environment())  # noqa: S606
-        # Windows knows no such thing. Ctrl-C reaches both; the other one says when it has stopped.
+        # Windows has no exec. Ctrl-C reaches both processes; the other one reports when it has stopped.
         signal.signal(signal.SIGINT, lambda *_: None)
         os._exit(subprocess.call(list(command), env=child_environment()))
     except OSError as error:
@@ -222,7 +221,7 @@ def _become(command: Sequence[str]) -> NoReturn:
 
 
 def main() -> int:
-    """``launch.py batch.headless VERB ARGS…``: what a plain file in this folder hands on; the exit code."""
+    """Entry point for the scripts of this folder, ``launch.py batch.headless VERB ARGS…``; returns the exit code."""
     return run_verb(sys.argv[1], script_arguments(sys.argv[1:]))
 
 

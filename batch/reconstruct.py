@@ -4,7 +4,8 @@
     python batch/reconstruct.py PHOTO --box 21,96,47,119 --out SCENE
     blender -b --factory-startup --python-exit-code 1 -P batch/reconstruct.py -- PHOTO --box 21,96,47,119 --out SCENE
 
-Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it runs as another Python (docs/headless.md).
+Arguments, events and exit codes are the verb's (docs/cli.md). In Blender it continues in
+another Python (docs/farm.md).
 """
 
 import runpy

@@ -10,42 +10,45 @@ Exit codes: 0 done, 2 usage, 3 bad input, 5 rendering failed, 130 cancelled; com
 from __future__ import annotations
 
 import argparse
-import importlib
 import runpy
 import sys
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-
-def _load(module: str) -> ModuleType:
-    """A module of the tree, when it is needed: what it imports in turn, Blender may lack."""
-    return importlib.import_module(f"..{module}", __package__)
+# The tree is imported inside functions: Blender may lack packages that it imports in turn.
+if TYPE_CHECKING:
+    from ..sim.errors import Cancelled
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The script's own arguments."""
+    """Return the parser of the script's own arguments."""
+    from .commands.render_commands import add_render_flags
+
     parser = argparse.ArgumentParser(prog="render.py", description="Baked scene → frames, video.", allow_abbrev=False)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     parser.add_argument("--bake", type=Path, required=True, metavar="BAKE", help="bake folder")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the frames")
-    parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all that are baked)")
-    _load("batch.render_arguments").add_render_options(parser)
-    parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode them: .mp4 or .webm")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the frames")
+    parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all baked frames)")
+    add_render_flags(parser)
+    parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode a video: .mp4 or .webm")
     return parser
 
 
 def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[dict[str, Any], str]:
-    """Render as ``options`` ask; the event that says so, and the same in words."""
+    """Render; return the ``done`` event, and the same in words."""
+    from ..sim.scene.folder import load_scene
+    from .commands.render_commands import render_options
+
     started = time.monotonic()
-    frames, settings = _load("physgen_addon.bridge.frames"), _load("batch.render_arguments").render_options(options)
-    folder = _load("sim.scene.folder").load_scene(options.scene)
+    folder, settings = load_scene(options.scene), render_options(options)
+    frames = import_module("..physgen_addon.render.render_frames", __package__)
     paths = frames.render_frames(
         folder, options.bake, options.out, settings, on_event, cancelled, frames=options.frames
     )
-    done = {"event": "done", "frames": len(paths), "out": str(options.out)}
+    done: dict[str, Any] = {"event": "done", "frames": len(paths), "out": str(options.out)}
     if options.video is not None:
         _encode(paths, options, on_event, cancelled)
         done["video"] = str(options.video)
@@ -54,37 +57,46 @@ def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[di
 
 
 def _encode(paths: Sequence[Path], options: argparse.Namespace, on_event: Any, cancelled: Any) -> None:
-    """The video of the frames at ``paths``, unless it is that already."""
-    baked_fps = _load("sim.cache.manifest").load_manifest(options.bake).fps
-    ledger = _load("physgen_addon.bridge.ledger").Ledger(options.out, suffix=paths[0].suffix, fps=baked_fps)
-    fps = _load("physgen_addon.bridge.sequence").own_fps([int(path.stem) for path in paths], baked_fps)
-    if ledger.has_video(options.video, paths, fps):
+    """Encode the frames at ``paths``, unless the video is up to date."""
+    from ..physgen_addon.frames.frame_index import FrameIndex, own_fps
+    from ..sim.cache.bake_folder import load_manifest
+
+    baked_fps = load_manifest(options.bake).fps
+    index = FrameIndex(options.out, suffix=paths[0].suffix, fps=baked_fps)
+    fps = own_fps([int(path.stem) for path in paths], baked_fps)
+    if index.has_video(options.video, paths, fps):
         on_event({"event": "notice", "stage": "encode", "message": f"up to date: {options.video}"})
         return
-    _load("physgen_addon.bridge.video").encode(paths, options.video, fps=fps, on_event=on_event, cancelled=cancelled)
-    ledger.record_video(options.video, paths, fps)
+    video = import_module("..physgen_addon.frames.video_encoding", __package__)
+    video.encode_video(paths, options.video, fps=fps, on_event=on_event, cancelled=cancelled)
+    index.record_video(options.video, paths, fps)
 
 
-def give_up(options: argparse.Namespace) -> Exception:
-    """Leave complete files only, when Blender cannot be waited for; what there is to say."""
+def give_up(options: argparse.Namespace) -> Cancelled:
+    """Remove incomplete files when Blender does not stop in time; return the error to report."""
+    from ..sim.atomic import remove_partials
+    from ..sim.cache.folder_lock import release_lock
+    from ..sim.errors import Cancelled
+
     for folder in {options.out, *([options.video.parent] if options.video else [])}:
-        _load("sim.atomic").remove_partials(folder)
-    _load("sim.cache.lock").let_go(options.out)
-    cancelled: Exception = _load("sim.errors").Cancelled(
-        "cancelled within a frame; complete frames are kept, run it again to continue"
-    )
-    return cancelled
+        remove_partials(folder)
+    release_lock(options.out)
+    return Cancelled("cancelled within a frame; complete frames are kept, run it again to continue")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry; the exit code. Inside Blender the arguments come after ``--``."""
-    return int(_load("batch.blender_script").run_script(build_parser(), work, give_up, arguments, stage="render"))
+    """Entry point; returns the exit code. Inside Blender the arguments follow ``--``."""
+    from .blender_script import run_script
+
+    return run_script(build_parser(), work, give_up, arguments, stage="render")
 
 
 if __name__ == "__main__":
     if __package__:
-        _load("batch.headless").leave(main)
+        from .headless import leave
+
+        leave(main)
     else:
-        # A plain file belongs to no package: it is run once more as a module of the tree that it lies in.
+        # A script belongs to no package: run it again as a module of its tree.
         launch = Path(__file__).resolve().parents[1] / "sim" / "app" / "launch.py"
         runpy.run_path(str(launch))["main"](["batch.render", *sys.argv[1:]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress on a terminal for people, or as JSON lines for machines."""
+"""Progress as text on a terminal, or as JSON lines."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ..sim.events import Event
 
 
 class Terminal:
-    """Shows events. One line that renews itself on a terminal, a line now and then in a log, JSON for machines."""
+    """Print events: one updating line on a terminal, occasional lines in a log, or JSON lines."""
 
     def __init__(self, *, as_json: bool, expected_s: dict[str, float] | None = None, out: TextIO | None = None) -> None:
-        """expected_s: first guess for each stage; out: where lines go, standard output by default."""
+        """expected_s: initial guess for each stage; out: stream to write to, standard output by default."""
         self._json = as_json
         self._out: TextIO = out or sys.stdout
         self._live = not as_json and self._out.isatty()
         self._started = time.monotonic()
-        # Stages that have not begun yet count with a first guess, so that the time left is of the whole job.
+        # Stages that have not started count with a guess, so that the remaining time is that of the whole job.
         self._left = dict(expected_s or {})
         self._last_line = 0.0
         self.reader_gone = False
         self._open_line = False
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``."""
+        """Print ``event``."""
         kind, stage = event.get("event"), str(event.get("stage", ""))
         if kind == "progress":
             done, total, eta = int(event["done"]), int(event["total"]), event.get("eta_s")
@@ -49,7 +49,7 @@ class Terminal:
             self._out.write(text)
             self._out.flush()
         except BrokenPipeError:
-            # As after ``physgen … | head -1``: nobody listens any more, which is a wish to stop and no crash.
+            # As in ``physgen … | head -1``: the reader has gone, which means stop, not crash.
             self.reader_gone = True
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._out.fileno())
 
@@ -62,7 +62,9 @@ class Terminal:
         self._last_line = now
         message = str(event.get("message") or event.get("step") or "")
         left = _clock(float(event["job_eta_s"]))
-        text = f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} gone, about {left} left"
+        text = (
+            f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed, about {left} left"
+        )
         if self._live:
             self._write("\r\x1b[K" + text + ("\n" if finished else ""))
             self._open_line = not finished
@@ -70,7 +72,7 @@ class Terminal:
             self._write(text + "\n")
 
     def line(self, text: str) -> None:
-        """Print one line of text, below a progress line that is being renewed."""
+        """Print one line of text, below a progress line that is being updated."""
         if self._json:
             return
         self._write(("\n" if self._open_line else "") + text + "\n")

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the local farm adds to its tasks: milliseconds a task, apart from the time of the commands themselves.
+"""Overhead of the local farm: milliseconds per task besides the commands themselves.
 
-    python benchmarks/farm.py [--tasks 1000] [--workers 1] [--json]
-    python benchmarks/farm.py --scene SCENE --bake BAKE [--frames 1-16] [--samples 16] [--json]
+    python -m physgen.benchmarks.farm [--tasks 1000] [--workers 1] [--json]
+    python -m physgen.benchmarks.farm --scene SCENE --bake BAKE [--frames 1-16] [--samples 16] [--json]
 
-The command of every task is a shell that writes one byte, so that no interpreter's start is measured. Of a run with one
-worker, the time that its commands ran (from their start to their end) is taken off; what is left is the scheduler, its
-events and summary, logs, hashes and records. The second run finds everything done: all of its time is overhead.
+Each task's command is a shell that writes one byte, so that no interpreter start is measured. The time of the commands
+is subtracted; the rest is the scheduler, events, summary, logs, hashes and records. The second run finds everything up
+to date: all of its time is overhead.
 
-With a scene, its frames are rendered by one worker and by two, with one CPU thread each, in four chunks: how many times
-faster the two are. It means something on a machine with two idle cores.
+With a scene, its frames are rendered in four chunks by one worker and by two, with one CPU thread each, to measure the
+speed-up. Meaningful only with two idle cores.
 """
 
 from __future__ import annotations
@@ -19,20 +19,23 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from unittest import mock
 
-from physgen.batch.farm import execute, local
-from physgen.batch.farm.graph import frame_chunks, range_text
-from physgen.batch.farm.monitor import Monitor
+from physgen.batch.farm import local_runner, task_execution
+from physgen.batch.farm.job_monitor import Monitor
+from physgen.batch.farm.planning.plan import Plan, Task
+from physgen.batch.farm.planning.task_graph import frame_chunks, range_text
 from physgen.batch.farm.runners import FarmOptions
-from physgen.batch.farm.task import Plan, Task
-from physgen.physgen_addon.bridge.frame_range import parse_range
+from physgen.benchmarks.common import benchmark_parser
+from physgen.physgen_addon.frames.frame_index import parse_frame_range
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
 
 
 def tiny_plan(root: Path, count: int) -> Plan:
-    """Tasks in chains of four, each with an input and a file to write, as variant, bake, render and encode are."""
+    """Return tasks in chains of four, each with an input and an output, like variant, bake, render and encode."""
     (root / "out").mkdir(parents=True)
     (root / "input.txt").write_text("input")
     tasks = []
@@ -53,13 +56,13 @@ def tiny_plan(root: Path, count: int) -> Plan:
 
 
 def shell_command(module: str, argument: str, *rest: str, folder: Path, ends_with_us: bool) -> list[str]:
-    """In place of ``own_command``: write one byte."""
+    """Return a command that writes one byte, in place of ``own_command``."""
     return ["/bin/sh", "-c", 'printf x > "$0"', str(folder / argument)]
 
 
 def render_plan(root: Path, scene: Path, bake: Path, frames: str, samples: int) -> Plan:
-    """The frames of a scene in four chunks."""
-    numbers = parse_range(frames, 1, 100_000)
+    """Return a plan that renders the frames of a scene in four chunks."""
+    numbers = parse_frame_range(frames, 1, 100_000)
     tasks = []
     for chunk in frame_chunks(numbers, -(-len(numbers) // 4)):
         out = f"out/{chunk[0]:04d}"
@@ -77,7 +80,7 @@ def render_plan(root: Path, scene: Path, bake: Path, frames: str, samples: int) 
 
 
 def compare_workers(options: argparse.Namespace) -> int:
-    """Render with one worker and with two; print how long each took."""
+    """Render with one worker and with two; print the times."""
     seconds = {}
     for workers in (1, 2):
         with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
@@ -88,15 +91,15 @@ def compare_workers(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"one_worker_s": seconds[1], "two_workers_s": seconds[2], "times_faster": ratio}))
     else:
-        print(f"one worker {seconds[1]:.1f} s, two {seconds[2]:.1f} s: {ratio:.2f} times faster")
+        print(f"one worker {seconds[1]:.1f} s, two {seconds[2]:.1f} s: {ratio:.2f} times as fast")
     return 0
 
 
 def measure(plan: Plan, workers: int) -> dict[str, float]:
-    """Seconds of one run, and milliseconds a task of it that were not its commands'."""
+    """Run ``plan``; return its seconds, and milliseconds per task besides the commands."""
     monitor = Monitor(plan, ignore)
     started = time.perf_counter()
-    outcomes = local.run(plan, FarmOptions(workers=workers, threads=1), monitor, never)
+    outcomes = local_runner.run_local(plan, FarmOptions(workers=workers, threads=1), monitor, never)
     seconds = time.perf_counter() - started
     summary_started = time.perf_counter()
     monitor.finish(outcomes, cancelled=False)
@@ -112,31 +115,32 @@ def measure(plan: Plan, workers: int) -> dict[str, float]:
     }
 
 
-def main() -> int:
-    """Entry of the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", type=int, default=1000)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--scene", type=Path)
-    parser.add_argument("--bake", type=Path)
-    parser.add_argument("--frames", default="1-16")
-    parser.add_argument("--samples", type=int, default=16)
-    options = parser.parse_args()
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = benchmark_parser("farm", __doc__, tasks=20)
+    parser.add_argument("--tasks", type=int, default=1000, help="number of tasks (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=1, help="concurrent tasks (default: %(default)s)")
+    parser.add_argument("--scene", type=Path, help="scene folder, to compare one worker with two")
+    parser.add_argument("--bake", type=Path, help="its bake folder")
+    parser.add_argument("--frames", default="1-16", help="frames to render (default: %(default)s)")
+    parser.add_argument("--samples", type=int, default=16, help="samples per pixel (default: %(default)s)")
+    options = parser.parse_args(arguments)
     if options.scene is not None:
         return compare_workers(options)
-    execute.own_command = shell_command  # type: ignore[assignment]
-    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+    with (
+        mock.patch.object(task_execution, "own_command", shell_command),
+        tempfile.TemporaryDirectory(prefix="physgen-") as folder,
+    ):
         plan = tiny_plan(Path(folder).resolve() / "job", options.tasks)
         results = {"first_run": measure(plan, options.workers), "all_kept": measure(plan, options.workers)}
     if options.json:
         print(json.dumps({"tasks": options.tasks, "workers": options.workers, **results}))
     else:
-        print(f"{options.tasks} tasks, {options.workers} at a time")
+        print(f"{options.tasks} tasks, {options.workers} workers")
         for name, result in results.items():
             print(
-                f"{name:<10} {result['seconds']:7.2f} s, of these {result['commands_s']:7.2f} s in commands; "
-                f"{result['overhead_ms_a_task']:6.2f} ms a task besides"
+                f"{name:<10} {result['seconds']:7.2f} s, {result['commands_s']:7.2f} s of them in commands; "
+                f"overhead {result['overhead_ms_a_task']:6.2f} ms per task"
             )
     return 0
 

@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Dask costs a task: many tasks that are already done, so that nothing is measured but the way to them and back.
+"""Overhead of Dask: many tasks that are up to date, so that only scheduling is measured.
 
-``python benchmarks/farm_dask.py [--tasks 1000] [--workers 2] [--farm dask|tcp://…] [--json]``
+python -m physgen.benchmarks.farm_dask [--tasks 1000] [--workers 2] [--farm dask|tcp://…] [--json]
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from physgen.batch.farm.records import Record, produced_hashes, save_record
+from physgen.batch.farm.planning.plan import Plan, Task
 from physgen.batch.farm.runners import FarmOptions, find_runner
-from physgen.batch.farm.task import Plan, Task
+from physgen.batch.farm.task_execution import Record, produced_hashes, save_record
+from physgen.benchmarks.common import benchmark_parser
 from physgen.sim.events import never
 from physgen.sim.version import VERSION
 
 
 def done_plan(root: Path, count: int) -> Plan:
-    """A plan of ``count`` tasks, ten chunks to a bake, whose records say that they are done."""
+    """Return a plan of ``count`` tasks, ten per bake, whose records show that they are up to date."""
     tasks: list[Task] = []
     for index in range(count):
         bake = f"v{index // 10}/bake"
@@ -53,14 +55,13 @@ def done_plan(root: Path, count: int) -> Plan:
     return Plan(name="tiny", root=root, version=VERSION, tasks=tuple(tasks))
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", type=int, default=1000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--farm", default="dask")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = benchmark_parser("farm_dask", __doc__, tasks=20, workers=1)
+    parser.add_argument("--tasks", type=int, default=1000, help="number of tasks (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=2, help="local workers (default: %(default)s)")
+    parser.add_argument("--farm", default="dask", help="dask, or the address of a scheduler (default: %(default)s)")
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         plan = done_plan(Path(folder), options.tasks)
         marks: list[float] = []
@@ -80,8 +81,9 @@ def main() -> None:
         print(json.dumps(result))
     else:
         print(f"{options.tasks} tasks on {options.workers} workers of {options.farm}:")
-        print(f"    until the first begins {result['start_s']} s, then {result['a_task_ms']} ms each")
+        print(f"    {result['start_s']} s until the first starts, then {result['a_task_ms']} ms each")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

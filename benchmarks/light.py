@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How well the light of a photo is found again: Cycles takes photos under known suns, the product reads them.
+"""Errors of the estimated lighting: Cycles renders photos under known suns, which are then reconstructed. Needs bpy.
 
-    python benchmarks/light.py [--cases 1,5,9] [--keep DIR] [--json]
+    python -m physgen.benchmarks.light [--cases 1,5,9] [--keep DIR] [--json]
 
-Each photo shows one object on a textured ground, bounces on, and goes through the ordinary reconstruction with a loose
-box; pitch and angle of view are given, as a user gives them. Wanted: the sun's direction within 10°, the ratio of sun
-to environment within 15 %.
+Each photo shows one object on a textured ground, with interreflections, and is reconstructed from a loose box with
+known pitch and field of view. Required: the sun's direction within 10°, the ratio of sun to environment within 15 %.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
-import os
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,13 +24,15 @@ import numpy as np
 import trimesh
 from mathutils import Vector
 from numpy.typing import NDArray
-from physgen.physgen_addon.bridge import camera as bridge_camera
-from physgen.physgen_addon.bridge import compat, cycles, passes
-from physgen.physgen_addon.bridge.ground import add_ground
-from physgen.physgen_addon.bridge.options import RenderOptions
-from physgen.physgen_addon.bridge.regions import Box
-from physgen.sim.app.reconstruct import reconstruct_scene
-from physgen.sim.composite.transfer import linear_to_bytes
+from physgen.benchmarks.common import benchmark_parser, blender_output_to_stderr
+from physgen.physgen_addon import compat
+from physgen.physgen_addon.render import render_engines
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.physgen_addon.render.render_regions import Box
+from physgen.physgen_addon.render.render_scene import add_ground
+from physgen.physgen_addon.scene_io import photo_view as bridge_camera
+from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import PhysGenError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.model import Camera, Ground, Light
@@ -44,10 +44,10 @@ WANTED_DEG, WANTED_SHARE = 10.0, 0.15
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A photo under a known light.
+    """A photo under known lighting.
 
     azimuth, elevation: degrees, of the direction towards the sun; azimuth 0 is right of the camera, 90 ahead.
-    strength: irradiance of the sun over that of the sky on open ground, 0: no sun. angle: its diameter in degrees.
+    strength: irradiance of the sun relative to the sky on open ground, 0: no sun. angle: its diameter in degrees.
     shape: ``ball``, ``box``, ``jug`` or ``monkey``. ground: ``grain``, ``planks``, ``tiles`` or ``plain``.
     """
 
@@ -89,13 +89,13 @@ CASES = (
 
 
 def direction(azimuth: float, elevation: float) -> NDArray[np.float64]:
-    """Unit vector (3,) of angles in degrees."""
+    """Return the unit vector (3,) for angles in degrees."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 
 
 def camera(case: Case, size: tuple[int, int]) -> Camera:
-    """Looks at a point a little above the origin from 0.55 m."""
+    """Return a camera 0.55 m from a point slightly above the origin."""
     pitch = math.radians(case.pitch)
     s, c = math.sin(pitch), math.cos(pitch)
     focal = max(size) / 2 / math.tan(math.radians(FOV_DEG) / 2)
@@ -112,7 +112,7 @@ def camera(case: Case, size: tuple[int, int]) -> Camera:
 
 
 def shape(name: str) -> trimesh.Trimesh:
-    """The object, 6 to 12 cm large, standing on the origin."""
+    """Return the object, 6 to 12 cm large, standing on the origin."""
     if name == "ball":
         mesh = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     elif name == "box":
@@ -135,13 +135,13 @@ def shape(name: str) -> trimesh.Trimesh:
 
 
 def photograph(case: Case, path: Path, size: tuple[int, int] = (480, 360), samples: int = 48) -> tuple[float, ...]:
-    """Write the photo of ``case`` as PNG; a loose box around its object in pixels."""
+    """Write the photo of ``case`` as PNG; return a loose box around its object in pixels."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     compat.enable_cycles()
     mesh = shape(case.shape)
     scene = bpy.data.scenes.new("truth")
-    passes.set_up(scene)
-    cycles.set_up(scene, RenderOptions(samples=samples, seed=3), denoise=True)
+    render_engines.set_up_passes(scene)
+    render_engines.set_up_cycles(scene, RenderOptions(samples=samples, seed=3), denoise=True)
     scene.cycles.max_bounces, scene.cycles.diffuse_bounces = 6, 6
     scene.render.use_persistent_data = False
     view = camera(case, size)
@@ -172,7 +172,9 @@ def photograph(case: Case, path: Path, size: tuple[int, int] = (480, 360), sampl
     scene.collection.objects.link(bpy.data.objects.new("object", data))
     scene.render.film_transparent = False
     with tempfile.TemporaryDirectory() as scratch:
-        picture = passes.stack(passes.render(scene, 1, Box(0, 0, *size), Path(scratch)), "Combined")
+        picture = render_engines.stack(
+            render_engines.render_passes(scene, 1, Box(0, 0, *size), Path(scratch)), "Combined"
+        )
     Image.fromarray(linear_to_bytes(picture)).save(path)
     pixels = view.project(mesh.vertices)[:, :2]
     low, high = pixels.min(axis=0) - 7, pixels.max(axis=0) + 7
@@ -222,7 +224,7 @@ def _floor(kind: str) -> bpy.types.Material:
 
 
 def judge(case: Case, light: Light) -> dict[str, object]:
-    """Found against true: ``direction_deg``, ``ratio_share`` (found over true, minus 1), ``angle_deg``."""
+    """Return the errors ``direction_deg`` and ``ratio_share`` (estimate over truth, minus 1), and ``angle_deg``."""
     found: dict[str, object] = {"direction_deg": None, "ratio_share": None, "angle_deg": None}
     if light.sun_direction is not None:
         found["angle_deg"] = math.degrees(light.sun_angle)
@@ -242,7 +244,7 @@ def judge(case: Case, light: Light) -> dict[str, object]:
 
 
 def measure(case: Case, root: Path, size: tuple[int, int], samples: int) -> dict[str, object]:
-    """Photograph ``case`` unless ``root`` has the photo, reconstruct it, compare."""
+    """Render ``case`` unless ``root`` has the photo, reconstruct it, return the errors."""
     root.mkdir(parents=True, exist_ok=True)
     photo, box_file = root / "photo.png", root / "box.json"
     if not (photo.is_file() and box_file.is_file()):
@@ -250,15 +252,15 @@ def measure(case: Case, root: Path, size: tuple[int, int], samples: int) -> dict
     box = tuple(json.loads(box_file.read_text()))
     said: list[str] = []
     started = time.process_time()
-    scene = reconstruct_scene(
+    scene = reconstruct(
         photo,
         [ObjectRequest(box=box, name=case.shape)],  # type: ignore[arg-type]
-        root / "scene",
-        ReconstructOptions(pitch_deg=case.pitch, fov_deg=FOV_DEG, mesh_vertices=4000),
-        lambda event: said.append(str(event.get("message", ""))) if event["event"] == "notice" else None,
+        out=root / "scene",
+        options=ReconstructOptions(pitch_deg=case.pitch, fov_deg=FOV_DEG, mesh_vertices=4000),
+        on_event=lambda event: said.append(str(event.get("message", ""))) if event["event"] == "notice" else None,
     )
     seconds = time.process_time() - started
-    light = scene.scene.light
+    light = scene.model.light
     return {**asdict(case), **judge(case, light), "light": asdict(light), "said": said, "cpu_s": round(seconds, 2)}
 
 
@@ -274,23 +276,18 @@ def _line(number: int, row: dict[str, object]) -> str:
     )
 
 
-def main() -> int:
-    """Entry; 0, or the exit code of what went wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", help="numbers from 1, with commas (default: all)")
-    parser.add_argument("--keep", type=Path, help="folder that keeps photos and scenes")
-    parser.add_argument("--size", type=int, default=480, help="width of the photos in pixels")
-    parser.add_argument("--samples", type=int, default=48)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
-    options = parser.parse_args()
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns 0, or the exit code of the error."""
+    parser = benchmark_parser("light", __doc__, cases="1", size=160, samples=4)
+    parser.add_argument("--cases", help="numbers from 1, comma-separated (default: all)")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep photos and scenes")
+    parser.add_argument("--size", type=int, default=480, help="width of the photos in pixels (default: %(default)s)")
+    parser.add_argument("--samples", type=int, default=48, help="samples per pixel (default: %(default)s)")
+    options = parser.parse_args(arguments)
     chosen = [int(n) for n in options.cases.split(",")] if options.cases else range(1, len(CASES) + 1)
-    # Blender's own messages go to standard error.
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
     rows = {}
     try:
-        with tempfile.TemporaryDirectory(prefix="physgen-light-") as scratch:
+        with blender_output_to_stderr(), tempfile.TemporaryDirectory(prefix="physgen-light-") as scratch:
             root = options.keep or Path(scratch)
             for number in chosen:
                 size = (options.size, options.size * 3 // 4)
@@ -298,9 +295,6 @@ def main() -> int:
     except PhysGenError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
     with contextlib.suppress(BrokenPipeError):
         if options.json:
             print(json.dumps({"cases": rows, "good": sum(bool(r["good"]) for r in rows.values()), "of": len(rows)}))

@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Speed of the elastic solver: four cubes dropped on a ground, 256 cells across a box of side 2, 8 particles a cell.
+"""Speed of the particle engine: four elastic cubes dropped on a ground, 256 cells across a box of side 2 m.
 
-    python benchmarks/mpm.py --particles 100000 --arch cpu --json
+    python -m physgen.benchmarks.mpm --particles 100000 --arch cpu --json
 
-Unit: Mpps, million particle-substeps a second, steady state, everything included that a bake pays for (sorting, step
-control, contact). The scene is that of the prototypes: density 1000 kg/m³, E 5e5 Pa, nu 0.2, 1 m/s downwards, a gap of
-two cells, at most 1e-4 s a substep.
+Unit: Mpps, million particle substeps per second, steady state, everything included that a bake pays for (sorting, step
+control, contact). 8 particles per cell, density 1000 kg/m³, E 5e5 Pa, nu 0.2, 1 m/s downwards, a gap of two cells,
+substeps of at most 1e-4 s.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from physgen.benchmarks.common import benchmark_parser, print_result
 
 SIDE = 2.0
 GRID = 256
@@ -28,7 +29,7 @@ GROUND = 0.25
 
 
 def cubes(count: int, seed: int = 0) -> list[np.ndarray]:
-    """Positions (N, 3) in metres of four cubes of ``count`` particles together, z up, at random in their volume."""
+    """Return positions (N, 3) in metres, z up, of four cubes of ``count`` random particles together."""
     rng = np.random.default_rng(seed)
     each = count // 4
     side = (each / 8) ** (1 / 3) * CELL
@@ -38,10 +39,10 @@ def cubes(count: int, seed: int = 0) -> list[np.ndarray]:
 
 
 def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, object]:
-    """One measurement in this process."""
+    """Measure in this process; return the figures."""
+    from physgen.sim.constitutive import ElasticMaterial
     from physgen.sim.mpm.bodies import BodyParticles
-    from physgen.sim.mpm.materials import ElasticMaterial
-    from physgen.sim.mpm.options import Ground, SolverOptions
+    from physgen.sim.mpm.solver_options import Ground, SolverOptions
     from physgen.sim.mpm.world import World
     from physgen.sim.scene.units import Similarity
 
@@ -93,26 +94,23 @@ def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, o
     }
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--particles", type=int, default=100_000, help="particles in all (default: %(default)s)")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = benchmark_parser("mpm", __doc__, particles=4000, steps=10, repeats=1)
+    parser.add_argument("--particles", type=int, default=100_000, help="total (default: %(default)s)")
     parser.add_argument("--arch", default="cpu", help="cpu, cuda, vulkan or metal (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads, 0 for all (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=60, help="substeps a repetition (default: %(default)s)")
-    parser.add_argument("--repeats", type=int, default=7, help="repetitions; the median counts (default: %(default)s)")
-    parser.add_argument("--cold", action="store_true", help="compile all kernels anew, in an empty cache folder")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args()
-    if arguments.particles < 400:
+    parser.add_argument("--steps", type=int, default=60, help="substeps per repetition (default: %(default)s)")
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="repetitions, of which the median counts (default: %(default)s)"
+    )
+    parser.add_argument("--cold", action="store_true", help="compile all kernels, in an empty cache folder")
+    options = parser.parse_args(arguments)
+    if options.particles < 400:
         parser.error("--particles: give at least 400")
     with tempfile.TemporaryDirectory() as folder:
-        result = run(arguments, Path(folder) if arguments.cold else None)
-    if arguments.json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:20} {value}")
+        result = run(options, Path(folder) if options.cold else None)
+    print_result(result, as_json=options.json)
     return 0
 
 

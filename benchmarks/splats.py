@@ -1,31 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""What a picture of Gaussian splats costs, and its gradients: a ball of splats with a checkered surface.
+"""Time to render Gaussian splats and their gradients: a sphere of splats with a checkered surface.
 
-    python benchmarks/splats.py --splats 5000 20000 100000 --sizes 128 256 512 --json
+    python -m physgen.benchmarks.splats --splats 5000 20000 100000 --sizes 128 256 512 --json
 
-CPU seconds of all threads are quoted, the median of the repeats, because the machine may be busy; wall seconds are
-there for GPUs. "thin" are splats as a fit ends with them (nearly opaque, on the surface), "dense" as it begins (three
-times as large, opacity 0.1): their layers go deep.
+Medians of the repeats: CPU seconds of all threads, because the machine may be busy, and wall seconds, for GPUs.
+"thin" splats are those at the end of a fit (nearly opaque, on the surface), "dense" those at its start (three times as
+large, opacity 0.1, many layers).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from physgen.benchmarks.common import benchmark_parser
 
 LOOKS = {"thin": (1.0, 0.9), "dense": (3.0, 0.1)}
-"""Size relative to the distance of neighbours, opacity."""
+"""Size relative to the spacing, opacity."""
 
 DISTANCE, RADIUS = 0.35, 0.1
 
 
 def ball(count: int, look: str) -> Any:
-    """``count`` flat splats evenly over a sphere."""
+    """Return ``count`` flat splats spread evenly over a sphere."""
     from physgen.sim.gaussians.splats import Splats
 
     size, opacity = LOOKS[look]
@@ -37,7 +38,7 @@ def ball(count: int, look: str) -> Any:
     return Splats(
         centres=RADIUS * outward,
         scales=np.tile([spread, spread, 0.1 * spread], (count, 1)),
-        # The turn that takes the splat's z to the surface's normal.
+        # The rotation that takes the splat's z to the surface's normal.
         rotations=np.stack([1 + outward[:, 2], -outward[:, 1], outward[:, 0], np.zeros(count)], axis=-1),
         opacities=np.full(count, opacity),
         colours=np.where((field % 2 == 0)[:, None], [0.1, 0.3, 0.8], [0.9, 0.2, 0.1]),
@@ -45,7 +46,7 @@ def ball(count: int, look: str) -> Any:
 
 
 def view(size: int) -> Any:
-    """A camera of ``size`` pixels squared that the ball nearly fills."""
+    """Return a camera of ``size`` pixels squared that the sphere nearly fills."""
     from physgen.sim.scene.model import Camera
 
     pose = np.eye(4)
@@ -56,9 +57,9 @@ def view(size: int) -> Any:
 
 
 def run(count: int, size: int, look: str, repeats: int, arch: str, threads: int) -> dict[str, object]:
-    """Seconds of one kind, after a rendering that compiles the kernels."""
+    """Return the seconds of one configuration, after a run that compiles the kernels."""
     from physgen.sim.gaussians.raster.rasteriser import Rasteriser
-    from physgen.sim.mpm.options import SolverOptions
+    from physgen.sim.mpm.solver_options import SolverOptions
 
     rasteriser = Rasteriser(solver=SolverOptions(arch=arch, threads=threads))
     splats, camera = ball(count, look), view(size)
@@ -76,25 +77,30 @@ def run(count: int, size: int, look: str, repeats: int, arch: str, threads: int)
     return {"splats": count, "size": size, "look": look, **dict(zip(names, medians, strict=True))}
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--splats", type=int, nargs="+", default=[5000, 20000, 100000], help="how many splats")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[256], help="sides of the picture in pixels")
-    parser.add_argument("--repeats", type=int, default=5, help="times that each is measured (default: %(default)s)")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = benchmark_parser("splats", __doc__, splats=[500], sizes=[64], repeats=1)
+    parser.add_argument(
+        "--splats",
+        type=int,
+        nargs="+",
+        default=[5000, 20000, 100000],
+        help="numbers of splats (default: 5000 20000 100000)",
+    )
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256], help="image sizes in pixels (default: 256)")
+    parser.add_argument("--repeats", type=int, default=5, help="repetitions (default: %(default)s)")
     parser.add_argument("--arch", default="cpu", help="cpu or cuda (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads, 0 for all (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args()
-    if min(arguments.splats + arguments.sizes + [arguments.repeats]) < 1:
+    options = parser.parse_args(arguments)
+    if min(options.splats + options.sizes + [options.repeats]) < 1:
         parser.error("give at least one splat, pixel and repeat")
     results = [
-        run(count, size, look, arguments.repeats, arguments.arch, arguments.threads)
-        for count in arguments.splats
-        for size in arguments.sizes
+        run(count, size, look, options.repeats, options.arch, options.threads)
+        for count in options.splats
+        for size in options.sizes
         for look in LOOKS
     ]
-    if arguments.json:
+    if options.json:
         print(json.dumps({"results": results}))
     else:
         print(" ".join(f"{name:>16}" for name in results[0]))

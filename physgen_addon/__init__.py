@@ -1,83 +1,89 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Blender side of PhysGen. ``bridge`` is bpy without any user interface; the rest is the interface.
+"""The Blender side of PhysGen.
 
-``props`` is what Blender remembers, ``operators`` what it can do, ``panels`` what people see, ``jobs`` long work.
+Without user interface: ``scene_io``, ``playback``, ``photo``, ``render``, ``frames``. With it: ``props`` (stored in
+.blend files), ``operators``, ``panels``, ``preview``, ``background_jobs``, ``handlers``, ``gizmos``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
-from types import ModuleType
+from types import FunctionType, ModuleType
 
 MODULES = (
     "props.preferences",
-    "props.body",
-    "props.rendering",
-    "props.scene",
-    "props.photo",
-    "props.diagnose",
-    "props.together",
-    "jobs",
-    "operators.check_python",
-    "operators.import_scene",
-    "operators.import_splats",
-    "operators.photo",
-    "operators.draw_box",
-    "operators.paint_mask",
-    "operators.set_horizon",
-    "operators.reconstruct",
-    "operators.body",
-    "operators.material",
-    "operators.effect_stack",
-    "operators.world",
-    "operators.bake",
-    "operators.cache",
-    "operators.render",
-    "operators.share",
-    "operators.capture",
-    "operators.diagnose",
-    "operators.effect",
-    "operators.together",
-    "preview.live",
-    "operators.preview",
+    "props.material_props",
+    "props.body_props",
+    "props.render_props",
+    "props.scene_props",
+    "props.photo_props",
+    "props.diagnose_props",
+    "background_jobs",
+    "operators.python_ops",
+    "operators.import_ops",
+    "operators.photo_ops",
+    "operators.mask_horizon_ops",
+    "operators.body_ops",
+    "operators.world_ops",
+    "operators.bake_ops",
+    "operators.render_ops",
+    "operators.diagnose_ops",
+    "operators.compose_ops",
+    "preview.live_preview",
     "gizmos",
     "handlers",
-    "panels.photo",
-    "panels.scene",
-    "panels.correct",
-    "panels.objects",
-    "panels.together",
-    "panels.motion",
-    "panels.world",
-    "panels.simulate",
-    "panels.render",
-    "panels.diagnose",
+    "panels.photo_panel",
+    "panels.scene_panel",
+    "panels.objects_panel",
+    "panels.world_panel",
+    "panels.simulate_panel",
+    "panels.render_panel",
+    "panels.diagnose_panel",
 )
-"""All that Blender must know, in the order in which it must learn it; each has CLASSES, some a ``register`` too."""
+"""Modules that register something with Blender, in order of registration."""
 
 
 def _modules() -> list[ModuleType]:
-    """Imported late, because this package is also there without bpy."""
+    """Return the modules, imported late: this package is also importable without bpy."""
     return [import_module(f".{name}", __package__) for name in MODULES]
 
 
+def registered_classes(module: ModuleType) -> list[type]:
+    """Return the Blender classes of ``module`` (named ``PHYSGEN_…``), in order of definition."""
+    return [
+        item
+        for name, item in vars(module).items()
+        if name.startswith("PHYSGEN_") and isinstance(item, type) and item.__module__ == module.__name__
+    ]
+
+
+def _hooks(module: ModuleType, prefix: str) -> list[Callable[[], None]]:
+    """Return the functions of ``module`` whose names begin with ``prefix``, in order of definition."""
+    return [
+        item
+        for name, item in vars(module).items()
+        if name.startswith(prefix) and isinstance(item, FunctionType) and item.__module__ == module.__name__
+    ]
+
+
 def register() -> None:
-    """Called by Blender when the extension is enabled."""
+    """Register classes, then properties, menus and handlers (``register_*``) of every module. Called by Blender."""
     import bpy
 
     for module in _modules():
-        for kind in module.CLASSES:
+        for kind in registered_classes(module):
             bpy.utils.register_class(kind)
-        if hasattr(module, "register"):
-            module.register()
+        for hook in _hooks(module, "register_"):
+            hook()
 
 
 def unregister() -> None:
-    """Called by Blender when the extension is disabled; running jobs are cancelled."""
+    """Undo ``register`` in reverse order; running jobs are cancelled. Called by Blender."""
     import bpy
 
     for module in reversed(_modules()):
-        if hasattr(module, "unregister"):
-            module.unregister()
-        for kind in reversed(module.CLASSES):
+        for hook in reversed(_hooks(module, "unregister_")):
+            hook()
+        for kind in reversed(registered_classes(module)):
             bpy.utils.unregister_class(kind)

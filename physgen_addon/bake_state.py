@@ -1,47 +1,44 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How it stands with a scene's bake, told from what is on disk and what the scene is now.
-
-A bake is found by the scene's fingerprint, so undo, redo, a crash or another file never lose one: whichever bake is of
-the scene as it is now gets shown.
-"""
+"""State of a scene's bake: none, running, current, stale or damaged; and bakes of files that are not saved yet."""
 
 from __future__ import annotations
 
 import contextlib
+import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 
-from ..sim.cache.lock import LOCK_FILE, is_written
-from ..sim.cache.manifest import MANIFEST_FILE, load_manifest
+from ..sim.cache.bake_folder import MANIFEST_FILE, load_manifest
+from ..sim.cache.folder_lock import LOCK_FILE, is_locked
 from ..sim.errors import InputError
-from . import bake_record, jobs, paths
-from .bake_record import BakeRecord
-from .bridge import playback
-from .bridge.fingerprint import fingerprint
-from .props.body import bodies
+from . import background_jobs, paths
+from .playback import bake_record, show_bake
+from .playback.bake_record import BakeRecord
+from .props.body_props import bodies
+from .scene_io.motion_fingerprint import fingerprint
 
 BAKE_OPERATOR = "physgen.bake"
 MESSAGES = {
     "none": "Nothing is baked yet",
     "baked": "",
-    "paused": "Stopped before the end. Resume goes on from there",
+    "paused": "Incomplete. Resume continues it",
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
-    "missing": "The bake is not where it was. Find its folder, or bake again",
+    "missing": "The bake was moved. Find its folder, or bake again",
     "damaged": "Files of the bake are gone or damaged. Bake again, or find an undamaged copy",
 }
 
 
 @dataclass(frozen=True)
 class BakeState:
-    """How it stands with a scene's bake.
+    """State of a scene's bake.
 
-    status: ``none``, ``baking``, ``paused`` (there is more to bake), ``baked``, ``stale`` (of the scene as it was) or
-    ``missing`` (its files are gone or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the
-    scene. trouble: what went wrong; advice: how it stands and what to do. estimate_text: what baking will cost; empty
-    when that is not known.
+    status: ``none``, ``baking``, ``paused`` (incomplete), ``baked``, ``stale`` (of an earlier state of the scene) or
+    ``missing`` (files deleted or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the scene.
+    trouble: the last error; advice: state and remedy in words. estimate_text: estimated cost of baking; empty if
+    unknown.
     """
 
     status: str = "none"
@@ -54,7 +51,7 @@ class BakeState:
 
     @property
     def message(self) -> str:
-        """All that a person should know."""
+        """Return all messages to show to the user."""
         return _sentences(self.trouble, self.advice)
 
 
@@ -63,36 +60,36 @@ def _sentences(*parts: str) -> str:
 
 
 _known: dict[int, BakeState] = {}
-"""By the scene's session_uid, which undo keeps."""
+"""State by the scene's session_uid, which survives undo."""
 _dirty: set[int] = set()
 _fingerprints: dict[int, tuple[str, str]] = {}
-"""Of scenes that have not changed since."""
+"""Fingerprint and problem of scenes that have not changed since, by session_uid."""
 _changed_at = [0.0]
 _troubles: dict[int, str] = {}
-"""Why the last bake of a scene stopped; until the next one begins."""
+"""Error that stopped the last bake of a scene; cleared when the next bake starts."""
 
 
 def state(scene: bpy.types.Scene) -> BakeState:
-    """How it stands. Costs microseconds in Blender's interface, where a timer keeps it up to date."""
+    """Return the state. Takes microseconds in Blender's interface, where a timer keeps it up to date."""
     known = _known.get(scene.session_uid)
-    # Timers never fire in the background, and without an interface nobody is in a hurry.
+    # Timers never fire in background mode, where latency does not matter.
     if known is not None and not bpy.app.background:
         return known
     waits = is_dirty(scene)
     found = observe(scene)
     if waits:
-        # A panel that is drawn first must not keep the timer from showing the bake that it will find.
+        # The first draw of a panel must not prevent the timer from showing a matching bake.
         _dirty.add(scene.session_uid)
     return found
 
 
 def last_seen(scene: bpy.types.Scene) -> BakeState | None:
-    """How it stood when it was last looked at; None when it never was."""
+    """Return the last observed state, or None."""
     return _known.get(scene.session_uid)
 
 
 def mark_dirty(scene: bpy.types.Scene | None = None) -> None:
-    """Something may have changed, in ``scene`` or anywhere."""
+    """Mark ``scene``, or all scenes, as possibly changed."""
     _changed_at[0] = time.monotonic()
     for item in [scene] if scene is not None else bpy.data.scenes:
         _dirty.add(item.session_uid)
@@ -100,12 +97,12 @@ def mark_dirty(scene: bpy.types.Scene | None = None) -> None:
 
 
 def mark_progress(scene: bpy.types.Scene) -> None:
-    """The bake of ``scene`` has got further; the scene is as it was."""
+    """Mark that the bake of ``scene`` has progressed; the scene itself has not changed."""
     _dirty.add(scene.session_uid)
 
 
 def forget() -> None:
-    """Another file is open."""
+    """Forget all states: another file was opened."""
     _known.clear()
     _dirty.clear()
     _fingerprints.clear()
@@ -113,47 +110,47 @@ def forget() -> None:
 
 
 def set_trouble(scene: bpy.types.Scene, message: str) -> None:
-    """Remember why the bake of ``scene`` stopped; empty when a new one begins."""
+    """Set the error that stopped the bake of ``scene``; empty when a new bake starts."""
     _troubles[scene.session_uid] = message
     mark_dirty(scene)
 
 
 def rest_s() -> float:
-    """Seconds since anything changed: while somebody drags or sculpts, nothing is looked at."""
+    """Return seconds since the last change: nothing is evaluated while the user drags or sculpts."""
     return time.monotonic() - _changed_at[0]
 
 
 def is_dirty(scene: bpy.types.Scene) -> bool:
-    """Whether ``scene`` may have changed since it was last looked at."""
+    """Return whether ``scene`` may have changed since it was last observed."""
     return scene.session_uid in _dirty or scene.session_uid not in _known
 
 
-def bake_job(scene: bpy.types.Scene) -> jobs.Job | None:
-    """The bake of ``scene`` that is under way in this Blender."""
-    job = jobs.running()
+def bake_job(scene: bpy.types.Scene) -> background_jobs.Job | None:
+    """Return the running bake job of ``scene`` in this Blender, or None."""
+    job = background_jobs.running()
     return job if job is not None and (job.operator, job.scene) == (BAKE_OPERATOR, scene.session_uid) else None
 
 
 def is_stopping(scene: bpy.types.Scene) -> bool:
-    """Whether a bake of ``scene`` was stopped and its worker still puts things in order."""
-    return any((job.operator, job.scene) == (BAKE_OPERATOR, scene.session_uid) for job in jobs.stopping())
+    """Return whether a bake of ``scene`` was stopped and its worker is still cleaning up."""
+    return any((job.operator, job.scene) == (BAKE_OPERATOR, scene.session_uid) for job in background_jobs.stopping())
 
 
 def shown_record(scene: bpy.types.Scene) -> BakeRecord | None:
-    """The record of the bake that ``scene`` shows; None when there is none, or its files are gone."""
+    """Return the record of the bake that ``scene`` shows; None without one or if its files are gone."""
     folder = paths.shown_bake(scene)
     return None if folder is None or bake_record.manifest_of(folder) is None else record_of(scene, folder)
 
 
 def record_of(scene: bpy.types.Scene, folder: Path) -> BakeRecord:
-    """The record of the bake ``folder``; where it is gone, what would do for ``scene``."""
+    """Return the record of the bake ``folder``; if that is gone, of another bake that matches ``scene``."""
     return bake_record.read_record(folder) or BakeRecord(
         folder=str(folder), frame_start=scene.physgen.simulation.frame_start
     )
 
 
 def caches_of(scene: bpy.types.Scene) -> list[Path]:
-    """Folders in which bakes of ``scene`` may be: where it would bake now, and beside the bake it shows."""
+    """Return folders that may hold bakes of ``scene``: its cache folder, and the folder of the bake it shows."""
     found = []
     with contextlib.suppress(InputError):
         found.append(paths.scene_cache(scene))
@@ -164,12 +161,12 @@ def caches_of(scene: bpy.types.Scene) -> list[Path]:
 
 
 def concerns(scene: bpy.types.Scene) -> bool:
-    """Whether there is anything to bake in ``scene``, or a bake; other people's files cost nothing."""
+    """Return whether ``scene`` has bodies or a bake, so that files that do not use PhysGen cost nothing."""
     return bool(scene.physgen.simulation.bake) or bool(bodies(scene))
 
 
 def refresh(scene: bpy.types.Scene) -> BakeState:
-    """Show the bake of the scene as it is now, if there is one, and say how it stands. May change the scene."""
+    """Show the bake that matches the scene, if there is one, and return the state. May modify the scene."""
     if concerns(scene) and bake_job(scene) is None:
         try:
             _show_matching(scene)
@@ -179,7 +176,7 @@ def refresh(scene: bpy.types.Scene) -> BakeState:
 
 
 def observe(scene: bpy.types.Scene) -> BakeState:
-    """Say how it stands, and remember it; changes nothing."""
+    """Evaluate, remember and return the state; modifies nothing."""
     found = _look(scene) if concerns(scene) else BakeState(advice=MESSAGES["none"])
     trouble = _troubles.get(scene.session_uid, "")
     if trouble and found.status != "baking":
@@ -195,15 +192,15 @@ def observe(scene: bpy.types.Scene) -> BakeState:
     _known[scene.session_uid] = found
     _dirty.discard(scene.session_uid)
     if found.status == "baking":
-        # It will change by itself: a worker that was killed leaves a child, which ends a moment later.
+        # Changes without further notice: a killed worker leaves a child process that ends a moment later.
         mark_progress(scene)
     return found
 
 
 def _fingerprint(scene: bpy.types.Scene) -> tuple[str, str]:
-    """Of the scene as it is; empty, and why, when that cannot be told."""
+    """Return the scene's fingerprint, or an empty one and the reason why there is none."""
     known = _fingerprints.get(scene.session_uid)
-    # Nobody tells of changes in the background.
+    # Background mode has no depsgraph notifications to rely on.
     if known is None or bpy.app.background:
         try:
             known = fingerprint(scene), ""
@@ -217,15 +214,15 @@ def _show_matching(scene: bpy.types.Scene) -> None:
     current, _ = _fingerprint(scene)
     shown = shown_record(scene)
     if shown is not None and current in shown.fingerprints:
-        playback.detach_misfits(scene, shown)
+        show_bake.detach_misfits(scene, shown)
         return
     for cache in caches_of(scene):
         found = bake_record.matching(cache, current)
         if found is not None and bake_record.playable(found.path):
-            playback.show(scene, found)
+            show_bake.show(scene, found)
             return
     if shown is not None:
-        playback.detach_misfits(scene, shown)
+        show_bake.detach_misfits(scene, shown)
 
 
 def _look(scene: bpy.types.Scene) -> BakeState:
@@ -244,13 +241,13 @@ def _look(scene: bpy.types.Scene) -> BakeState:
         return BakeState(status, 0, frames, trouble=obstacle or _unreadable(scene), advice=MESSAGES[status])
     done = bake_record.playable(shown.path)
     damage = bake_record.damage(shown.path, manifest)
-    troubles = playback.misfits(scene, shown)
+    troubles = show_bake.misfits(scene, shown)
     if damage:
         return BakeState("missing", 0, manifest.frames, trouble=damage, advice=MESSAGES["damaged"])
     if current not in shown.fingerprints:
         status = "stale"
-    elif is_written(shown.path) and not is_stopping(scene):
-        words = f"Another process is baking this. If none is, delete {shown.path / LOCK_FILE}"
+    elif is_locked(shown.path) and not is_stopping(scene):
+        words = f"Another process is baking this scene. If none is, delete {shown.path / LOCK_FILE}"
         return BakeState("baking", done, manifest.frames, advice=words)
     else:
         status = "baked" if manifest.state == "complete" and done == manifest.frames else "paused"
@@ -258,7 +255,7 @@ def _look(scene: bpy.types.Scene) -> BakeState:
 
 
 def _unreadable(scene: bpy.types.Scene) -> str:
-    """Why the bake that ``scene`` shows cannot be read, where it is still there."""
+    """Return why the bake that ``scene`` shows cannot be read, or None if it is readable or gone."""
     folder = paths.shown_bake(scene)
     if folder is None or not (folder / MANIFEST_FILE).exists():
         return ""
@@ -270,5 +267,92 @@ def _unreadable(scene: bpy.types.Scene) -> str:
 
 
 def shows(scene: bpy.types.Scene, folder: Path) -> bool:
-    """Whether ``scene`` plays the bake ``folder``."""
+    """Return whether ``scene`` plays the bake ``folder``."""
     return paths.shown_bake(scene) == folder
+
+
+_moved: dict[int, tuple[Path, Path]] = {}
+"""During saving, by the scene's session_uid: old and new cache folder."""
+_shown: dict[int, Path] = {}
+"""During saving, by the scene's session_uid: absolute folder of the shown bake."""
+
+
+def forget_unsaved() -> None:
+    """Forget pending moves: another file was opened."""
+    _moved.clear()
+    _shown.clear()
+
+
+def before_first_save(path: str) -> None:
+    """Copy bakes beside the file that is about to be written, and store paths relative to its new location."""
+    blend = Path(path)
+    for scene in bpy.data.scenes:
+        shown = paths.shown_bake(scene)
+        if shown is not None:
+            _shown[scene.session_uid] = shown
+        if paths.is_unsaved_cache(scene) and bake_job(scene) is None:
+            old, new = paths.scene_cache(scene), paths.scene_cache_beside(scene, blend)
+            if old.is_dir() and _copy(scene, old, new):
+                show_bake.repoint(scene, old, new, blend)
+                _moved[scene.session_uid] = (old, new)
+                continue
+        if shown is not None:
+            scene.physgen.simulation.bake = paths.stored(shown, blend)
+
+
+def after_first_save(path: str) -> None:
+    """Delete the originals of copied bakes; restore everything if the save failed or only wrote a copy."""
+    saved_here = bool(bpy.data.filepath) and Path(bpy.data.filepath) == Path(path) and Path(path).is_file()
+    for scene in bpy.data.scenes:
+        shown = _shown.pop(scene.session_uid, None)
+        moved = _moved.pop(scene.session_uid, None)
+        if moved is None:
+            if shown is not None:
+                scene.physgen.simulation.bake = paths.stored(shown)
+            continue
+        old, new = moved
+        if saved_here:
+            show_bake.repoint(scene, new, new)
+            scene.physgen.simulation.unsaved = ""
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            show_bake.repoint(scene, new, old)
+            if shown is not None:
+                scene.physgen.simulation.bake = paths.stored(shown)
+    _note_file(Path(path))
+
+
+def _note_file(blend: Path) -> None:
+    """Record in the bakes that the saved file ``blend`` shows them, so that no other file beside it deletes them."""
+    if not blend.is_file():
+        return
+    for scene in bpy.data.scenes:
+        for cache in caches_of(scene):
+            for record in bake_record.records(cache):
+                shown = any(shows(other, record.path) for other in bpy.data.scenes)
+                # A cache that cannot be written to cannot be deleted either.
+                with contextlib.suppress(InputError):
+                    bake_record.note_file(record, blend, shown)
+
+
+def settle(scene: bpy.types.Scene) -> None:
+    """Move bakes that were held by a running bake beside the saved file, which must be saved again afterwards."""
+    old = paths.unsaved_cache(scene, scene.physgen.simulation.unsaved)
+    if old is None or not bpy.data.filepath:
+        return
+    new = paths.scene_cache(scene)
+    if old.is_dir() and _copy(scene, old, new):
+        show_bake.repoint(scene, old, new)
+        scene.physgen.simulation.unsaved = ""
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _copy(scene: bpy.types.Scene, old: Path, new: Path) -> bool:
+    """Copy bakes. A bake that cannot be copied stays in place and is played from there."""
+    try:
+        shutil.copytree(old, new, dirs_exist_ok=True)
+    except OSError as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        set_trouble(scene, f"Its bakes could not be brought to {new} ({reason}) and stay in {old}")
+        return False
+    return True

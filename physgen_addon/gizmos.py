@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Arrows in the viewport that give the active body its velocity and spin: drag the tip.
+"""Viewport arrows for the velocity and spin of the active body; drag the tip to change them."""
 
-Shift keeps the tip at its height, Ctrl moves it up and down. Escape or the right button gives the old value back.
-"""
+from __future__ import annotations
 
 import itertools
 import math
@@ -12,14 +11,81 @@ import bpy
 import numpy as np
 from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
+from numpy.typing import NDArray
 
-from . import gizmo_maths as maths
-from .bridge.bounds import box_corners
-from .bridge.export_units import metres_per_unit
-from .views import redraw
+from .context import redraw
+from .scene_io.export_animation import metres_per_unit
+from .scene_io.export_meshes import box_corners
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.81
+TURN = 2 * math.pi
+
+FREE, LEVEL, UPRIGHT = "free", "level", "upright"
+"""Drag modes: in the view plane, in a horizontal plane, vertically."""
+
+
+def seconds_shown(size: float, metres_per_unit: float) -> float:
+    """Return the travel time in seconds that a velocity arrow's length represents, for a body of ``size``.
+
+    It is the time to fall about half the body's size: an arrow as long as the body throws it about that high.
+    """
+    return math.sqrt(max(size, 1e-9) * metres_per_unit / GRAVITY)
+
+
+def spin_length(size: float) -> float:
+    """Return the arrow length per radian a second: one turn a second is as long as the body."""
+    return max(size, 1e-9) / TURN
+
+
+def pixel_size(perspective: Array, point: Array, width: int) -> float:
+    """Return the size of a pixel at ``point`` (3,) in a view of ``width`` pixels with matrix ``perspective`` (4, 4)."""
+    depth = float(perspective[3, :3] @ point + perspective[3, 3])
+    return 2.0 * abs(depth) / (width * max(float(np.linalg.norm(perspective[0, :3])), 1e-30))
+
+
+def on_screen(perspective: Array, point: Array, width: int, height: int) -> Array | None:
+    """Return the pixel (2,), from the lower left corner, where ``point`` (3,) is seen; None behind the viewer."""
+    x, y, _, w = perspective @ np.append(point, 1.0)
+    if w <= 0:
+        return None
+    return np.array([(x / w + 1) * width / 2, (y / w + 1) * height / 2])
+
+
+def dragged(start: Array, origin: Array, ray: Array, forward: Array, mode: str) -> Array | None:
+    """Return the position (3,) of a tip dragged from ``start`` (3,) to the mouse.
+
+    origin, ray: line of sight through the mouse, (3,). forward: unit viewing direction (3,). mode: ``FREE``, ``LEVEL``
+    or ``UPRIGHT``. None if the line of sight does not meet the drag plane in front of the viewer.
+    """
+    normal = forward
+    if mode == LEVEL:
+        normal = np.array([0.0, 0.0, 1.0])
+    elif mode == UPRIGHT:
+        # The vertical plane that faces the viewer most.
+        normal = np.array([forward[0], forward[1], 0.0])
+    slope = float(ray @ normal)
+    length = float(np.linalg.norm(normal))
+    if abs(slope) <= 0.02 * length * float(np.linalg.norm(ray)) or length < 1e-6:
+        return None
+    found: Array = origin + ray * (float((start - origin) @ normal) / slope)
+    if mode == UPRIGHT:
+        found = np.array([start[0], start[1], found[2]])
+    return found
+
+
+def frame_along(direction: Array) -> Array:
+    """Return a rotation (3, 3) with its third column along ``direction`` (3,); identity-like (up) for zero length."""
+    length = float(np.linalg.norm(direction))
+    z = direction / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
 
 SHOW_ARROWS = "physgen_show_arrows"
-"""Name of the switch, a property of the window manager."""
+"""Name of the toggle, a property of the window manager."""
 
 STEM_PIXELS, TIP_PIXELS, GRAB_PIXELS = 1.6, 9.0, 14.0
 ZERO_PIXELS = 7.5
@@ -30,7 +96,7 @@ SIDES = 12
 
 
 def _cylinder() -> list[tuple[float, float, float]]:
-    """Triangles of a cylinder of radius 1 from the origin to z = 1."""
+    """Return triangles of a cylinder of radius 1 from the origin to z = 1."""
     triangles = []
     for (ax, ay), (bx, by) in _sides():
         triangles += [(ax, ay, 0.0), (bx, by, 0.0), (bx, by, 1.0), (ax, ay, 0.0), (bx, by, 1.0), (ax, ay, 1.0)]
@@ -38,7 +104,7 @@ def _cylinder() -> list[tuple[float, float, float]]:
 
 
 def _cone() -> list[tuple[float, float, float]]:
-    """Triangles of a cone with its tip at the origin, 2 long."""
+    """Return triangles of a cone with its tip at the origin, length 2."""
     triangles = []
     for (ax, ay), (bx, by) in _sides():
         triangles += [(0.0, 0.0, 0.0), (ax * 0.7, ay * 0.7, -2.0), (bx * 0.7, by * 0.7, -2.0)]
@@ -47,7 +113,7 @@ def _cone() -> list[tuple[float, float, float]]:
 
 
 def _knob() -> list[tuple[float, float, float]]:
-    """Triangles of a double pyramid of radius 1."""
+    """Return triangles of a double pyramid of radius 1."""
     triangles = []
     for (ax, ay), (bx, by) in _sides():
         triangles += [(0.0, 0.0, 1.0), (ax, ay, 0.0), (bx, by, 0.0), (0.0, 0.0, -1.0), (bx, by, 0.0), (ax, ay, 0.0)]
@@ -55,69 +121,69 @@ def _knob() -> list[tuple[float, float, float]]:
 
 
 def _sides() -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    ring = [(math.cos(maths.TURN * i / SIDES), math.sin(maths.TURN * i / SIDES)) for i in range(SIDES + 1)]
+    ring = [(math.cos(TURN * i / SIDES), math.sin(TURN * i / SIDES)) for i in range(SIDES + 1)]
     return list(itertools.pairwise(ring))
 
 
 def box_of(item: bpy.types.Object) -> tuple[np.ndarray, float, float]:
-    """Of ``item`` in the world: middle (3,) of its bounding box, its largest extent, height of its highest corner."""
+    """Return the world-space bounding box centre (3,) of ``item``, its largest extent, and its top z."""
     corners = box_corners(item)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return 0.5 * (low + high), max(float((high - low).max()), 1e-9), float(high[2])
 
 
 class PHYSGEN_GT_arrow(bpy.types.Gizmo):
-    """An arrow for a vector property of the active body; its tip can be dragged."""
+    """Arrow gizmo of a vector property of the active body; its tip can be dragged."""
 
     bl_idname = "PHYSGEN_GT_arrow"
     __slots__ = ("before", "cone", "cylinder", "grabbed", "grabbed_tip", "key", "knob", "title")
 
     def setup(self) -> None:
-        """Shapes, once."""
+        """Create the shapes once."""
         if not hasattr(self, "cone"):
             self.cone = self.new_custom_shape("TRIS", _cone())
             self.cylinder = self.new_custom_shape("TRIS", _cylinder())
             self.knob = self.new_custom_shape("TRIS", _knob())
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Stem and tip; a knob where the vector is zero."""
+        """Draw stem and tip, or a knob for a zero vector."""
         base, way = self._arrow(context)
         tip = base + way
-        pixel = maths.pixel_size(_perspective(context), tip, context.region.width)
+        pixel = pixel_size(_perspective(context), tip, context.region.width)
         scale = context.preferences.system.ui_scale * pixel
         length = float(np.linalg.norm(way))
         if length < NO_LENGTH_PIXELS * scale:
             self.draw_custom_shape(self.knob, matrix=_matrix(base, np.eye(3), [ZERO_PIXELS * scale] * 3))
             return
-        turn = maths.frame_along(way)
+        turn = frame_along(way)
         size = TIP_PIXELS * scale
         stem = max(length - 2 * size, 0.0)
         self.draw_custom_shape(self.cylinder, matrix=_matrix(base, turn, [STEM_PIXELS * scale] * 2 + [stem]))
         self.draw_custom_shape(self.cone, matrix=_matrix(tip, turn, [size, size, min(size, length / 2)]))
 
     def test_select(self, context: bpy.types.Context, location: Any) -> int:
-        """Whether the mouse is at the tip."""
+        """Return 0 if the mouse is at the tip, else -1."""
         base, way = self._arrow(context)
         region, perspective = context.region, _perspective(context)
-        seen = maths.on_screen(perspective, base + way, region.width, region.height)
+        seen = on_screen(perspective, base + way, region.width, region.height)
         if seen is None:
             return -1
-        # The cone lies before its tip; the middle of it is what people aim at.
-        pixel = maths.pixel_size(perspective, base + way, region.width)
+        # The cone lies before its tip; users aim at its middle.
+        pixel = pixel_size(perspective, base + way, region.width)
         scale = context.preferences.system.ui_scale
         length = float(np.linalg.norm(way))
         if length > NO_LENGTH_PIXELS * scale * pixel:
             back = base + way * (1 - min(0.5, TIP_PIXELS * scale * pixel / length))
-            middle = maths.on_screen(perspective, back, region.width, region.height)
+            middle = on_screen(perspective, back, region.width, region.height)
             seen = seen if middle is None else middle
         return 0 if float(np.hypot(*(seen - np.array(location)))) <= GRAB_PIXELS * scale else -1
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Take hold of the tip."""
+        """Start dragging the tip."""
         base, way = self._arrow(context)
         self.before = tuple(getattr(context.object.physgen, self.key))
         self.grabbed_tip = base + way
-        under = self._under_mouse(context, event, maths.FREE)
+        under = self._under_mouse(context, event, FREE)
         self.grabbed = self.grabbed_tip - under if under is not None else np.zeros(3)
         return {"RUNNING_MODAL"}
 
@@ -126,14 +192,14 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
         item = context.object
         if item is None:
             return {"CANCELLED"}
-        mode = maths.LEVEL if event.shift else maths.UPRIGHT if event.ctrl else maths.FREE
+        mode = LEVEL if event.shift else UPRIGHT if event.ctrl else FREE
         under = self._under_mouse(context, event, mode)
         if under is not None:
             base, _ = self._arrow(context)
             tip = under + self.grabbed
-            if mode == maths.LEVEL:
+            if mode == LEVEL:
                 tip[2] = self.grabbed_tip[2]
-            elif mode == maths.UPRIGHT:
+            elif mode == UPRIGHT:
                 tip[:2] = self.grabbed_tip[:2]
             value = (tip - base) / self._length(context, item)
             setattr(item.physgen, self.key, value)
@@ -142,7 +208,7 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
         return {"RUNNING_MODAL"}
 
     def exit(self, context: bpy.types.Context, cancel: bool) -> None:
-        """Let go: one step of undo, or the value from before."""
+        """End dragging: push one undo step, or restore the value."""
         context.area.header_text_set(None)
         if context.object is None:
             return
@@ -152,14 +218,14 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
             bpy.ops.ed.undo_push(message=f"{self.title} of {context.object.name}")
 
     def _length(self, context: bpy.types.Context, item: bpy.types.Object) -> float:
-        """Length of the arrow for each unit of the property."""
+        """Return arrow length per unit of the property."""
         _, size, _ = box_of(item)
         if self.key == "velocity":
-            return maths.seconds_shown(size, metres_per_unit(context.scene))
-        return maths.spin_length(size)
+            return seconds_shown(size, metres_per_unit(context.scene))
+        return spin_length(size)
 
     def _arrow(self, context: bpy.types.Context) -> tuple[np.ndarray, np.ndarray]:
-        """Where the arrow begins and where it leads, (3,) each."""
+        """Return start and direction vector of the arrow, (3,) each."""
         item = context.object
         middle, size, top = box_of(item)
         base = middle if self.key == "velocity" else np.array([middle[0], middle[1], top + 0.15 * size])
@@ -171,15 +237,13 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
         origin = view3d_utils.region_2d_to_origin_3d(region, view, mouse)
         ray = view3d_utils.region_2d_to_vector_3d(region, view, mouse)
         forward = view.view_rotation @ Vector((0.0, 0.0, -1.0))
-        return maths.dragged(self.grabbed_tip, np.array(origin), np.array(ray), np.array(forward), mode)
+        return dragged(self.grabbed_tip, np.array(origin), np.array(ray), np.array(forward), mode)
 
     def _say(self, context: bpy.types.Context, value: np.ndarray) -> None:
         x, y, z = value
         size = float(np.linalg.norm(value))
         unit = metres_per_unit(context.scene) if self.key == "velocity" else 1.0
-        words = (
-            f"{size * unit:.3g} m/s" if self.key == "velocity" else f"{size:.3g} rad/s, {size / maths.TURN:.2g} turns/s"
-        )
+        words = f"{size * unit:.3g} m/s" if self.key == "velocity" else f"{size:.3g} rad/s, {size / TURN:.2g} turns/s"
         context.area.header_text_set(
             f"{self.title} {words}   ({x * unit:.3g}, {y * unit:.3g}, {z * unit:.3g})   "
             "Shift: level   Ctrl: up and down   Esc: as before"
@@ -187,7 +251,7 @@ class PHYSGEN_GT_arrow(bpy.types.Gizmo):
 
 
 class PHYSGEN_GGT_arrows(bpy.types.GizmoGroup):
-    """The arrows of the active body."""
+    """Arrow gizmos of the active body"""
 
     bl_idname = "PHYSGEN_GGT_arrows"
     bl_label = "PhysGen Motion"
@@ -197,7 +261,7 @@ class PHYSGEN_GGT_arrows(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """The active object moves, and arrows are wanted."""
+        """Enabled when the active object moves and arrows are switched on."""
         item = context.object
         return (
             getattr(context.window_manager, SHOW_ARROWS)
@@ -210,7 +274,7 @@ class PHYSGEN_GGT_arrows(bpy.types.GizmoGroup):
         )
 
     def setup(self, context: bpy.types.Context) -> None:
-        """One arrow each; colours that are told apart on light and dark."""
+        """Create one arrow each, in colours distinguishable on light and dark backgrounds."""
         for key, title, colour in (
             ("velocity", "Velocity", (1.0, 0.55, 0.05)),
             ("spin", "Spin", (0.75, 0.25, 0.95)),
@@ -237,11 +301,8 @@ def _on_switch(self: bpy.types.WindowManager, context: bpy.types.Context) -> Non
     redraw("VIEW_3D")
 
 
-CLASSES = (PHYSGEN_GT_arrow, PHYSGEN_GGT_arrows)
-
-
-def register() -> None:
-    """The switch, on at first; it belongs to the window manager and no file keeps it."""
+def register_arrow_switch() -> None:
+    """Add the toggle to the window manager, on by default and not saved in files."""
     switch = bpy.props.BoolProperty(
         name="Arrows in Viewport",
         description="Show velocity and spin of the active object as arrows whose tips can be dragged",
@@ -252,6 +313,6 @@ def register() -> None:
     setattr(bpy.types.WindowManager, SHOW_ARROWS, switch)
 
 
-def unregister() -> None:
-    """Take the switch away."""
+def unregister_arrow_switch() -> None:
+    """Remove the toggle."""
     delattr(bpy.types.WindowManager, SHOW_ARROWS)

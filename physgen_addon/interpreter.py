@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Python that runs simulations: never Blender's own process, because Taichi and bpy do not share one.
+"""The Python interpreter that runs simulations: never Blender's process, because Taichi and bpy cannot share one.
 
-It needs the third-party packages only; PhysGen's code is the extension's own (``sim/app/launch.py``). It is the one
-named in the preferences or in PHYSGEN_PYTHON, else Blender's with the wheels that the extension was installed with,
-else the environment that ``install_command`` makes in the home folder.
+It needs the third-party packages only; PhysGen's code is that of the extension (``sim/app/launch.py``). It is the one
+set in the preferences or PHYSGEN_PYTHON, else Blender's own with the extension's wheels, else the environment that
+``install_command`` creates in the home folder.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-from ..sim.app.process import NO_WINDOW, child_environment, own_command
 from ..sim.app.requirements import MODULE, NEWEST, OLDEST, REQUIREMENTS
+from ..sim.app.stage_process import NO_WINDOW, child_environment, own_command
 from ..sim.errors import InputError
 
 VARIABLE = "PHYSGEN_PYTHON"
 TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
-"""Where commands are typed: Windows' other one, PowerShell, knows no ``&&``."""
+"""Name of the terminal for commands: PowerShell, Windows' other one, has no ``&&``."""
 _TIMEOUT_S = 60.0
 _MOST_BYTES = 2**20
-"""Of an answer; what says more is no Python."""
+"""Maximum output of a probed program; one that prints more is not Python."""
 
 
 class NoPython(InputError):
-    """No interpreter that simulates. reason: what is wrong; command: what to type to mend it, in one line."""
+    """No interpreter can simulate. reason: the cause; command: a shell command that fixes it, in one line."""
 
     def __init__(self, reason: str, command: str) -> None:
         super().__init__(f"{reason}. In {TERMINAL}: {command}")
@@ -45,10 +45,10 @@ class NoPython(InputError):
 
 
 def find_python(preferred: str = "") -> Path:
-    """The interpreter that simulates: named in the preferences or in PHYSGEN_PYTHON, Blender's, or ~/physgen-python.
+    """Return the interpreter that simulates: from the preferences, PHYSGEN_PYTHON, Blender's own, or ~/physgen-python.
 
-    Takes seconds the first time, because it is started and asked; call it in a job. Raises NoPython if it cannot.
-    One that somebody named is never quietly replaced by another.
+    The first call takes seconds because the interpreter is probed; call it in a job. Raises NoPython. A configured
+    interpreter is never silently replaced by another.
     """
     for where, name in (("in the preferences", preferred), (f"in {VARIABLE}", os.environ.get(VARIABLE, ""))):
         if name.strip():
@@ -63,7 +63,7 @@ def find_python(preferred: str = "") -> Path:
 
 
 def _unnamed() -> Path:
-    """Blender's own Python or the one in the home folder; NoPython with what is wrong with the one that comes last."""
+    """Return Blender's own Python or the one in the home folder; raise NoPython with the last one's problem."""
     python = Path(sys.executable)
     try:
         _checked(str(python), wheels_for(python))
@@ -81,9 +81,9 @@ def _unnamed() -> Path:
 
 
 def named_python() -> Path | None:
-    """The interpreter that PHYSGEN_PYTHON names, else the one in the home folder; not asked whether it simulates.
+    """Return the interpreter set in PHYSGEN_PYTHON, else the one in the home folder, without probing its packages.
 
-    Raises NoPython where the named one cannot be started; None where nothing is named and nothing is there.
+    Raises NoPython if the configured one cannot be started; None if there is neither.
     """
     name = os.environ.get(VARIABLE, "").strip()
     if name:
@@ -92,31 +92,31 @@ def named_python() -> Path | None:
 
 
 def python_version(python: Path) -> str:
-    """Such as ``3.13.1``, of an interpreter that ``find_python`` gave."""
+    """Return the version, such as ``3.13.1``, of an interpreter from ``find_python``."""
     return _checked(str(python), wheels_for(python))
 
 
 def forget() -> None:
-    """Ask anew the next time, because somebody has installed something."""
+    """Clear the cache, because packages were installed."""
     _checked.cache_clear()
 
 
 def cli_command(python: Path, *arguments: str) -> Sequence[str]:
-    """``physgen ARGUMENTS --json`` as a command of that interpreter, running this extension's own code."""
+    """Return the command for ``physgen ARGUMENTS --json`` in that interpreter, running this extension's code."""
     return own_command("batch.cli", *arguments, "--json", python=str(python), packages=wheels_for(python))
 
 
 def wheel_folder() -> str:
-    """Where Blender has unpacked the extension's wheels, found without importing any; empty where there are none."""
+    """Return the folder of the extension's unpacked wheels, found without importing any; empty if there are none."""
     found = importlib.util.find_spec("taichi")
     return str(Path(found.origin).parents[1]) if found is not None and found.origin else ""
 
 
 def install_command(python: Path | None = None, installs: bool = False) -> str:
-    """One line for a terminal that makes a Python that simulates.
+    """Return a shell command, one line, that creates a Python environment for simulation.
 
-    python: it gets what it lacks, or, where pip may not install into it, a virtual environment is made with it in the
-    home folder; None for one made with the newest Python that will do.
+    python: interpreter that gets the missing packages, or, if pip may not install into it, the base of a virtual
+    environment in the home folder; None for one based on the newest suitable Python.
     """
     wanted = " ".join(_quoted(requirement) for requirement in REQUIREMENTS.values())
     if python is not None and installs:
@@ -127,12 +127,12 @@ def install_command(python: Path | None = None, installs: bool = False) -> str:
 
 
 def _quoted(word: str | Path) -> str:
-    """``word`` as the terminal takes it for one: a shell would also look for $ and ` between double quotes."""
+    """Return ``word`` quoted for the terminal; inside double quotes a shell would still expand $ and `."""
     return f'"{word}"' if os.name == "nt" else shlex.quote(str(word))
 
 
 def home_folder() -> Path:
-    """Where ``install_command`` makes an environment; looked for there when nothing else simulates."""
+    """Return the folder in which ``install_command`` creates an environment; the last place searched."""
     return Path.home() / "physgen-python"
 
 
@@ -141,13 +141,13 @@ def _home_python() -> Path:
 
 
 def why_not(version: tuple[int, int], wheels: str, trouble: str) -> str:
-    """Why Blender's own Python of that version, with those wheels, does not simulate, and what to do about it."""
+    """Return why Blender's own Python of that version, with those wheels, cannot simulate, and the remedy."""
     which = f"name a Python {_dotted(OLDEST)} to {_dotted(NEWEST)} that has its packages"
     remedy = f"{which} in PhysGen's preferences, or in {VARIABLE}"
     if not OLDEST <= version <= NEWEST:
         return f"Taichi, which simulates, has no build for Blender's Python {_dotted(version)}: {remedy}"
     if not wheels:
-        return f"PhysGen was installed without what simulates: install the zip that has it, or {remedy}"
+        return f"PhysGen was installed without its simulation packages: install the zip that has them, or {remedy}"
     return f"Blender's own Python cannot simulate ({trouble}): {remedy}"
 
 
@@ -156,24 +156,24 @@ def _dotted(version: tuple[int, ...]) -> str:
 
 
 def _located(name: str, where: str) -> Path:
-    """The program that somebody meant by ``name``: a file, a command, or the folder of an environment."""
+    """Return the program that ``name`` means: a file, a command, or the folder of an environment."""
     path = Path(name).expanduser()
     inside = [path / "bin" / "python", path / "Scripts" / "python.exe", path / "python.exe"]
     for candidate in inside if path.is_dir() else [path]:
         found = shutil.which(candidate)
         if found is not None:
-            # Not resolved: the environment of a link is where the link lies.
+            # Not resolved: the environment of a symlink is where the link lies.
             return Path(found).absolute()
     raise NoPython(f"{name}, named {where}, is no Python that can be started", install_command())
 
 
 def wheels_for(python: Path) -> str:
-    """The extension's wheels fit Blender's own Python and no other."""
+    """Return the wheel folder if ``python`` is Blender's own; wheels fit no other."""
     return wheel_folder() if python == Path(sys.executable) else ""
 
 
 class _Unfit(Exception):
-    """An interpreter that cannot simulate. lacks: but would if more were installed; installs: which pip may do."""
+    """An interpreter that cannot simulate. lacks: missing packages only; installs: pip may install into it."""
 
     def __init__(self, reason: str, *, lacks: bool = False, installs: bool = False) -> None:
         super().__init__(reason)
@@ -182,7 +182,7 @@ class _Unfit(Exception):
 
 @functools.lru_cache(maxsize=8)
 def _checked(python: str, packages: str) -> str:
-    """The version of an interpreter that can simulate; raises _Unfit. What is good is kept, it is asked before jobs."""
+    """Return the version of an interpreter that can simulate (cached); raises _Unfit."""
     code, said, complaints = _asked(own_command(MODULE, python=python, packages=packages))
     lines = said.strip().splitlines()
     if code != 0 or not lines:
@@ -206,9 +206,9 @@ def _checked(python: str, packages: str) -> str:
 
 
 def _asked(command: Sequence[str]) -> tuple[int, str, str]:
-    """Exit code, output and complaints of ``command``; _Unfit where it cannot be started or has no end.
+    """Return exit code, stdout and stderr of ``command``; _Unfit if it cannot be started or does not end.
 
-    Neither a program that prints for ever nor one that leaves children behind keeps this waiting.
+    Neither endless output nor child processes that outlive the program block this call.
     """
     try:
         process = subprocess.Popen(
@@ -245,13 +245,13 @@ def _asked(command: Sequence[str]) -> tuple[int, str, str]:
     for reader in readers:
         reader.join(1.0)
     if any(len(text) == _MOST_BYTES for text in said):
-        raise _Unfit("it is no Python: it prints without end")
+        raise _Unfit("it is not Python: its output does not end")
     out, complaints = (text.decode("utf-8", "replace") for text in said)
     return code, out, complaints
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """With all that it has started."""
+    """Kill a process with all its children."""
     with contextlib.suppress(OSError):
         if os.name == "nt":
             process.kill()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Folders as people type them into Blender."""
+"""Folder paths as entered in Blender."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from pathlib import Path
 
 import bpy
 
-from ..sim.cache.manifest import load_manifest
+from ..sim.cache.bake_folder import load_manifest
 from ..sim.errors import InputError
-from ..sim.scene.names import DEVICES
+from ..sim.scene.object_names import DEVICES
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
-"""Option of a property that may begin with ``//``."""
+"""Options of a property whose path may begin with ``//``."""
 
 
 def require_folder(path: str, what: str) -> Path:
-    """``path``, where ``//`` is beside the .blend, as an absolute path; InputError when it is empty."""
+    """Return ``path`` as an absolute path (``//`` is the .blend's folder); InputError if empty."""
     if not path.strip():
         raise InputError(f"{what} is empty: choose a folder")
     return Path(bpy.path.abspath(path.strip())).resolve()
 
 
 def folder_beside(path: Path, suffix: str) -> Path:
-    """``NAME_suffix`` beside ``path``. Raises InputError where nothing can be written there."""
+    """Return ``NAME_suffix`` beside ``path``. Raises InputError if the place is not writable."""
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path.parent}: cannot be written; choose another folder for the results")
     return path.with_name(f"{path.name}_{suffix}")
 
 
 def bake_folder(path: Path) -> Path:
-    """``path``, or with a number behind it where a complete bake or something else has that name already.
+    """Return ``path``, numbered if a complete bake or something else has that name.
 
-    A bake that was stopped keeps its name, so that it goes on.
+    An incomplete bake keeps its name, so that it is resumed.
     """
     candidate, number = path, 2
     while candidate.exists() and not _unfinished(candidate):
@@ -53,7 +53,7 @@ def _unfinished(folder: Path) -> bool:
 
 
 def file_name(name: str) -> str:
-    """``name`` as every file system takes it; two names that differ stay different."""
+    """Return ``name`` as a valid file name on all systems; different names stay different."""
     plain = re.sub(r"[^\w .-]", "_", name).strip(" .") or "_"
     if plain == name and name.lower() not in DEVICES:
         return name
@@ -61,57 +61,57 @@ def file_name(name: str) -> str:
 
 
 def is_unsaved_cache(scene: bpy.types.Scene) -> bool:
-    """Whether the scene's bakes wait in a temporary folder, because ``//`` means nothing before the file is saved."""
+    """Return whether the scene's bakes are in a temporary folder, because ``//`` is undefined before the first save."""
     return not bpy.data.filepath and scene.physgen.simulation.cache.strip().startswith("//")
 
 
 _KEY = re.compile("[0-9a-f]{12}")
 _unsaved_key = [uuid.uuid4().hex[:12]]
-"""Of the file that is open; also kept here, because undo takes back what a scene remembers."""
+"""Key of the open file; also kept here, because undo reverts the scene's copy."""
 
 
 def unsaved_key() -> str:
-    """What tells the bakes of this unsaved file from those of others."""
+    """Return the key that separates the bakes of this unsaved file from those of others."""
     return _unsaved_key[0]
 
 
 def new_unsaved_key() -> None:
-    """Another file is open."""
+    """Start a new key: another file was opened."""
     _unsaved_key[0] = uuid.uuid4().hex[:12]
 
 
 def unsaved_root() -> Path:
-    """Where bakes of unsaved files wait. Beside Blender's temporary folder, which is deleted when Blender ends.
+    """Return the folder for bakes of unsaved files, beside Blender's temporary folder, which is deleted on exit.
 
-    Everybody may write there, so it is the user's own: ``make_unsaved_root``.
+    The place is world-writable, so the folder belongs to the user alone: ``make_unsaved_root``.
     """
     user = f"-{os.getuid()}" if hasattr(os, "getuid") else ""
     return Path(bpy.app.tempdir).resolve().parent / f"physgen_unsaved{user}"
 
 
 def make_unsaved_root() -> None:
-    """Make ``unsaved_root`` for nobody but this user. Raises InputError where somebody else has put something there."""
+    """Create ``unsaved_root`` for this user only. Raises InputError if another user owns that path."""
     root = unsaved_root()
     try:
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = root.lstat()
         if not stat.S_ISDIR(found.st_mode) or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
-            raise InputError(f"{root}: is somebody else's, so no bake is kept there; save the file first")
+            raise InputError(f"{root}: belongs to another user, so no bake is stored there; save the file first")
         root.chmod(0o700)
     except OSError as error:
         raise InputError(f"{root}: cannot be made ({error.strerror or error}); save the file first") from error
 
 
 def unsaved_cache(scene: bpy.types.Scene, key: str) -> Path | None:
-    """Where bakes of ``scene`` waited under ``key``; None for a key that this extension has not made.
+    """Return the temporary cache folder of ``scene`` for ``key``; None for a key this extension did not create.
 
-    A .blend keeps the key, so it may come from anybody, and what is there is deleted once it is copied.
+    The key is read from the .blend, which may come from anyone, and the folder is deleted after copying.
     """
     return unsaved_root() / key / file_name(scene.name) if _KEY.fullmatch(key) else None
 
 
 def scene_cache(scene: bpy.types.Scene) -> Path:
-    """Folder of all bakes of ``scene``, absolute; it need not exist. InputError when no cache folder is named."""
+    """Return the absolute folder of all bakes of ``scene``; it may not exist. InputError without a cache folder."""
     simulation = scene.physgen.simulation
     if is_unsaved_cache(scene):
         kept = unsaved_cache(scene, simulation.unsaved)
@@ -120,14 +120,14 @@ def scene_cache(scene: bpy.types.Scene) -> Path:
 
 
 def scene_cache_beside(scene: bpy.types.Scene, blend: Path) -> Path:
-    """``scene_cache`` as it will be once the file is saved as ``blend``."""
+    """Return ``scene_cache`` as it will be once the file is saved as ``blend``."""
     cache = scene.physgen.simulation.cache.strip()
     root = blend.parent / cache[2:].replace("\\", "/") if cache.startswith("//") else require_folder(cache, "Cache")
     return Path(os.path.normpath(root)) / file_name(scene.name)
 
 
 def require_writable(folder: Path) -> None:
-    """Make ``folder``. Raises InputError where nothing can be written there."""
+    """Create ``folder``. Raises InputError if it is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -140,9 +140,9 @@ def require_writable(folder: Path) -> None:
 
 
 def stored(path: Path, blend: Path | None = None) -> str:
-    """``path`` as the file remembers it: from ``//`` with forward slashes, absolute before the file is saved.
+    """Return ``path`` as stored in the file: ``//`` with forward slashes, absolute before the first save.
 
-    blend: where the file is about to be saved, if not where it is now.
+    blend: target file of a save in progress, if not the current one.
     """
     folder = blend.parent if blend else Path(bpy.data.filepath).parent if bpy.data.filepath else None
     if folder is None:
@@ -150,16 +150,16 @@ def stored(path: Path, blend: Path | None = None) -> str:
     try:
         return "//" + os.path.relpath(path, folder).replace("\\", "/")
     except ValueError:
-        # Another drive of Windows.
+        # Another drive on Windows.
         return str(path)
 
 
 def absolute(path: str) -> Path:
-    """What ``stored`` gave, as an absolute path."""
+    """Return the absolute path of a ``stored`` one."""
     return Path(os.path.normpath(bpy.path.abspath(path)))
 
 
 def shown_bake(scene: bpy.types.Scene) -> Path | None:
-    """Folder of the bake that ``scene`` shows, whether it is still there or not; None: it shows none."""
+    """Return the folder of the bake that ``scene`` shows, existing or not; None without one."""
     path = scene.physgen.simulation.bake
     return absolute(path) if path else None

@@ -1,16 +1,44 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sentences and numbers for people: Blender's labels neither wrap nor round."""
+"""Text for users: numbers as typed, error reports of operators, and labels (Blender neither wraps nor rounds them)."""
 
 from __future__ import annotations
 
+import functools
 import math
 import textwrap
+from collections.abc import Callable
+from typing import Any
 
 import bpy
 
+from ..sim.errors import PhysGenError
+
+
+def decimal(value: float) -> float:
+    """Return the number as typed: Blender stores 32 bits, where 0.4 is 0.4000000059604645."""
+    return float(f"{value:.7g}")
+
+
+Execute = Callable[[Any, bpy.types.Context], set[str]]
+
+
+def report_errors(execute: Execute) -> Execute:
+    """Decorate an operator's ``execute``: a PhysGenError is reported and the operator cancelled."""
+
+    # Blender inspects the signature, so arguments are named.
+    @functools.wraps(execute)
+    def guarded(self: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
+        try:
+            return execute(self, context)
+        except PhysGenError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    return guarded
+
 
 def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE") -> None:
-    """``text`` on as many lines as the sidebar's width asks for."""
+    """Draw ``text`` on as many lines as the sidebar's width requires."""
     scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
     width = context.region.width if context.region is not None else 300
     room = max(int((width - (70 if icon == "NONE" else 95) * scale) / (5.8 * scale)), 16)
@@ -21,7 +49,7 @@ def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str,
 
 
 def brief(message: str, most: int = 300) -> str:
-    """``message`` for a panel: of many lines, as a crashed process leaves them, the first and the last."""
+    """Return ``message`` shortened for a panel: first and last of many lines, as in the traceback of a crash."""
     lines = message.strip().splitlines()
     if len(lines) > 3:
         message = f"{lines[0]} … {lines[-1]}"
@@ -29,7 +57,7 @@ def brief(message: str, most: int = 300) -> str:
 
 
 def paragraph(layout: bpy.types.UILayout, text: str, room: int) -> None:
-    """``text`` on lines of up to ``room`` characters, for popups, whose width is known beforehand."""
+    """Draw ``text`` on lines of up to ``room`` characters, for popups of known width."""
     column = layout.column(align=True)
     column.scale_y = 0.8
     for line in textwrap.wrap(text, room):
@@ -37,17 +65,17 @@ def paragraph(layout: bpy.types.UILayout, text: str, room: int) -> None:
 
 
 def readable(name: str) -> str:
-    """``air_drag`` as ``Air drag``."""
+    """Return ``air_drag`` as ``Air drag``."""
     return name.replace("_", " ").capitalize()
 
 
 def count(number: int, what: str) -> str:
-    """``1 object``, ``2 objects``."""
+    """Return ``1 object``, ``2 objects``."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def pressure(pascals: float) -> str:
-    """Such as ``25 kPa`` or ``70 GPa``."""
+    """Return a pressure such as ``25 kPa`` or ``70 GPa``."""
     for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
         if pascals >= size * 0.9995:
             return f"{pascals / size:.3g} {unit}"
@@ -55,7 +83,7 @@ def pressure(pascals: float) -> str:
 
 
 def storage(size: int) -> str:
-    """Bytes, such as ``12 MB``."""
+    """Return a size such as ``12 MB``."""
     for unit, unit_size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= unit_size:
             return f"{size / unit_size:.3g} {unit}"
@@ -63,14 +91,14 @@ def storage(size: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Such as ``12 s``, ``3 min``, ``2.5 h``."""
+    """Return a duration such as ``12 s``, ``3 min``, ``2.5 h``."""
     if seconds < 100:
         return f"{max(seconds, 1.0):.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def length(metres: float) -> str:
-    """Such as ``1.2 mm`` or ``34 cm``; a dash for what is not known (below zero)."""
+    """Return a length such as ``1.2 mm`` or ``34 cm``; a dash if unknown (below zero)."""
     if not math.isfinite(metres) or metres < 0:
         return "–"
     for unit, size in (("m", 1.0), ("cm", 1e-2)):
@@ -80,14 +108,14 @@ def length(metres: float) -> str:
 
 
 def number(value: float, unit: str) -> str:
-    """Three digits and the unit, a dash for what is no number."""
+    """Return three digits and the unit, or a dash if not finite."""
     if not math.isfinite(value):
         return "–"
     return f"{value:.3g}" if unit in ("", "1") else f"{value:.3g} {unit}"
 
 
 def volume(cubic_metres: float) -> str:
-    """Such as ``2.4 cm³`` or ``0.13 m³``."""
+    """Return a volume such as ``2.4 cm³`` or ``0.13 m³``."""
     for unit, size in (("m³", 1.0), ("dm³", 1e-3), ("cm³", 1e-6)):
         if cubic_metres >= 0.1 * size:
             return f"{cubic_metres / size:.3g} {unit}"

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: GPL-3.0-or-later
 # pick_python.sh [VERSION]
 # Prints the newest interpreter that a Blender LTS line has a bpy build for: 3.13 (Blender 5.2) or 3.11 (Blender 4.5).
 # pyenv's shims exist for versions that are not selected, so each candidate is asked for its version.

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: GPL-3.0-or-later
 # The shared libraries that `import bpy` loads even without a display. Installed when root, otherwise named.
 # EGL, with which EEVEE draws without a display, likewise, but nothing fails for want of it.
 set -eu

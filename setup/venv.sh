@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: GPL-3.0-or-later
 # venv.sh PYTHON VENV: a virtual environment with the project and everything it needs, made again when the
 # interpreter or the requirements changed.
 set -eu

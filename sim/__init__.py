@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Everything of PhysGen that needs no Blender: it never imports bpy and never looks upward."""
+"""Reconstruction, simulation, effects, diagnosis and image formation: everything that needs no Blender."""

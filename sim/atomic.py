@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files and folders that exist whole or not at all: written under a temporary name, renamed at the end."""
+"""Atomic writes: files and folders are written under a temporary name and renamed at the end."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from typing import Any
 from .errors import InputError
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
-"""Seconds between attempts: Windows refuses to replace a file that somebody reads at that moment."""
+"""Seconds between attempts: Windows refuses to replace a file that another process is reading."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
 
-    The suffix is kept, because image writers choose the format by it. Raises InputError, with the way out, when
-    the disk is full or the folder cannot be written.
+    The suffix stays, because image writers choose the format by it. Raises InputError when the disk is full or the
+    folder cannot be written.
     """
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
@@ -39,13 +39,13 @@ def replacing(path: Path) -> Iterator[Path]:
         if partial.is_dir():
             shutil.rmtree(partial, ignore_errors=True)
         else:
-            # The folder may be a file, or gone.
+            # The parent may be a file, or gone.
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what this process has begun to write in ``folder``, when it must end without coming back from there."""
+    """Remove this process's unfinished files in ``folder``, for an exit that skips ``finally`` blocks."""
     for partial in folder.glob(f".*.partial-{os.getpid()}*"):
         with contextlib.suppress(OSError):
             partial.unlink()
@@ -64,12 +64,12 @@ def _replace(partial: Path, path: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as indented UTF-8 JSON, atomically. NaN and infinity are refused."""
+    """Write ``value`` atomically as indented UTF-8 JSON. Raises ValueError for NaN and infinity."""
     with replacing(path) as partial:
         partial.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write ``content``, atomically."""
+    """Write ``content`` atomically."""
     with replacing(path) as partial:
         partial.write_bytes(content)

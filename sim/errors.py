@@ -1,30 +1,40 @@
 # SPDX-License-Identifier: MIT
-"""The one error tree of the project.
+"""The project's error tree, and the text of OpenImageIO's errors.
 
-Every message names the field or file, the value that was found, and the way out, because it is shown as it
-stands on a terminal, in Blender's status bar and in a farm's log.
+Every message names the field or file, the value found and the remedy, because it is shown unchanged in a terminal,
+in Blender's status bar and in a farm's log.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 
 class PhysGenError(Exception):
-    """Base of all errors that a user can do something about.
+    """Base of all errors that the user can fix.
 
-    ``exit_code`` is what the command line ends with (docs/cli.md).
+    exit_code: of the command line (docs/cli.md).
+
+    >>> import physgen
+    >>> try:
+    ...     physgen.load_scene("no such folder")
+    ... except physgen.PhysGenError as error:
+    ...     code = error.exit_code
+    >>> code
+    3
     """
 
     exit_code = 3
 
 
 class InputError(PhysGenError):
-    """A photo, box, mask, mesh, scene, bake or option cannot be used as it is."""
+    """Unusable input: a photo, box, mask, mesh, scene, bake or option."""
 
     exit_code = 3
 
 
 class SimulationError(PhysGenError):
-    """The simulation could not be carried to its end."""
+    """The simulation failed before its end."""
 
     exit_code = 4
 
@@ -36,6 +46,19 @@ class RenderError(PhysGenError):
 
 
 class Cancelled(PhysGenError):
-    """The user or the system asked the job to stop; what was complete stays usable."""
+    """The job was cancelled by the user or the system; completed results stay usable."""
 
     exit_code = 130
+
+
+def openimageio_error(geterror: Callable[[], str]) -> str:
+    """Return the last line of ``geterror()``: OpenEXR repeats an error in several lines, the last most precisely.
+
+    geterror: of OpenImageIO itself, or of one of its inputs and outputs. Messages about damaged files may hold bytes of
+    the file that are not UTF-8.
+    """
+    try:
+        said = geterror()
+    except UnicodeDecodeError:
+        return "its header is damaged"
+    return (said.strip().splitlines() or ["no reason given"])[-1]

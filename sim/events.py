@@ -2,7 +2,7 @@
 """Progress, as plain dictionaries: the same in a callback, on a pipe and in a log (docs/file-formats.md).
 
 ``{"event": "progress", "stage", "done", "total", "eta_s", "message"}`` while a stage runs,
-``{"event": "notice", "stage", "message"}`` for what a user should know,
+``{"event": "notice", "stage", "message"}`` for information to the user,
 ``{"event": "done", …}`` and ``{"event": "error", "kind", "message"}`` at the end of a process.
 """
 
@@ -18,18 +18,18 @@ IsCancelled = Callable[[], bool]
 
 
 def ignore(event: Event) -> None:
-    """Take no notice of ``event``."""
+    """Discard ``event``."""
 
 
 def never() -> bool:
-    """Not cancelled."""
+    """Return False: never cancelled."""
     return False
 
 
 class StageProgress:
-    """Reports how far a stage is and how long it may still take.
+    """Progress events of one stage, with the remaining time.
 
-    The estimate goes by the pace of the recent units, because the first ones carry compile and start-up time.
+    The remaining time follows the pace of recent units, because the first ones include compile and start-up time.
     """
 
     def __init__(self, on_event: OnEvent, stage: str, total: int) -> None:
@@ -39,7 +39,7 @@ class StageProgress:
         self._marks: list[tuple[int, float]] = []
 
     def report(self, done: int, message: str = "") -> None:
-        """Say that ``done`` of the total units are finished."""
+        """Report that ``done`` of the total units are finished."""
         now = time.monotonic()
         self._marks = [*self._marks[-8:], (done, now)]
         first_done, first_time = self._marks[0]
@@ -52,5 +52,5 @@ class StageProgress:
         self._on_event(event)
 
     def notice(self, message: str) -> None:
-        """Say something that a user should know."""
+        """Emit ``message`` as a notice to the user."""
         self._on_event({"event": "notice", "stage": self._stage, "message": message})

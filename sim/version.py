@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: MIT
-"""The program's version; ``pyproject.toml`` and ``blender_manifest.toml`` hold the same, which a test checks."""
+"""The program's version, the same as in ``pyproject.toml`` and ``blender_manifest.toml`` (a test checks)."""
 
 VERSION = "0.1.0"

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Many jobs on many machines: ``physgen batch`` (docs/farm.md)."""
+"""Batch jobs on one or many machines: ``physgen batch`` (docs/farm.md)."""

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A Dask cluster to work with: on this machine, at an address, or as SLURM's jobs."""
+"""Connect to a Dask cluster: local workers, a scheduler at an address, or SLURM jobs; with TLS.
+
+Dask's messages are pickles: whoever may connect may run any code.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import logging
 import shutil
+import ssl
 import subprocess
 import threading
 from collections import deque
@@ -14,31 +19,88 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
-from ...sim.app.process import own_command, read_errors, start_process
+from ...sim.app.stage_process import own_command, read_errors, start_process
 from ...sim.errors import Cancelled, InputError
 from ...sim.events import IsCancelled
-from .dask_security import check_trust, file_security
 from .runners import FarmOptions
+
+
+def file_security(address: str, ca: Path | None, cert: Path | None, key: Path | None) -> Any:
+    """Return Dask's ``Security`` for a scheduler at ``address``; None for ``tcp://``.
+
+    Raises InputError for a malformed address, for TLS with missing or unusable files, and for files given with an
+    address that does not use them.
+    """
+    try:
+        parts = urlsplit(address)
+        scheme, known = parts.scheme, bool(parts.hostname and parts.port)
+    except ValueError:
+        scheme, known = "", False
+    if scheme not in ("tcp", "tls") or not known:
+        raise InputError(f"{address!r} is not the address of a scheduler: write tcp://HOST:PORT or tls://HOST:PORT")
+    files = {"--tls-ca": ca, "--tls-cert": cert, "--tls-key": key}
+    given = [option for option, path in files.items() if path is not None]
+    if scheme == "tcp":
+        if given:
+            raise InputError(f"{given[0]} is unused with {address}: start the scheduler with TLS and write tls://…")
+        return None
+    missing = [option for option, path in files.items() if path is None]
+    if missing:
+        raise InputError(f"{missing[0]} is missing: {address} needs --tls-ca, --tls-cert and --tls-key")
+    assert ca is not None and cert is not None and key is not None
+    for option, path in files.items():
+        if path is not None and not path.is_file():
+            raise InputError(f"{option} {path}: there is no such file")
+    try:
+        context = ssl.create_default_context(cafile=str(ca))
+        context.load_cert_chain(cert, key)
+    except OSError as error:
+        raise InputError(
+            f"{ca}, {cert}, {key}: cannot be used ({error}); give PEM files that belong together"
+        ) from error
+    from distributed.security import Security
+
+    return Security(
+        require_encryption=True,
+        tls_ca_file=str(ca),
+        **{f"tls_{role}_cert": str(cert) for role in ("client", "worker")},
+        **{f"tls_{role}_key": str(key) for role in ("client", "worker")},
+    )
+
+
+def check_trust(address: str, *, trust_network: bool) -> None:
+    """Raise InputError for a scheduler on another machine without TLS, unless ``trust_network``."""
+    host = urlsplit(address).hostname or ""
+    try:
+        local = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = host == "localhost"
+    if address.startswith("tcp://") and not local and not trust_network:
+        raise InputError(
+            f"{address} is another machine and uses no TLS, so anyone who reaches it can run commands as you: "
+            "use tls://…, or --trust-network if everyone on the network may"
+        )
+
 
 CONNECT_S = 10.0
 START_S = 60.0
-"""How long workers on this machine may take to start."""
+"""Time for local workers to start."""
 
 LOOK_S = 0.2
 MOST_FAILED_STARTS = 3
-"""Workers on this machine that die before any has come up: then something is wrong with all of them."""
+"""Local workers that may die at start-up before all are considered broken."""
 
 
 @contextmanager
-def connected(
+def dask_client(
     options: FarmOptions, slots: Mapping[str, int], in_all: Mapping[str, int], scratch: Path, cancelled: IsCancelled
 ) -> Iterator[Any]:
-    """A ``distributed.Client`` with at least one worker; whatever was started for it ends with it.
+    """Yield a ``distributed.Client`` with at least one worker; everything started for it ends with it.
 
-    slots: by name, what a worker needs that can carry out any task. in_all: what this machine has.
-    scratch: folder that all machines see.
-    Raises InputError when Dask is not installed, nobody answers, or no worker comes.
+    slots: by name, enough for a worker to run any task. in_all: total of this machine. scratch: folder that all
+    machines share. Raises InputError when Dask is not installed, no scheduler answers, or no worker appears.
     """
     try:
         import distributed
@@ -61,7 +123,7 @@ def connected(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without Dask's own log, which tells of every worker that goes, with its stack."""
+    """Silence Dask's own log, which prints a stack trace for every worker that leaves."""
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
     levels = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -82,7 +144,7 @@ def _at_address(distributed: Any, options: FarmOptions, cancelled: IsCancelled) 
         client = distributed.Client(options.farm, security=security, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"{options.farm}: no scheduler answers there ({_first_line(error)}); start one with 'dask scheduler', "
+            f"{options.farm}: no scheduler answers ({_first_line(error)}); start one with 'dask scheduler', "
             "check address and certificates"
         ) from error
     with client:
@@ -99,28 +161,28 @@ def _on_this_machine(
     in_all: Mapping[str, int],
     cancelled: IsCancelled,
 ) -> Iterator[Any]:
-    """Workers on the loopback, with certificates that exist in the memory of these processes only.
+    """Yield a client of local workers, with certificates that exist only in the memory of these processes.
 
-    Without them any other user of this machine could connect, and run anything as this one.
+    Without them any other user of this machine could connect and run code as this one.
     """
     import dask
 
     security = distributed.Security.temporary()
-    # Deaths of workers that a task outlives before Dask gives it up; the last word has the retry rule.
+    # Worker deaths before Dask gives a task up; the retry rule decides in the end.
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": options.retries}),
         distributed.LocalCluster(
             n_workers=0, host="127.0.0.1", protocol="tls://", security=security, dashboard_address=None
         ) as cluster,
-        _LocalWorkers(cluster.scheduler_address, security, shares(slots, in_all, options.workers)) as workers,
+        _LocalWorkers(cluster.scheduler_address, security, worker_shares(slots, in_all, options.workers)) as workers,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
         _await_workers(client, options.workers, START_S, cancelled, workers.complaint, workers.have_failed)
         yield client
 
 
-def shares(slots: Mapping[str, int], in_all: Mapping[str, int], workers: int) -> list[dict[str, int]]:
-    """What each of ``workers`` workers has of ``in_all``, dealt out in portions of ``slots``."""
+def worker_shares(slots: Mapping[str, int], in_all: Mapping[str, int], workers: int) -> list[dict[str, int]]:
+    """Return the slots of each of ``workers`` workers: ``in_all``, distributed in portions of ``slots``."""
     result: list[dict[str, int]] = [{} for _ in range(workers)]
     for name, portion in sorted(slots.items()):
         for index in range(in_all[name] // portion):
@@ -130,12 +192,12 @@ def shares(slots: Mapping[str, int], in_all: Mapping[str, int], workers: int) ->
 
 
 class _LocalWorkers:
-    """Worker processes of this machine; one that dies is started again, as long as this object is open."""
+    """Local worker processes; one that dies is restarted while this object is open."""
 
     def __init__(self, address: str, security: Any, shares: list[dict[str, int]]) -> None:
         self._address = address
         self._credentials = json.dumps(
-            {"require_encryption": True, **{k: getattr(security, k) for k in vars_of(security)}}
+            {"require_encryption": True, **{k: getattr(security, k) for k in credential_fields(security)}}
         ).encode()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._shares = shares
@@ -159,12 +221,12 @@ class _LocalWorkers:
         self._end()
 
     def have_failed(self) -> bool:
-        """Whether nothing else is to be expected."""
+        """Return whether the workers cannot start."""
         return self._failed_starts >= MOST_FAILED_STARTS
 
     def complaint(self) -> str:
-        """Why none came up."""
-        return "workers of this machine do not start: " + ("\n".join(self._words).strip() or "they say nothing")
+        """Return why no worker has started."""
+        return "workers of this machine do not start: " + ("\n".join(self._words).strip() or "no output")
 
     def _start(self, share: Mapping[str, int]) -> subprocess.Popen[bytes]:
         slots = [word for name, count in share.items() for word in ("--slot", f"{name}={count}")]
@@ -200,8 +262,8 @@ class _LocalWorkers:
                 process.wait()
 
 
-def vars_of(security: Any) -> list[str]:
-    """Names of the fields of ``security`` that a worker needs."""
+def credential_fields(security: Any) -> list[str]:
+    """Return the names of the fields of ``security`` that a worker needs."""
     return [name for name in ("tls_ca_file", "tls_worker_cert", "tls_worker_key") if getattr(security, name)]
 
 
@@ -215,9 +277,9 @@ def _drain(process: subprocess.Popen[bytes]) -> None:
 def _on_slurm(
     distributed: Any, options: FarmOptions, slots: Mapping[str, int], scratch: Path, cancelled: IsCancelled
 ) -> Iterator[Any]:
-    """One worker a job; they come when SLURM lets them. The scheduler is this process, reached by TLS."""
+    """Yield a client with one worker per SLURM job; the scheduler is in this process and uses TLS."""
     if shutil.which("sbatch") is None:
-        raise InputError("--farm slurm: there is no sbatch on this machine; run it on a login node of the cluster")
+        raise InputError("--farm slurm: this machine has no sbatch; run it on a login node of the cluster")
     with (
         slurm_cluster(options, slots, scratch) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
@@ -228,10 +290,10 @@ def _on_slurm(
 
 
 def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path) -> Any:
-    """dask-jobqueue's ``SLURMCluster`` as ``options`` ask for it, without jobs yet.
+    """Return dask-jobqueue's ``SLURMCluster`` for ``options``, without jobs yet.
 
-    slots: what each worker has, by name. scratch: folder that all nodes see; certificates are written there, for this
-    user only. Raises InputError when dask-jobqueue is not installed.
+    slots: of each worker, by name. scratch: folder that all nodes share; certificates are written there, readable by
+    this user only. Raises InputError when dask-jobqueue is not installed.
     """
     try:
         from dask_jobqueue.slurm import SLURMCluster
@@ -246,7 +308,7 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         queue=wanted.queue or None,
         account=wanted.account or None,
         walltime=wanted.walltime or "1-00:00:00",
-        # Dask's threads and memory are those of its own process: one task at a time, and no limit of its own.
+        # Dask's threads and memory are those of the worker process itself: one task at a time, without a limit.
         cores=1,
         processes=1,
         memory="1GB",
@@ -260,7 +322,7 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         shared_temp_directory=str(scratch),
         security=True,
         protocol="tls://",
-        # Its pages about itself are there without a dashboard too.
+        # Its status pages are served even without a dashboard.
         scheduler_options={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
     )
 
@@ -273,7 +335,7 @@ def _await_workers(
     complaint: Callable[[], str],
     hopeless: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Wait for ``count`` workers; a part of them is enough after ``seconds``. None waits as long as it takes."""
+    """Wait for ``count`` workers; after ``seconds`` at least one is enough. None waits indefinitely."""
     waited = 0.0
     pause = threading.Event()
     while (present := len(worker_addresses(client))) < count:
@@ -288,7 +350,7 @@ def _await_workers(
 
 
 def worker_addresses(client: Any) -> list[str]:
-    """Addresses of the workers that the scheduler has now."""
+    """Return the addresses of the scheduler's current workers."""
     return sorted(client.nthreads())
 
 

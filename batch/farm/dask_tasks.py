@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What runs on a Dask worker, ours or any other."""
+"""Functions that run on a Dask worker, ours or any other."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from pathlib import Path
 
 from ...sim.errors import Cancelled
 from ...sim.events import Event
-from .execute import execute
-from .task import Outcome, Task
+from .planning.plan import Outcome, Task
+from .task_execution import execute_task
 
 PROGRESS_S = 0.5
-"""Progress of a task is told not more often than this: all of it passes through the scheduler."""
+"""Minimum interval between progress events of a task: they all pass through the scheduler."""
 
 _closed: set[str] = set()
 _stopped: set[str] = set()
-"""Runs of which nothing begins any more, and of which nothing goes on. Only this process's tasks look."""
+"""Runs whose tasks may not start, and whose running tasks must stop, in this process."""
 
 ending = threading.Event()
-"""Set when this worker has to end: then nothing goes on."""
+"""Set when this worker must end, which stops its tasks."""
 
 
-def carry_out(task: Task, root: str, version: str, run: str, threads: int) -> Outcome:
-    """Carry out ``task`` in the folder ``root``; what it says goes to the topic ``run``. For a worker's thread."""
+def run_on_worker(task: Task, root: str, version: str, run: str, threads: int) -> Outcome:
+    """Run ``task`` in the folder ``root`` in a worker's thread; its events go to the topic ``run``."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -47,18 +47,20 @@ def carry_out(task: Task, root: str, version: str, run: str, threads: int) -> Ou
     if run in _closed:
         return Outcome(task=task.id, state="cancelled", exit_code=Cancelled.exit_code, message="cancelled", worker=name)
     worker.log_event(run, {"event": "started", "task": task.id, "place": name})
-    return execute(task, Path(root), version=version, worker=name, cancelled=stopped, on_event=tell, threads=threads)
+    return execute_task(
+        task, Path(root), version=version, worker=name, cancelled=stopped, on_event=tell, threads=threads
+    )
 
 
-def stop(run: str, begun_too: bool) -> None:
-    """Let no task of ``run`` begin at this worker any more; begun_too: ask those that run to stop."""
+def stop_run(run: str, begun_too: bool) -> None:
+    """Start no more tasks of ``run`` at this worker; begun_too: also ask running ones to stop."""
     _closed.add(run)
     if begun_too:
         _stopped.add(run)
 
 
 def read_token(path: str) -> str:
-    """What this machine finds at ``path``; empty when it finds nothing."""
+    """Return the content of ``path`` on this machine; empty if there is none."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, ValueError):
@@ -66,5 +68,5 @@ def read_token(path: str) -> str:
 
 
 def worker_name() -> str:
-    """This process, for people."""
+    """Return a readable name of this process."""
     return f"{socket.gethostname()}:{os.getpid()}"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``python -m physgen.batch.farm.dask_worker ADDRESS``: a Dask worker that is set up for our tasks.
+"""``python -m physgen.batch.farm.dask_worker ADDRESS``: a Dask worker configured for our tasks.
 
-``dask worker ADDRESS --nthreads 1`` does as well. This one takes certificates on standard input too, so that no file
-holds those of a farm that lives for one command.
+``dask worker ADDRESS --nthreads 1`` works as well. This one also reads certificates from standard input, so that those
+of a farm that exists for one command are never on disk.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from pathlib import Path
 from typing import Any
 
 from ...sim.errors import PhysGenError
-from .dask_security import check_trust, file_security
+from .dask_cluster import check_trust, file_security
 from .dask_tasks import ending
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry of a worker: runs until the scheduler or a signal ends it."""
+    """Entry point of a worker: run until the scheduler or a signal ends it; return the exit code."""
     parser = argparse.ArgumentParser(prog="physgen.batch.farm.dask_worker", description=__doc__, allow_abbrev=False)
     parser.add_argument("address", help="of the scheduler: tcp://HOST:PORT or tls://HOST:PORT")
-    slots = "what this machine has of the resources that tasks take, such as gpu=1"
+    slots = "slots that this machine offers to tasks, such as gpu=1"
     parser.add_argument("--slot", action="append", default=[], metavar="NAME=COUNT", help=slots)
-    parser.add_argument("--host", help="address of this machine that the others see (default: the one facing ADDRESS)")
+    parser.add_argument("--host", help="address of this machine for the others (default: the one facing ADDRESS)")
     parser.add_argument("--tls-ca", type=Path, metavar="PEM")
     parser.add_argument("--tls-cert", type=Path, metavar="PEM")
     parser.add_argument("--tls-key", type=Path, metavar="PEM")
-    trust = "take a scheduler on another machine without TLS: whoever reaches this one can run commands as you"
+    trust = "accept a scheduler on another machine without TLS: anyone who reaches this one can run commands as you"
     parser.add_argument("--trust-network", action="store_true", help=trust)
     parser.add_argument("--security-on-stdin", action="store_true", help="certificates come as JSON on standard input")
     options = parser.parse_args(arguments)
@@ -64,10 +64,10 @@ async def _work(address: str, host: str | None, resources: dict[str, float], sec
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory(prefix="physgen-worker-", ignore_cleanup_errors=True) as scratch:
-        # The work is done by processes that it starts, so its own memory says nothing.
+        # Tasks run in child processes, so its own memory is meaningless.
         worker = Worker(
             address,
-            # Told nothing, a worker listens on all interfaces.
+            # By default a worker listens on all interfaces.
             host=host or get_ip(get_address_host(address)),
             nthreads=1,
             resources=resources,
@@ -75,7 +75,7 @@ async def _work(address: str, host: str | None, resources: dict[str, float], sec
             local_directory=scratch,
             memory_limit=0,
             dashboard=False,
-            # Its pages about itself are there without a dashboard too.
+            # Its status pages are served even without a dashboard.
             dashboard_address="127.0.0.1:0",
         )
 
@@ -91,7 +91,7 @@ async def _work(address: str, host: str | None, resources: dict[str, float], sec
             async with worker:
                 await worker.finished()
         finally:
-            # The scheduler may have gone.
+            # The scheduler may be gone.
             ending.set()
 
 

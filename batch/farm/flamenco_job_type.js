@@ -29,7 +29,7 @@ function compileJob(job) {
         task.addCommand(author.Command("exec", {
             exe: settings.python,
             args: [
-                "-m", "physgen.batch.farm.one", settings.plan, name,
+                "-m", "physgen.batch.farm.run_task", settings.plan, name,
                 "--retries", String(settings.retries || 0),
             ],
         }));

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panels of the tab "PhysGen" share: their place and order, what is locked while a bake runs."""
+"""Shared by the panels of the tab "PhysGen": order, locking while a bake runs, job progress, live preview."""
 
 from __future__ import annotations
 
@@ -8,37 +8,41 @@ from typing import Any
 import bpy
 
 from .. import bake_state, text
+from ..background_jobs import Job, PHYSGEN_OT_cancel_job, progress_text, running
+from ..context import TAB
+from ..gizmos import SHOW_ARROWS
 from ..interpreter import TERMINAL
-from ..props.body import is_body
+from ..preview import live_preview
+from ..preview.live_preview import PHYSGEN_OT_toggle_preview
+from ..props.body_props import is_body
 from ..props.preferences import PHYSGEN_AP_preferences
-from ..views import TAB
 
 SCENE, OBJECTS, TOGETHER, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(8)
 """``bl_order``: the order of work."""
 
 COMMAND = f" In {TERMINAL}:"
-"""What precedes the command that installs what a Python lacks (``interpreter``)."""
+"""Prefix of the command that installs missing packages (``interpreter``)."""
 
 
 class Sidebar:
-    """Mixin: a panel of the 3D viewport's sidebar."""
+    """Mixin of panels in the 3D viewport's sidebar."""
 
     bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", TAB
 
 
 def is_baking(scene: bpy.types.Scene) -> bool:
-    """Whether what a bake depends on must not change now."""
+    """Return whether inputs of the bake are locked."""
     return bake_state.state(scene).status == "baking"
 
 
 def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: bool = False) -> bpy.types.UILayout:
-    """A column for settings that a bake depends on: names left, values right; locked while one runs.
+    """Return a column for settings that affect the bake: names left, values right; locked while one runs.
 
-    why: say so above it; once a panel is enough.
+    why: draw the reason above it; once a panel is enough.
     """
     locked = is_baking(context.scene)
     if locked and why:
-        text.sentences(layout, context, "Locked while baking. Pause or cancel to change it.", icon="LOCKED")
+        text.sentences(layout, context, "Locked while baking. Pause or cancel the bake to edit.", icon="LOCKED")
     column = layout.column()
     column.use_property_split, column.use_property_decorate = True, False
     column.enabled = not locked
@@ -46,14 +50,14 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
 
 
 def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Context, surface: Any) -> None:
-    """Where ``surface`` (a body or the world) has less static than sliding friction: what counts then."""
+    """Draw the effective static friction where ``surface`` (a body or the world) has less than sliding friction."""
     if surface.static_friction < surface.friction:
         words = f"Static friction counts as {surface.friction:.3g}: it is never below the sliding one."
         text.sentences(layout, context, words, icon="INFO")
 
 
 def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message: str, *, icon: str = "NONE") -> None:
-    """What went wrong; where the Python is to blame, the way to the preferences instead of a long command."""
+    """Draw an error; for a Python problem, a button to the preferences instead of a long command."""
     words, command, _ = message.partition(COMMAND)
     text.sentences(layout, context, text.brief(words), icon=icon)
     if command:
@@ -61,12 +65,74 @@ def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message
         button.module = PHYSGEN_AP_preferences.bl_idname
 
 
-def active_body(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The active object, if it takes part in the simulation."""
+def active_body(context: bpy.types.Context) -> Any:
+    """Return the active object if it is simulated."""
     item = context.active_object
     return item if is_body(item) else None
 
 
 def is_in(item: bpy.types.Object, scene: bpy.types.Scene) -> bool:
-    """Whether ``item`` is in the scene; a deleted object lives on as long as something points to it."""
+    """Return whether ``item`` is in the scene; a deleted object lives on while it is referenced."""
     return scene.objects.get(item.name) == item
+
+
+def draw_job(layout: bpy.types.UILayout) -> None:
+    """Draw progress and Cancel of the running job; nothing without one."""
+    job = running()
+    if job is not None:
+        draw_progress(layout, job).operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+
+
+def draw_progress(layout: bpy.types.UILayout, job: Job) -> bpy.types.UILayout:
+    """Draw a progress bar and the message of ``job``; return the bar's row, for a button beside it."""
+    column = layout.column(align=True)
+    row = column.row(align=True)
+    row.scale_y = 1.4
+    row.progress(factor=job.fraction or 0.0, text=progress_text(job))
+    if job.message:
+        column.label(text=job.message)
+    return row
+
+
+NOTICE = 120
+"""Maximum length of a notice in characters."""
+
+WORDS = {
+    "starting": ("Starting the worker", "TIME"),
+    "compiling": ("Preparing: seconds, once", "TIME"),
+    "running": ("Simulating", "PLAY"),
+    "playing": ("Playing", "PLAY"),
+}
+
+
+def draw_preview(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the button, the preview's state, and differences from the bake."""
+    session = live_preview.session()
+    column = layout.column(align=True)
+    column.operator(
+        PHYSGEN_OT_toggle_preview.bl_idname,
+        text="Stop Live Preview" if session is not None else "Live Preview",
+        icon="PAUSE" if session is not None else "PLAY",
+        depress=session is not None,
+    )
+    if session is None:
+        return
+    scene = session.scene()
+    if scene is not None and scene != context.scene:
+        column.label(text=f"On in scene {scene.name}", icon="INFO")
+        return
+    if session.state == "error":
+        draw_trouble(column, context, session.message, icon="ERROR")
+        return
+    words, icon = WORDS[session.state]
+    column.label(text=f"{words}: {session.message}" if session.message else words, icon=icon)
+    # All notices would push the Bake button out of sight; a bake reports all of them.
+    for notice in session.notices[:1]:
+        text.sentences(column, context, text.brief(notice, NOTICE), icon="INFO")
+    if len(session.notices) > 1:
+        column.label(text=f"and {len(session.notices) - 1} more; a bake says them all", icon="BLANK1")
+
+
+def draw_arrows(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the toggle of the viewport arrows, for the panel of initial motion."""
+    layout.prop(context.window_manager, SHOW_ARROWS, icon="EMPTY_SINGLE_ARROW")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender remembers for PhysGen: in the scene, so that it is saved and undone, and in the preferences."""
+"""Properties stored by PhysGen: in the scene, hence saved and undone, and in the preferences."""

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The add-on's preferences: which Python simulates, and what came of asking it."""
+"""Preferences: the Python interpreter for simulations, and the result of its check."""
 
 import bpy
 
 from .. import text
+from ..context import redraw
 from ..interpreter import TERMINAL, home_folder
-from ..views import redraw
 
 ADDON = __package__.removesuffix(".physgen_addon.props")
-"""Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` where it is installed."""
+"""Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` when installed."""
 
 
 def _forget(self: "PHYSGEN_AP_preferences", context: bpy.types.Context) -> None:
@@ -23,8 +23,8 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
     python: bpy.props.StringProperty(
         name="Python",
         description=(
-            "Interpreter that simulates and diagnoses, or the folder of its virtual environment. It needs the "
-            "packages that Check names, not PhysGen itself. Empty: the one in the environment variable "
+            "Python interpreter for simulation and diagnosis, or the folder of its virtual environment. It needs the "
+            "packages listed by Check, not PhysGen itself. Empty: the environment variable "
             "PHYSGEN_PYTHON, else Blender's own, else the folder physgen-python in your home folder"
         ),
         subtype="FILE_PATH",
@@ -35,9 +35,9 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
     check_command: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     def draw(self, context: bpy.types.Context) -> None:
-        """The preferences' page."""
+        """Draw the preferences."""
         layout = self.layout
-        layout.label(text="Simulations run in a Python of their own, beside Blender.")
+        layout.label(text="Simulations run in a separate Python process.")
         split = layout.split(factor=0.85, align=True)
         split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
         split.operator("physgen.check_python")
@@ -59,18 +59,15 @@ def _own(context: bpy.types.Context) -> PHYSGEN_AP_preferences | None:
 
 
 def python(context: bpy.types.Context) -> str:
-    """The interpreter named in the preferences; empty where none is, or the add-on was registered by a script."""
+    """Return the interpreter set in the preferences; empty if none, or if registered by a script."""
     own = _own(context)
     return bpy.path.abspath(own.python) if own and own.python else ""
 
 
 def show_check(context: bpy.types.Context, answer: str, sentence: str, command: str) -> None:
-    """Show what a check found on the preferences' page. answer: YES, NO, or empty for none."""
+    """Show the result of a check in the preferences. answer: YES, NO, or empty for none."""
     own = _own(context)
     if own is None:
         return
     own.check, own.check_text, own.check_command = answer, sentence, command
     redraw("PREFERENCES")
-
-
-CLASSES = (PHYSGEN_AP_preferences,)

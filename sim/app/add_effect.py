@@ -13,8 +13,8 @@ from typing import Any
 from ..effects.registry import effect
 from ..errors import Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
-from ..scene.folder import SceneFolder, load_scene, save_scene
-from ..scene.model import Effect, Scene
+from ..scene.folder import Scene, load_scene, save_scene
+from ..scene.model import Effect, SceneModel
 
 FoundEffects = Mapping[str, Mapping[str, float]]
 """Effect → parameter → value, in the order in which the diagnosis found them."""
@@ -52,7 +52,7 @@ def _number(name: str, key: str, entry: Any) -> float:
     return float(value)
 
 
-def with_effects(scene: Scene, found: FoundEffects) -> Scene:
+def with_effects(scene: SceneModel, found: FoundEffects) -> SceneModel:
     """``scene`` with the ``found`` effects; one of the same name is replaced in its place and keeps its objects.
 
     Raises InputError for an unknown effect, a parameter out of its range, and where all that was found concerns the
@@ -79,18 +79,17 @@ def with_effects(scene: Scene, found: FoundEffects) -> Scene:
     return dataclasses.replace(scene, effects=tuple(effects))
 
 
-def without_effects(scene: Scene, names: Collection[str]) -> Scene:
+def without_effects(scene: SceneModel, names: Collection[str]) -> SceneModel:
     """``scene`` without the effects called ``names``."""
     return dataclasses.replace(scene, effects=tuple(item for item in scene.effects if item.name not in names))
 
 
-def add_effects(root: Path, found: FoundEffects) -> SceneFolder:
-    """Put ``found`` into the scene folder ``root``; ``scene.json`` is replaced whole or stays as it was.
+def add_effects(scene: Scene, found: FoundEffects) -> Scene:
+    """Return ``scene`` with the effects ``found`` added, saved in its folder (whole or not at all).
 
-    Raises InputError as ``load_scene`` and ``with_effects`` do.
+    Raises InputError as ``with_effects`` does.
     """
-    folder = load_scene(root)
-    return save_scene(root, with_effects(folder.scene, found))
+    return save_scene(scene.root, with_effects(scene.model, found))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +112,7 @@ def add_and_bake(request: AddRequest, run_bake: RunBake, on_event: OnEvent, canc
     A bake that fails leaves ``scene.json`` as it was before; one that is cancelled in the second bake leaves the
     effects in, so that the same call goes on from there. Returns ``{"event": "done", "scene", "before", "after"}``.
     """
-    original = load_scene(request.scene).scene
+    original = load_scene(request.scene).model
     changed = with_effects(original, request.found)
     try:
         if request.bake_before:

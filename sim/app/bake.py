@@ -15,28 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_json
-from ..cache.folder import remove_leftovers, remove_listed
-from ..cache.lock import folder_lock
-from ..cache.manifest import (
+from ..cache.bake_folder import (
     CHECKPOINT_FILE,
     MANIFEST_FILE,
     METRICS_FILE,
+    Bake,
     BakeManifest,
     load_manifest,
+    remove_leftovers,
+    remove_listed,
     save_manifest,
 )
+from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import Cancelled, InputError, PhysGenError, SimulationError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
-from ..scene.folder import SceneFolder, load_scene
+from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
 from ..version import VERSION
 from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
 from .bake_estimate import disk_bytes, require_disk_space
-from .bake_inputs import BakeOptions, geometry_hash, inputs_hash
-from .bake_samples import ObjectSampler, baked_objects
-from .bake_splats import load_object_splats
-from .setup_world import prepare_world
+from .bake_options import BakeOptions, geometry_hash, inputs_hash
+from .bake_samples import ObjectSampler, baked_objects, load_object_splats
+from .world_setup import prepare_world
 
 __all__ = ["CHECKPOINT_FILE", "BakeOptions", "bake", "is_up_to_date"]
 
@@ -55,15 +56,15 @@ PART_WORK = 2e7
 between which its state can be kept; by the estimate, not by the clock, so that the same input gives the same bytes."""
 
 
-def is_up_to_date(scene_root: Path, out: Path, options: BakeOptions) -> bool:
-    """Whether ``out`` holds the complete bake of the scene as it is now."""
-    return _complete(load_scene(scene_root), out, options) is not None
+def is_up_to_date(scene: Scene, out: Path, options: BakeOptions) -> bool:
+    """Return whether ``out`` holds the complete bake of ``scene``."""
+    return _complete(scene, out, options) is not None
 
 
-def _complete(folder: SceneFolder, out: Path, options: BakeOptions) -> BakeManifest | None:
+def _complete(scene: Scene, out: Path, options: BakeOptions) -> BakeManifest | None:
     try:
         manifest = load_manifest(out)
-        if manifest.state != "complete" or manifest.inputs_hash != inputs_hash(folder, options):
+        if manifest.state != "complete" or manifest.inputs_hash != inputs_hash(scene, options):
             return None
         for name, count in manifest.files.items():
             cache = Pc2Reader(out / name)
@@ -77,29 +78,36 @@ def _complete(folder: SceneFolder, out: Path, options: BakeOptions) -> BakeManif
 
 
 def bake(
-    scene_root: Path,
-    out: Path,
+    scene: Scene,
+    *,
+    out: str | Path,
     options: BakeOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
-) -> BakeManifest:
-    """Simulate the scene at ``scene_root`` into the bake folder ``out``.
+) -> Bake:
+    """Simulate ``scene`` and return its bake, the folder ``out``: one point cache per object.
 
-    Nothing happens when ``out`` already holds it; a run that was stopped goes on from its last checkpoint.
+    Does nothing when ``out`` already holds this bake; a run that was stopped resumes from its last checkpoint.
+    on_event receives progress and notices (dicts, ``sim/events.py``); cancelled is polled often and must be cheap.
 
-    Raises InputError for a scene, option or folder that cannot be used, SimulationError when the run diverged (the
-    frames that were good are kept), Cancelled when asked to stop. ``cancelled`` is asked often, so it must be cheap.
+    >>> import physgen
+    >>> scene = physgen.load_scene("scene")  # doctest: +SKIP
+    >>> baked = physgen.bake(scene, out="bake", options=physgen.BakeOptions(frames=24))  # doctest: +SKIP
+    >>> baked.vertices(scene.objects[0].name, frame=baked.last_frame).shape  # doctest: +SKIP
+    (4098, 3)
+
+    Raises InputError for an unusable scene, option or folder, SimulationError when the simulation diverges (complete
+    frames are kept), Cancelled when cancelled.
     """
-    options = options or BakeOptions()
+    options, out = options or BakeOptions(), Path(out)
     progress = StageProgress(on_event, "bake", options.frames)
-    folder = load_scene(scene_root)
-    done = _complete(folder, out, options)
+    done = _complete(scene, out, options)
     if done is not None:
         progress.notice(f"up to date: {out}")
-        return done
+        return Bake(root=out, manifest=done)
     _refuse_foreign_folder(out)
     with folder_lock(out), _named_errors(out):
-        return _bake_locked(folder, out, options, progress, cancelled)
+        return Bake(root=out, manifest=_bake_locked(scene, out, options, progress, cancelled))
 
 
 def _refuse_foreign_folder(out: Path) -> None:
@@ -122,7 +130,7 @@ def _named_errors(out: Path) -> Iterator[None]:
 
 
 def _bake_locked(
-    folder: SceneFolder, out: Path, options: BakeOptions, progress: StageProgress, cancelled: IsCancelled
+    folder: Scene, out: Path, options: BakeOptions, progress: StageProgress, cancelled: IsCancelled
 ) -> BakeManifest:
     # Imported here, because opening Blender or rendering a frame must never pay for Taichi.
     from .simulation import build_world
@@ -132,8 +140,8 @@ def _bake_locked(
             raise Cancelled("bake cancelled before its first frame; run it again to start")
 
     progress.report(0, "sampling particles")
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
-    splats = [load_object_splats(folder, *pair) for pair in zip(folder.scene.objects, meshes, strict=True)]
+    meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
+    splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
     go_on()
     prepared = prepare_world(folder, meshes, options)
     objects = baked_objects(folder, meshes, splats, prepared, options)
@@ -157,7 +165,7 @@ def _bake_locked(
     samplers = [
         ObjectSampler(slot, baked, mesh, seen, np.asarray(item.world_from_mesh), simulation)
         for slot, (baked, mesh, seen, item) in enumerate(
-            zip(objects, meshes, splats, folder.scene.objects, strict=True)
+            zip(objects, meshes, splats, folder.model.objects, strict=True)
         )
     ]
     remove_leftovers(out)

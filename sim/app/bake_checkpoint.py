@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
-from ..cache.manifest import CHECKPOINT_FILE, BakeManifest, load_manifest
+from ..cache.bake_folder import CHECKPOINT_FILE, BakeManifest, load_manifest
 from ..cache.pc2 import Pc2Reader
 from ..errors import InputError
 

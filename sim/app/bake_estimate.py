@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..cache.manifest import BakedObject
+from ..cache.bake_folder import BakedObject
 from ..errors import InputError
-from ..scene.folder import SceneFolder
+from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
-from .bake_inputs import BakeOptions
-from .bake_samples import baked_objects
-from .bake_splats import load_object_splats
-from .setup_world import PreparedWorld, prepare_world
+from .bake_options import BakeOptions
+from .bake_samples import baked_objects, load_object_splats
+from .world_setup import PreparedWorld, prepare_world
 
 STATE_BYTES = 190
 """Of a checkpoint, a particle, with all that any law keeps."""
@@ -57,7 +56,7 @@ class BakeCost:
         }
 
 
-def estimate_bake(folder: SceneFolder, options: BakeOptions) -> PreparedWorld:
+def estimate_bake(folder: Scene, options: BakeOptions) -> PreparedWorld:
     """The world that a bake of ``folder`` would begin with; its ``cost`` is time and memory.
 
     Raises InputError as ``setup_world.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
@@ -65,10 +64,10 @@ def estimate_bake(folder: SceneFolder, options: BakeOptions) -> PreparedWorld:
     return bake_cost(folder, options).prepared
 
 
-def bake_cost(folder: SceneFolder, options: BakeOptions) -> BakeCost:
+def bake_cost(folder: Scene, options: BakeOptions) -> BakeCost:
     """What a bake of ``folder`` will take, disk included. Raises InputError as ``estimate_bake`` does."""
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
-    splats = [load_object_splats(folder, *pair) for pair in zip(folder.scene.objects, meshes, strict=True)]
+    meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
+    splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
     prepared = prepare_world(folder, meshes, options)
     objects = baked_objects(folder, meshes, splats, prepared, options)
     return BakeCost(prepared=prepared, disk_bytes=disk_bytes(objects, prepared.particle_count, options.frames))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What a bake writes at each frame: the vertices of every object, the particles of those that flow, and splats."""
+"""The splats of an object in a bake: read, and led by what leads the object's mesh.
+
+What a bake writes at each frame: the vertices of every object, the particles of those that flow, and splats."""
 
 from __future__ import annotations
 
@@ -10,29 +12,94 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cache.manifest import GRAINS, MESH_SPACE, SURFACE, BakedObject
-from ..gaussians.moving import from_points
-from ..gaussians.ply.write import write_splats
-from ..gaussians.splats import Splats
-from ..mpm.materials import FLUID, SAND, SNOW, FluidMaterial, RigidMaterial
-from ..scene.folder import SceneFolder
+from ..cache.bake_folder import GRAINS, MESH_SPACE, SURFACE, BakedObject
+from ..constitutive import FLUID, SHAPED, RigidMaterial
+from ..errors import InputError
+from ..gaussians.splat_ply import read_splats, write_splats
+from ..gaussians.splats import (
+    Splats,
+    as_points,
+    bind_splats,
+    deformed_half_axes,
+    from_points,
+    half_axes,
+    transform_splats,
+)
+from ..scene.folder import Scene
 from ..scene.meshes import ObjectMesh
-from ..skinning.binding import bind, deform
-from .bake_inputs import BakeOptions
-from .bake_splats import MovingSplats
-from .setup_world import PreparedWorld
+from ..scene.model import SceneObject
+from ..skinning import bind, deform
+from .bake_options import BakeOptions
+from .world_setup import PreparedWorld
 
 if TYPE_CHECKING:
     from .simulation import Simulation
 
+
 Array = NDArray[np.float64]
 
-AS_PARTICLES = frozenset({SAND, FLUID, SNOW})
-"""Laws whose matter is shown by its particles as well: its skin tears or covers what it should not."""
+LEAST_BESIDE = 0.5
+"""Share of the splats that must lie in the mesh's box, grown to three times its size; others are of something else."""
+
+
+def load_object_splats(folder: Scene, item: SceneObject, mesh: ObjectMesh) -> Splats | None:
+    """The splats of ``item``, whose mesh is ``mesh``, in the mesh file's own coordinates; None for one without.
+
+    Raises InputError for a file that cannot be read, or whose splats lie far from the mesh.
+    """
+    if item.splats is None:
+        return None
+    splats = read_splats(folder.file(item.splats))
+    low, high = mesh.in_file.min(axis=0), mesh.in_file.max(axis=0)
+    reach = float((high - low).max())
+    beside = ((splats.centres > low - reach) & (splats.centres < high + reach)).all(axis=1)
+    if beside.mean() < LEAST_BESIDE:
+        raise InputError(
+            f"object {item.name}: {1 - beside.mean():.0%} of the splats in {item.splats} lie far from the mesh "
+            f"{item.mesh}: both must be in the same coordinates; import the splats again (physgen import)"
+        )
+    return splats
+
+
+class MovingSplats:
+    """Splats of one object, as the points of ``moving.as_points`` (4N, 3).
+
+    rest: in the mesh file's coordinates, which names their opacities and colours.
+    """
+
+    def __init__(self, rest: Splats, world_from_mesh: Array, vertices: Array, particles: Array | None) -> None:
+        """vertices: (V, 3) of the mesh; particles: (P, 3) of the matter, None for a collider; at rest in the world."""
+        self.rest = rest
+        self._world = transform_splats(rest, world_from_mesh)
+        self._vertices = vertices
+        self._binding = None if particles is None else bind_splats(self._world, particles)
+
+    def at_rest(self, *, in_world: bool) -> Array:
+        """In the world, or in the mesh file's coordinates, where they are the file's own to rounding."""
+        splats = self._world if in_world else self.rest
+        return as_points(splats.centres, half_axes(splats))
+
+    def with_matter(self, positions: Array, gradients: Array) -> Array:
+        """In the world, where particles (P, 3) and their deformation gradients (P, 3, 3) have taken them."""
+        assert self._binding is not None
+        return as_points(*deformed_half_axes(self._world, self._binding, positions, gradients))
+
+    def with_vertices(self, vertices: Array) -> Array:
+        """In the world, where the rigid motion that took the mesh to ``vertices`` (V, 3) takes them."""
+        matrix = _affine_map(self._vertices, vertices)
+        return self.at_rest(in_world=True) @ matrix[:3] + matrix[3]
+
+
+def _affine_map(before: Array, after: Array) -> Array:
+    """(4, 3) M with [before, 1] M = after in least squares; about the middle, so that places far away cost nothing."""
+    middle = before.mean(axis=0)
+    found = np.linalg.lstsq(np.column_stack([before - middle, np.ones(len(before))]), after, rcond=None)[0]
+    found[3] -= middle @ found[:3]
+    return np.asarray(found)
 
 
 def baked_objects(
-    folder: SceneFolder,
+    folder: Scene,
     meshes: Sequence[ObjectMesh],
     splats: Sequence[Splats | None],
     prepared: PreparedWorld,
@@ -41,7 +108,7 @@ def baked_objects(
     """The caches that a bake of the scene has, one entry an object."""
     return tuple(
         _baked_object(item.name, len(mesh.vertices), len(seen or ()), prepared, slot, options)
-        for slot, (item, mesh, seen) in enumerate(zip(folder.scene.objects, meshes, splats, strict=True))
+        for slot, (item, mesh, seen) in enumerate(zip(folder.model.objects, meshes, splats, strict=True))
     )
 
 
@@ -58,7 +125,7 @@ def _baked_object(
         space=options.space,
         points_file=f"{name}.points.pc2" if points else None,
         points=points,
-        points_as=SURFACE if points and isinstance(material, FluidMaterial) else GRAINS,
+        points_as=SURFACE if points and getattr(material, "cohesion", None) == FLUID else GRAINS,
         splats_file=f"{name}.splats.pc2" if splats else None,
         splats_folder=f"{name}.splats" if splats else None,
         splats=splats,
@@ -66,14 +133,14 @@ def _baked_object(
 
 
 def _points(prepared: PreparedWorld, slot: int) -> int:
-    """Particles of object ``slot`` if it is, or becomes, of one of the ``AS_PARTICLES`` laws, else 0."""
+    """Particles of object ``slot`` if it has no shape to return to, so that its skin can tear, else 0."""
     index = prepared.body_of_object[slot]
     if index is None:
         return 0
     body = prepared.setup.bodies[index]
     if isinstance(body.material, RigidMaterial):
         return 0
-    return body.count if any(m.law in AS_PARTICLES for m in (body.material, *body.materials)) else 0
+    return body.count if any(m.cohesion != SHAPED for m in (body.material, *body.materials)) else 0
 
 
 class ObjectSampler:

@@ -7,34 +7,43 @@ import shutil
 from pathlib import Path
 
 from ..atomic import replacing
-from ..diagnose.capture import load_capture
-from ..diagnose.conclude import DiagnoseOptions, diagnose
+from ..diagnose import run_diagnosis
+from ..diagnose.capture import Capture
 from ..diagnose.diagnosis import REPORT_FILE, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
+from ..diagnose.run_diagnosis import DiagnoseOptions
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 
 
-def diagnose_capture(
-    root: Path,
-    out: Path,
+def diagnose(
+    capture: Capture,
+    *,
+    out: str | Path,
     options: DiagnoseOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> Diagnosis:
-    """Diagnose the capture folder ``root`` and write the folder ``out``, whole or not at all.
+    """Return which unmodelled effect explains ``capture``, and write the diagnosis folder ``out``, whole or not at all.
 
-    An earlier diagnosis in ``out`` is replaced. Raises what ``load_capture`` and ``diagnose`` raise, and InputError
-    when ``out`` holds something else.
+    ``out`` holds report.json, report.html with its pictures, where.npz and prediction.npz (docs/diagnosis.md); an
+    earlier diagnosis there is replaced.
+
+    >>> import physgen
+    >>> capture = physgen.load_capture("capture")  # doctest: +SKIP
+    >>> physgen.diagnose(capture, out="diagnosis").verdict.effect  # doctest: +SKIP
+    'air_drag'
+
+    Raises InputError when ``out`` holds something else, and what ``sim.diagnose.run_diagnosis.diagnose`` raises.
     """
+    out = Path(out)
     if out.exists() and not (out / REPORT_FILE).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there and holds no diagnosis; choose another folder")
-    if out.resolve() == root.resolve():
+    if capture.root is not None and out.resolve() == capture.root.resolve():
         raise InputError(f"{out}: is the capture itself; choose another folder")
-    capture = load_capture(root)
     for warning in capture.warnings:
         on_event({"event": "notice", "stage": "diagnose", "message": warning})
-    diagnosis = diagnose(capture, options, on_event, cancelled)
+    diagnosis = run_diagnosis.diagnose(capture, options, on_event, cancelled)
     with replacing(out) as partial:
         partial.mkdir()
         write_diagnosis(diagnosis, partial)

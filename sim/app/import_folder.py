@@ -1,18 +1,47 @@
 # SPDX-License-Identifier: MIT
-"""What another program has written, a folder or a file of splats → a scene folder."""
+"""Files of other programs: a folder of PhysGen or PhysGen3D or a splat file → a scene folder; masks → objects."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from ..atomic import replacing
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
-from ..importers.physgen import MASKS, SETTINGS
+from ..importers.masks import read_masks
+from ..importers.physgen import MASKS, SETTINGS, import_physgen
 from ..importers.physgen3d import TRANSFORM_FILE
-from ..scene.folder import SceneFolder
-from .import_physgen import import_physgen
-from .import_physgen3d import import_physgen3d
-from .import_splats import DEFAULT_UP, import_splats
+from ..importers.physgen3d_scene import import_physgen3d
+from ..importers.splat_scene import DEFAULT_UP_AXIS, import_splats
+from ..reconstruct import ObjectRequest
+from ..reconstruct.photo import load_photo
+from ..scene.folder import Scene
+
+
+def mask_requests(
+    path: Path, photo: Path, folder: Path, *, max_size: int, only: Sequence[str] = ()
+) -> tuple[ObjectRequest, ...]:
+    """Return an object request for each mask in ``path`` (``sim.importers.masks``) of ``photo``; writes the masks to
+    ``folder``, where a correction finds them again.
+
+    max_size: longest side in pixels of the written masks, the resolution of the reconstruction. only: names to import;
+    () for all. Raises InputError for files that cannot be read or hold no mask.
+    """
+    picture = load_photo(photo, max_size)
+    found = read_masks(path, picture.width, picture.height, photo.name, only)
+    if not found:
+        raise InputError(f"{path}: contains no mask; give --box around each object instead")
+    requests = []
+    for item in found:
+        target = folder / f"{item.name}.png"
+        with replacing(target) as partial:
+            Image.fromarray(item.mask.astype(np.uint8) * 255).save(partial)
+        requests.append(ObjectRequest(mask=target, name=item.name, kind=item.kind))
+    return tuple(requests)
 
 
 def import_folder(
@@ -24,27 +53,26 @@ def import_folder(
     up: str | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
-) -> SceneFolder:
-    """Turn ``root`` into the scene folder ``out``: PhysGen3D's if it has a ``transform.json``, else PhysGen's; or a
-    file of splats.
+) -> Scene:
+    """Return the scene folder ``out`` made of ``root``: a folder of PhysGen3D or PhysGen, or a splat file.
 
-    size_m: largest extent of the first object in metres. settings: YAML file of PhysGen3D's simulation. up: axis of a
-    file of splats, one of ``import_splats.UPS``.
-    Raises InputError for what is none of them or does not go with them, and what their importers raise.
+    size_m: largest extent of the first object in metres. settings: YAML file of PhysGen3D's simulation. up: up axis of
+    a splat file, one of ``splat_scene.SPLAT_UP_AXES``. Raises InputError for anything else and for arguments that do
+    not apply, and what the importers raise.
     """
     if root.is_file():
         if settings is not None:
-            raise InputError(f"--settings {settings}: {root} is a file of splats, which has none; leave the flag out")
-        return import_splats(root, out, size_m=size_m, up=up or DEFAULT_UP, on_event=on_event)
+            raise InputError(f"--settings {settings}: {root} is a splat file, which has none; omit the flag")
+        return import_splats(root, out, size_m=size_m, up=up or DEFAULT_UP_AXIS, on_event=on_event)
     if up is not None:
-        raise InputError(f"--up {up}: {root} is no file of splats; leave the flag out")
+        raise InputError(f"--up {up}: {root} is not a splat file; omit the flag")
     if (root / TRANSFORM_FILE).is_file():
         return import_physgen3d(root, out, size_m=size_m, settings=settings, on_event=on_event)
     if (root / SETTINGS).is_file() and (root / MASKS).is_file():
         if settings is not None:
-            raise InputError(f"--settings {settings}: PhysGen's settings are {root / SETTINGS}; leave the flag out")
+            raise InputError(f"--settings {settings}: PhysGen's settings are {root / SETTINGS}; omit the flag")
         return import_physgen(root, out, size_m=size_m, on_event=on_event, cancelled=cancelled)
     raise InputError(
-        f"{root}: holds neither {TRANSFORM_FILE}, as PhysGen3D's perception writes it, nor {SETTINGS} and {MASKS}, as "
-        "PhysGen has them; choose such a folder, or a PLY file of splats"
+        f"{root}: contains neither {TRANSFORM_FILE} of PhysGen3D's perception nor {SETTINGS} and {MASKS} of PhysGen; "
+        "choose such a folder, or a PLY file of splats"
     )

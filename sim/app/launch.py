@@ -3,12 +3,12 @@
 
 An installed extension is called ``bl_ext.<repository>.physgen``, and the interpreter that simulates may have no
 ``physgen``, or another version of it. Here the tree becomes the package ``physgen``, whatever else is installed, so
-that the code that works is the code that asked.
+that caller and worker run the same code.
 
-MODULE: from the tree's root, such as ``batch.cli``. --packages: a folder of packages that the interpreter would not
-look in, such as the extension's wheels; asked last, and inherited by what is started from here. --folder: the working
-folder. --parent: the process that waits for this one; when it is gone, this one is asked to stop, then ended. No syntax
-newer than Python 3.6, so that an old interpreter is told apart from a broken one.
+MODULE: from the tree's root, such as ``batch.cli``. --packages: another folder of packages, such as the extension's
+wheels; searched last, and inherited by child processes. --folder: the working folder. --parent: a process; when it has
+ended, this one is asked to stop, then ended. No syntax newer than Python 3.6, so that an old interpreter can report its
+version.
 """
 
 import importlib.util
@@ -24,14 +24,14 @@ PACKAGE = "physgen"
 PACKAGES_VARIABLE = "PHYSGEN_PACKAGES"
 OLDEST = (3, 11)
 ORPHAN_GRACE_S = 20.0
-"""How long a process that nobody waits for any more may take to put things in order."""
+"""Time for an orphaned process to clean up."""
 
 
 def main(arguments: "list[str]") -> None:
-    """Take the options off ``arguments`` and run the module as ``__main__``."""
+    """Parse the options in ``arguments`` and run the module as ``__main__``."""
     if sys.version_info[:2] < OLDEST:
         sys.exit("Python {}.{} is too old: 3.11 to 3.13 are needed".format(*sys.version_info[:2]))
-    # Python puts the script's folder first in its search path, where ours would hide other modules called process.
+    # Python puts the script's folder first in its search path, where ours could shadow modules of the same names.
     here = Path(__file__).absolute().parent
     hiding = (here, here.parents[1] / "batch")
     sys.path[:] = [entry for entry in sys.path if Path(entry).absolute() not in hiding]
@@ -55,7 +55,7 @@ def main(arguments: "list[str]") -> None:
 
 
 def _end_with(parent: int) -> None:
-    """Wait until the process ``parent`` is gone, then end this one."""
+    """Wait until the process ``parent`` has ended, then end this one."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os.kill(os.getpid(), signal.SIGTERM)

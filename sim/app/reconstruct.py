@@ -1,30 +1,38 @@
 # SPDX-License-Identifier: MIT
-"""Photo → scene folder, once: the same photo, boxes and options are not reconstructed twice."""
+"""Photo → scene folder, once: the same photo, boxes and options are not reconstructed twice.
+
+A correction of a scene that was reconstructed: the same photo again, with something told that was guessed wrong.
+
+What the correction does not touch is not computed again (``sim/reconstruct/stage_store``). What has been changed in the
+scene since, matter, motion, effects, light, stays."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+import shutil
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from ..atomic import write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
-from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct
-from ..reconstruct.adapters.names import spec_files
+from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
+from ..reconstruct.adapters.adapter_registry import spec_files
 from ..reconstruct.adapters.protocols import STAGES
-from ..reconstruct.physics.chat import ChatRequest
+from ..reconstruct.reasoning.chat_client import ChatRequest
+from ..reconstruct.scene_output import PHYSICS_FILE
 from ..scene.environment import read_environment
-from ..scene.folder import SceneFolder, load_scene, parse_scene, save_scene, scene_to_json
-from ..scene.json_fields import parse, read_json, to_json
-from ..scene.materials import load_preset
-from ..scene.model import Ground, Scene, Vector
+from ..scene.folder import Scene, load_scene, parse_scene, save_scene, scene_to_json
+from ..scene.material import load_preset
+from ..scene.model import Ground, SceneModel, Vector
 from ..scene.overrides import PHYSICS_FIELDS, apply_overrides, without_physics
-from .bake_inputs import file_hash
+from ..validation import parse, read_json, to_json
+from .bake_options import file_hash
 
 T = TypeVar("T")
 
@@ -48,32 +56,81 @@ class Stamp:
     scene: Any
 
 
-def reconstruct_scene(
+@dataclass(frozen=True, kw_only=True)
+class Physics:
+    """Materials and motion of a scene's objects, in their order; objects beyond a list keep their defaults.
+
+    presets: material presets (``presets/materials``); a single one goes to all objects. velocities: m/s, spins: rad/s,
+    at time 0 in the world frame. overrides: ``OBJECT.FIELD=VALUE``, applied last (``sim/scene/overrides``).
+    """
+
+    presets: tuple[str, ...] = ()
+    velocities: tuple[Vector, ...] = ()
+    spins: tuple[Vector, ...] = ()
+    overrides: tuple[str, ...] = ()
+
+
+def reconstruct(
+    photo: str | Path,
+    objects: Sequence[ObjectRequest],
+    *,
+    out: str | Path,
+    options: ReconstructOptions | None = None,
+    physics: Physics | None = None,
+    ask: ChatRequest | None = None,
+    answered: str | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Scene:
+    """Return the scene reconstructed from ``photo`` as the folder ``out``; what is already there is not done again.
+
+    objects: one request per object: a box (x0, y0, x1, y1 in pixels) or a mask, and what is known of it.
+    physics: overrides the requests' presets, velocities and spins. The physics asked for is always applied, to a
+    cached scene as well; effects that were added to the scene since stay.
+    ask: a chat model to query for what the objects are; answered: an earlier reply of one, in its place.
+
+    >>> import physgen
+    >>> cup = physgen.ObjectRequest(box=(215, 960, 475, 1190), velocity=(0, 0, 1.5))
+    >>> scene = physgen.reconstruct("photo.jpg", [cup], out="scene")  # doctest: +SKIP
+    >>> [item.name for item in scene.objects]  # doctest: +SKIP
+    ['object_1']
+
+    Raises InputError for an unreadable photo, mask or option, Cancelled when cancelled; ``out`` is then unchanged.
+    """
+    photo, out, options, physics = Path(photo), Path(out), options or ReconstructOptions(), physics or Physics()
+    require_physics(len(objects), physics)
+    scene = _reconstruct_cached(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
+    velocities = (*physics.velocities, *(item.velocity for item in objects[len(physics.velocities) :]))
+    spins = (*physics.spins, *(item.spin for item in objects[len(physics.spins) :]))
+    asked = dataclasses.replace(physics, velocities=velocities, spins=spins)
+    return set_all_physics(scene, asked, friction=options.friction)
+
+
+def _reconstruct_cached(
     photo: Path,
     objects: Sequence[ObjectRequest],
     out: Path,
-    options: ReconstructOptions | None = None,
-    on_event: OnEvent = ignore,
-    cancelled: IsCancelled = never,
+    options: ReconstructOptions,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
     *,
     ask: ChatRequest | None = None,
     answered: str | None = None,
-) -> SceneFolder:
-    """Reconstruct ``photo`` into the scene folder ``out``, unless it is there already.
-
-    ask: a model to ask what things are; answered: what one answered before, in its place. Physics (preset, velocity,
-    spin) does not count: ``set_physics`` changes it in the finished scene. Raises what ``sim.reconstruct.reconstruct``
-    raises.
-    """
-    options = options or ReconstructOptions()
+) -> Scene:
+    """The scene folder ``out``, reconstructed unless it is there already; its physics may be of an earlier request."""
     if not photo.is_file():
         raise InputError(f"{photo}: there is no such photo; check its name")
     if options.environment is not None:
-        # Before anything is hashed or cut out: nobody should wait for a message about the last step.
+        # Before anything is hashed or segmented: a bad file should not be reported only after the last stage.
         read_environment(options.environment)
     inputs_hash = _inputs_hash(photo, objects, options, ask, answered)
     stamp = read_stamp(out)
-    if stamp is not None and stamp.inputs_hash == inputs_hash:
+    if (
+        stamp is not None
+        and stamp.inputs_hash == inputs_hash
+        # What an object is made of is decided with its shape; motion is not, and is set afterwards.
+        and [item.preset for item in stamp.objects] == [item.preset for item in objects]
+    ):
         try:
             folder = load_scene(out)
         except InputError:
@@ -81,13 +138,13 @@ def reconstruct_scene(
         else:
             on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
             return folder
-    folder = reconstruct(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
+    folder = reconstruct_photo(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
     stamp = Stamp(
         inputs_hash=inputs_hash,
         photo=photo.resolve(),
         objects=tuple(_resolved(item, ("mask", "mesh")) for item in objects),
         options=_resolved(options, ("environment", "depth")),
-        scene=scene_to_json(folder.scene),
+        scene=scene_to_json(folder.model),
     )
     write_json(out / STAMP_FILE, to_json(stamp))
     return folder
@@ -148,44 +205,27 @@ def _file_hashes(value: object, names: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def require_physics(
-    objects: int, presets: Sequence[str], velocities: Sequence[Vector], spins: Sequence[Vector]
-) -> None:
-    """Raise InputError when there are more entries than ``objects``, or an unknown preset."""
-    for name, values in (("preset", presets), ("velocity", velocities), ("spin", spins)):
+def require_physics(objects: int, physics: Physics) -> None:
+    """Raise InputError when ``physics`` has more entries than there are ``objects``, or names an unknown preset."""
+    for name, values in (("preset", physics.presets), ("velocity", physics.velocities), ("spin", physics.spins)):
         if len(values) > objects:
             raise InputError(f"{name}: {len(values)} given for {objects} objects; give at most one an object")
-    for preset in presets:
+    for preset in physics.presets:
         load_preset(preset)
 
 
-def set_all_physics(
-    root: Path,
-    *,
-    presets: Sequence[str] = (),
-    velocities: Sequence[Vector] = (),
-    spins: Sequence[Vector] = (),
-    overrides: Sequence[str] = (),
-    friction: float | None = None,
-) -> SceneFolder:
-    """Like ``set_physics``, but what is not given becomes what it is in a new scene, whatever it was before.
+def set_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> Scene:
+    """Return ``scene`` with ``physics``, saved; whatever ``physics`` leaves open becomes what it is in a new scene.
 
     A new scene is as it was reconstructed, at rest; where the folder does not tell, its objects are ``medium``.
-    friction: the ground's; None takes that of the new scene. Effects stay.
+    friction: Coulomb coefficient of the ground; None takes that of the new scene. Effects stay.
     """
-    folder = load_scene(root)
-    scene = with_physics(
-        _as_reconstructed(folder, friction),
-        presets=presets,
-        velocities=velocities,
-        spins=spins,
-        overrides=overrides,
-    )
-    return folder if scene == folder.scene else save_scene(root, scene)
+    model = with_physics(_as_reconstructed(scene, friction), physics)
+    return scene if model == scene.model else save_scene(scene.root, model)
 
 
-def _as_reconstructed(folder: SceneFolder, friction: float | None) -> Scene:
-    bare = without_physics(folder.scene, Ground().friction if friction is None else friction)
+def _as_reconstructed(folder: Scene, friction: float | None) -> SceneModel:
+    bare = without_physics(folder.model, Ground().friction if friction is None else friction)
     stamp = read_stamp(folder.root)
     if stamp is None:
         return bare
@@ -206,41 +246,118 @@ def _as_reconstructed(folder: SceneFolder, friction: float | None) -> Scene:
     )
 
 
-def set_physics(
-    root: Path,
-    *,
-    presets: Sequence[str] = (),
-    velocities: Sequence[Vector] = (),
-    spins: Sequence[Vector] = (),
-    overrides: Sequence[str] = (),
-) -> SceneFolder:
-    """Change the scene folder as ``with_physics`` does; ``scene.json`` is only written when something changes."""
-    folder = load_scene(root)
-    scene = with_physics(folder.scene, presets=presets, velocities=velocities, spins=spins, overrides=overrides)
-    return folder if scene == folder.scene else save_scene(root, scene)
+def set_physics(scene: Scene, physics: Physics) -> Scene:
+    """Return ``scene`` changed as ``with_physics`` does; ``scene.json`` is only written when something changes."""
+    model = with_physics(scene.model, physics)
+    return scene if model == scene.model else save_scene(scene.root, model)
 
 
-def with_physics(
-    scene: Scene,
-    *,
-    presets: Sequence[str] = (),
-    velocities: Sequence[Vector] = (),
-    spins: Sequence[Vector] = (),
-    overrides: Sequence[str] = (),
-) -> Scene:
-    """Give the scene's objects, in order, other materials and motions; objects beyond a list keep what they have.
+def with_physics(scene: SceneModel, physics: Physics) -> SceneModel:
+    """Return ``scene`` with the materials and motions of ``physics``; what it leaves open stays.
 
-    A single preset goes to all objects. overrides: ``OBJECT.FIELD=VALUE``, carried out last (``sim/scene/overrides``).
-    Raises InputError for an unknown preset, more entries than objects, or an override that cannot be carried out.
+    Raises InputError for an unknown preset, more entries than objects, or an override that cannot be applied.
     """
-    require_physics(len(scene.objects), presets, velocities, spins)
-    if len(presets) == 1:
-        presets = [presets[0]] * len(scene.objects)
+    require_physics(len(scene.objects), physics)
+    presets = physics.presets * len(scene.objects) if len(physics.presets) == 1 else physics.presets
     changed = list(scene.objects)
     for index, preset in enumerate(presets):
         changed[index] = dataclasses.replace(changed[index], material=load_preset(preset))
-    for index, velocity in enumerate(velocities):
+    for index, velocity in enumerate(physics.velocities):
         changed[index] = dataclasses.replace(changed[index], velocity=velocity)
-    for index, spin in enumerate(spins):
+    for index, spin in enumerate(physics.spins):
         changed[index] = dataclasses.replace(changed[index], spin=spin)
-    return apply_overrides(dataclasses.replace(scene, objects=tuple(changed)), overrides)
+    return apply_overrides(dataclasses.replace(scene, objects=tuple(changed)), physics.overrides)
+
+
+MATTER_FIELDS = ("material", "fill", "roughness")
+"""What follows from what a thing is."""
+
+
+def require_stamp(root: Path) -> Stamp:
+    """What the scene folder ``root`` was reconstructed from. Raises InputError when it does not say."""
+    load_scene(root)
+    stamp = read_stamp(root)
+    if stamp is None:
+        raise InputError(
+            f"{root}: does not say what it was reconstructed from ({STAMP_FILE} is missing or of another version); "
+            "reconstruct it from the photo again"
+        )
+    return stamp
+
+
+def correct(
+    scene: Scene,
+    *,
+    objects: Sequence[ObjectRequest],
+    options: ReconstructOptions,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Scene:
+    """Return ``scene`` reconstructed again, in place, with other ``objects`` or ``options``, from the same photo.
+
+    Objects keep their physics by name. Raises what ``reconstruct`` raises, and InputError when the photo has moved.
+    """
+    root = scene.root
+    stamp = require_stamp(root)
+    if not stamp.photo.is_file():
+        raise InputError(f"{stamp.photo}: the photo of this scene is no longer there; put it back, or reconstruct anew")
+    before, first = scene.model, parse_scene(stamp.scene, STAMP_FILE)
+    lights = ("environment", "environment_frame", "sun")
+    told_light = any(getattr(options, name) != getattr(stamp.options, name) for name in lights)
+    keeps_light = before.light != first.light and not told_light
+    with TemporaryDirectory(dir=root.resolve().parent, prefix=f".{root.name}.light-") as place:
+        light = None
+        if keeps_light and before.light.environment is not None:
+            light = Path(place) / "environment.exr"
+            shutil.copyfile(scene.file(before.light.environment), light)
+        folder = _reconstruct_cached(stamp.photo, objects, root, options, on_event, cancelled, answered=_answered(root))
+        if light is not None and before.light.environment is not None:
+            target = folder.file(before.light.environment)
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(light, target)
+    told = {item.name: (item.kind, item.preset) for item in stamp.objects}
+    changed = {item.name for item in objects if told.get(item.name) != (item.kind, item.preset)}
+    model = _as_before(folder.model, before, changed)
+    if keeps_light:
+        model = dataclasses.replace(model, light=before.light)
+    return folder if model == folder.model else save_scene(root, model)
+
+
+def _answered(root: Path) -> str | None:
+    """What a model once answered about the scene; it is not asked again for a correction."""
+    try:
+        record = read_json(root / PHYSICS_FILE)
+    except InputError:
+        return None
+    answers = record.get("answers") if isinstance(record, dict) else None
+    raw = answers.get("raw") if isinstance(answers, dict) else None
+    return raw if isinstance(raw, str) and raw else None
+
+
+def _as_before(scene: SceneModel, before: SceneModel, changed: Collection[str | None]) -> SceneModel:
+    """``scene`` with the physics of ``before``, but the matter of the objects ``changed``, which are something else."""
+    known = {item.name: item for item in before.objects}
+    names = {item.name for item in scene.objects}
+    return dataclasses.replace(
+        scene,
+        objects=tuple(
+            dataclasses.replace(
+                item,
+                **{
+                    name: getattr(known[item.name], name)
+                    for name in PHYSICS_FIELDS
+                    if item.name not in changed or name not in MATTER_FIELDS
+                },
+            )
+            if item.name in known
+            else item
+            for item in scene.objects
+        ),
+        ground=scene.ground
+        and before.ground
+        and dataclasses.replace(before.ground, point=scene.ground.point, normal=scene.ground.normal),
+        gravity=before.gravity,
+        gravity_track=before.gravity_track,
+        effects=tuple(effect for effect in before.effects if set(effect.objects) <= names),
+        contacts=tuple(pair for pair in before.contacts if set(pair.between) <= names | {"ground"}),
+    )

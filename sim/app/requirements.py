@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Which packages an interpreter needs to simulate, and whether this one has them.
+"""Packages that an interpreter needs to simulate, and whether this one has them.
 
-As a module, ``launch.py sim.app.requirements`` answers with one line of JSON: ``python`` (its version), ``missing``
-(requirements that are not there), ``trouble`` (why Taichi does not load, or null) and ``installs`` (whether pip may
-install into it: Linux distributions and Blender keep theirs to themselves).
+As a module, ``launch.py sim.app.requirements`` prints one line of JSON: ``python`` (its version), ``missing``
+(missing requirements), ``trouble`` (why Taichi does not load, or null) and ``installs`` (whether pip may install into
+it, which Linux distributions and Blender forbid).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sysconfig
 from pathlib import Path
 
 MODULE = "sim.app.requirements"
-"""From the tree's root, as ``process.own_command`` takes it."""
+"""From the tree's root, for ``own_command``."""
 
 REQUIREMENTS = {
     "numpy": "numpy>=1.26",
@@ -29,26 +29,27 @@ REQUIREMENTS = {
     "cv2": "opencv-python-headless>=4.10",
     "OpenImageIO": "openimageio>=3.0",
     "yaml": "pyyaml>=6",
+    "jinja2": "jinja2>=3.1,<4",
 }
-"""Name to import → what to ask pip for; the widest of pyproject.toml."""
+"""Module → requirement for pip; the widest range of pyproject.toml."""
 
 OLDEST, NEWEST = (3, 11), (3, 13)
-"""Python versions that all of them have wheels for; Taichi 1.7.4 ends at 3.13."""
+"""Python versions for which all of them have wheels; Taichi 1.7.4 supports up to 3.13."""
 
 
 def missing() -> list[str]:
-    """The requirements that this interpreter lacks, as pip takes them."""
+    """Return this interpreter's missing requirements, in pip's format."""
     return [wanted for name, wanted in REQUIREMENTS.items() if importlib.util.find_spec(name) is None]
 
 
 def installs() -> bool:
-    """Whether pip may install into this interpreter (PEP 668)."""
+    """Return whether pip may install into this interpreter (PEP 668)."""
     own = sys.prefix != sys.base_prefix
     return own or not (Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED").exists()
 
 
 def main() -> None:
-    """Answer. A Taichi whose libraries do not fit the machine may end the process here, which is an answer too."""
+    """Print the answer. A Taichi whose libraries do not fit the machine may crash here, which callers handle too."""
     lacking, trouble = missing(), None
     if not lacking:
         try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""PC2 point caches: one sample of all vertices a frame, float32, world metres.
+"""PC2 point caches: one sample of all vertices per frame, float32.
 
-The format is the one that Blender's Mesh Cache modifier reads: a little-endian header of 32 bytes
+The format of Blender's Mesh Cache modifier: a little-endian header of 32 bytes
 
     char[12] "POINTCACHE2\\0" · int32 version 1 · int32 vertices · float32 start · float32 rate · int32 samples
 
@@ -23,13 +23,13 @@ from ..errors import InputError
 _HEADER = struct.Struct("<12siiffi")
 _SIGNATURE = b"POINTCACHE2\0"
 MAX_VERTICES = 50_000_000
-"""A header that claims more is taken for garbage; a sample of that size is 600 MB."""
+"""A header that claims more is refused; a sample of that size is 600 MB."""
 
 
 class Pc2Reader:
-    """A cache on disk: opening reads the header, samples are read when asked for.
+    """A cache on disk: opening reads the header, samples are read on request.
 
-    Not memory-mapped, because a bake may cut the file short meanwhile, which would end the process that looks.
+    Not memory-mapped, because a bake may truncate the file, which would crash a process that has mapped it.
 
     Raises InputError when the file is missing, not PC2, or shorter than its header says.
     """
@@ -49,7 +49,7 @@ class Pc2Reader:
         _, version, vertices, start, rate, samples = _HEADER.unpack(header)
         if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or rate <= 0:
             raise InputError(
-                f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is garbage; rebake"
+                f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is invalid; rebake"
             )
         if size < _HEADER.size + samples * vertices * 12:
             raise InputError(
@@ -61,7 +61,7 @@ class Pc2Reader:
         self.sample_rate: float = rate
 
     def sample(self, index: int) -> NDArray[np.float32]:
-        """Vertex positions (V, 3) of sample ``index`` from 0; InputError outside the cache."""
+        """Return the vertex positions (V, 3) of sample ``index`` from 0. Raises InputError out of range."""
         if not 0 <= index < self.sample_count:
             raise InputError(
                 f"{self.path}: has {self.sample_count} samples, so there is no sample {index}; bake more frames"
@@ -72,7 +72,7 @@ class Pc2Reader:
         except OSError as error:
             raise InputError(f"{self.path}: {error.strerror or error}; bake again") from None
         if len(numbers) < count:
-            raise InputError(f"{self.path}: was cut off meanwhile at sample {index}; wait for the bake, or bake again")
+            raise InputError(f"{self.path}: was cut off at sample {index} meanwhile; wait for the bake, or bake again")
         sample: NDArray[np.float32] = numbers.reshape(-1, 3).astype(np.float32, copy=False)
         if not np.isfinite(sample).all():
             raise InputError(f"{self.path}: sample {index} has positions that are not finite; bake again")
@@ -80,9 +80,9 @@ class Pc2Reader:
 
 
 class Pc2Writer:
-    """Appends samples; the header is brought up to date after each, so that a killed run leaves a readable file.
+    """Appends samples; the header is updated after each, so that a killed run leaves a readable file.
 
-    Opened on an existing cache with ``keep`` samples it drops everything after them and goes on from there.
+    Opened on an existing cache, it keeps the first ``keep`` samples and drops the rest.
     """
 
     def __init__(self, path: Path, *, vertex_count: int, start_frame: int = 1, keep: int = 0) -> None:
@@ -95,14 +95,14 @@ class Pc2Writer:
         if keep:
             existing = Pc2Reader(path)
             if existing.vertex_count != vertex_count or existing.sample_count < keep:
-                raise InputError(f"{path}: does not hold the {keep} samples of {vertex_count} vertices to go on from")
+                raise InputError(f"{path}: does not have the {keep} samples of {vertex_count} vertices to resume from")
         self._file = path.open("r+b" if keep else "w+b")
-        # The header first: whoever looks, or goes on after a kill between the two, never misses what it promises.
+        # The header first: readers, and a resume after a kill between the two, always find the samples it promises.
         self._write_header()
         self._file.truncate(_HEADER.size + keep * vertex_count * 12)
 
     def append(self, positions: NDArray[np.floating]) -> None:
-        """Write one sample of (V, 3) world positions in metres; they must be finite."""
+        """Append one sample of finite positions (V, 3)."""
         sample = np.ascontiguousarray(positions, dtype="<f4")
         if sample.shape != (self.vertex_count, 3):
             raise InputError(f"{self.path}: a sample of shape {sample.shape} does not fit {self.vertex_count} vertices")
@@ -119,7 +119,7 @@ class Pc2Writer:
         self._file.flush()
 
     def close(self) -> None:
-        """Flush to the disk and close."""
+        """Flush to disk and close."""
         if not self._file.closed:
             try:
                 self._file.flush()

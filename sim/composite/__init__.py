@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Image formation without Blender: how rendered layers and the photo become one frame (docs/rendering.md)."""
+"""Image formation without Blender: rendered layers and the photo become one frame (docs/rendering.md)."""

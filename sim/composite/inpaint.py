@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The photo without its objects: PatchMatch (Barnes et al., SIGGRAPH 2009; Wexler et al., PAMI 2007).
+"""Inpainting by PatchMatch (Barnes et al., SIGGRAPH 2009; Wexler et al., PAMI 2007).
 
-pypatchmatch (MIT) ships a compiled library; with a fixed seed equal inputs give equal results.
+pypatchmatch (MIT) ships a compiled library; a fixed seed makes it repeatable.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Mask = NDArray[np.bool_]
 Guide = NDArray[np.float32]
 
 SOLVE_SIDE = 220.0
-"""Pixels; larger holes are filled at a scale that makes them this large. On more pixels PatchMatch's patches see too
-little of the structure around them, and it takes long."""
+"""Pixels; larger holes are filled at a scale that makes them this large: on more pixels patches see too little of the
+structure around them, and it is slow."""
 GUIDE_SCALE, GUIDE_WEIGHT = 0.1, 0.015
-"""Cost of taking a patch from another height: found by eye; ten times as much repeats rows like wallpaper."""
+"""Cost of a patch from another row, chosen by eye; ten times as much repeats rows like wallpaper."""
 FEATHER = 4.0
-"""Pixels at 1024 over which the filling fades into the photo, inside the hole only."""
+"""Pixels (at 1024) over which the filling blends into the photo, inside the hole only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FillOptions:
-    """How holes are filled.
+    """Inpainting options.
 
-    radius: patches span (2 radius + 1)² pixels, 1 to 10. limit: no fill searches more pixels, 1e4 to 1e8.
-    seed: 0 to 2³²−1. by_row: prefer sources at the same height of the photo, as where a wall meets a floor.
+    radius: patches span (2 radius + 1)² pixels, 1 to 10. limit: pixels searched at most, 1e4 to 1e8. seed: 0 to 2³²−1.
+    by_row: prefer sources in the same row, as where a wall meets a floor.
     """
 
     radius: int = 4
@@ -49,10 +49,10 @@ def inpaint(
     options: FillOptions | None = None,
     guide: Guide | None = None,
 ) -> NDArray[np.uint8]:
-    """``pixels`` (H, W, 3) with ``hole`` filled from elsewhere; outside the hole equal to the photo bit for bit.
+    """Return ``pixels`` (H, W, 3) with ``hole`` inpainted; outside the hole equal to the photo bit for bit.
 
-    objects: what may be seen neither in the filling nor through the feather at its edge, inside ``hole``.
-    guide: two numbers from 0 to 1 for every pixel; sources are preferred that are alike in them. It replaces by_row.
+    objects: (H, W), inside ``hole``; must not show in the filling or through its feathered edge.
+    guide: (H, W, 2), 0 to 1; sources with similar values are preferred. Replaces by_row.
     Raises InputError when hardly any background is left to fill from, or the native library is missing.
     """
     options = options or FillOptions()
@@ -71,7 +71,7 @@ def inpaint(
     return np.where(hole[..., None], np.clip(mixed + 0.5, 0, 255).astype(np.uint8), pixels)
 
 
-def searched(
+def inpaint_once(
     pixels: NDArray[np.uint8],
     hole: Mask,
     barred: Mask,
@@ -79,10 +79,10 @@ def searched(
     guide: Guide | None = None,
     solve_side: float = SOLVE_SIDE,
 ) -> NDArray[np.uint8]:
-    """``pixels`` (h, w, 3) with ``hole`` filled in one go from what is in neither it nor ``barred``; no feather.
+    """Return ``pixels`` (h, w, 3) with ``hole`` inpainted at once from pixels outside it and ``barred``; no feather.
 
-    guide: as for ``inpaint``. solve_side: larger holes are filled at a scale that makes them this large.
-    Raises InputError as ``inpaint``.
+    guide: as for ``inpaint``. solve_side: larger holes are filled at a scale that makes them this large. Raises
+    InputError as ``inpaint``.
     """
     closed = hole | barred
     if not hole.any():
@@ -97,7 +97,7 @@ def searched(
 
 
 def _parts(hole: Mask) -> list[Mask]:
-    """The connected parts of ``hole``, smallest first: small ones are filled best and then serve as surroundings."""
+    """Return the connected parts of ``hole``, smallest first: they are filled best and then serve as sources."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     order = np.argsort(stats[1:count, cv2.CC_STAT_AREA], kind="stable") + 1
     return [np.asarray(labels == index) for index in order]
@@ -131,8 +131,8 @@ def _fill_part(pixels: NDArray[np.uint8], part: Mask, hole: Mask, options: FillO
 def _patch_match(
     pixels: NDArray[np.uint8], hole: Mask, closed: Mask, options: FillOptions, guide: Guide | None
 ) -> NDArray[np.uint8]:
-    """``pixels`` with ``hole`` filled; ``closed`` pixels outside of it are no source."""
-    # Imported late: loading a native library must not be the price of importing the package.
+    """Return ``pixels`` with ``hole`` inpainted; ``closed`` pixels outside it are not sources."""
+    # Imported late: it loads a native library.
     from patchmatch import patch_match
 
     if not getattr(patch_match, "patchmatch_available", False):
@@ -163,9 +163,9 @@ def _patch_match(
 def _at_scale(
     pixels: NDArray[np.uint8], hole: Mask, closed: Mask, scale: float, options: FillOptions, guide: Guide | None
 ) -> NDArray[np.uint8]:
-    """Fill a smaller copy, where patches span whole structures, then give the enlargement its fine detail back.
+    """Return ``pixels`` inpainted at reduced ``scale``, where patches span whole structures, with fine detail restored.
 
-    The detail of each filled place comes from the place outside the hole whose coarse neighbourhood is most alike.
+    Detail of each filled pixel comes from the pixel outside the hole with the most similar coarse neighbourhood.
     """
     height, width = hole.shape
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
@@ -195,12 +195,12 @@ def _at_scale(
 def _alike(
     filled: NDArray[np.uint8], hole: Mask, closed: Mask, block: int = 3, sources: int = 60_000
 ) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-    """For each pixel (h, w) the row and column of the most similar one outside ``closed``; itself outside ``hole``.
+    """Return row and column (h, w) of each pixel's most similar one outside ``closed``; itself outside ``hole``.
 
-    Matched for one pixel of every ``block`` x ``block`` and carried to its neighbours, so that details stay together.
+    Matched once per ``block`` x ``block`` pixels and shared by its neighbours, so that details stay together.
     """
     height, width = hole.shape
-    # Mean colours of a 3x3 neighbourhood of small squares describe a place well enough, in 27 numbers.
+    # Descriptor: mean colours of a 3x3 neighbourhood of small squares, 27 numbers.
     smooth = cv2.blur(filled, (2, 2)).astype(np.float32)
     padded = np.pad(smooth, ((2, 2), (2, 2), (0, 0)), mode="reflect")
     features = np.concatenate(
@@ -229,11 +229,11 @@ def _alike(
 
 
 def _feather(hole: Mask, objects: Mask) -> NDArray[np.float32]:
-    """Weight of the filling: 0 outside the hole, 1 deep inside and on the objects."""
+    """Return the filling's weight (H, W): 0 outside the hole, 1 deep inside and on the objects."""
     width = max(1.0, FEATHER * max(hole.shape) / 1024.0)
     depth = ndimage.distance_transform_edt(np.pad(hole, 1, mode="edge"))[1:-1, 1:-1]
     if objects.any():
-        # Where an object comes close to the edge of its hole, the feather must end before it.
+        # Where an object is close to the edge of its hole, the feather ends before it.
         away = ndimage.distance_transform_edt(~objects)
         room = np.maximum(depth + away - 2.0, 1.0)
         weight = depth / np.minimum(width, room)

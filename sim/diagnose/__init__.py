@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Where a simulation and a recording part, which unmodelled effect is the cause, and how far it closes the gap.
+"""Sim-to-real diagnosis: where simulation and recording diverge, which unmodelled effect is the cause, gap closed.
 
-``capture`` reads what was observed; ``rigid`` and ``soft`` fit candidate effects to it (``analysis`` is what they
-hand over); ``evidence`` weighs the candidates; ``diagnosis`` is what is concluded, as written to disk.
+``capture`` reads the observations; ``rigid`` and ``soft`` fit candidate effects to them; ``model_comparison`` weighs
+the candidates; ``run_diagnosis`` runs all stages; ``diagnosis`` is the result, in memory and on disk.
 docs/diagnosis.md explains the method.
 """

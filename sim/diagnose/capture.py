@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Capture folders (``physgen-capture/1``): what was observed of a real motion, and what the modeller believes.
+"""Capture folders (``physgen-capture/1``): observations of a real motion, and the nominal model of it.
 
 docs/file-formats.md describes the files for other programs.
 """
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_json
 from ..errors import InputError
 from ..scene.folder import inside
-from ..scene.json_fields import parse, read_json, to_json
 from ..scene.meshes import read_mesh
+from ..validation import parse, read_json, to_json
 
 FORMAT = "physgen-capture/1"
 CAPTURE_FILE = "capture.json"
@@ -28,7 +28,7 @@ STIFFNESSES = ("soft", "medium", "hard")
 ROLES = ("fit", "predict")
 
 MAX_TRIAL_BYTES = 512 * 2**20
-"""A trial's arrays together; a larger file is refused before it is read."""
+"""Total size of a trial's arrays; larger files are rejected before reading."""
 
 Vector = tuple[float, float, float]
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """The believed ground plane. normal: any length; friction: Coulomb's coefficient; restitution: None if unknown."""
+    """The assumed ground plane. normal: any length; friction: Coulomb coefficient; restitution: None if unknown."""
 
     point: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
@@ -53,14 +53,14 @@ class Ground:
 
     @property
     def unit_normal(self) -> Array:
-        """(3,), of length 1."""
+        """Return the unit normal (3,)."""
         normal = np.asarray(self.normal, dtype=np.float64)
         return normal / np.linalg.norm(normal)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectBelief:
-    """What is believed of an object. density in kg/m³, Young's modulus in Pa (None with ``hard``: a rigid body)."""
+    """Assumed properties of an object. Density in kg/m³, Young's modulus in Pa (None with ``hard``: a rigid body)."""
 
     name: str
     mesh: str
@@ -85,7 +85,7 @@ class ObjectBelief:
 
     @property
     def rigid(self) -> bool:
-        """Whether it is modelled as a body that does not deform."""
+        """Return whether it is modelled as a rigid body."""
         return self.youngs_modulus_pa is None
 
 
@@ -117,13 +117,13 @@ class Camera:
 
     @property
     def matrix(self) -> Array:
-        """world_from_camera, (4, 4)."""
+        """Return world_from_camera (4, 4)."""
         return np.asarray(self.world_from_camera, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureObject:
-    """An object: what is believed of it, and its mesh in its rest frame, (V, 3) in m and (F, 3) vertex indices."""
+    """An object: assumed properties, and its mesh in its rest frame, (V, 3) in m and (F, 3) vertex indices."""
 
     belief: ObjectBelief
     vertices: Array
@@ -131,13 +131,13 @@ class CaptureObject:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Return its name."""
         return self.belief.name
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One take. T frames, K tracked points.
+    """One recorded trial. T frames, K tracked points.
 
     times: (T,) s, rising. points: (T, K, 3) m, world, NaN where not seen; or pixels: (T, K, 2); the other is None.
     object_index: (K,) object of a point. rest_points: (K, 3) m, in the object's rest frame.
@@ -155,22 +155,27 @@ class Trial:
 
     @property
     def observed(self) -> Array:
-        """points or pixels, whichever there is: (T, K, 3) or (T, K, 2)."""
+        """Return points (T, K, 3) or pixels (T, K, 2), whichever is given."""
         found = self.points if self.points is not None else self.pixels
         assert found is not None
         return found
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(T, K): where a point was seen."""
+        """Return (T, K): whether a point was seen."""
         return np.asarray(np.isfinite(self.observed).all(axis=2))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """A loaded capture. gravity in m/s², believed; noise_sigma of one coordinate: m with points, pixels with pixels.
+    """A loaded capture. gravity: assumed, m/s²; noise_sigma: of one coordinate, m for points, pixels for pixels.
 
-    warnings: what looks wrong but does not stop a diagnosis.
+    warnings: problems that do not prevent a diagnosis.
+
+    >>> import physgen
+    >>> capture = physgen.load_capture("capture")  # doctest: +SKIP
+    >>> [(trial.name, trial.role, len(trial.times)) for trial in capture.trials]  # doctest: +SKIP
+    [('toss_1', 'fit', 120), ('toss_2', 'predict', 24)]
     """
 
     gravity: Vector
@@ -184,12 +189,12 @@ class Capture:
 
     @property
     def fit_trials(self) -> tuple[Trial, ...]:
-        """The complete takes."""
+        """Return the complete trials."""
         return tuple(t for t in self.trials if t.role == "fit")
 
     @property
     def predict_trials(self) -> tuple[Trial, ...]:
-        """The takes of which only the first frames are shown."""
+        """Return the trials with only their first frames."""
         return tuple(t for t in self.trials if t.role == "predict")
 
 
@@ -211,13 +216,18 @@ class _CaptureFile:
     camera: Camera | None = None
 
 
-def load_capture(root: Path) -> Capture:
+def load_capture(root: str | Path) -> Capture:
     """Read and check the capture folder ``root``.
 
-    Raises InputError, with file, field, value and remedy, for anything malformed. What can go on is in ``warnings``.
+    >>> import physgen
+    >>> physgen.load_capture("capture").warnings  # doctest: +SKIP
+    ()
+
+    Raises InputError, with file, field, value and remedy, for anything malformed. Lesser problems are in ``warnings``.
     """
     from .capture_checks import check_capture
 
+    root = Path(root)
     path = root / CAPTURE_FILE
     data = read_json(path)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -246,7 +256,7 @@ def load_capture(root: Path) -> Capture:
     if len({t.pixels is None for t in trials}) > 1:
         raise InputError(f"{path}: some trials have points and others pixels: make two captures of them")
     if not any(t.role == "fit" for t in trials):
-        raise InputError(f"{path}: no trial has the role 'fit': there is nothing to learn from")
+        raise InputError(f"{path}: no trial has the role 'fit': there is nothing to fit to")
     capture = Capture(
         gravity=file.gravity,
         ground=file.ground,
@@ -260,11 +270,11 @@ def load_capture(root: Path) -> Capture:
 
 
 def save_capture(capture: Capture, root: Path) -> None:
-    """Write ``capture`` as a new folder ``root``, whole or not at all; InputError when it is there already."""
+    """Write ``capture`` to the new folder ``root``, atomically. Raises InputError when it exists."""
     import trimesh
 
     if root.exists():
-        raise InputError(f"{root}: is there already; choose another folder")
+        raise InputError(f"{root}: already exists; choose another folder")
     with replacing(root) as partial:
         partial.mkdir(parents=True)
         entries = []
@@ -331,7 +341,7 @@ def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
         raise InputError(f"{where}: {kind} has no points: track at least one")
     if np.isinf(observed).any():
         raise InputError(f"{where}: {kind} has infinite numbers: write NaN where a point was not seen")
-    # A point half seen is not seen.
+    # A point with a missing coordinate counts as not seen.
     observed = np.where(np.isfinite(observed).all(axis=2, keepdims=True), observed, np.nan)
     if not np.isfinite(observed).any():
         raise InputError(f"{where}: no point was seen in any frame; leave this trial out")
@@ -359,15 +369,15 @@ def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
 
 
 def read_arrays(path: Path) -> Mapping[str, NDArray[Any]]:
-    """All arrays of the ``.npz`` at ``path``; never unpickles.
+    """Return all arrays of the ``.npz`` at ``path``; never unpickles.
 
-    Raises InputError when it is missing, too large once unpacked, or no archive of plain arrays.
+    Raises InputError when it is missing, too large once unpacked, or not an archive of plain arrays.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
         if size > MAX_TRIAL_BYTES:
-            raise InputError(f"{path}: holds {size >> 20} MiB, more than {MAX_TRIAL_BYTES >> 20}; shorten the take")
+            raise InputError(f"{path}: holds {size >> 20} MiB, more than {MAX_TRIAL_BYTES >> 20}; shorten the trial")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except FileNotFoundError:
@@ -376,7 +386,7 @@ def read_arrays(path: Path) -> Mapping[str, NDArray[Any]]:
         raise
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, MemoryError, NotImplementedError) as error:
         raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from None
-    except Exception as error:  # zlib and numpy's header parser fail in whatever way the garbage leads them to
+    except Exception as error:  # zlib and numpy's header parser raise all kinds of errors on corrupt data
         raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from error
 
 

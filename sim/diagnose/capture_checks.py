@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What looks wrong in a capture although every field is well-formed: units, handedness, places of the points."""
+"""Plausibility checks of a well-formed capture: units, handedness, rest points on the mesh."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import trimesh
 
 from ..errors import InputError
 from .capture import Array, Capture, CaptureObject, Trial
-from .rotation import nearest_rotation
+from .capture_geometry import nearest_rotation
 
 LARGEST_M = 20.0
-"""Extent of a mesh above which it is taken to be in millimetres."""
+"""Mesh extent above which millimetres are assumed."""
 
 MISFIT_SIGMAS = 12.0
-"""Rigid misfit of the points of a hard body, in standard deviations, above which the capture contradicts itself."""
+"""Rigid alignment residual of a hard body, in standard deviations, above which the capture is inconsistent."""
 
 OFF_MESH = 0.25
-"""Distance of a rest point from the mesh, over the mesh's extent, above which it is warned about."""
+"""Distance of a rest point from the mesh, relative to the mesh's extent, above which a warning is given."""
 
 
 def check_capture(capture: Capture) -> Capture:
-    """``capture`` with its warnings. Raises InputError where no diagnosis could mean anything."""
+    """Return ``capture`` with its warnings. Raises InputError where no diagnosis is possible."""
     warnings: list[str] = []
     for item in capture.objects:
         _check_mesh(item, warnings)
@@ -47,9 +47,9 @@ def _check_mesh(item: CaptureObject, warnings: list[str]) -> None:
         raise InputError(f"object {item.name!r}: the mesh is {extent:.3g} m across: export it in metres")
     mesh = trimesh.Trimesh(item.vertices, item.faces, process=True)
     if not mesh.is_watertight:
-        warnings.append(f"object {item.name!r}: the mesh is not closed; its convex hull stands in for it")
+        warnings.append(f"object {item.name!r}: the mesh is not closed; its convex hull is used instead")
     elif mesh.volume < 0:
-        warnings.append(f"object {item.name!r}: the mesh is inside out; its convex hull stands in for it")
+        warnings.append(f"object {item.name!r}: the mesh is inside out; its convex hull is used instead")
 
 
 def _enough(trial: Trial, capture: Capture, warnings: list[str]) -> bool:
@@ -77,7 +77,7 @@ def _check_places(trial: Trial, capture: Capture, warnings: list[str]) -> None:
 
 
 def _check_scale_and_hand(trial: Trial, capture: Capture) -> None:
-    """Compare distances between tracked points with those between their rest points, object by object."""
+    """Check scale and handedness: tracked points against their rest points, object by object."""
     assert trial.points is not None
     for index, item in enumerate(capture.objects):
         chosen = trial.object_index == index
@@ -110,7 +110,7 @@ def _spread(points: Array) -> float:
 
 
 def _misfit(a: Array, b: Array, hand: float) -> float:
-    """Root mean square distance in m of ``b`` from ``a`` turned (hand 1) or turned and mirrored (hand -1)."""
+    """Return the RMS distance in m of ``b`` from ``a`` rotated (hand 1) or rotated and mirrored (hand -1)."""
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     turn = nearest_rotation(b.T @ a, hand=hand)
     return float(np.sqrt(((b - a @ turn.T) ** 2).sum(axis=1).mean()))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A diagnosis (``physgen-diagnosis/1``): what is concluded, as dataclasses and as files. CAPTURE's counterpart."""
+"""A diagnosis: what the fits of one kind of body deliver, and the conclusion as dataclasses and files.
+
+``rigid`` and ``soft`` implement ``Fits``; model comparison and report know nothing else of them. A ``Diagnosis`` is
+what is written (``physgen-diagnosis/1``), the counterpart of ``capture``."""
 
 from __future__ import annotations
 
@@ -7,30 +10,117 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..errors import InputError
-from ..scene.json_fields import read_json, to_json
-from .analysis import Estimate
+from ..validation import read_json, to_json
 from .capture import read_arrays
+
+Array = NDArray[np.float64]
+PHASES = ("flight", "impact", "contact", "rest")
+DIRECTIONS = ("normal", "along_velocity", "along_gravity", "other")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A fitted number: value in ``unit`` with its 95 % interval [low, high]."""
+
+    value: float
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidateFit:
+    """The nominal model with ``effects`` added, fitted.
+
+    effects: names, as in ``sim.effects``; () for the nominal model.
+    parameters: effect → parameter of its schema → estimate, as ``Effect.apply`` takes them.
+    beliefs: re-fitted parameters of the nominal model (``friction``, ``restitution``, ``youngs_modulus_pa``).
+    log_evidence: log marginal likelihood in nats of all fit trials (Laplace approximation over states, beliefs and
+        parameters). Comparable between all candidates of one capture: same data, same noise.
+    heldout_log_score: (trials,) log probability in nats of each fit trial when the parameters were fitted without it.
+    heldout_rms_m: RMS distance in m between observed and predicted points on held-out data.
+    misfit: RMS residual over what noise and numerical error would leave; 1 is explained, far above 1 means that
+        something is still missing.
+    """
+
+    effects: tuple[str, ...]
+    parameters: Mapping[str, Mapping[str, Estimate]]
+    beliefs: Mapping[str, Estimate] = field(default_factory=dict)
+    log_evidence: float
+    heldout_log_score: Array
+    heldout_rms_m: float
+    misfit: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseInterval:
+    """A time interval of a trial in one of ``PHASES``, from start_s to end_s of recorded time."""
+
+    start_s: float
+    end_s: float
+    phase: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Discrepancy:
+    """Localised discrepancy of the nominal model in one trial. T frames, K points.
+
+    frame_score: (T,) m/s², missing force per mass in each frame, not the accumulated error.
+    point_score: (T, K) the same at every point.
+    residual: (T, K, 3) m or (T, K, 2) pixels, observed minus nominal; NaN where not seen.
+    intervals: the whole trial, split into phases.
+    directions: direction of the missing force as shares by ``DIRECTIONS``; they sum to 1.
+    """
+
+    frame_score: Array
+    point_score: Array
+    residual: Array
+    intervals: tuple[PhaseInterval, ...]
+    directions: Mapping[str, float]
+
+
+class Fits(Protocol):
+    """All candidates fitted to one capture.
+
+    nominal: the model as given. refitted: the same with its own parameters fitted. candidates: one or two effects each.
+    floor_rms_m: noise floor, distance in m that noise alone leaves on held-out data.
+    numerics_rms_m: change in m of the nominal model's prediction when its resolution or time step changes.
+    """
+
+    nominal: CandidateFit
+    refitted: CandidateFit
+    candidates: tuple[CandidateFit, ...]
+    floor_rms_m: float
+    numerics_rms_m: float
+
+    def predict(self, fit: CandidateFit) -> dict[str, Array]:
+        """Return points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""
+
+    def simulate(self, fit: CandidateFit) -> dict[str, Array]:
+        """Return points (T, K, 3) in m at the frames of every trial, by its name, simulated from its first frames."""
+
+    def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
+        """Return the discrepancy by trial; with a ``fit`` as that candidate explains it, which is less noisy."""
+
 
 FORMAT = "physgen-diagnosis/1"
 REPORT_FILE, WHERE_FILE, PREDICTION_FILE, PAGE_FILE = "report.json", "where.npz", "prediction.npz", "report.html"
 
 NONE, UNKNOWN = "none", "unknown"
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """effect: the most probable single name; alternatives: what the data cannot tell from it.
+    """effect: the most probable single name; alternatives: effects that the data cannot distinguish from it.
 
-    effects: all effects found, in the order found (two causes at once); () for ``none`` and ``unknown``.
+    effects: all effects found, in the order found (two simultaneous causes); () for ``none`` and ``unknown``.
     """
 
     effect: str
@@ -41,7 +131,7 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class RankedEffect:
-    """One candidate as the report lists it; NaN where a number does not exist for it."""
+    """One candidate as listed in the report; NaN for missing numbers."""
 
     name: str
     kind: str
@@ -53,9 +143,9 @@ class RankedEffect:
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """Root mean square distances in m on data that no fit saw; closed_fraction with its 95 % bootstrap interval.
+    """RMS distances in m on held-out data; closed_fraction with its 95 % bootstrap interval.
 
-    numerics_rms_m: how much of the gap is the simulator's own (two resolutions).
+    numerics_rms_m: numerical error of the simulator (two resolutions).
     """
 
     before_rms_m: float
@@ -70,7 +160,7 @@ class Gap:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectShare:
-    """Share of the discrepancy that sits in an object."""
+    """Share of the discrepancy in one object."""
 
     name: str
     share: float
@@ -78,7 +168,7 @@ class ObjectShare:
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalShare:
-    """Share of the discrepancy in a stretch of a take."""
+    """Share of the discrepancy in one time interval of a trial."""
 
     trial: str
     start_s: float
@@ -88,8 +178,8 @@ class IntervalShare:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where:
-    """Shares by object, by stretch of time and by direction; each sums to 1."""
+class Localisation:
+    """Shares of the discrepancy by object, time interval and direction; each sums to 1."""
 
     objects: tuple[ObjectShare, ...]
     intervals: tuple[IntervalShare, ...]
@@ -98,9 +188,10 @@ class Where:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialArrays:
-    """Per trial. frame_score (T,) and point_score (T, K) in m/s², residual (T, K, 3 or 2); before and after (P, K, 3).
+    """Arrays of one trial. frame_score (T,) and point_score (T, K) in m/s², residual (T, K, 3) m or (T, K, 2) px.
 
-    nominal and found: (T, K, 3) m, where the points are under the nominal model and with the verdict's effect.
+    nominal and found: (T, K, 3) m, points of the nominal model and of the verdict's model. before and after:
+    (P, K, 3) m, their predictions; None unless it is a predict trial.
     """
 
     times: Array
@@ -115,11 +206,16 @@ class TrialArrays:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What is concluded from a capture.
+    """The diagnosis of a capture.
 
-    effects: all candidates tried, ``none`` and ``unknown``, most probable first; probabilities sum to 1.
+    effects: all tested candidates, ``none`` and ``unknown``, most probable first; probabilities sum to 1.
     controls: ``wrong_effect_rms_m`` and ``last_residual_rms_m``.
-    summary: the verdict in a sentence. warnings: of the capture and of the diagnosis.
+    summary: the verdict in a sentence. warnings: of the capture and of the diagnosis. confirmation: verification runs.
+
+    >>> import physgen
+    >>> found = physgen.diagnose(physgen.load_capture("capture"), out="diagnosis")  # doctest: +SKIP
+    >>> found.verdict.effect, found.verdict.probability, found.gap.closed_fraction  # doctest: +SKIP
+    ('air_drag', 0.99, 0.97)
     """
 
     verdict: Verdict
@@ -127,7 +223,7 @@ class Diagnosis:
     gap: Gap
     controls: Mapping[str, float]
     next_experiment: str | None
-    where: Where
+    where: Localisation
     trials: Mapping[str, TrialArrays]
     summary: str
     warnings: tuple[str, ...] = ()
@@ -151,7 +247,7 @@ def write_diagnosis(diagnosis: Diagnosis, out: Path) -> None:
 
 
 def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """``report.json`` as plain values; numbers that do not exist are null."""
+    """Return the content of ``report.json`` as plain values; missing numbers are null."""
     effects = []
     for item in diagnosis.effects:
         parameters = {
@@ -180,14 +276,14 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def read_diagnosis(out: Path) -> tuple[dict[str, Any], Mapping[str, NDArray[Any]], Mapping[str, NDArray[Any]]]:
-    """(report, where arrays, prediction arrays) of the folder ``out``.
+    """Return (report, localisation arrays, prediction arrays) of the folder ``out``.
 
-    Raises InputError where it is none, a file is missing or not readable.
+    Raises InputError where it is not a diagnosis, or a file is missing or unreadable.
     """
     path = out / REPORT_FILE
     report = read_json(path)
     if not isinstance(report, dict) or report.get("format") != FORMAT:
-        raise InputError(f"{path}: this is no {FORMAT}; run `physgen diagnose` first")
+        raise InputError(f"{path}: not in {FORMAT} format; run `physgen diagnose` first")
     for key, kind in (("verdict", dict), ("effects", list), ("gap", dict), ("where", dict)):
         if not isinstance(report.get(key), kind):
             raise InputError(f"{path}.{key}: missing or malformed; run `physgen diagnose` again")

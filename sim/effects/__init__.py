@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Physical effects, one file each; ``registry`` is the way in, docs/effects.md the overview. No Taichi."""
+"""Physical effects, one file each; ``registry`` is the way in, docs/simulation.md the overview. No Taichi."""

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.setup import WorldSetup
-from .changes import change_forces
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import change_forces
 
 DRAG = Parameter(
     name="drag_per_mass", unit="1/m", low=0.0, high=100.0, default=0.05, description="rho c_d A / (2 m): drag over mass"

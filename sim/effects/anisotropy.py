@@ -13,11 +13,11 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from ..constitutive import DeformableMaterial
 from ..errors import InputError
-from ..mpm.materials import ElasticMaterial
-from ..mpm.setup import WorldSetup
-from .changes import SHAPED, change_materials, needs
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values, unit_vector, vector_parameters
+from .setup_changes import SHAPED_SOLIDS, change_materials, needs
 
 SAME_AXIS = 1e-6
 """Sine of the angle below which two axes count as one."""
@@ -26,7 +26,7 @@ SAME_AXIS = 1e-6
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
     axis = unit_vector(values, "axis")
 
-    def fibred(material: ElasticMaterial) -> ElasticMaterial:
+    def fibred(material: DeformableMaterial) -> DeformableMaterial:
         if material.fibre_modulus > 0:
             x, y, z = material.fibre_axis
             a, b, c = axis
@@ -38,7 +38,7 @@ def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetu
             return dataclasses.replace(material, fibre_modulus=material.fibre_modulus + values["fibre_modulus"])
         return dataclasses.replace(material, fibre_modulus=values["fibre_modulus"], fibre_axis=axis)
 
-    return change_materials(setup, targets, SHAPED, fibred)
+    return change_materials(setup, targets, SHAPED_SOLIDS, fibred)
 
 
 EFFECT = Effect(
@@ -60,5 +60,5 @@ EFFECT = Effect(
     description=__doc__,
     transform=_transform,
     neutral={"fibre_modulus": 0.0},
-    obstacle=needs(SHAPED, "which has no fibres"),
+    obstacle=needs(SHAPED_SOLIDS, "which has no fibres"),
 )

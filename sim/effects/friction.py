@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Coulomb's coefficient of what a body touches.
+"""Coulomb's friction coefficient of a body's contacts.
 
 Equation: |T| <= mu N, against the sliding; where the contact has a larger static coefficient, it keeps its ratio to mu.
 Source: Coulomb, Théorie des machines simples (1785).
@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.contacts import SurfaceContact
-from ..mpm.setup import WorldSetup
-from .changes import change_contacts, contact_with_ground
+from ..mpm.surface_contact import SurfaceContact
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import change_contacts, contact_with_ground
 
 MOST = 10.0
 

@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mpm.setup import WorldSetup
-from ..mpm.tracks import Track
+from ..mpm.colliders import Track
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
 
 

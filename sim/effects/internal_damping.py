@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.setup import WorldSetup
-from .changes import COHERENT, change_materials, needs
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import COHERENT_SOLIDS, change_materials, needs
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
     more = values["damping_time"]
     return change_materials(
-        setup, targets, COHERENT, lambda m: dataclasses.replace(m, damping_time=m.damping_time + more)
+        setup, targets, COHERENT_SOLIDS, lambda m: dataclasses.replace(m, damping_time=m.damping_time + more)
     )
 
 
@@ -40,5 +40,5 @@ EFFECT = Effect(
     description=__doc__,
     transform=_transform,
     neutral={"damping_time": 0.0},
-    obstacle=needs(COHERENT, "which has no inner damping of this kind"),
+    obstacle=needs(COHERENT_SOLIDS, "which has no inner damping of this kind"),
 )

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.setup import WorldSetup
-from .changes import change_forces
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import change_forces
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
-from ..mpm.setup import WorldSetup
-from .changes import change_bodies
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values, vector, vector_parameters
+from .setup_changes import change_bodies
 
 TOLERANCE = 1e-12
 """Largest error of the pellet's centre, in its own widths."""

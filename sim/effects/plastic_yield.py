@@ -13,18 +13,18 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.materials import ElasticMaterial, VonMisesMaterial
-from ..mpm.setup import WorldSetup
-from .changes import SHAPED, change_materials, needs
+from ..constitutive import DeformableMaterial, VonMisesMaterial
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import SHAPED_SOLIDS, change_materials, needs
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
-    def yielding(material: ElasticMaterial) -> ElasticMaterial:
-        same = {spec.name: getattr(material, spec.name) for spec in dataclasses.fields(ElasticMaterial)}
+    def yielding(material: DeformableMaterial) -> DeformableMaterial:
+        same = {spec.name: getattr(material, spec.name) for spec in dataclasses.fields(DeformableMaterial)}
         return VonMisesMaterial(**same, yield_stress=values["yield_stress"])
 
-    return change_materials(setup, targets, SHAPED, yielding)
+    return change_materials(setup, targets, SHAPED_SOLIDS, yielding)
 
 
 EFFECT = Effect(
@@ -42,5 +42,5 @@ EFFECT = Effect(
     ),
     description=__doc__,
     transform=_transform,
-    obstacle=needs(SHAPED, "which has no shape to lose by yielding"),
+    obstacle=needs(SHAPED_SOLIDS, "which has no shape to lose by yielding"),
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""All effects by name, and a scene's effects put into a world."""
+"""Registry of effects by name, and application of a scene's effects to a world."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from ..mpm.setup import WorldSetup
-from ..scene.json_fields import to_json
+from ..mpm.world_setup import WorldSetup
 from ..scene.model import Effect as SceneEffect
+from ..validation import to_json
 from . import (
     adhesion,
     air_drag,
@@ -57,7 +57,7 @@ _MODULES = (
     time_scale,
     camera_pose,
 )
-"""In the order in which people see them."""
+"""In the order of menus and listings."""
 
 _EFFECTS: Mapping[str, Effect] = MappingProxyType({module.EFFECT.name: module.EFFECT for module in _MODULES})
 
@@ -91,7 +91,7 @@ def apply_effects(setup: WorldSetup, scene_effects: Iterable[SceneEffect]) -> Wo
 
 
 def effect_to_json(item: Effect) -> dict[str, Any]:
-    """What a program needs to offer the effect: names, kind, parameters, equation."""
+    """JSON description of the effect: names, kind, parameters, equation."""
     return {
         "name": item.name,
         "kind": item.kind,

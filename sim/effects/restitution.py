@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.setup import WorldSetup
-from .changes import change_contacts, contact_with_ground, rigid_only
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import change_contacts, contact_with_ground, rigid_only
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
@@ -37,5 +37,5 @@ EFFECT = Effect(
     description=__doc__,
     transform=_transform,
     current=lambda setup, targets: {"restitution": contact_with_ground(setup, targets).restitution},
-    obstacle=rigid_only("so its bounce is that of its matter: use stiffness or internal_damping, or make it rigid"),
+    obstacle=rigid_only("so its bounce is that of its material: use stiffness or internal_damping, or make it rigid"),
 )

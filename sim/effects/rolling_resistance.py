@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.contacts import SurfaceContact
-from ..mpm.setup import WorldSetup
-from .changes import change_contacts, rigid_only
+from ..mpm.surface_contact import SurfaceContact
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import change_contacts, rigid_only
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:

@@ -13,18 +13,18 @@ from __future__ import annotations
 
 import dataclasses
 
+from ..constitutive import SandMaterial
 from ..mpm.bodies import BodyParticles
-from ..mpm.materials import SandMaterial
-from ..mpm.setup import WorldSetup
-from .changes import SOLID, change_bodies, needs, solids
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import SOLIDS, change_bodies, needs, solids
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
     start = values["start"]
 
     def crumbling(body: BodyParticles) -> BodyParticles:
-        softest = min(solids(body, SOLID), key=lambda m: m.youngs_modulus)
+        softest = min(solids(body, SOLIDS), key=lambda m: m.youngs_modulus)
         sand = SandMaterial(
             density=softest.density,
             youngs_modulus=softest.youngs_modulus,
@@ -54,5 +54,5 @@ EFFECT = Effect(
     ),
     description=__doc__,
     transform=_transform,
-    obstacle=needs(SOLID, "which cannot turn to sand"),
+    obstacle=needs(SOLIDS, "which cannot turn to sand"),
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an effect is: its parameters, the bodies it can apply to, and how it changes a world that has not run yet."""
+"""Definition of an effect: its parameters, the bodies it applies to, and its change to a world's setup."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from types import MappingProxyType
 
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
-from ..mpm.setup import WorldSetup
+from ..mpm.world_setup import WorldSetup
 
 KINDS = ("force", "contact", "material", "mass", "observation")
 SECTIONS = ("Equation", "Source", "Bodies", "Twice")
-"""What the docstring of every effect's module says after its first line; see ``Effect.section``."""
+"""Sections of the docstring of every effect's module after its first line; see ``Effect.section``."""
 
 Values = Mapping[str, float]
 Targets = tuple[int, ...]
@@ -28,7 +28,7 @@ class Parameter:
 
     unit: SI; "1" for a number without unit.
     low, high: what is accepted, both included.
-    default: what an artist starts with, plain to see on a thing that fits in a hand.
+    default: start value, clearly visible on an object that fits in a hand.
     whole: only whole numbers count.
     """
 
@@ -76,21 +76,21 @@ def unit_vector(values: Values, prefix: str) -> tuple[float, float, float]:
 
 
 def nothing_against(body: BodyParticles) -> str | None:
-    """Obstacle of the effects that apply to every body: there is none."""
+    """Obstacle of effects that apply to every body: none."""
     return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """A physical effect: an artist adds it to a scene, ``apply`` puts it into a world, the diagnosis proposes it.
+    """A physical effect: added to a scene by a user, applied to a world by ``apply``, proposed by the diagnosis.
 
-    kind: one of ``KINDS``. Those of kind "observation" concern who looks: they leave a world as it is.
+    kind: one of ``KINDS``. Kind "observation" concerns camera and clock only: the world is unchanged.
     description: the docstring of the effect's module, with the ``SECTIONS``.
     transform: the change itself, a pure function of the setup, all parameters and the bodies concerned.
     neutral: parameters that alone make the effect do nothing; empty where none do.
     current: for effects that put a value in place of another: the value that the setup has now.
-    obstacle: why the effect means nothing for a body, with the remedy; None where it applies.
-    of_world: it concerns the whole world, so that no bodies can be named.
+    obstacle: why the effect does not apply to a body, with the remedy; None where it applies.
+    of_world: the effect concerns the whole world, so that no bodies can be named.
     """
 
     name: str
@@ -104,13 +104,13 @@ class Effect:
     of_world: bool = False
 
     def apply(self, setup: WorldSetup, values: Values, *, bodies: Collection[str] | None = None) -> WorldSetup:
-        """``setup`` with the effect in it; ``setup`` itself stays as it is and is returned where nothing changes.
+        """Return ``setup`` with the effect applied; ``setup`` itself is not changed, and returned if nothing changes.
 
-        values: every parameter; ``defaults`` has what an artist starts with.
-        bodies: names of the bodies concerned; None for all that the effect can apply to.
+        values: every parameter; ``defaults`` has start values.
+        bodies: names of the bodies concerned; None for all that the effect applies to.
 
-        Raises InputError, with the effect's name, for parameters that are missing, unknown or out of range, bodies
-        that are not there or that the effect means nothing for, and where it applies to no body.
+        Raises InputError, with the effect's name, for parameters that are missing, unknown or out of range, for bodies
+        that do not exist or that the effect does not apply to, and where it applies to no body.
         """
         try:
             complete = self.checked(values)
@@ -162,7 +162,7 @@ class Effect:
 
     @property
     def defaults(self) -> dict[str, float]:
-        """What an artist starts with."""
+        """Default values by parameter."""
         return {parameter.name: parameter.default for parameter in self.parameters}
 
     def neutral_values(self, setup: WorldSetup, *, bodies: Collection[str] | None = None) -> dict[str, float] | None:
@@ -180,11 +180,11 @@ class Effect:
         return self.description.strip().split("\n\n")[0].replace("\n", " ")
 
     def section(self, title: str) -> str:
-        """What the docstring says under ``title``, one of ``SECTIONS``, on one line; empty if nothing."""
+        """Text of the docstring's section ``title``, one of ``SECTIONS``, on one line; empty if there is none."""
         found = re.search(rf"^{title}: (.*?)(?=\n\n|\n(?:{'|'.join(SECTIONS)}): |\Z)", self.description, re.S | re.M)
         return " ".join(found[1].split()) if found else ""
 
 
 def leave(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
-    """The transformation of effects that concern who looks: none."""
+    """Transformation of effects of kind "observation": none."""
     return setup

@@ -13,15 +13,15 @@ import dataclasses
 
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
-from ..mpm.setup import WorldSetup
-from .changes import SOLID, change_materials, needs, solids
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values
+from .setup_changes import SOLIDS, change_materials, needs, solids
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
     factor = values["factor"]
     return change_materials(
-        setup, targets, SOLID, lambda m: dataclasses.replace(m, youngs_modulus=factor * m.youngs_modulus)
+        setup, targets, SOLIDS, lambda m: dataclasses.replace(m, youngs_modulus=factor * m.youngs_modulus)
     )
 
 
@@ -41,7 +41,7 @@ EFFECT = Effect(
     description=__doc__,
     transform=_transform,
     neutral={"factor": 1.0},
-    obstacle=needs(SOLID, "which has no Young's modulus"),
+    obstacle=needs(SOLIDS, "which has no Young's modulus"),
 )
 
 
@@ -56,7 +56,7 @@ def factor_for(body: BodyParticles, youngs_modulus: float) -> float:
 
 
 def _believed(body: BodyParticles) -> float:
-    found = solids(body, SOLID)
+    found = solids(body, SOLIDS)
     if not found:
         raise InputError(f"body {body.name!r} has no Young's modulus: give it a solid material that deforms")
     return found[0].youngs_modulus

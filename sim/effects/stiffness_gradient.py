@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mpm.bodies import BodyParticles
-from ..mpm.setup import WorldSetup
-from .changes import SOLID, change_bodies, needs
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values, unit_vector, vector_parameters
+from .setup_changes import SOLIDS, change_bodies, needs
 
 
 def place_across(body: BodyParticles, direction: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -37,7 +37,7 @@ def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetu
     def graded(body: BodyParticles) -> BodyParticles:
         scale = 1.0 + values["slope"] * place_across(body, direction)
         if body.material_index is not None:
-            solid = np.array([getattr(m, "law", None) in SOLID for m in (body.material, *body.materials)])
+            solid = np.array([getattr(m, "cohesion", None) in SOLIDS for m in (body.material, *body.materials)])
             scale = np.where(solid[body.material_index], scale, 1.0)
         return dataclasses.replace(
             body, stiffness_scale=scale if body.stiffness_scale is None else scale * body.stiffness_scale
@@ -69,5 +69,5 @@ EFFECT = Effect(
     description=__doc__,
     transform=_transform,
     neutral={"slope": 0.0},
-    obstacle=needs(SOLID, "which has no Young's modulus"),
+    obstacle=needs(SOLIDS, "which has no Young's modulus"),
 )

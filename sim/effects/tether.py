@@ -13,10 +13,10 @@ from __future__ import annotations
 import dataclasses
 
 from ..errors import InputError
-from ..mpm.forces import BodyForces
-from ..mpm.setup import WorldSetup
-from .changes import change_forces
+from ..mpm.bodies import BodyForces
+from ..mpm.world_setup import WorldSetup
 from .schema import Effect, Parameter, Targets, Values, vector, vector_parameters
+from .setup_changes import change_forces
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..mpm.forces import BodyForces
-from ..mpm.setup import WorldSetup
+from ..mpm.bodies import BodyForces
+from ..mpm.world_setup import WorldSetup
 from .air_drag import DRAG
-from .changes import change_forces
 from .schema import Effect, Targets, Values, vector, vector_parameters
+from .setup_changes import change_forces
 
 
 def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Compositional assets out of Gaussian splats and meshes (PhyCAGE); docs/compositional-assets.md is the way in.
+"""Gaussian splats, and objects composed out of them (PhyCAGE); docs/composition.md is the overview.
 
-splats.py        what a splat object is
-sample.py        splats on a mesh, in its colours
-ply/             3DGS PLY files in and out
-views/           pictures of an object from all around: cameras, masks, the hull that they leave, whose each point is
-raster/          pictures from splats and their gradients (Taichi)
-fit/             splats from pictures: losses, descent
-guidance/        score distillation: which way a picture becomes likelier
-physics/         the simulator as an optimiser: points moved by MPM beside a surface; penetration; staying together
-compose/         Algorithm 1 and its ablations
-moving.py        splats that follow particles
-"""
+splats.py         the splat object: data, affine maps, deformation with particles
+mesh_to_splats.py splats sampled on a textured mesh
+splat_ply.py      3DGS PLY files in several dialects; ply_format.py the PLY format itself
+views/            posed images with masks and labels, their visual hull and its segmentation
+raster/           differentiable rasteriser (Taichi)
+image_loss.py     photometric losses and their gradients
+splat_fit.py      splats fitted to views by Adam; pair_fit.py two objects at once
+guidance/         score distillation: gradients that make a render more likely
+compose/          Algorithm 1 of PhyCAGE: optimisation with the simulator, penetration, stability"""

@@ -1,2 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What other programs leave behind, read as it is: PhysGen3D, PhysGen, masks by SAM, COCO annotations."""
+"""Files of other programs, one importer a program: PhysGen3D, PhysGen, splat files, masks by SAM and in COCO's format.
+
+physgen3d.py    output folders of PhysGen3D's perception and settings of its simulation, as they are
+physgen3d_scene.py  the same as a scene folder
+physgen.py      folders of PhysGen, as they are and as a scene folder
+splat_scene.py  splat files as a scene folder
+masks.py        masks in any supported form; image_masks.py images and arrays (SAM), coco_masks.py JSON (COCO)
+yaml_fields.py  YAML of bounded size and checked numbers"""

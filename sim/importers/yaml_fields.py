@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""YAML files of other programs: plain values alone, of bounded size; and the numbers in them."""
+"""YAML files of other programs: plain values only, of bounded size; and checked numbers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any
 from ..errors import InputError
 
 MAX_YAML_BYTES = 64 * 2**10
-"""A larger file is refused unread: the settings of a simulation are a few kilobytes, and the parser is slow."""
+"""Larger files are refused unread: the settings of a simulation are a few kilobytes, and the parser is slow."""
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of the YAML file ``path``: dicts, lists, texts, numbers, booleans, None.
+    """Return the content of the YAML file ``path``: dicts, lists, strings, numbers, booleans, None.
 
-    Aliases are refused: a few lines of them can stand for billions of values. So are tags of Python objects.
+    Aliases are refused, because a few lines of them can expand to billions of values; so are tags of Python objects.
     Raises InputError, also where PyYAML is missing.
     """
-    # Late: Blender's own Python, which lists folders with this package, does not have it.
+    # Late: Blender's own Python, which lists folders with this package, lacks it.
     try:
         import yaml
     except ModuleNotFoundError:
@@ -28,28 +28,28 @@ def read_yaml(path: Path) -> Any:
     class PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
-                raise InputError(f"{path}: has an alias (*{self.peek_event().anchor}); write the value out")
+                raise InputError(f"{path}: has an alias (*{self.peek_event().anchor}); write out the value")
             return super().compose_node(parent, index)
 
     try:
         if path.stat().st_size > MAX_YAML_BYTES:
-            raise InputError(f"{path}: larger than {MAX_YAML_BYTES >> 10} KiB, so these are no settings")
+            raise InputError(f"{path}: larger than {MAX_YAML_BYTES >> 10} KiB, too large for settings")
         text = path.read_text(encoding="utf-8-sig")
         return yaml.load(text, Loader=PlainLoader)  # noqa: S506 - a SafeLoader
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
+        raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    # ValueError: dates and numbers that cannot be, such as 2001-99-99; not UTF-8.
+    # ValueError: impossible dates and numbers such as 2001-99-99; not UTF-8.
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, RecursionError) as error:
         words = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not readable as YAML ({words})") from None
 
 
 def number(value: Any, where: str, low: float, high: float) -> float:
-    """``value`` as a float from ``low`` to ``high``; InputError, naming ``where``, for anything else.
+    """Return ``value`` as a float from ``low`` to ``high``. Raises InputError, naming ``where``, for anything else.
 
-    A text that is a number counts: PyYAML takes ``5.0e4``, which has no sign in its exponent, for a text.
+    Numeric strings are accepted, because PyYAML reads ``5.0e4``, whose exponent has no sign, as a string.
     """
     result = math.nan
     if isinstance(value, int | float | str) and not isinstance(value, bool):
@@ -63,7 +63,7 @@ def number(value: Any, where: str, low: float, high: float) -> float:
 
 
 def numbers(value: Any, count: int, where: str, limit: float = 1e9) -> tuple[float, ...]:
-    """``value`` as a list of ``count`` numbers, each of at most ``limit``; InputError for anything else."""
+    """Return ``value`` as ``count`` floats within ±``limit``. Raises InputError for anything else."""
     if not isinstance(value, list) or len(value) != count:
         raise InputError(f"{where} is {_brief(value)}: expected a list of {count} numbers")
     return tuple(number(entry, f"{where}[{i}]", -limit, limit) for i, entry in enumerate(value))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """MLS-MPM engine; ``world.World`` is the way in.
 
-What describes a world imports no Taichi: ``setup`` and all that it is made of, ``sampling``, ``placement``,
-``distance``, ``estimate``, ``checks``, ``diagnostics``, ``fitting``.
+The description of a world imports no Taichi: ``world_setup``, ``bodies``, ``colliders``, ``surface_contact``,
+``solver_options``, ``cost_estimate``, ``diagnostics``, ``geometry``.
 """
 
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is simulated: bodies made of particles. World metres, kilograms, seconds."""
+"""Bodies made of particles, and the forces on them. World metres, kilograms, seconds. No Taichi."""
 
 from __future__ import annotations
 
@@ -9,14 +9,82 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..constitutive import DeformableMaterial, RigidMaterial, bounding_speed
 from ..errors import InputError
-from .colliders import Surface
-from .contacts import GROUND_NAME
-from .forces import NO_FORCES, BodyForces
-from .materials import ElasticMaterial, RigidMaterial, bounding_speed
-from .tracks import Track
+from .colliders import Surface, Track
+from .surface_contact import GROUND_NAME
 
 Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyForces:
+    """Accelerations of a body of velocity v and angular velocity w at the place x of its centre of mass.
+
+        a = gravity_factor g - drag |v - wind| (v - wind) + lift w x (v - wind) + tether
+
+    The tether pulls with tether_stiffness (d - tether_length) towards its anchor, d the distance to it; a string
+    (``tether_string``) only where d is larger than its length. Drag of matter that deforms acts with the matter's local
+    velocity, all else on the body as a whole. Raises InputError on a value out of range.
+    """
+
+    gravity_factor: float = 1.0
+    """Share of gravity that acts, -10 to 10; 1 - fraction of the weight that a medium carries."""
+
+    drag: float = 0.0
+    """rho c_d A / (2 m) in 1/m, 0 to 1e4."""
+
+    wind: Vector = (0.0, 0.0, 0.0)
+    """Velocity of the air in m/s."""
+
+    lift: float = 0.0
+    """Magnus coefficient S / m, no unit, -10 to 10."""
+
+    tether_stiffness: float = 0.0
+    """Spring constant over mass in 1/s², 0 to 1e6."""
+
+    tether_length: float = 0.0
+    """Length in metres at which the tether does not pull, 0 or more."""
+
+    tether_anchor: Vector = (0.0, 0.0, 0.0)
+    """Where the tether is fixed, world metres."""
+
+    tether_string: bool = False
+    """Whether the tether only pulls (a string) or also pushes (a spring)."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("gravity_factor", -10.0, 10.0),
+            ("drag", 0.0, 1e4),
+            ("lift", -10.0, 10.0),
+            ("tether_stiffness", 0.0, 1e6),
+            ("tether_length", 0.0, 1e6),
+        ):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise InputError(f"force {name} is {value!r}: give {low:g} to {high:g}")
+        for name in ("wind", "tether_anchor"):
+            vector = getattr(self, name)
+            if len(vector) != 3 or not all(math.isfinite(c) for c in vector):
+                raise InputError(f"force {name} is {vector!r}: give three finite numbers")
+
+    def in_cells(self, scale: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The fields in their order as 12 numbers for the kernels, ``scale`` cells a metre counted from ``origin``."""
+        return np.array(
+            [
+                self.gravity_factor,
+                self.drag / scale,
+                *(np.asarray(self.wind) * scale),
+                self.lift,
+                self.tether_stiffness,
+                self.tether_length * scale,
+                *((np.asarray(self.tether_anchor) - origin) * scale),
+                float(self.tether_string),
+            ]
+        )
+
+
+NO_FORCES = BodyForces()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,7 +92,7 @@ class BodyParticles:
     """One body at rest in its undeformed shape. Raises InputError on bad shapes or values."""
 
     name: str
-    """What messages call the body."""
+    """Name of the body in messages."""
 
     positions: NDArray[np.float64]
     """Particle positions (N, 3), world metres."""
@@ -32,10 +100,10 @@ class BodyParticles:
     volumes: NDArray[np.float64]
     """Volume of each particle (N,), m³, above 0."""
 
-    material: ElasticMaterial | RigidMaterial
-    """What the body is made of: any of ``materials``."""
+    material: DeformableMaterial | RigidMaterial
+    """Material: a model of ``constitutive``, or rigid."""
 
-    materials: tuple[ElasticMaterial, ...] = ()
+    materials: tuple[DeformableMaterial, ...] = ()
     """More materials in the same body, for the particles that ``material_index`` sends there; none may be rigid."""
 
     material_index: NDArray[np.int32] | None = None
@@ -55,20 +123,20 @@ class BodyParticles:
     """The body's skin at rest, world metres; a rigid body needs it."""
 
     forces: BodyForces = NO_FORCES
-    """What acts on the body besides gravity and contact."""
+    """Forces on the body besides gravity and contact."""
 
     acceleration: Track | None = None
     """Force over mass of the whole body over time, (K, 3) m/s²."""
 
     velocity_keys: Track | None = None
-    """At each of its times the body as a whole is given the velocity (3,) in m/s: what it has is changed by the same
-    amount everywhere. Between the times it moves freely."""
+    """At each of its times the body's mean velocity is set to (3,) m/s: all particles change by the same amount.
+    Between the times it moves freely."""
 
     pins: NDArray[np.bool_] | None = None
     """Particles (N,) held in place, or where ``pin_motion`` takes them. Not of rigid bodies."""
 
     pin_motion: Track | None = None
-    """Way (K, 3) in metres of all pinned particles from their places at rest, over time; None holds them there."""
+    """Displacement (K, 3) in metres of all pinned particles from rest, over time; None holds them there."""
 
     goal_stiffness: float = 0.0
     """Pull of every particle to its place at rest (moved with ``pin_motion``), force over mass and distance in 1/s²,
@@ -79,7 +147,7 @@ class BodyParticles:
 
     contact_radii: NDArray[np.float64] | None = None
     """Distance (N,) in metres at which a particle touches the ground: its distance to the body's surface, at most half
-    the particle spacing, as ``sampling.sample_interior`` returns it. None takes half the cube root of the volume."""
+    the particle spacing, as ``sample_interior`` returns it. None takes half the cube root of the volume."""
 
     velocity: Vector = (0.0, 0.0, 0.0)
     """Velocity of the centre of mass, m/s."""
@@ -134,7 +202,7 @@ class BodyParticles:
         )
 
     def _check_fields(self, count: int) -> None:
-        """The fields that a particle or a time has values of its own for."""
+        """Check the fields with a value per particle or per time."""
         for field in ("density_scale", "stiffness_scale"):
             scale = getattr(self, field)
             if scale is not None:
@@ -181,10 +249,10 @@ class BodyParticles:
 
     @property
     def rigid(self) -> bool:
-        """Whether the body moves as one."""
+        """Whether the body does not deform."""
         return isinstance(self.material, RigidMaterial)
 
-    def bounding_speed(self, material: ElasticMaterial, scale: float) -> float:
+    def bounding_speed(self, material: DeformableMaterial, scale: float) -> float:
         """Speed in cells/s of the wave in ``material`` that bounds the substep, with ``scale`` cells a metre."""
         stiffer = 1.0 if self.stiffness_scale is None else float(self.stiffness_scale.max())
         lighter = 1.0 if self.density_scale is None else float(self.density_scale.min())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Surfaces that bodies hit and that no body moves: static, moving, deforming. No Taichi."""
+"""Keyframed tracks, and surfaces that bodies hit: static, moving, deforming. No Taichi."""
 
 from __future__ import annotations
 
@@ -11,11 +11,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .contacts import GROUND_NAME
-from .tracks import Track
+from .surface_contact import GROUND_NAME
 
 if TYPE_CHECKING:
-    from .distance import DistanceLattice
+    from .geometry.signed_distance import DistanceLattice
+
+
+SAME_TIME = 1e-5
+"""Events closer than this in s happen together. Contacts take out overlap within a substep, so that one which only
+fills the gap between two keyframes that were meant to be one, 1e-7 s long, would throw what it touches."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """Keyframes: ``values`` (K, ...) at ``times`` (K,) in s, linear between them, constant before and after.
+
+    Raises InputError unless the times rise and all numbers are finite.
+    """
+
+    times: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        times = np.ascontiguousarray(self.times, dtype=np.float64)
+        values = np.ascontiguousarray(self.values, dtype=np.float64)
+        if times.ndim != 1 or len(times) == 0 or len(values) != len(times):
+            raise InputError(f"track times has shape {times.shape} and values {values.shape}: give one value a time")
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise InputError("track times do not rise: give finite seconds in rising order, each once")
+        if not np.isfinite(values).all():
+            raise InputError("track values are not finite: remove NaN and infinite numbers")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """The value at ``time`` in s."""
+        i = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, max(len(self.times) - 2, 0)))
+        if len(self.times) == 1:
+            return np.asarray(self.values[0])
+        share = np.clip((time - self.times[i]) / (self.times[i + 1] - self.times[i]), 0.0, 1.0)
+        return np.asarray((1 - share) * self.values[i] + share * self.values[i + 1])
+
+    def knots(self, start: float, end: float) -> list[float]:
+        """Times of keyframes strictly between ``start`` and ``end``, where the slope changes."""
+        return [float(t) for t in self.times if start < t < end]
+
 
 Array = NDArray[np.float64]
 
@@ -24,7 +64,7 @@ Array = NDArray[np.float64]
 class Surface:
     """A closed triangle mesh: vertices (V, 3) in metres, faces (T, 3). Raises InputError on bad shapes or numbers.
 
-    Whether it is closed is checked where it matters, by ``distance.signed_distance``.
+    Whether it is closed is checked where it matters, by ``geometry.signed_distance``.
     """
 
     vertices: Array
@@ -45,9 +85,9 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Collider:
-    """A surface that bodies hit.
+    """A surface with prescribed motion that bodies hit.
 
-    name: what messages and the table of contacts call it.
+    name: in messages and the contact table.
     surface: at rest, world metres.
     translations: Track of (3,) metres added to the surface, or None.
     rotations: Track of rotation vectors (3,) in radians (axis times angle) about ``pivot``, or None. Between keyframes
@@ -89,7 +129,7 @@ class Collider:
 
     @property
     def middle(self) -> Array:
-        """The world point (3,) about which it turns."""
+        """World point (3,) about which it rotates."""
         if self.pivot is not None:
             return np.asarray(self.pivot, dtype=np.float64)
         return np.asarray(0.5 * (self.surface.vertices.min(axis=0) + self.surface.vertices.max(axis=0)))

@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Conserved quantities of a particle state, in float64 on the host. Any consistent units; no Taichi."""
+"""Momenta, energies and fitted deformation gradients of a particle state, in float64 on the host. No Taichi.
+
+The engine's F of a plastic particle is the elastic part; the whole deformation is in the positions. With the rest
+offsets X_j - X_i of the neighbours j and their displacements u_j - u_i the least-squares fit (Falk and Langer 1998) is
+
+    F_i = I + [ sum_j w_j (u_j - u_i)(X_j - X_i)^T ] [ sum_j w_j (X_j - X_i)(X_j - X_i)^T ]^-1
+
+It is exact for affine motion, and the identity at rest. Where a neighbourhood has been torn apart the fit is poor;
+its principal stretches are clamped to ``LEAST`` and ``MOST``.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +16,45 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from .materials import FIXED_COROTATED, FLUID, NEO_HOOKEAN, SNOW, ElasticMaterial, SnowMaterial
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
+
+NEIGHBOURS = 14
+"""Particles fitted to: the nearest shells of a cubic lattice are 6, 12 and 8."""
+
+LEAST = 0.1
+MOST = 5.0
+
+
+class FittedGradients:
+    """Fits for one body, set up once from its rest ``positions`` (N, 3)."""
+
+    def __init__(self, positions: Array) -> None:
+        self._rest = positions
+        count = min(NEIGHBOURS, len(positions) - 1)
+        distance, index = cKDTree(positions).query(positions, k=count + 1)
+        self._index = index[:, 1:]
+        self._offsets = positions[self._index] - positions[:, None, :]
+        scale = distance[:, -1:] + 1e-300
+        self._weights = (1.0 - 0.8 * (distance[:, 1:] / scale) ** 2) / scale**2
+        moment = np.einsum("nk,nki,nkj->nij", self._weights, self._offsets, self._offsets)
+        # A neighbourhood in a plane or line says nothing across: no change there. (1e-6: moments are of order 1.)
+        self._inverse = np.linalg.pinv(moment, rcond=1e-6, hermitian=True)
+
+    def gradients(self, positions: Array) -> Array:
+        """Deformation gradients (N, 3, 3) that take the rest positions to ``positions`` (N, 3)."""
+        moved = positions - self._rest
+        relative = moved[self._index] - moved[:, None, :]
+        fitted = np.einsum("nk,nki,nkj->nij", self._weights, relative, self._offsets) @ self._inverse + np.eye(3)
+        if not np.isfinite(fitted).all():
+            fitted = np.where(np.isfinite(fitted), fitted, 0.0)
+        size = np.abs(fitted - np.eye(3)).max(axis=(1, 2))
+        far = np.flatnonzero(size > 0.25)
+        if len(far):
+            u, s, vt = np.linalg.svd(fitted[far])
+            fitted[far] = u * np.clip(s, LEAST, MOST)[:, None, :] @ vt
+        return fitted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,31 +106,3 @@ def kinetic_energy(masses: Array, velocities: Array, affine: Array, cell_size: f
     """Sum of m/2 (v² + dx²/4 C:C)."""
     squares = (velocities**2).sum(axis=1) + cell_size**2 / 4 * (affine**2).sum(axis=(1, 2))
     return float(0.5 * masses @ squares)
-
-
-def elastic_energy(material: ElasticMaterial, volumes: Array, deformation: Array, memories: Array) -> float:
-    """Sum of V0 psi over particles with elastic ``deformation`` (N, 3, 3), in J; the laws are in ``laws``."""
-    mu, lam = material.shear_modulus, material.lame_lambda
-    if material.law == FLUID:
-        # psi = integral of p dJ from J to 1 with p = K/7 (J^-7 - 1); none in tension.
-        ratio = np.exp(np.minimum(memories, 0.0))
-        return float(volumes @ (material.bulk_number / 7 * ((ratio**-6 - 1) / 6 + ratio - 1)))
-    fibres = 0.0
-    if material.fibre_modulus > 0:
-        along = np.linalg.norm(deformation @ np.asarray(material.fibre_axis), axis=1)
-        fibres = float(volumes @ (0.5 * material.fibre_modulus * (along - 1) ** 2))
-    stretches = np.linalg.svd(deformation, compute_uv=False)
-    volume_ratio = np.linalg.det(deformation)
-    if material.law in (FIXED_COROTATED, SNOW):
-        stretches[:, 2] = np.copysign(stretches[:, 2], volume_ratio)
-        density = mu * ((stretches - 1) ** 2).sum(axis=1) + 0.5 * lam * (volume_ratio - 1) ** 2
-        if isinstance(material, SnowMaterial):
-            density = density * np.exp(material.hardening * (1 - np.exp(memories)))
-        return float(volumes @ density) + fibres
-    strains = np.log(np.maximum(stretches, 1e-3))
-    total = strains.sum(axis=1)
-    if material.law == NEO_HOOKEAN:
-        shear = 0.5 * mu * ((stretches**2).sum(axis=1) - 3) - mu * total
-    else:
-        shear = mu * (strains**2).sum(axis=1)
-    return float(volumes @ (shear + 0.5 * lam * total**2)) + fibres

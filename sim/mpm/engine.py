@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The substep loop and the arrays on the device. Lengths in cells; ``packing`` and ``view`` convert."""
+"""The substep loop and the arrays on the device. Lengths in cells; ``packing`` and ``world_view`` convert."""
 
 from __future__ import annotations
 
@@ -12,47 +12,61 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..events import IsCancelled
-from . import layout, meeting, runtime, sorting
-from .launch import Launcher
-from .layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .materials import FLOWING, FLUID, ONLY_ELASTIC
-from .nodes import SUMS
-from .obstacles import PUSH
-from .packed import Added, Numbers
-from .solids import MOVE, SEARCH, Solids
-from .solids_alone import advance_solids
-from .stepping import prime_worlds
-from .substep_launch import SOLID_NAMES, substep_launcher
+from .kernels import broad_phase, layout, runtime, sorting
+from .kernels.collider_distance import PUSH
+from .kernels.constitutive_response import law_set
+from .kernels.grid import SUMS
+from .kernels.kernel_arrays import (
+    BlockTable,
+    CouplingArrays,
+    FlowArrays,
+    GridBlocks,
+    NearBlocks,
+    NodeArrays,
+    OverlapBlocks,
+    ParticleArrays,
+    ParticleBlocks,
+    ParticleState,
+    StepLimits,
+    WorldArrays,
+)
+from .kernels.kernel_bundles import Launcher
+from .kernels.layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
+from .kernels.substep import substep_launcher
+from .kernels.time_stepping import prime_worlds
+from .packing import NewParticles, PackedWorlds
+from .rigid.rigid_bodies import RigidBodies
+from .rigid.rigid_motion import advance_solids
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
 
-ALWAYS = ("x", "v", "C", "F", "constants", "reaction", "ids")
+ALWAYS = ParticleState._fields
 """Arrays that every particle needs."""
 
 MATTER = ("memory", "material")
-"""Arrays that only laws other than fixed-corotated elasticity need."""
+"""Arrays that only models other than plain fixed-corotated elasticity need."""
 
 MOST_RETRIES = 6
-"""Times that a stretch of substeps is tried again with half the step, before the run is given up."""
+"""Times that a stretch of substeps is repeated with half the step before the run fails."""
 
 RECOVER = 1.25
-"""Factor by which a step that had to be shortened grows again after each stretch that went well."""
+"""Factor by which a shortened step grows again after each stretch that did not diverge."""
 
 LEAST_STEP = 1e-10
-"""Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a lost run."""
+"""Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a diverged run."""
 
 LEAST_BLOCKS = 64
 GROWTH = 1.3
-"""Room for more blocks than there are, so that the arrays are not made anew at every sort."""
+"""Spare capacity of block arrays, so that they are not reallocated at every sort."""
 
 
 class Stopped(Exception):
-    """The caller wants no more; the worlds are left between two times."""
+    """The caller cancelled; the worlds are between two times."""
 
 
 class Diverged(Exception):
-    """World ``world`` went wrong in field ``field`` and shorter steps did not help."""
+    """World ``world`` diverged in field ``field`` and shorter steps did not help."""
 
     def __init__(self, world: int, field: int) -> None:
         super().__init__(f"world {world}, field {field}")
@@ -67,30 +81,31 @@ class Engine:
     """
 
     def __init__(
-        self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: Numbers, solids: Solids
+        self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: PackedWorlds, solids: RigidBodies
     ) -> None:
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
         self.solids = solids
         self._most_solids = int(numbers.world_integers[:, layout.SOLIDS].max())
         self._running = ti.ndarray(ti.i32, 1)
-        self._steps = ti.ndarray(ti.f64, len(numbers.worlds))
         self._touching = ti.ndarray(ti.f32, max(1, solids.count))
         self.laws = numbers.laws
+        models = law_set(self.laws)
+        self._flowing = models.flowing
         self.world_count = len(numbers.worlds)
         self.field_count = len(numbers.fields)
         self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
         several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
         anchored = bool(numbers.field_integers[:, layout.HAS_ANCHORS].any())
-        self._names = ALWAYS + (() if self.laws == ONLY_ELASTIC else MATTER)
+        self._names = ALWAYS + (() if models.only_elastic else MATTER)
         self._names += ("volumes",) if several else ()
         self._names += ("anchors",) if anchored else ()
-        self._names += ("slopes",) if self.laws & (1 << FLUID) else ()
+        self._names += ("slopes",) if models.volumetric else ()
         self._several = several
         self.count = 0
         self.retries = 0
         self._table = _upload_new(numbers.table)
         self._world_integers = _upload_new(numbers.world_integers)
-        self._worlds = _upload_new(numbers.worlds)
+        self._world_numbers = _upload_new(numbers.worlds)
         self._field_integers = _upload_new(numbers.field_integers)
         self._field_world = numbers.field_integers[:, layout.WORLD].copy()
         self._fields = _upload_new(numbers.fields)
@@ -109,8 +124,8 @@ class Engine:
         self._targets = ti.ndarray(ti.i32, self._capacity)
         self._g_starts = ti.ndarray(ti.i32, self.field_count + 1)
         self._p_blocks = self._g_blocks = 0
-        self._near = self._meeting = (0, 0)
-        self._meet_p_count = 0
+        self._near = (0, 0)
+        self._overlap = (0, 0, 0)
         self._p_capacity = self._g_capacity = 0
         self._allocate_blocks(LEAST_BLOCKS, 4 * LEAST_BLOCKS)
 
@@ -144,9 +159,8 @@ class Engine:
             self._touched, self._slack = ti.ndarray(ti.i32, p), ti.ndarray(ti.f32, p)
             self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
-            flowing = bool(self.laws & FLOWING)
-            self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if flowing else 1)
-            self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if flowing else 1)
+            self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
+            self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
             self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
             self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
@@ -157,7 +171,7 @@ class Engine:
             self._near_g, self._mate, self._meet = (ti.ndarray(ti.i32, g) for _ in range(3))
             self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
             self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
-            self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self.laws & FLOWING else 1)
+            self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self._flowing else 1)
             self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
             self._block_sums = ti.ndarray(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
@@ -178,15 +192,15 @@ class Engine:
         self._control.from_numpy(np.ascontiguousarray(control).ravel())
 
     def set_rows(self, *, worlds: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
-        """Take the numbers of worlds and fields for the next segment of time."""
-        self._worlds.from_numpy(np.ascontiguousarray(worlds, dtype=np.float32).ravel())
+        """Set the parameters of worlds and fields for the next segment of time."""
+        self._world_numbers.from_numpy(np.ascontiguousarray(worlds, dtype=np.float32).ravel())
         if self.field_count:
             self._fields.from_numpy(np.ascontiguousarray(fields, dtype=np.float32).ravel())
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
-    def add(self, groups: Sequence[tuple[Added, float]]) -> None:
-        """Take in particles, each group with the speed in cells/s of the fastest wave in it (``bounding_speed``)."""
+    def add(self, groups: Sequence[tuple[NewParticles, float]]) -> None:
+        """Add particles, each group with the speed in cells/s of the fastest wave in it (``bounding_speed``)."""
         state = self._download()
         parts = {name: [state[name]] for name in self._names}
         all_keys = [state["keys"].astype(np.int64)]
@@ -266,50 +280,33 @@ class Engine:
         return state
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Take up a state that ``state`` returned, on an engine of the same capacity and worlds."""
+        """Restore a state that ``state`` returned, on an engine of the same capacity and worlds."""
         self._upload(state, np.asarray(state["keys"], dtype=np.int64))
         self._put_control(np.asarray(state["control"], dtype=np.float64))
         self._means.from_numpy(np.asarray(state["means"], dtype=np.float32))
 
     def replace(self, state: State) -> None:
-        """Take particles that the caller has changed, as ``state`` returned them, in the same order."""
+        """Replace the particles by ``state``, which the caller has changed, in the same order."""
         self._upload(state, np.asarray(state["keys"], dtype=np.int64))
 
     # ---- grouping -----------------------------------------------------------------------------------------------
 
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
-        sorting.rebase(
-            self._p_blocks,
-            self._p_cells,
-            self._p_field,
-            self._starts,
-            self._field_integers,
-            self._control,
-            self._particles[0]["x"],
-            self._keys,
-        )
+        sorting.rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks())
         self._group()
 
     def _group(self) -> None:
         """Lists, neighbours and permutation for the blocks named in ``_keys``."""
         while True:
             self._p_keys.fill(-1)
-            p = sorting.list_particle_blocks(
-                self.count,
-                self._p_capacity,
-                self._p_mask,
-                self._keys,
-                self._p_keys,
-                self._p_slots,
-                self._p_cells,
-                self._p_field,
-                self._starts,
+            self._p_blocks = sorting.list_particle_blocks(
+                self.count, self._p_capacity, self._keys, self._p_table(), self._blocks()
             )
-            if p <= self._p_capacity:
+            if self._p_blocks <= self._p_capacity:
                 break
-            self._allocate_blocks(int(GROWTH * p) + LEAST_BLOCKS, 0)
-        # The grid's list turns the counts of particles into offsets, once: its room must do the first time.
+            self._allocate_blocks(int(GROWTH * self._p_blocks) + LEAST_BLOCKS, 0)
+        # The grid's list turns the counts of particles into offsets, once: they are put back for every new attempt.
         counts = None
         while True:
             self._g_keys.fill(-1)
@@ -317,44 +314,16 @@ class Engine:
                 counts = self._starts.to_numpy()
             else:
                 self._starts.from_numpy(counts)
-            g = sorting.list_grid_blocks(
-                p,
-                self.field_count,
-                self._g_capacity,
-                self._g_mask,
-                self._p_cells,
-                self._p_field,
-                self._g_keys,
-                self._g_slots,
-                self._g_cells,
-                self._g_field,
-                self._g_starts,
-                self._starts,
-                self._cursors,
+            self._g_blocks = sorting.list_grid_blocks(
+                self.field_count, self._g_capacity, self._cursors, self._g_table(), self._blocks(), self._grid()
             )
-            if g <= self._g_capacity:
+            if self._g_blocks <= self._g_capacity:
                 break
-            self._allocate_blocks(0, int(GROWTH * g) + LEAST_BLOCKS)
-        self._p_blocks, self._g_blocks = p, g
-        sorting.link_blocks(
-            p,
-            g,
-            self._p_mask,
-            self._g_mask,
-            self._p_cells,
-            self._p_field,
-            self._g_cells,
-            self._g_field,
-            self._p_keys,
-            self._p_slots,
-            self._g_keys,
-            self._g_slots,
-            self._p_neighbours,
-            self._g_neighbours,
-        )
-        sorting.place(self.count, self._p_mask, self._keys, self._p_keys, self._p_slots, self._cursors, self._targets)
+            self._allocate_blocks(0, int(GROWTH * self._g_blocks) + LEAST_BLOCKS)
+        sorting.link_blocks(self._blocks(), self._grid(), self._p_table(), self._g_table())
+        sorting.place(self.count, self._keys, self._cursors, self._targets, self._p_table())
         old, new = self._particles
-        sorting.permute(self.count, self._targets, *(old[name] for name in ALWAYS), *(new[name] for name in ALWAYS))
+        sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
             "memory": sorting.permute_numbers,
             "material": sorting.permute_integers,
@@ -369,49 +338,16 @@ class Engine:
         self._list_contacts()
 
     def _list_contacts(self) -> None:
-        solids = self.solids.arrays
-        found = meeting.list_near_blocks(
-            self._p_blocks,
-            self._g_blocks,
-            self._p_cells,
-            self._p_field,
-            self._g_neighbours,
-            self._field_integers,
-            self._world_integers,
-            self._worlds,
-            solids["solid_kinds"],
-            solids["solid_numbers"],
-            solids["solids"],
-            solids["shape_numbers"],
-            solids["shape_dims"],
-            solids["distances"],
-            self._near_of_p,
-            self._near_p,
-            self._near_g,
-        )
+        solids = self.solids
+        near, blocks, grid = self._near_blocks(), self._blocks(), self._grid()
+        found = broad_phase.list_near_blocks(self._worlds(), blocks, grid, near, solids.bodies, solids.shapes)
         self._touched.fill(0)
         self._slack.fill(0.0)
         self._near = (int(found[0]), int(found[1]))
         if self._several:
-            found = meeting.list_meeting_blocks(
-                self._p_blocks,
-                self._g_blocks,
-                self._g_mask,
-                self._g_cells,
-                self._g_field,
-                self._g_keys,
-                self._g_slots,
-                self._p_neighbours,
-                self._field_integers,
-                self._world_integers,
-                self._mate,
-                self._meet,
-                self._meet_g,
-                self._leads,
-                self._meet_p,
-                self._meets_p,
-            )
-            self._meeting, self._meet_p_count = (int(found[0]), int(found[1])), int(found[2])
+            overlap = self._overlap_blocks()
+            found = broad_phase.list_overlap_blocks(self._worlds(), blocks, grid, self._g_table(), overlap)
+            self._overlap = (int(found[0]), int(found[1]), int(found[2]))
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
@@ -427,10 +363,10 @@ class Engine:
         return np.asarray(np.minimum(step, scale * self.cfl_velocity / np.maximum(fastest, 1e-30)))
 
     def advance(self, durations: Array, *, longest_step: Array, stop: IsCancelled) -> None:
-        """Advance every world by its duration (W,) in s, 0 to let it be, in substeps of at most ``longest_step`` (W,).
+        """Advance every world by its duration (W,) in s, 0 to leave it, in substeps of at most ``longest_step`` (W,).
 
-        stop: asked before every launch. Raises Stopped when it says yes: only ``restore`` makes sense after that.
-        Raises Diverged when a world goes wrong and shorter steps do not help. All worlds are then as they were when
+        stop: called before every launch. Raises Stopped when it returns True: only ``restore`` works after that.
+        Raises Diverged when a world diverges and shorter steps do not help. All worlds are then as they were when
         they were last sorted, ELAPSED s after the call.
         """
         control = self.control()
@@ -448,14 +384,14 @@ class Engine:
             before = self.solids.state() if self.solids.count else None
             self._sort()
             while True:
-                prime_worlds(self.world_count, self.cfl_elastic, self.cfl_velocity, self._control)
+                prime_worlds(self._limits(), self._worlds())
                 if self.count:
-                    launcher, arguments = self._launcher(), self._arguments()
+                    launch = self._launcher().bind(self._arguments())
                     self._running[0] = self.world_count
                     while self._running[0] > 0:
                         if stop():
                             raise Stopped
-                        launcher.launch(arguments)
+                        launch()
                 elif stop():
                     raise Stopped
                 else:
@@ -487,92 +423,93 @@ class Engine:
         self._put_control(control)
 
     def _advance_solids(self) -> None:
-        """All substeps of all worlds, none of which holds matter."""
-        solids = self.solids.arrays
-        names = dict.fromkeys((*MOVE[:3], *SEARCH, *MOVE))
-        advance_solids(
-            self.world_count,
-            self.cfl_elastic,
-            self.cfl_velocity,
-            self._world_integers,
-            self._control,
-            *(solids[name] for name in names),
-        )
+        """All substeps of all worlds, none of which holds particles."""
+        solids = self.solids
+        advance_solids(self._limits(), self._worlds(), solids.bodies, solids.shapes, solids.contacts)
 
     def _launcher(self) -> Launcher:
-        """The kernels that the present lists of blocks ask for."""
+        """The kernels that the present lists of blocks require."""
         return substep_launcher(
-            runtime.generation(), self.laws, self._meet_p_count > 0, self.solids.count > 0, self._near[0] > 0
+            runtime.generation(), self.laws, self._overlap[2] > 0, self.solids.count > 0, self._near[0] > 0
         )
 
+    # ---- bundles ------------------------------------------------------------------------------------------------
+
     def _arguments(self) -> dict[str, Any]:
-        """What the kernels' parameters are now."""
-        here = self._particles[0]
-        solids = self.solids.arrays
+        """Arguments of the substep's kernels by the kernels' parameter names."""
         return {
-            **{SOLID_NAMES.get(name, name): array for name, array in solids.items()},
-            **here,
-            "material": here.get("material", self._starts),
-            "memory": here.get("memory", self._masses),
-            "volumes": here.get("volumes", self._masses),
-            "anchors": here.get("anchors", self._nodes),
-            "slopes": here.get("slopes", here["v"]),
-            "past_window": self._past_window,
-            "past_scattered": self._past_scattered,
-            "past_nodes": self._past_nodes,
-            "world_count": self.world_count,
-            "mean_fields": self._mean_fields,
-            "p_blocks": self._p_blocks,
-            "g_blocks": self._g_blocks,
-            "near_p_count": self._near[0],
-            "near_g_count": self._near[1],
-            "meet_g_count": self._meeting[0],
-            "lead_count": self._meeting[1],
-            "meet_p_count": self._meet_p_count,
-            "solid_count": self.solids.count,
-            "most_solids": self._most_solids,
-            "cfl_elastic": self.cfl_elastic,
-            "cfl_velocity": self.cfl_velocity,
-            "p_cells": self._p_cells,
-            "p_field": self._p_field,
-            "starts": self._starts,
-            "p_neighbours": self._p_neighbours,
-            "near": self._near_of_p,
-            "near_p": self._near_p,
-            "meets_p": self._meets_p,
-            "meet_p": self._meet_p,
-            "touched": self._touched,
-            "slack": self._slack,
-            "g_cells": self._g_cells,
-            "g_field": self._g_field,
-            "g_starts": self._g_starts,
-            "g_neighbours": self._g_neighbours,
-            "near_g": self._near_g,
-            "mate": self._mate,
-            "meet": self._meet,
-            "meet_g": self._meet_g,
-            "leads": self._leads,
-            "world_integers": self._world_integers,
-            "worlds": self._worlds,
-            "field_integers": self._field_integers,
-            "fields": self._fields,
-            "means": self._means,
-            "touches": self._touches,
-            "body_pairs": self._pairs,
-            "control": self._control,
-            "steps": self._steps,
+            "limits": self._limits(),
+            "worlds": self._worlds(),
+            "blocks": self._blocks(),
+            "grid": self._grid(),
+            "near": self._near_blocks(),
+            "overlap": self._overlap_blocks(),
+            "particles": self._particle_bundle(),
+            "nodes": NodeArrays(self._window, self._scattered, self._nodes, self._sums, self._masses, self._block_sums),
+            "flow": FlowArrays(self._past_window, self._past_scattered, self._past_nodes),
+            "bodies": self.solids.bodies,
+            "shapes": self.solids.shapes,
+            "contacts": self.solids.contacts,
+            "coupling": CouplingArrays(self.solids.count, self._most_solids, self._touching, self._pushes),
             "running": self._running,
-            "table": self._table,
-            "window": self._window,
-            "scattered": self._scattered,
-            "nodes": self._nodes,
-            "sums": self._sums,
-            "masses": self._masses,
-            "block_sums": self._block_sums,
-            "report": self._report,
-            "touching": self._touching,
-            "pushes": self._pushes,
         }
+
+    def _limits(self) -> StepLimits:
+        return StepLimits(self.cfl_elastic, self.cfl_velocity)
+
+    def _worlds(self) -> WorldArrays:
+        return WorldArrays(
+            count=self.world_count,
+            mean_fields=self._mean_fields,
+            integers=self._world_integers,
+            numbers=self._world_numbers,
+            field_integers=self._field_integers,
+            field_numbers=self._fields,
+            contacts=self._touches,
+            pairs=self._pairs,
+            materials=self._table,
+            control=self._control,
+            means=self._means,
+        )
+
+    def _blocks(self) -> ParticleBlocks:
+        return ParticleBlocks(
+            self._p_blocks, self._p_cells, self._p_field, self._starts, self._p_neighbours, self._report
+        )
+
+    def _grid(self) -> GridBlocks:
+        return GridBlocks(self._g_blocks, self._g_cells, self._g_field, self._g_starts, self._g_neighbours)
+
+    def _p_table(self) -> BlockTable:
+        return BlockTable(self._p_mask, self._p_keys, self._p_slots)
+
+    def _g_table(self) -> BlockTable:
+        return BlockTable(self._g_mask, self._g_keys, self._g_slots)
+
+    def _near_blocks(self) -> NearBlocks:
+        lists = (self._near_of_p, self._near_p, self._near_g)
+        return NearBlocks(*self._near, *lists, touched=self._touched, slack=self._slack)
+
+    def _overlap_blocks(self) -> OverlapBlocks:
+        return OverlapBlocks(
+            *self._overlap, self._mate, self._meet, self._meet_g, self._leads, self._meet_p, self._meets_p
+        )
+
+    def _particle_bundle(self) -> ParticleArrays:
+        """Arrays that no kernel of this engine reads are stood in for by others of the same type."""
+        here = self._particles[0]
+        spare = {
+            "material": self._starts,
+            "memory": self._masses,
+            "volumes": self._masses,
+            "anchors": self._nodes,
+            "slopes": here["v"],
+        }
+        return ParticleArrays(**{name: here.get(name, spare.get(name)) for name in ParticleArrays._fields})
+
+
+def _state_of(arrays: Mapping[str, ti.Ndarray]) -> ParticleState:
+    return ParticleState(*(arrays[name] for name in ParticleState._fields))
 
 
 def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64]) -> NDArray[np.int64]:

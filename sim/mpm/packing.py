@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From setups in SI units to the rows of numbers that the kernels read (``layout`` names the columns)."""
+"""Setups in SI units as the rows of numbers that the kernels read; ``kernels.layout`` names the columns."""
 
 from __future__ import annotations
 
@@ -12,26 +12,56 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..constitutive import ROW, DeformableMaterial, ElasticMaterial, RigidMaterial
 from ..scene.units import Similarity
-from . import layout
 from .bodies import BodyParticles
-from .contacts import GROUND_NAME, MODES, SurfaceContact
-from .materials import ONLY_ELASTIC, ROW, ElasticMaterial, RigidMaterial
-from .packed import Added, Numbers
-from .setup import WorldSetup
-from .solids import LEAST_RECOVERY, RECOVERY_HEIGHT
-from .transfer import GOAL, PIN
+from .kernels import layout
+from .kernels.particle_transfer import GOAL, PIN
+from .rigid.rigid_bodies import LEAST_RECOVERY, RECOVERY_HEIGHT
+from .surface_contact import GROUND_NAME, MODES, SurfaceContact
+from .world_setup import WorldSetup
 
 Array = NDArray[np.float64]
 
-DEEPEST, DEEPEST_ELASTIC = 0.05, 0.25
-"""Depth in cells below which no particle sinks, should the contact solve not have held it; an elastic contact is a
-spring, which carries a load only as far as it is pressed in."""
+
+@dataclass(frozen=True, kw_only=True)
+class PackedWorlds:
+    """Parameters of worlds and fields as the kernels read them; ``layout`` names the columns."""
+
+    laws: int
+    table: NDArray[np.float32]
+    world_integers: NDArray[np.int32]
+    worlds: NDArray[np.float32]
+    field_integers: NDArray[np.int32]
+    fields: NDArray[np.float32]
+    touches: NDArray[np.float32]
+    pairs: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
-    """World ``world`` and how its metres become cells."""
+class NewParticles:
+    """Particles to add to field ``field``, N of them, as ``kernel_arrays.ParticleArrays`` describes them."""
+
+    field: int
+    x: Array
+    v: Array
+    C: Array
+    F: Array
+    constants: Array
+    ids: NDArray[np.int32]
+    material: NDArray[np.int32]
+    volumes: Array
+    anchors: Array
+
+
+DEEPEST, DEEPEST_ELASTIC = 0.05, 0.25
+"""Depth in cells below which no particle sinks if the contact solve fails; an elastic contact is a
+spring, which carries a load only as far as it is compressed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldSlot:
+    """World ``world``: its map from metres to cells, and its first rows in the common arrays."""
 
     world: int
     setup: WorldSetup
@@ -49,37 +79,40 @@ class Place:
         return self.first_field + self.soft.index(body)
 
 
-def places(setups: Sequence[WorldSetup], cells: Sequence[Similarity]) -> tuple[Place, ...]:
-    """Where each world's fields and materials stand in the common arrays."""
-    result: list[Place] = []
+def world_slots(setups: Sequence[WorldSetup], cells: Sequence[Similarity]) -> tuple[WorldSlot, ...]:
+    """Rows of each world's fields and materials in the common arrays."""
+    result: list[WorldSlot] = []
     field = material = 0
     for world, (setup, similarity) in enumerate(zip(setups, cells, strict=True)):
-        result.append(Place(world=world, setup=setup, cells=similarity, first_field=field, first_material=material))
+        result.append(WorldSlot(world=world, setup=setup, cells=similarity, first_field=field, first_material=material))
         field += len(result[-1].soft)
         material += sum(1 + len(setup.bodies[i].materials) for i in result[-1].soft)
     return tuple(result)
 
 
-def materials_of(body: BodyParticles) -> tuple[ElasticMaterial, ...]:
+def materials_of(body: BodyParticles) -> tuple[DeformableMaterial, ...]:
     """All materials of a body that deforms, in the order of ``material_index``."""
     assert not isinstance(body.material, RigidMaterial)
     return (body.material, *body.materials)
 
 
-def first_material(place: Place, body: int) -> int:
+def first_material(place: WorldSlot, body: int) -> int:
     """Row of the body's first material in the table."""
     before = place.soft[: place.soft.index(body)]
     return place.first_material + sum(1 + len(place.setup.bodies[i].materials) for i in before)
 
 
 def laws_of(setup: WorldSetup) -> int:
-    """The set of laws that the matter of a world follows; that of the simplest kernel where it holds only solids."""
+    """Bits of the constitutive models in a world; those of the simplest kernel where all bodies are rigid."""
     soft = [body for body in setup.bodies if not body.rigid]
-    return functools.reduce(operator.or_, (m.laws for body in soft for m in materials_of(body)), 0) or ONLY_ELASTIC
+    return (
+        functools.reduce(operator.or_, (m.laws for body in soft for m in materials_of(body)), 0)
+        or 1 << ElasticMaterial.number
+    )
 
 
-def pack(all_places: Sequence[Place]) -> Numbers:
-    """All that stays the same for the whole run; rows of worlds and fields are those at time 0."""
+def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
+    """Pack all that is constant over the run; rows of worlds and fields are those at time 0."""
     bodies = [place.setup.bodies[i] for place in all_places for i in place.soft]
     laws = functools.reduce(operator.or_, (laws_of(place.setup) for place in all_places))
     table = [m.row for body in bodies for m in materials_of(body)] or [(0.0,) * ROW]
@@ -90,7 +123,7 @@ def pack(all_places: Sequence[Place]) -> Numbers:
     first_solid = 0
     for place in all_places:
         setup, soft = place.setup, place.soft
-        obstacles = obstacle_names(setup)
+        obstacles = collider_names(setup)
         row = world_integers[place.world]
         row[layout.FIRST_SOLID], row[layout.SOLIDS] = first_solid, len(obstacles)
         row[layout.FIRST_FIELD], row[layout.FIELDS] = place.first_field, len(soft)
@@ -104,10 +137,10 @@ def pack(all_places: Sequence[Place]) -> Numbers:
             integers[layout.WANTS_MEANS] = int(body.forces.lift != 0 or body.forces.tether_stiffness > 0)
             integers[layout.HAS_ANCHORS] = int(body.pins is not None or body.goal_stiffness > 0)
             for name in (GROUND_NAME, *obstacles):
-                touches.append(touch_row(setup.contact(body.name, name), place.cells))
+                touches.append(contact_row(setup.contact(body.name, name), place.cells))
             for j in soft:
-                pairs.append(touch_row(setup.contact(body.name, setup.bodies[j].name), place.cells))
-    return Numbers(
+                pairs.append(contact_row(setup.contact(body.name, setup.bodies[j].name), place.cells))
+    return PackedWorlds(
         laws=laws,
         table=np.asarray(table, dtype=np.float32),
         world_integers=world_integers,
@@ -119,12 +152,12 @@ def pack(all_places: Sequence[Place]) -> Numbers:
     )
 
 
-def obstacle_names(setup: WorldSetup) -> tuple[str, ...]:
-    """Names of a world's solids in the order in which the kernels count them: rigid bodies, then colliders."""
+def collider_names(setup: WorldSetup) -> tuple[str, ...]:
+    """Names of a world's rigid bodies, then colliders: the order in which the kernels count them."""
     return (*(body.name for body in setup.bodies if body.rigid), *(collider.name for collider in setup.colliders))
 
 
-def touch_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]:
+def contact_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]:
     """One row of the tables ``touches`` and ``pairs``."""
     return (
         contact.sticking,
@@ -134,7 +167,7 @@ def touch_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]:
     )
 
 
-def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
+def world_row(place: WorldSlot, start: float, end: float) -> NDArray[np.float32]:
     """Numbers of a world for the segment of time from ``start`` to ``end`` in s."""
     row = np.zeros(layout.WORLD_ROW)
     scale = place.cells.scale
@@ -157,20 +190,20 @@ def world_row(place: Place, start: float, end: float) -> NDArray[np.float32]:
 def strongest_pull(setup: WorldSetup) -> float:
     """The largest acceleration in m/s² that gravity or a track gives a body at any time.
 
-    Of any time, as a moment without gravity must not stop surfaces and pins from taking back what went too deep.
+    At any time, because a moment without gravity must not stop the position correction of surfaces and pins.
     """
     gravity = setup.gravity_track.values if setup.gravity_track is not None else np.asarray([setup.gravity])
     tracks = [gravity] + [body.acceleration.values for body in setup.bodies if body.acceleration is not None]
     return max(float(np.linalg.norm(values, axis=1).max()) for values in tracks)
 
 
-def field_rows(all_places: Sequence[Place], starts: Sequence[float], ends: Sequence[float]) -> NDArray[np.float32]:
+def field_rows(all_places: Sequence[WorldSlot], starts: Sequence[float], ends: Sequence[float]) -> NDArray[np.float32]:
     """Numbers of all fields, each for its world's segment of time."""
     rows = [field_row(place, i, starts[place.world], ends[place.world]) for place in all_places for i in place.soft]
     return np.stack(rows) if rows else np.zeros((0, layout.FIELD_ROW), dtype=np.float32)
 
 
-def field_row(place: Place, body_index: int, start: float, end: float) -> NDArray[np.float32]:
+def field_row(place: WorldSlot, body_index: int, start: float, end: float) -> NDArray[np.float32]:
     """Numbers of one field for the segment of time from ``start`` to ``end`` in s."""
     body, scale = place.setup.bodies[body_index], place.cells.scale
     row = np.zeros(layout.FIELD_ROW)
@@ -195,7 +228,9 @@ def field_row(place: Place, body_index: int, start: float, end: float) -> NDArra
     return row.astype(np.float32)
 
 
-def particles(place: Place, body_index: int, first_id: int, choice: NDArray[np.int32]) -> tuple[Added, float]:
+def particles(
+    place: WorldSlot, body_index: int, first_id: int, choice: NDArray[np.int32]
+) -> tuple[NewParticles, float]:
     """The particles of a body as the engine takes them, and the speed in cells/s of the fastest wave in them.
 
     choice: material of each particle (N,), as in ``BodyParticles.material_index``.
@@ -211,7 +246,7 @@ def particles(place: Place, body_index: int, first_id: int, choice: NDArray[np.i
     if body.pins is not None:
         anchors[body.pins, 3] = PIN
     constants, wave_speed = stiffness(body, choice, cells)
-    added = Added(
+    added = NewParticles(
         field=place.field(body_index),
         x=cells.points_to_engine(body.positions),
         v=body.initial_velocities * scale,

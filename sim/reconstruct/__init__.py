@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """One photo and a box around each object → a scene folder, without learned weights (docs/reconstruction.md)."""
 
-from .options import ObjectRequest, ReconstructOptions
-from .pipeline import reconstruct
+from .reconstruct_options import ObjectRequest, ReconstructOptions
+from .reconstruct_pipeline import reconstruct_photo
 
-__all__ = ["ObjectRequest", "ReconstructOptions", "reconstruct"]
+__all__ = ["ObjectRequest", "ReconstructOptions", "reconstruct_photo"]

@@ -1,24 +1,158 @@
 # SPDX-License-Identifier: MIT
-"""Read a photo as a person would see it: upright, sRGB, 8 bits, at a size that can be worked with."""
+"""Read a photo upright, in 8-bit sRGB, at working size, with its focal length by Exif 2.32."""
 
 from __future__ import annotations
 
 import io
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from ..errors import InputError
-from .view.exif_focal import FULL_FRAME_DIAGONAL_MM, ROUNDING_SIGMA, ExifFocal, focal_from_exif
+
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+ROUNDING_SIGMA = 0.02
+"""Standard deviation of the logarithm: rounding to millimetres, focusing, distortion correction."""
+SENSOR_SIGMA = 0.03
+CROPPED_SIGMA = 0.15
+SAME_SHAPE = 0.015
+"""Relative difference of aspect ratio above which a photo counts as cropped."""
+_FOCAL_35MM, _FOCAL, _DIGITAL_ZOOM = 0xA405, 0x920A, 0xA404
+_WIDTH, _HEIGHT = 0xA002, 0xA003
+_PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+_MAKE, _MODEL = 0x010F, 0x0110
+_MM_OF_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+SENSORS_MM: tuple[tuple[str, float, float], ...] = (
+    ("CANON EOS 5D", 36.0, 24.0),
+    ("CANON EOS 6D", 36.0, 24.0),
+    ("CANON EOS-1D X", 36.0, 24.0),
+    ("CANON EOS R5", 36.0, 24.0),
+    ("CANON EOS R6", 36.0, 24.0),
+    ("CANON EOS RP", 36.0, 24.0),
+    ("CANON EOS R8", 36.0, 24.0),
+    ("CANON EOS R3", 36.0, 24.0),
+    ("CANON EOS-1D", 28.7, 19.1),
+    ("CANON EOS", 22.3, 14.9),
+    ("SONY ILCE-7", 35.7, 23.8),
+    ("SONY ILCE-9", 35.6, 23.8),
+    ("SONY ILCE-1", 35.9, 24.0),
+    ("SONY ILCE", 23.5, 15.6),
+    ("SONY NEX", 23.5, 15.6),
+    ("LEICA M8", 27.0, 18.0),
+    ("LEICA M", 36.0, 24.0),
+    ("LEICA SL", 36.0, 24.0),
+    ("FUJIFILM GFX", 43.8, 32.9),
+    ("FUJIFILM X", 23.5, 15.6),
+    ("NIKON D1", 23.7, 15.6),
+    ("OLYMPUS E-", 17.3, 13.0),
+    ("OM DIGITAL", 17.3, 13.0),
+    ("PANASONIC DMC-G", 17.3, 13.0),
+    ("PANASONIC DC-G", 17.3, 13.0),
+    ("RICOH GR", 23.5, 15.7),
+)
+"""Width and height of sensors by prefix of maker and model, the first match: for cameras whose 35 mm equivalent is not
+in the file. Phones write it."""
+
+
+@dataclass(frozen=True)
+class ExifFocal:
+    """Focal length in diagonals of the photo, the standard deviation of its logarithm, and the tags it was read
+    from."""
+
+    per_diagonal: float
+    sigma: float
+    source: str
+
+
+def focal_from_exif(base: Mapping[int, Any], details: Mapping[int, Any], width: int, height: int) -> ExifFocal | None:
+    """Return the focal length by the tags of a photo of ``width`` by ``height`` pixels as stored; None if undetermined.
+
+    base, details: tags of the first and of the Exif directory, with values of any type, since files hold anything. The
+    35 mm equivalent compares diagonals (CIPA DCG-001). A photo whose aspect ratio differs from the camera's is assumed
+    to be cropped along one side only.
+    """
+    taken = _number(details.get(_WIDTH)), _number(details.get(_HEIGHT))
+    found = _equivalent(details) or _by_resolution(details, taken) or _by_sensor(base, details)
+    if found is None:
+        return None
+    value, sigma, source = found
+    if not 0.1 <= value <= 50.0:
+        return None
+    if taken[0] is None or taken[1] is None or not _cropped(taken[0], taken[1], width, height):
+        return ExifFocal(value, sigma, source)
+    scale = max(width / taken[0], height / taken[1])
+    uncut = math.hypot(taken[0], taken[1]) * scale
+    return ExifFocal(value * uncut / math.hypot(width, height), CROPPED_SIGMA, f"{source}, of a photo that was cropped")
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _equivalent(details: Mapping[int, Any]) -> tuple[float, float, str] | None:
+    focal = _number(details.get(_FOCAL_35MM))
+    if focal is None or not 5 <= focal <= 2000:
+        return None
+    return focal / FULL_FRAME_DIAGONAL_MM, ROUNDING_SIGMA, "EXIF (35 mm equivalent)"
+
+
+def _millimetres(details: Mapping[int, Any]) -> float | None:
+    focal = _number(details.get(_FOCAL))
+    zoom = _number(details.get(_DIGITAL_ZOOM))
+    return None if focal is None else focal * max(1.0, min(zoom or 1.0, 20.0))
+
+
+def _by_resolution(
+    details: Mapping[int, Any], taken: tuple[float | None, float | None]
+) -> tuple[float, float, str] | None:
+    """FocalPlaneXResolution counts the pixels of the picture as taken in a unit of length of the sensor."""
+    focal, per_unit = _millimetres(details), _number(details.get(_PLANE_X))
+    unit = _MM_OF_UNIT.get(int(_number(details.get(_PLANE_UNIT)) or 2))
+    if focal is None or per_unit is None or unit is None or taken[0] is None or taken[1] is None:
+        return None
+    across = _number(details.get(_PLANE_Y)) or per_unit
+    diagonal = math.hypot(taken[0] / per_unit * unit, taken[1] / across * unit)
+    # Some cameras count the thumbnail's pixels; no sensor is that large or small.
+    if not 3.0 <= diagonal <= 80.0:
+        return None
+    return focal / diagonal, SENSOR_SIGMA, "EXIF (focal length and sensor resolution)"
+
+
+def _by_sensor(base: Mapping[int, Any], details: Mapping[int, Any]) -> tuple[float, float, str] | None:
+    focal = _millimetres(details)
+    make, model = (str(base.get(tag, "")).strip("\0 ").upper() for tag in (_MAKE, _MODEL))
+    # Some makers repeat themselves in the model.
+    name = model if model.startswith(make.split(" ")[0]) else f"{make.removesuffix(' CORPORATION')} {model}"
+    for beginning, width, height in SENSORS_MM:
+        if focal is not None and name.startswith(beginning):
+            return focal / math.hypot(width, height), SENSOR_SIGMA, f"EXIF (focal length, and the sensor of {name})"
+    return None
+
+
+def _cropped(taken_width: float, taken_height: float, width: int, height: int) -> bool:
+    if taken_width < 16 or taken_height < 16:
+        return False
+    ratio = math.log(taken_width / taken_height) - math.log(width / height)
+    # Some programs rotate the pixels and leave the tags.
+    turned = math.log(taken_height / taken_width) - math.log(width / height)
+    return min(abs(ratio), abs(turned)) > SAME_SHAPE
+
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "MPO")
 MAX_PIXELS = 200_000_000
-"""More than the largest phone sensors have; a file that claims more is taken for a decompression bomb."""
+"""Above the largest phone sensors; a file that claims more is treated as a decompression bomb."""
 MIN_SIDE = 32
 _EXIF_IFD = 0x8769
 
@@ -62,7 +196,7 @@ class Photo:
 def load_photo(path: Path, max_size: int) -> Photo:
     """Read ``path`` and scale it down so that its longest side has at most ``max_size`` pixels.
 
-    Raises InputError when the file is missing, empty, truncated, too large, of another kind, or no image.
+    Raises InputError when the file is missing, empty, truncated, too large, of an unsupported format, or not an image.
     """
     try:
         with warnings.catch_warnings():
@@ -80,7 +214,7 @@ def load_photo(path: Path, max_size: int) -> Photo:
         raise _too_large(path, "far more") from None
     except MemoryError:
         raise InputError(f"{path}: does not fit in memory; give a smaller photo") from None
-    # Decoders of damaged files fail in whatever way the garbage leads them to (SyntaxError, struct.error, …).
+    # Decoders of damaged files raise arbitrary exceptions (SyntaxError, struct.error, …).
     except Exception as error:
         raise InputError(
             f"{path}: cannot be read as an image ({type(error).__name__}: {error}); it may be damaged, save it again"
@@ -129,17 +263,17 @@ def _decode(path: Path, image: Image.Image, max_size: int) -> Photo:
 
 
 def _focal(image: Image.Image) -> ExifFocal | None:
-    """Focal length by EXIF, when it is there and believable."""
+    """Focal length by EXIF, if present and plausible."""
     try:
         exif = image.getexif()
         return focal_from_exif(exif, exif.get_ifd(_EXIF_IFD), *image.size)
     except (TypeError, ValueError, KeyError, ZeroDivisionError, OSError, SyntaxError, OverflowError):
-        # Damaged EXIF beside a sound picture: the picture counts.
+        # Damaged EXIF beside an intact picture: use the picture.
         return None
 
 
 def _to_rgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """8-bit RGB in sRGB; transparent pixels go onto white."""
+    """8-bit RGB in sRGB; transparent pixels are composited on white."""
     exif = image.info.get("exif")
     result = _convert_mode(image)
     if profile:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The scene model, its units, its folder on disk and the materials it names."""
+"""The scene model, scene folders on disk, materials, meshes and camera paths."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Environment maps in files: read, turned to fit a camera, written; and what light the ground has of one.
+"""Environment maps: read from files, rotate to fit a camera, write; irradiance of the ground.
 
-How a map lies around the scene is in ``equirectangular``.
+The orientation convention is in ``equirectangular``.
 """
 
 from __future__ import annotations
@@ -14,25 +14,24 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..openimageio import last_error
+from ..errors import InputError, openimageio_error
 from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
 from .model import Camera, Ground
 
 SUFFIXES = (".exr", ".hdr")
 MAX_PIXELS = 64_000_000
 MAX_WIDTH = 2048
-"""Of what is kept in a scene; larger maps are averaged down, which loses no light."""
+"""Width stored in a scene; larger maps are averaged down, which preserves their light."""
 MIN_HEIGHT = 8
 SPOT_DEG, SPOT_SHARE = 10.0, 0.2
-"""A spot of this radius that gives this share of the ground's light casts shadows like a sun."""
+"""A spot of this radius (degrees) that gives at least this share of the ground's light casts shadows like a sun."""
 
 
 def read_environment(path: Path) -> Radiance:
-    """Read a Radiance (.hdr) or OpenEXR file of up to 64 megapixels, twice as wide as high.
+    """Return the map (H, 2 H, 3) of a Radiance (.hdr) or OpenEXR file of up to 64 megapixels.
 
-    Raises InputError, with the way out, for a file that is missing, no such picture, cut off, of another shape, or
-    holds values that are not finite, negative, or dark all over.
+    Raises InputError for a file that is missing, unreadable, truncated, not twice as wide as high, not finite,
+    negative, or black in the upper half.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -45,7 +44,7 @@ def read_environment(path: Path) -> Radiance:
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise InputError(
-            f"environment {path}: is not a readable picture ({last_error(oiio.geterror)}); export it again"
+            f"environment {path}: is not a readable picture ({openimageio_error(oiio.geterror)}); export it again"
         )
     try:
         spec = source.spec()
@@ -62,7 +61,7 @@ def read_environment(path: Path) -> Radiance:
         pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None:
             raise InputError(
-                f"environment {path}: is cut off or damaged ({last_error(source.geterror)}); export it again"
+                f"environment {path}: is cut off or damaged ({openimageio_error(source.geterror)}); export it again"
             )
     finally:
         source.close()
@@ -88,7 +87,7 @@ def _checked(path: Path, radiance: Radiance) -> Radiance:
     if bad:
         raise InputError(f"environment {path}: {bad} pixels are not finite; export it again, as 32-bit float")
     darkest, brightest = float(radiance.min()), float(radiance.max())
-    # Filters leave a little below zero beside what is very bright.
+    # Resampling filters undershoot beside very bright pixels.
     if darkest < -0.01 * brightest or darkest < -1e4:
         raise InputError(f"environment {path}: has negative light ({darkest:g}); export it again without grading")
     radiance = np.maximum(radiance, 0.0)
@@ -101,14 +100,14 @@ def _checked(path: Path, radiance: Radiance) -> Radiance:
 
 
 def prepared(path: Path, frame: str, camera: Camera, ground: Ground | None) -> Radiance:
-    """The environment in the file ``path`` as a scene keeps it, turned so that it fits ``camera``.
+    """Return the environment in ``path`` as a scene stores it, rotated to fit ``camera``.
 
     frame: one of ``FRAMES``. Raises InputError as ``read_environment`` does.
     """
     if frame not in FRAMES:
         raise InputError(f"frame of the environment is {frame!r}: choose {', '.join(FRAMES)}")
     radiance = read_environment(path)
-    # One scale for all: only the ratio of a sun to it matters.
+    # Normalised to mean 1: only the ratio of the sun to it matters.
     radiance = (radiance / float((radiance @ LUMINANCE).mean())).astype(np.float32)
     height, width = radiance.shape[:2]
     if width > MAX_WIDTH or width != 2 * height:
@@ -118,7 +117,7 @@ def prepared(path: Path, frame: str, camera: Camera, ground: Ground | None) -> R
 
 
 def world_from_file(frame: str, camera: Camera, ground: Ground | None) -> NDArray[np.float64]:
-    """Rotation (3, 3) from a map's own axes (x: its middle, y: left of it, z: up) to the scene's."""
+    """Return the rotation (3, 3) from a map's axes (x: its centre, y: left of it, z: up) to the scene's."""
     if frame == "world":
         return np.eye(3)
     pose = np.asarray(camera.world_from_camera, dtype=np.float64)[:3, :3]
@@ -127,14 +126,14 @@ def world_from_file(frame: str, camera: Camera, ground: Ground | None) -> NDArra
         normal = np.array([0.0, 0.0, 1.0]) if ground is None else ground.unit_normal
         level = ahead - (ahead @ normal) * normal
         if np.linalg.norm(level) < 1e-6:
-            # Straight down: the picture's upper edge is ahead.
+            # Looking straight down: the image's upper edge is ahead.
             level = up - (up @ normal) * normal
         ahead, up = level / np.linalg.norm(level), normal
     return np.column_stack([ahead, np.cross(up, ahead), up])
 
 
 def turned(radiance: Radiance, rotation: NDArray[np.float64]) -> Radiance:
-    """``radiance`` of a map whose axes become the scene's by ``rotation`` (3, 3)."""
+    """Return ``radiance`` resampled by ``rotation`` (3, 3) from the map's axes to the scene's."""
     if np.allclose(rotation, np.eye(3)):
         return radiance
     height, width = radiance.shape[:2]
@@ -154,9 +153,9 @@ def turned(radiance: Radiance, rotation: NDArray[np.float64]) -> Radiance:
 
 
 def ground_light(radiance: Radiance, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit vectors (D, 3) over the ground, in its own axes, and how much light each gives to it (D,).
+    """Return unit vectors (D, 3) above the ground, in its axes, and the irradiance from each (D,).
 
-    axes: rows (3, 3) two unit vectors along the ground, and its normal. The map is averaged down to 32 by 16 pixels.
+    axes: (3, 3), rows two unit vectors along the ground and its normal. The map is averaged down to 32 by 16 pixels.
     """
     small = cv2.resize(radiance, (32, 16), interpolation=cv2.INTER_AREA)
     towards, solid = directions(16, 32)
@@ -167,9 +166,9 @@ def ground_light(radiance: Radiance, axes: NDArray[np.float64]) -> tuple[NDArray
 
 
 def sun_in(radiance: Radiance, normal: NDArray[np.float64]) -> float:
-    """Share (0 to 1) of the light on ground of unit ``normal`` (3,) that comes from the brightest spot, 10° in radius.
+    """Return the share (0 to 1) of the light on ground of unit ``normal`` (3,) from the brightest spot of 10° radius.
 
-    Of an even sky it is about 0.06 at most.
+    About 0.06 at most for an even sky.
     """
     height = min(radiance.shape[0], 128)
     small = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA)
@@ -178,14 +177,14 @@ def sun_in(radiance: Radiance, normal: NDArray[np.float64]) -> float:
     total = float(light.sum())
     if not total > 0:
         return 0.0
-    # The middle of a spot, not the first of its equal pixels.
+    # Smoothed to find the centre of a spot rather than the first of its equal pixels.
     smooth = cv2.GaussianBlur(light / solid, (0, 0), height * SPOT_DEG / 2 / 180)
     brightest = towards.reshape(-1, 3)[int(np.argmax(smooth))]
     return float(light[towards @ brightest > math.cos(math.radians(SPOT_DEG))].sum()) / total
 
 
 def write_environment(path: Path, radiance: Radiance) -> None:
-    """Write ``radiance`` as 32-bit EXR. Raises InputError when it cannot be written."""
+    """Write ``radiance`` as a 32-bit EXR. Raises InputError if that fails."""
     height, width, channels = radiance.shape
     spec = oiio.ImageSpec(width, height, channels, "float")
     spec.attribute("compression", "zip")
@@ -197,4 +196,4 @@ def write_environment(path: Path, radiance: Radiance) -> None:
         and output.close()
     )
     if not written:
-        raise InputError(f"{path}: cannot be written ({last_error(oiio.geterror)}); choose another folder")
+        raise InputError(f"{path}: cannot be written ({openimageio_error(oiio.geterror)}); choose another folder")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Light from all around as an equirectangular picture in linear light.
+"""Equirectangular environment maps in linear light: directions, solid angles, irradiance.
 
-Row 0 is the zenith, the middle column looks along +X, columns to its right turn to the right, as Blender has it. Needs
-numpy alone: the extension imports this wherever it is enabled, and Blender may have no image library.
+Row 0 is the zenith, the middle column looks along +X, and columns to its right turn to the right, as in Blender. Needs
+only numpy: the extension imports this when it is enabled, and Blender may lack image libraries.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ Radiance = NDArray[np.float32]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 FRAMES = ("ahead", "camera", "world")
-"""Where the middle of a file looks: ahead of the camera with the horizon level; along the camera's own axis, as
-DiffusionLight has it; or along the scene's +X."""
+"""Direction of a file's centre: ahead of the camera with a level horizon; along the camera's axis, as in
+DiffusionLight; or along the scene's +X."""
 
 
 def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World direction (H, W, 3) and solid angle (H, W) in sr of each pixel of a map."""
+    """Return the world direction (H, W, 3) and solid angle (H, W) in sr of each pixel of a map."""
     azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * math.pi
     edges = np.sin((0.5 - np.arange(height + 1) / height) * math.pi)
     latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
@@ -34,7 +34,7 @@ def directions(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def irradiance(radiance: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.float64]:
-    """RGB irradiance (3,) of a map (H, W, 3) on open ground with unit ``normal``."""
+    """Return the RGB irradiance (3,) of a map (H, W, 3) on open ground with unit ``normal``."""
     towards, solid = directions(*radiance.shape[:2])
     cosine = np.clip(towards @ np.asarray(normal, dtype=float), 0.0, None)
     return np.einsum("hwc,hw,hw->c", radiance[..., :3].astype(np.float64), cosine, solid)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scene folders on disk: load, check, save. docs/file-formats.md describes them for other programs."""
+"""Scene folders on disk: load, check, save (format: docs/file-formats.md)."""
 
 from __future__ import annotations
 
@@ -9,26 +9,49 @@ from typing import Any
 
 from ..atomic import write_json
 from ..errors import InputError
-from .json_fields import parse, read_json, to_json
-from .model import FORMAT, Ground, Scene
+from ..validation import parse, read_json, to_json
+from .model import FORMAT, Ground, SceneModel
+from .scene_object import SceneObject
 
 SCENE_FILE = "scene.json"
 
 
 @dataclass(frozen=True)
-class SceneFolder:
-    """A loaded scene and the folder that its file names are relative to."""
+class Scene:
+    """A scene folder: its path and its content, as loaded. Made by ``reconstruct``, ``load_scene`` and ``compose``.
+
+    root: the folder, which file names in the scene are relative to. model: the content of ``scene.json``, immutable;
+    ``with_model`` and ``save`` make a changed scene. World frame: metres, Z up.
+
+    >>> import dataclasses, physgen
+    >>> scene = physgen.load_scene("scene")  # doctest: +SKIP
+    >>> moon = dataclasses.replace(scene.model, gravity=(0, 0, -1.62))  # doctest: +SKIP
+    >>> scene = scene.with_model(moon).save()  # doctest: +SKIP
+    """
 
     root: Path
-    scene: Scene
+    model: SceneModel
+
+    @property
+    def objects(self) -> tuple[SceneObject, ...]:
+        """The scene's objects, in order."""
+        return self.model.objects
 
     def file(self, name: str) -> Path:
-        """The path of the scene's file ``name``; InputError when it would lie outside the folder."""
+        """Return the path of the scene's file ``name``; InputError when it would lie outside the folder."""
         return inside(self.root, name)
+
+    def with_model(self, model: SceneModel) -> Scene:
+        """Return this folder with another content, not saved yet."""
+        return Scene(root=self.root, model=model)
+
+    def save(self) -> Scene:
+        """Write ``scene.json`` whole or not at all; return the scene. The files it names are not written."""
+        return save_scene(self.root, self.model)
 
 
 def inside(root: Path, name: str) -> Path:
-    """``root / name`` for a relative, forward-slashed ``name`` that stays inside ``root``, links resolved.
+    """Return ``root / name`` for a relative ``name`` with forward slashes that stays inside ``root``.
 
     Raises InputError for absolute names, drive letters, ``..`` and links that lead out.
     """
@@ -39,30 +62,34 @@ def inside(root: Path, name: str) -> Path:
     try:
         inside_root = path.resolve().is_relative_to(root.resolve())
     except (OSError, ValueError, RuntimeError) as error:
-        # Half a character, links in a circle.
+        # A lone surrogate, or links in a circle.
         raise InputError(f"file name {name!r}: no file can be called that ({error})") from None
     if not inside_root:
         raise InputError(f"file name {name!r}: leads out of {root}")
     return path
 
 
-def load_scene(root: Path) -> SceneFolder:
-    """Read and check the scene folder ``root``.
+def load_scene(root: str | Path) -> Scene:
+    """Return the scene in the folder ``root``, checked.
 
-    Raises InputError when ``scene.json`` is missing, malformed, of another format, or names files that are not
-    there or lie outside the folder.
+    >>> import physgen
+    >>> scene = physgen.load_scene("scene")  # doctest: +SKIP
+
+    Raises InputError when ``scene.json`` is missing, malformed or of another format, or names files that are missing or
+    lie outside the folder.
     """
+    root = Path(root)
     path = root / SCENE_FILE
     data = read_json(path)
-    folder = SceneFolder(root=root, scene=parse_scene(data, str(path)))
-    for name in referenced_files(folder.scene):
+    folder = Scene(root=root, model=parse_scene(data, str(path)))
+    for name in referenced_files(folder.model):
         if not folder.file(name).is_file():
-            raise InputError(f"{path}: names {name!r}, which is not there; restore it or reconstruct the scene again")
+            raise InputError(f"{path}: names {name!r}, which is missing; restore it or reconstruct the scene again")
     return folder
 
 
-def parse_scene(data: Any, where: str) -> Scene:
-    """Scene from parsed JSON; ``where`` names the file in messages."""
+def parse_scene(data: Any, where: str) -> SceneModel:
+    """Return the scene of parsed JSON; ``where`` names the file in messages."""
     if not isinstance(data, dict):
         raise InputError(f"{where}: expected a JSON object")
     fields = dict(data)
@@ -77,11 +104,11 @@ def parse_scene(data: Any, where: str) -> Scene:
     effects = fields.get("effects")
     if isinstance(effects, list):
         fields["effects"] = [_effect_from_json(e, f"{where}: effects[{i}]") for i, e in enumerate(effects)]
-    return parse(Scene, fields, where)
+    return parse(SceneModel, fields, where)
 
 
 def _effect_from_json(value: Any, where: str) -> Any:
-    """Parameters are an object in the file (readable) and pairs in memory (immutable)."""
+    """Return an effect's JSON with parameters as pairs (immutable in memory) in place of an object (readable)."""
     if isinstance(value, dict) and "parameters" in value:
         if not isinstance(value["parameters"], dict):
             raise InputError(f"{where}.parameters: expected an object of numbers by name")
@@ -89,8 +116,8 @@ def _effect_from_json(value: Any, where: str) -> Any:
     return value
 
 
-def scene_to_json(scene: Scene) -> dict[str, Any]:
-    """The content of ``scene.json``."""
+def scene_to_json(scene: SceneModel) -> dict[str, Any]:
+    """Return the content of ``scene.json``."""
     data = {"format": FORMAT, **to_json(scene)}
     data["effects"] = [
         {"name": e.name, "parameters": dict(e.parameters), **({"objects": list(e.objects)} if e.objects else {})}
@@ -99,20 +126,20 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     return data
 
 
-def save_scene(root: Path, scene: Scene) -> SceneFolder:
-    """Write ``scene.json`` into ``root`` whole or not at all; the files it names are the caller's to write."""
+def save_scene(root: Path, scene: SceneModel) -> Scene:
+    """Write ``scene.json`` into ``root`` atomically; the caller writes the files that it names."""
     for name in referenced_files(scene):
         inside(root, name)
     write_json(root / SCENE_FILE, scene_to_json(scene))
-    return SceneFolder(root=root, scene=scene)
+    return Scene(root=root, model=scene)
 
 
-def require_photo(folder: SceneFolder) -> tuple[str, str, Ground]:
-    """Names of the photo and its background, and the ground in it: what is needed to show anything in the photo.
+def require_photo(folder: Scene) -> tuple[str, str, Ground]:
+    """Return the names of photo and clean plate, and the ground: what rendering into the photo needs.
 
-    Raises InputError, with what to do instead, for a scene without a photo or without a ground.
+    Raises InputError for a scene without a photo or without a ground.
     """
-    scene = folder.scene
+    scene = folder.model
     if scene.photo is None or scene.background is None:
         raise InputError(
             f"{folder.root}: this scene has no photo to render into; render it in Blender, with the bake attached to "
@@ -126,8 +153,8 @@ def require_photo(folder: SceneFolder) -> tuple[str, str, Ground]:
     return scene.photo, scene.background, scene.ground
 
 
-def referenced_files(scene: Scene) -> list[str]:
-    """Names of all files that ``scene`` needs, photo first if there is one."""
+def referenced_files(scene: SceneModel) -> list[str]:
+    """Return the names of all files that ``scene`` needs, the photo first if there is one."""
     names = [name for name in (scene.photo, scene.background) if name is not None]
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None

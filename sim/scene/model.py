@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The scene: what stands in the photo (if there is one), where, of what matter, under which light.
+"""The scene model: camera, ground, objects, light, effects and contacts, as immutable dataclasses.
 
-Metres, kilograms, seconds; the world is right-handed with +Z up. A reconstructed scene has its origin on the
-ground, X to the right of the camera and Y away from it. All data here are immutable.
+Metres, kilograms, seconds; the world is right-handed with +Z up. A reconstructed scene has its origin on the ground, X
+to the camera's right and Y away from it.
 """
 
 from __future__ import annotations
@@ -13,10 +13,24 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import finite, require
-from .control import CONTACT_MODES, GROUND, Box, Contact, Key, Keys, Motion, Vector, require_rising
-from .matter import LAWS, Material
-from .object import IDENTITY4, ROLES, Matrix4, SceneObject
+from ..errors import InputError
+from ..validation import finite, quantity, require, require_quantities
+from .material import LAWS, Material
+from .object_names import GROUND
+from .scene_object import (
+    CONTACT_MODES,
+    IDENTITY4,
+    ROLES,
+    Box,
+    Contact,
+    Key,
+    Keys,
+    Matrix4,
+    Motion,
+    SceneObject,
+    Vector,
+    require_rising,
+)
 
 __all__ = [
     "CONTACT_MODES",
@@ -36,7 +50,7 @@ __all__ = [
     "Material",
     "Matrix4",
     "Motion",
-    "Scene",
+    "SceneModel",
     "SceneObject",
     "Vector",
 ]
@@ -85,7 +99,7 @@ class Camera:
         )
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """World directions (..., 3) through ``pixels`` (..., 2), with unit depth along the optical axis."""
+        """Return world directions (..., 3) through ``pixels`` (..., 2), with unit depth along the optical axis."""
         pixels = np.asarray(pixels, dtype=np.float64)
         local = np.stack(
             [(pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy, np.ones(pixels.shape[:-1])],
@@ -99,7 +113,7 @@ class Camera:
         return np.asarray(self.world_from_camera, dtype=np.float64)[:3, 3]
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """World ``points`` (..., 3) to pixels and depth (..., 3): x, y in pixels, z metres along the optical axis."""
+        """Return pixels and depth (..., 3) of world ``points`` (..., 3): x, y in pixels, z metres along the axis."""
         matrix = np.asarray(self.world_from_camera, dtype=np.float64)
         local = (np.asarray(points, dtype=np.float64) - matrix[:3, 3]) @ matrix[:3, :3]
         depth = local[..., 2]
@@ -111,24 +125,24 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """The supporting plane. ``normal`` is a unit vector that points to the side on which objects stand.
+    """The ground plane; ``normal`` is a unit vector towards the objects' side.
 
     friction: Coulomb's kinetic coefficient, 0 (ice) and up; 0.4 is wood on wood.
     static_friction: Coulomb's static coefficient, not below ``friction``; None takes ``friction``.
-    restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1; of matter that deforms, the share of its
-        outermost layer's energy that comes back.
-    reflectivity: share of light that it mirrors, looked at from straight above: 0 (matte) to 1 (a mirror); 0.04 is
-        varnish, glass or water. Seen at a slant, it is more.
-    reflection_roughness: how blurred what it mirrors is, 0 (polished) to 1, as the roughness of Blender's shaders.
+    restitution: Newton's coefficient for rigid bodies, 0 (no bounce) to 1; for deformables, the share of the outermost
+        layer's energy that is returned.
+    reflectivity: reflectance at normal incidence, 0 (matte) to 1 (a mirror); 0.04 is varnish, glass or water. It rises
+        towards grazing angles.
+    reflection_roughness: blur of reflections, 0 (polished) to 1, as the roughness of Blender's shaders.
     """
 
     point: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
-    friction: float = 0.4
-    static_friction: float | None = None
-    restitution: float = 0.0
-    reflectivity: float = 0.0
-    reflection_roughness: float = 0.15
+    friction: float = quantity(0.4, 0.0, 10.0)
+    static_friction: float | None = quantity(None, 0.0, 10.0)
+    restitution: float = quantity(0.0, 0.0, 1.0)
+    reflectivity: float = quantity(0.0, 0.0, 1.0)
+    reflection_roughness: float = quantity(0.15, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         require(finite(*self.point), "ground.point", self.point, "give three finite numbers in metres")
@@ -138,40 +152,31 @@ class Ground:
             self.normal,
             "give a unit vector",
         )
-        require(finite(self.friction) and 0 <= self.friction <= 10, "ground.friction", self.friction, "give 0 to 10")
+        require_quantities(self, "ground.")
         static = self.static_friction
         require(
-            static is None or (finite(static) and self.friction <= static <= 10),
+            static is None or self.friction <= static,
             "ground.static_friction",
             static,
             "give friction or more, up to 10, or null",
         )
-        require(
-            finite(self.restitution) and 0 <= self.restitution <= 1,
-            "ground.restitution",
-            self.restitution,
-            "give 0 to 1",
-        )
-        for name in ("reflectivity", "reflection_roughness"):
-            value = getattr(self, name)
-            require(finite(value) and 0 <= value <= 1, f"ground.{name}", value, "give 0 to 1")
 
     @property
     def unit_normal(self) -> NDArray[np.float64]:
-        """``normal`` (3,) of length 1 to the last digit."""
+        """``normal`` (3,), renormalised in float64."""
         normal = np.asarray(self.normal, dtype=np.float64)
         return np.asarray(normal / np.linalg.norm(normal))
 
     def heights(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Heights (...) of ``points`` (..., 3) over the plane, metres."""
+        """Return signed heights (...) of ``points`` (..., 3) above the plane, metres."""
         return np.asarray((np.asarray(points, dtype=np.float64) - np.asarray(self.point)) @ self.unit_normal)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """A physical effect of the registry with its parameters (docs/effects.md).
+    """A registered physical effect with its parameters (docs/simulation.md).
 
-    objects: names of the objects that it acts on; empty for all that it can act on.
+    objects: names of the objects that it acts on; empty for all that it applies to.
     """
 
     name: str
@@ -181,12 +186,12 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """What lights the objects.
+    """Environment and sun that light the objects.
 
-    environment: equirectangular EXR in linear light relative to the scene folder, or None for plain white.
+    environment: equirectangular EXR in linear light, relative to the scene folder, or None for uniform white.
     sun_direction: unit vector from the scene to the sun, or None for no sun.
-    sun_strength: irradiance of the sun over the irradiance of the environment on the open ground, 0 to 20.
-    sun_angle: apparent diameter in radians; larger is softer.
+    sun_strength: irradiance of the sun over that of the environment on open ground, 0 to 20.
+    sun_angle: apparent diameter in radians; larger gives softer shadows.
     """
 
     environment: str | None = None
@@ -217,13 +222,13 @@ class Light:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
-    """A whole scene. File names are relative to the scene folder.
+class SceneModel:
+    """A complete scene. File names are relative to the scene folder.
 
-    ground: None for no floor at all; ``contacts`` cannot name it then.
-    photo, background: None, both, for a scene without a photo: it can be baked, and not rendered into anything.
-    gravity: m/s²; gravity_track: keyframes of it, in its place; none: steady.
-    contacts: how pairs meet where it does not follow from the two surfaces.
+    ground: None for no floor; ``contacts`` cannot name it then.
+    photo, background: both None for a scene without a photo, which can be baked but not rendered into anything.
+    gravity: m/s²; gravity_track: keyframes that replace it; empty: constant.
+    contacts: pairs whose contact parameters do not follow from the two surfaces.
     """
 
     camera: Camera
@@ -289,3 +294,17 @@ class Scene:
             pair = frozenset(contact.between)
             require(pair not in pairs, f"contacts[{i}].between", list(contact.between), "name every pair once")
             pairs.add(pair)
+
+    @property
+    def ground_plane(self) -> Ground:
+        """The ground. Raises InputError for a scene without one."""
+        if self.ground is None:
+            raise InputError("the scene has no ground: give one")
+        return self.ground
+
+    @property
+    def photo_files(self) -> tuple[str, str]:
+        """Photo and background in the scene folder. Raises InputError for a scene without a photo."""
+        if self.photo is None or self.background is None:
+            raise InputError("the scene has no photo: give photo and background")
+        return self.photo, self.background

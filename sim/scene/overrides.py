@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Changes to a scene in a line each: ``cup.density=300``, ``cup.preset=wood``, ``ground.friction=0.1``."""
+"""Overrides of scene fields, one line each: ``cup.density=300``, ``cup.preset=wood``, ``ground.friction=0.1``."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import InputError
+from ..validation import to_json
 from .folder import parse_scene, scene_to_json
-from .json_fields import to_json
-from .materials import load_preset
-from .model import GROUND, Camera, Ground, Material, Scene, SceneObject
+from .material import load_preset
+from .model import GROUND, Camera, Ground, Material, SceneModel, SceneObject
 
 WHOLE = "scene"
-"""What the scene itself is called before the dot."""
+"""Name of the scene itself before the dot."""
 
 SHAPE_FIELDS = ("name", "mesh", "world_from_mesh", "size_m", "occlusion_order", "mask", "shadow")
-"""Fields of an object that a photo decides; all others are physics."""
+"""Fields of an object that come from the photo; all others are physics."""
 
 PHYSICS_FIELDS = tuple(f.name for f in dataclasses.fields(SceneObject) if f.name not in SHAPE_FIELDS)
 MATERIAL_FIELDS = tuple(f.name for f in dataclasses.fields(Material))
@@ -26,12 +26,12 @@ GROUND_FIELDS = ("friction", "static_friction", "restitution", "reflectivity", "
 SCENE_FIELDS = ("gravity", "gravity_track", "contacts")
 
 
-def apply_overrides(scene: Scene, overrides: Sequence[str]) -> Scene:
-    """``scene`` with ``OBJECT.FIELD=VALUE`` carried out one after another.
+def apply_overrides(scene: SceneModel, overrides: Sequence[str]) -> SceneModel:
+    """Return ``scene`` with the overrides ``OBJECT.FIELD=VALUE`` applied in order.
 
-    OBJECT: a name of the scene's objects, ``ground`` or ``scene`` (gravity, gravity_track, contacts). FIELD: a field of
-    the object or of its material; ``preset`` takes all numbers of a preset. VALUE: JSON, or bare text, or numbers with
-    commas between them. Raises InputError that names the override.
+    OBJECT: an object's name, ``ground`` or ``scene`` (gravity, gravity_track, contacts). FIELD: a field of the
+    object or its material; ``preset`` sets all numbers of a preset. VALUE: JSON, bare text, or comma-separated numbers.
+    Raises InputError that names the override.
     """
     if not overrides:
         return scene
@@ -42,21 +42,21 @@ def apply_overrides(scene: Scene, overrides: Sequence[str]) -> Scene:
 
 
 def check_overrides(names: Sequence[str], overrides: Sequence[str]) -> None:
-    """Raise InputError unless ``overrides`` could be carried out on a scene with objects of these ``names``."""
+    """Raise InputError unless ``overrides`` apply to a scene with objects of these ``names``."""
     rest = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     camera = Camera(width=1, height=1, fx=1.0, fy=1.0, cx=0.5, cy=0.5, world_from_camera=rest)
     objects = tuple(SceneObject(name=name, mesh="-", size_m=1.0) for name in names)
-    apply_overrides(Scene(camera=camera, objects=objects), overrides)
+    apply_overrides(SceneModel(camera=camera, objects=objects), overrides)
 
 
-def without_physics(scene: Scene, friction: float) -> Scene:
-    """``scene`` with the shapes alone: default matter at rest on a ground of this ``friction``. Effects are kept."""
+def without_physics(scene: SceneModel, friction: float) -> SceneModel:
+    """Return ``scene`` with default physics: default materials at rest on a ground of ``friction``. Effects stay."""
     shapes = [{name: getattr(item, name) for name in SHAPE_FIELDS} for item in scene.objects]
     return dataclasses.replace(
         scene,
         objects=tuple(SceneObject(**shape) for shape in shapes),
         ground=scene.ground and Ground(point=scene.ground.point, normal=scene.ground.normal, friction=friction),
-        gravity=Scene.gravity,
+        gravity=SceneModel.gravity,
         gravity_track=(),
         contacts=(),
     )

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """A small world that Cycles renders twice: once as the truth, once from a "photo" of it through the render stage."""
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
-from physgen.sim.composite.transfer import linear_to_bytes
-from physgen.sim.scene.folder import SceneFolder, save_scene
-from physgen.sim.scene.model import Camera, Ground, Light, Scene, SceneObject
+from physgen.sim.composite.srgb import linear_to_bytes
+from physgen.sim.scene.folder import Scene, save_scene
+from physgen.sim.scene.model import Camera, Ground, Light, SceneModel, SceneObject
 from PIL import Image
 
 if importlib.util.find_spec("bpy") is None:
@@ -22,11 +23,12 @@ if importlib.util.find_spec("bpy") is None:
 else:
     import bpy
     from mathutils import Vector
-    from physgen.physgen_addon.bridge import camera as bridge_camera
-    from physgen.physgen_addon.bridge import compat, cycles, passes
-    from physgen.physgen_addon.bridge.ground import add_ground
-    from physgen.physgen_addon.bridge.options import RenderOptions
-    from physgen.physgen_addon.bridge.regions import Box
+    from physgen.physgen_addon import compat
+    from physgen.physgen_addon.render import render_engines
+    from physgen.physgen_addon.render.render_options import RenderOptions
+    from physgen.physgen_addon.render.render_regions import Box
+    from physgen.physgen_addon.render.render_scene import add_ground
+    from physgen.physgen_addon.scene_io import photo_view as bridge_camera
 
 WIDTH, HEIGHT = 160, 120
 RADIUS = 0.05
@@ -52,7 +54,7 @@ def photo_camera() -> Camera:
 class World:
     """A scene folder with its photo, and the true pictures: photo, empty ground, ball moved by SHIFT."""
 
-    folder: SceneFolder
+    folder: Scene
     photo: np.ndarray
     background: np.ndarray
     moved: np.ndarray
@@ -98,8 +100,8 @@ def render_truth(
     bpy.ops.wm.read_factory_settings(use_empty=True)
     compat.enable_cycles()
     scene = bpy.data.scenes.new("truth")
-    passes.set_up(scene)
-    cycles.set_up(scene, RenderOptions(samples=256, seed=7), denoise=False)
+    render_engines.set_up_passes(scene)
+    render_engines.set_up_cycles(scene, RenderOptions(samples=256, seed=7), denoise=False)
     scene.render.use_persistent_data = False
     bridge_camera.add_camera(scene, camera, (WIDTH, HEIGHT))
     scene.world = bpy.data.worlds.new("sky")
@@ -125,10 +127,10 @@ def render_truth(
         data.materials.append(_diffuse(material, compat.node_tree(material), (0.55, 0.25, 0.08, 1)))
         scene.collection.objects.link(bpy.data.objects.new("ball", data))
         floor.hide_render = True
-        mask = passes.render(scene, 1, box, folder)["Combined.A"] > 0.5
+        mask = render_engines.render_passes(scene, 1, box, folder)["Combined.A"] > 0.5
         floor.hide_render = False
     scene.render.film_transparent = False
-    picture = passes.stack(passes.render(scene, 1, box, folder), "Combined")
+    picture = render_engines.stack(render_engines.render_passes(scene, 1, box, folder), "Combined")
     return linear_to_bytes(picture), mask
 
 
@@ -159,7 +161,7 @@ def world(tmp_path_factory) -> World:
     Image.fromarray(mask.astype(np.uint8) * 255).save(root / "masks" / "ball.png")
     item = SceneObject(name="ball", mesh="meshes/ball.glb", size_m=2 * RADIUS, mask="masks/ball.png")
     light = Light(sun_direction=SUN, sun_strength=SUN_STRENGTH, sun_angle=SUN_ANGLE)
-    folder = save_scene(root, Scene(camera=camera, objects=(item,), light=light))
+    folder = save_scene(root, SceneModel(camera=camera, objects=(item,), light=light))
     return World(folder=folder, photo=photo, background=background, moved=moved, moved_mask=moved_mask)
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Baking from Blender with a real worker: what is found, shown, out of date, moved, freed."""
 
 import json
@@ -13,14 +14,15 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from mathutils import Matrix  # noqa: E402
-from physgen.physgen_addon import bake_record, bake_state, jobs, paths, unsaved  # noqa: E402
-from physgen.physgen_addon.bridge import caches, playback  # noqa: E402
-from physgen.physgen_addon.operators.bake import Bake  # noqa: E402
-from physgen.sim.cache.manifest import load_manifest  # noqa: E402
-from physgen.sim.cache.pc2 import Pc2Reader  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
+import physgen
+from mathutils import Matrix
+from physgen.physgen_addon import background_jobs, bake_state, paths
+from physgen.physgen_addon import bake_state as unsaved
+from physgen.physgen_addon.operators.bake_ops import Bake
+from physgen.physgen_addon.playback import bake_record, point_caches, show_bake
+from physgen.sim.cache.bake_folder import load_manifest
+from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.errors import InputError
 
 FRAMES = 5
 START = 3
@@ -99,7 +101,7 @@ def test_a_bake_plays_what_is_in_its_cache(file):
     assert (found.status, found.frames_done, found.frames) == ("baked", FRAMES, FRAMES)
     assert found.disk_bytes > 8 * 12 * FRAMES
     item = bpy.data.objects["Cube"]
-    assert item.modifiers[0].name == caches.MODIFIER
+    assert item.modifiers[0].name == point_caches.MODIFIER
     assert item.modifiers[0].filepath.startswith("//physgen_cache/Scene/bakes/")
     assert scene().physgen.simulation.bake.startswith("//physgen_cache/Scene/bakes/")
     folder = paths.absolute(scene().physgen.simulation.bake)
@@ -133,7 +135,7 @@ def test_a_change_is_out_of_date_and_changing_it_back_is_baked(file):
     density = item.physgen.material.density
     item.physgen.material.density = 321.0
     assert status() == "stale" and "Out of date" in bake_state.state(scene()).message
-    assert caches.MODIFIER in item.modifiers
+    assert point_caches.MODIFIER in item.modifiers
     item.physgen.material.density = density
     assert status() == "baked"
 
@@ -142,8 +144,8 @@ def test_own_modifiers_stay_behind_the_cache(file):
     item = bpy.data.objects["Cube"]
     item.modifiers.clear()
     item.modifiers.new("Bevel", "BEVEL")
-    playback.show(scene(), bake_state.shown_record(scene()))
-    assert [modifier.name for modifier in item.modifiers] == [caches.MODIFIER, "Bevel"]
+    show_bake.show(scene(), bake_state.shown_record(scene()))
+    assert [modifier.name for modifier in item.modifiers] == [point_caches.MODIFIER, "Bevel"]
 
 
 def test_undo_and_redo_never_lose_a_bake(file):
@@ -168,7 +170,7 @@ def test_undoing_a_bake_keeps_it(baked, tmp_path):
     assert bake_state.refresh(scene()).status == "baked"
     bpy.ops.ed.undo_push(message="baked")
     bpy.ops.ed.undo()
-    assert status() == "baked" and caches.MODIFIER in bpy.data.objects["Cube"].modifiers
+    assert status() == "baked" and point_caches.MODIFIER in bpy.data.objects["Cube"].modifiers
     bpy.ops.ed.redo()
     assert status() == "baked"
 
@@ -237,7 +239,7 @@ def test_bakes_of_unsaved_files_are_nobody_elses():
     root.rename(target)
     try:
         root.symlink_to(target)
-        with pytest.raises(InputError, match="somebody else's"):
+        with pytest.raises(InputError, match="belongs to another user"):
             paths.make_unsaved_root()
         root.unlink()
     finally:
@@ -249,7 +251,7 @@ def test_a_mesh_that_has_changed_says_so_and_loses_its_cache(file):
     item.data.vertices.add(1)
     found = bake_state.refresh(scene())
     assert found.status == "stale" and "Cube has 9 vertices and its bake 8; bake again" in found.message
-    assert caches.MODIFIER not in item.modifiers
+    assert point_caches.MODIFIER not in item.modifiers
 
 
 def test_deleted_and_renamed_objects_are_named(file):
@@ -368,10 +370,10 @@ def test_a_bake_is_played_stopped_killed_and_goes_on(tmp_path):
     bpy.ops.ed.undo_push(message="with some frames")
     bpy.ops.ed.undo()
     count = job.done
-    live.run_until(lambda: (job.done or 0) > count and caches.MODIFIER in bpy.data.objects["Cube"].modifiers)
+    live.run_until(lambda: (job.done or 0) > count and point_caches.MODIFIER in bpy.data.objects["Cube"].modifiers)
     # Cancel does not wait for the worker, and the next bake does.
     bpy.ops.physgen.pause_bake()
-    assert live.tick() == {"CANCELLED"} and jobs.running() is None
+    assert live.tick() == {"CANCELLED"} and background_jobs.running() is None
     assert bake_state.state(scene()).status == "paused"
     again = Live()
     job = again.begin(bpy.context)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Blender's own projection against ``Camera.project``."""
 
 import numpy as np
@@ -5,8 +6,8 @@ import pytest
 from physgen.sim.scene.model import Camera
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge import compat  # noqa: E402
-from physgen.physgen_addon.bridge.camera import add_camera, render_size  # noqa: E402
+from physgen.physgen_addon import compat
+from physgen.physgen_addon.scene_io.photo_view import add_camera, render_size
 
 POSE = ((0.8, -0.36, 0.48, 0.1), (0.0, -0.8, -0.6, 0.4), (0.6, 0.48, -0.64, 0.9), (0, 0, 0, 1))
 

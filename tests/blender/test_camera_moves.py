@@ -1,21 +1,22 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Frames seen by a moved camera, against what Cycles itself sees from there."""
 
 import json
 
 import numpy as np
 import pytest
-from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.transfer import read_rgb
+from physgen.sim.composite.image_metrics import psnr
+from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
-from physgen.sim.scene.camera_move import Offset, moved
+from physgen.sim.scene.camera_path import CameraOffset, offset_camera
 from scipy import ndimage
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon.bridge import import_scene  # noqa: E402
-from physgen.physgen_addon.bridge.export_camera import camera_path  # noqa: E402
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+import physgen
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.physgen_addon.scene_io import import_scene
+from physgen.physgen_addon.scene_io.export_animation import camera_path
 
 REST = (0.0, 0.0, 0.0)
 PIVOT = [0.02, 0.0, 0.0]
@@ -38,7 +39,9 @@ def test_the_moved_camera_sees_what_is_there(world, bake, truth, tmp_path):
     assert first.read_bytes() == still.read_bytes()
     assert second.read_bytes() != third.read_bytes()
 
-    camera = moved(world.folder.scene.camera, Offset(**OFFSET), pivot=np.array(PIVOT), normal=np.array([0.0, 0.0, 1.0]))
+    camera = offset_camera(
+        world.folder.model.camera, CameraOffset(**OFFSET), pivot=np.array(PIVOT), normal=np.array([0.0, 0.0, 1.0])
+    )
     expected, mask = truth(REST, tmp_path, camera)
     picture = read_rgb(third)
     assert psnr(picture, expected) > 40
@@ -63,7 +66,7 @@ def test_a_camera_that_goes_too_far_is_refused_before_anything_is_rendered(world
 def test_blenders_camera_becomes_a_path(world):
     physgen.register()
     try:
-        scene, photo = bpy.context.scene, world.folder.scene.camera
+        scene, photo = bpy.context.scene, world.folder.model.camera
         import_scene.import_scene(scene, world.folder.root)
         frames = range(10, 13)
         assert camera_path(scene, photo, frames, first_frame=1) is None

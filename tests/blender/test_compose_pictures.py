@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 import pytest
-from physgen.benchmarks.assets import cameras, fields, pictures, render
-from physgen.benchmarks.assets.asset import Asset, Part
-from physgen.benchmarks.assets.meshing import meshed
-from physgen.benchmarks.assets.warp import Warp
+from physgen.benchmarks.compose_assets import blender_render, pictures, sdf
+from physgen.benchmarks.compose_assets import pictures as cameras
+from physgen.benchmarks.compose_assets.asset import Asset, Part
+from physgen.benchmarks.compose_assets.sdf import Warp, mesh_of
 
 SIZE = 32
 
@@ -22,7 +22,7 @@ def two_balls() -> Asset:
 
     def ball(name, centre, radius, colour):
         low, high = (tuple(c + s * 1.2 * radius for c in centre) for s in (-1, 1))
-        vertices, faces = meshed(fields.ball(centre, radius), low, high, radius / 8)
+        vertices, faces = mesh_of(sdf.sphere(centre, radius), low, high, radius / 8)
         colours = np.broadcast_to(np.array(colour), vertices.shape)
         return Part(name=name, vertices=vertices, faces=faces, colours=colours)
 
@@ -41,8 +41,8 @@ def test_pictures_show_whose_each_pixel_is(two_balls, tmp_path, monkeypatch):
         monkeypatch.setattr(module, "FITTING", places[1:2])
         monkeypatch.setattr(module, "HELD_OUT", places[2:])
         monkeypatch.setattr(module, "PLACES", places)
-    folder = tmp_path / pictures.kept_as(two_balls, SIZE)
-    render.shoot(two_balls, SIZE, folder, look=dataclasses.replace(pictures.LOOK, samples=8), threads=1)
+    folder = tmp_path / pictures.cache_name(two_balls, SIZE)
+    blender_render.shoot(two_balls, SIZE, folder, look=dataclasses.replace(pictures.LOOK, samples=8), threads=1)
     shot = pictures.load(two_balls, folder)
     view, alone, green = shot.views[0], shot.background_views[0], shot.foreground_views[0][0]
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Corrections of a photo's scene: what is told becomes the command's arguments; only what depends on it is redone."""
 
 import argparse
@@ -13,29 +14,35 @@ import trimesh
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.batch.photo_arguments import object_requests, reconstruct_options  # noqa: E402
-from physgen.batch.photos import add_reconstruct  # noqa: E402
-from physgen.physgen_addon import kept_changes  # noqa: E402
-from physgen.physgen_addon.bridge.import_scene import import_scene  # noqa: E402
-from physgen.physgen_addon.mask_painting import ellipse, extent  # noqa: E402
-from physgen.physgen_addon.operators.draw_box import add_box  # noqa: E402
-from physgen.physgen_addon.operators.photo import set_photo  # noqa: E402
-from physgen.physgen_addon.panels.correct import PHYSGEN_PT_correct  # noqa: E402
-from physgen.physgen_addon.panels.photo import draw_photo  # noqa: E402
-from physgen.physgen_addon.photo_masks import (  # noqa: E402
-    store_mask,
+import physgen
+from physgen.batch.commands.flags import object_requests, reconstruct_options
+from physgen.batch.commands.photo_commands import add_reconstruct
+from physgen.physgen_addon.operators.photo_ops import (
+    add_box,
+    set_photo,
 )
-from physgen.physgen_addon.photo_request import arguments, object_name, scene_folder  # noqa: E402
-from physgen.physgen_addon.photo_scene import found_mask, made_folder, take_camera  # noqa: E402
-from physgen.physgen_addon.props.body import PHYSGEN_PG_body  # noqa: E402
-from physgen.physgen_addon.props.material import PHYSGEN_PG_material, is_modified  # noqa: E402
-from physgen.physgen_addon.props.photo import PHYSGEN_PG_photo_box  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
-from physgen.sim.reconstruct.cut.given import read_mask  # noqa: E402
-from physgen.sim.reconstruct.options import BACKS, SHAPES, UP_AXES  # noqa: E402
-from physgen.sim.scene.folder import load_scene, save_scene  # noqa: E402
-from physgen.sim.scene.meshes import load_object_mesh  # noqa: E402
+from physgen.physgen_addon.panels.photo_panel import draw_photo
+from physgen.physgen_addon.panels.scene_panel import PHYSGEN_PT_correct
+from physgen.physgen_addon.photo.photo_image import store_mask
+from physgen.physgen_addon.photo.photo_maths import ellipse, extent
+from physgen.physgen_addon.photo.photo_request import (
+    arguments,
+    found_mask,
+    made_folder,
+    object_name,
+    scene_folder,
+    take_camera,
+)
+from physgen.physgen_addon.props.body_props import PHYSGEN_PG_body
+from physgen.physgen_addon.props.material_props import PHYSGEN_PG_material, is_modified
+from physgen.physgen_addon.props.photo_props import PHYSGEN_PG_photo_box
+from physgen.physgen_addon.scene_io import import_physics
+from physgen.physgen_addon.scene_io.import_scene import import_scene
+from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES
+from physgen.sim.reconstruct.segmentation.object_masks import read_mask
+from physgen.sim.scene.folder import load_scene, save_scene
+from physgen.sim.scene.meshes import load_object_mesh
 
 SIZE = (160, 120)
 """Pixels of the photo, the world's own; small, because it is reconstructed twice."""
@@ -181,8 +188,8 @@ def stages(folder):
 def volume(folder):
     """Of the object, in cubes of the camera's height, which the scale does not change."""
     scene = load_scene(folder)
-    mesh = load_object_mesh(scene, scene.scene.objects[0])
-    height = scene.scene.camera.world_from_camera[2][3]
+    mesh = load_object_mesh(scene, scene.model.objects[0])
+    height = scene.model.camera.world_from_camera[2][3]
     return trimesh.Trimesh(mesh.vertices, mesh.faces).volume / height**3
 
 
@@ -229,9 +236,9 @@ def test_what_was_changed_by_hand_stays_and_the_rest_is_new(world, tmp_path):
     scene, root = bpy.context.scene, tmp_path / "scene"
     shutil.copytree(world.folder.root, root)
     import_scene(scene, root)
-    assert kept_changes.changes(scene, root) == {}
-    kept_changes.remember(scene, root)
-    assert kept_changes.changes(scene, root) == {}
+    assert import_physics.find_edits(scene, root) == {}
+    import_physics.remember_imported(scene, root)
+    assert import_physics.find_edits(scene, root) == {}
     item = scene.physgen.photo_root.objects["ball"]
     body, world_state = item.physgen, scene.physgen.world
     body.material.preset = "jelly"
@@ -247,15 +254,15 @@ def test_what_was_changed_by_hand_stays_and_the_rest_is_new(world, tmp_path):
         entry.effect = name
         entry.targets.add().item = target
     next(number for number in world_state.effects[0].parameters if number.name == "wind_x").value = 4.5
-    changed = kept_changes.changes(scene, root)
-    assert kept_changes.changes(scene, tmp_path) == {}
+    changed = import_physics.find_edits(scene, root)
+    assert import_physics.find_edits(scene, tmp_path) == {}
     folder = load_scene(root)
-    again = dataclasses.replace(folder.scene.objects[0], spin=(0.0, 0.0, 5.0), velocity=(9.0, 0.0, 0.0))
-    save_scene(root, dataclasses.replace(folder.scene, objects=(again,)))
+    again = dataclasses.replace(folder.model.objects[0], spin=(0.0, 0.0, 5.0), velocity=(9.0, 0.0, 0.0))
+    save_scene(root, dataclasses.replace(folder.model, objects=(again,)))
     bpy.data.objects.remove(ramp)
     import_scene(scene, root)
-    kept_changes.remember(scene, root)
-    kept_changes.restore(scene, changed)
+    import_physics.remember_imported(scene, root)
+    import_physics.restore_edits(scene, changed)
     item = scene.physgen.photo_root.objects["ball"]
     body = item.physgen
     assert body.material.preset == "jelly" and not is_modified(body.material)
@@ -268,16 +275,16 @@ def test_what_was_changed_by_hand_stays_and_the_rest_is_new(world, tmp_path):
     assert entry.effect == "wind" and [target.item for target in entry.targets] == [item]
     assert next(number.value for number in entry.parameters if number.name == "wind_x") == 4.5
     # It is still the artist's change after one more import.
-    assert {what.partition("/")[0] for what in kept_changes.changes(scene, root)} == {
+    assert {what.partition("/")[0] for what in import_physics.find_edits(scene, root)} == {
         *("body:ball", "material:ball", "scene", "world"),
     }
 
 
 def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
-    kept = {name for names in kept_changes.OF_BODY for name in names}
+    kept = {name for names in import_physics.OF_BODY for name in names}
     others = {"rna_type", "name", "enabled", "source", "cache", "material", "speed", "pins", "pin_index"}
     assert set(PHYSGEN_PG_body.bl_rna.properties.keys()) == kept | others
-    kept = {name for names in kept_changes.OF_MATERIAL for name in names}
+    kept = {name for names in import_physics.OF_MATERIAL for name in names}
     assert set(PHYSGEN_PG_material.bl_rna.properties.keys()) == kept | {"rna_type", "name", "preset"}
 
 
@@ -347,7 +354,7 @@ def test_the_panel_shows_what_can_be_told(photo, world):
     assert "Reconstruct" in shown()
     (folder / "reconstruct.json").write_text(f'{{"photo": "{photo.path}"}}')
     assert "Reconstruct Again" in shown()
-    take_camera(photo, world.folder.scene.camera)
+    take_camera(photo, world.folder.model.camera)
     assert any("pitch 35°" in word for word in shown())
     photo.boxes.clear()
     assert "kind" not in shown()

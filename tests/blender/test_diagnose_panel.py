@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The Diagnose panel without its pixels: what its operators do, and what is in the scene at a frame."""
 
 import json
@@ -12,12 +13,11 @@ import pytest
 import trimesh
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import jobs  # noqa: E402
-from physgen.physgen_addon.bridge.capture_nodes import COLOUR, RAMP  # noqa: E402
-from physgen.sim.app.process import run_stage  # noqa: E402
-from physgen.sim.diagnose.analysis import Estimate  # noqa: E402
-from physgen.sim.diagnose.capture import (  # noqa: E402
+import physgen
+from physgen.physgen_addon import background_jobs
+from physgen.physgen_addon.playback.geometry_nodes import COLOUR, RAMP
+from physgen.sim.app.stage_process import run_stage
+from physgen.sim.diagnose.capture import (
     Camera,
     Capture,
     CaptureObject,
@@ -26,18 +26,19 @@ from physgen.sim.diagnose.capture import (  # noqa: E402
     Trial,
     save_capture,
 )
-from physgen.sim.diagnose.diagnosis import (  # noqa: E402
+from physgen.sim.diagnose.diagnosis import (
     Diagnosis,
+    Estimate,
     Gap,
+    Localisation,
     ObjectShare,
     RankedEffect,
     TrialArrays,
     Verdict,
-    Where,
     write_diagnosis,
 )
-from physgen.sim.errors import Cancelled  # noqa: E402
-from physgen.sim.scene.folder import load_scene  # noqa: E402
+from physgen.sim.errors import Cancelled
+from physgen.sim.scene.folder import load_scene
 
 RATE = 50.0
 FRAMES = 12
@@ -151,7 +152,7 @@ def a_diagnosis(capture, effect="air_drag", scores=None):
         ),
         controls={},
         next_experiment="Throw it the other way.",
-        where=Where(objects=(ObjectShare(name="box", share=1.0),), intervals=(), direction={}),
+        where=Localisation(objects=(ObjectShare(name="box", share=1.0),), intervals=(), direction={}),
         trials=trials,
         summary="Air drag is missing.",
         warnings=("few points",),
@@ -458,17 +459,17 @@ def interpreter(tmp_path, monkeypatch):
                 print(json.dumps({{"event": "done", "out": out}}), flush=True)
                 sys.exit(0)
             from pathlib import Path
-            from physgen.sim.app.bake_inputs import geometry_hash
-            from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest
+            from physgen.sim.app.bake_options import geometry_hash
+            from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
             from physgen.sim.cache.pc2 import Pc2Writer
             from physgen.sim.scene.folder import load_scene
             from physgen.sim.scene.meshes import load_object_mesh
             folder, out = load_scene(Path(source)), Path(out)
             out.mkdir()
-            mesh = load_object_mesh(folder, folder.scene.objects[0]).vertices
+            mesh = load_object_mesh(folder, folder.model.objects[0]).vertices
             with Pc2Writer(out / "ball.pc2", vertex_count=len(mesh)) as writer:
                 for frame in range(3):
-                    writer.append(mesh + [0, 0, frame * (2.0 if folder.scene.effects else 1.0)])
+                    writer.append(mesh + [0, 0, frame * (2.0 if folder.model.effects else 1.0)])
             save_manifest(out, BakeManifest(
                 inputs_hash="0", fps=30.0, frame_start=1, frames=3, frames_done=3, state="complete", engine="test",
                 version="0", particles=1, geometry_hash=geometry_hash(folder),
@@ -507,14 +508,14 @@ def test_an_interpreter_that_cannot_simulate_is_named(throw, monkeypatch):
 def a_scene_folder(root):
     from physgen.sim.scene.folder import save_scene
     from physgen.sim.scene.model import Camera as SceneCamera
-    from physgen.sim.scene.model import Scene, SceneObject
+    from physgen.sim.scene.model import SceneModel, SceneObject
 
     root.mkdir()
     trimesh.creation.icosphere(subdivisions=1, radius=0.05).export(root / "ball.stl")
     for name in ("photo.png", "background.png"):
         (root / name).write_bytes(b"-")
     camera = SceneCamera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, world_from_camera=LOOK)
-    save_scene(root, Scene(camera=camera, objects=(SceneObject(name="ball", mesh="ball.stl", size_m=0.1),)))
+    save_scene(root, SceneModel(camera=camera, objects=(SceneObject(name="ball", mesh="ball.stl", size_m=0.1),)))
     return root
 
 
@@ -545,7 +546,7 @@ def test_the_found_effect_goes_into_the_scene_and_both_bakes_are_shown(throw, tm
     # Once more: the bake from before is kept, the new one gets a folder of its own, the effect is not there twice.
     assert bpy.ops.physgen.add_found_effect("EXEC_DEFAULT") == {"FINISHED"}
     assert Path(state.after) == tmp_path / "scene_bake_after_2"
-    assert [e.name for e in load_scene(root).scene.effects] == ["air_drag"]
+    assert [e.name for e in load_scene(root).model.effects] == ["air_drag"]
     assert len([c for c in bpy.data.collections if "physgen_bake" in c]) == 2
     assert state.root.hide_viewport
     bpy.ops.physgen.clear_overlay()
@@ -563,13 +564,15 @@ def test_without_a_finding_there_is_nothing_to_add(throw, verdict):
 def test_a_job_reports_progress_and_is_cancelled():
     event = {"event": "progress", "stage": "fits", "done": 1, "total": 4, "eta_s": 9}
     code = f"import json, time; print({json.dumps(event)!r}, flush=True); time.sleep(60)"
-    job = jobs.Job("Test", lambda on_event, cancelled: run_stage([sys.executable, "-c", code], on_event, cancelled))
+    job = background_jobs.Job(
+        "Test", lambda on_event, cancelled: run_stage([sys.executable, "-c", code], on_event, cancelled)
+    )
     job.start()
     give_up = time.monotonic() + 30
     while job.fraction is None and time.monotonic() < give_up:
         assert not job.step()
         time.sleep(0.02)
-    assert jobs.progress_text(job) == "Test: fits 25 %, 9 s left"
+    assert background_jobs.progress_text(job) == "Test: fits 25 %, 9 s left"
     job.cancel()
     with pytest.raises(Cancelled):
         job.wait()

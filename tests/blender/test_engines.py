@@ -1,19 +1,20 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """EEVEE makes the pictures that Cycles makes; a device that is not there is replaced and said."""
 
 import os
 
 import numpy as np
 import pytest
-from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.transfer import linear_to_bytes, read_mask
+from physgen.sim.composite.image_metrics import psnr
+from physgen.sim.composite.srgb import linear_to_bytes, read_mask
 from physgen.sim.errors import InputError, RenderError
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge import graphics  # noqa: E402
-from physgen.physgen_addon.bridge.caches import open_bake  # noqa: E402
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
+from physgen.physgen_addon.playback.point_caches import open_bake
+from physgen.physgen_addon.render import render_engines
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.physgen_addon.render.renderer import Renderer
 
 SHIFT = (-0.07, 0.03, 0.0)
 
@@ -22,13 +23,13 @@ SHIFT = (-0.07, 0.03, 0.0)
 def drawing():
     """Skips where EEVEE has nothing to draw with."""
     try:
-        graphics.require_graphics()
+        render_engines.require_graphics()
     except RenderError as error:
         pytest.skip(str(error))
 
 
 def test_eevee_makes_the_same_pictures(drawing, world, bake):
-    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.scene)
+    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.model)
     made = {}
     for engine, samples in (("cycles", 16), ("eevee", 4)):
         renderer = Renderer(world.folder, opened, RenderOptions(engine=engine, samples=samples, motion_blur=0.0))
@@ -58,9 +59,9 @@ def test_without_graphics_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    graphics.require_graphics.cache_clear()
+    render_engines.require_graphics.cache_clear()
     with pytest.raises(RenderError, match=r"libegl1.*--engine cycles"):
-        graphics.require_graphics()
+        render_engines.require_graphics()
 
 
 def test_what_is_not_there_falls_back_to_the_cpu(world, bake, tmp_path):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Any Blender scene as a scene folder: exact where it can be, refused with a way out where it cannot."""
 
 import dataclasses
@@ -10,21 +11,21 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from mathutils import Matrix  # noqa: E402
-from physgen.physgen_addon.bridge import camera as bridge_camera  # noqa: E402
-from physgen.physgen_addon.bridge import compat  # noqa: E402
-from physgen.physgen_addon.bridge.export import export_scene  # noqa: E402
-from physgen.physgen_addon.bridge.export_names import export_names  # noqa: E402
-from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
-from physgen.sim.app.bake_inputs import BakeOptions, inputs_hash  # noqa: E402
-from physgen.sim.app.collider_motion import vertices_at  # noqa: E402
-from physgen.sim.app.setup_world import prepare_world  # noqa: E402
-from physgen.sim.cache.pc2 import Pc2Reader  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
-from physgen.sim.scene.folder import load_scene, save_scene  # noqa: E402
-from physgen.sim.scene.meshes import load_object_mesh, read_mesh  # noqa: E402
-from physgen.sim.scene.model import Camera  # noqa: E402
+import physgen
+from mathutils import Matrix
+from physgen.physgen_addon import compat
+from physgen.physgen_addon.scene_io import photo_view as bridge_camera
+from physgen.physgen_addon.scene_io.export_animation import export_names
+from physgen.physgen_addon.scene_io.export_scene import export_scene
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+from physgen.sim.app.bake_options import BakeOptions, inputs_hash
+from physgen.sim.app.world_setup import prepare_world
+from physgen.sim.app.world_setup_checks import vertices_at
+from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.errors import InputError
+from physgen.sim.scene.folder import load_scene, save_scene
+from physgen.sim.scene.meshes import load_object_mesh, read_mesh
+from physgen.sim.scene.model import Camera
 
 CUBE = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -70,8 +71,8 @@ def exported(scene, tmp_path, name="scene"):
     """The folder as the worker reads it, objects by name."""
     written = export_scene(scene, tmp_path / name)
     folder = load_scene(tmp_path / name)
-    assert folder.scene == written.scene
-    return folder, {item.name: item for item in folder.scene.objects}
+    assert folder.model == written.model
+    return folder, {item.name: item for item in folder.model.objects}
 
 
 def world_vertices(item):
@@ -82,7 +83,7 @@ def world_vertices(item):
 
 
 def prepared(folder):
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     return prepare_world(folder, meshes, BakeOptions(quality="preview"))
 
 
@@ -440,7 +441,7 @@ def test_the_numbers_of_an_object(scene, tmp_path):
     assert (cube.fill, cube.shell_thickness, cube.start_time) == (False, 0.07, 0.2)
     assert (cube.friction, cube.static_friction, cube.restitution, cube.contact_mode) == (0.6, 0.6, 0.2, "sticky")
     assert (cube.goal_stiffness, cube.goal_damping) == (10.0, 0.3)
-    (effect,) = folder.scene.effects
+    (effect,) = folder.model.effects
     assert (effect.name, effect.objects, dict(effect.parameters)["start"]) == ("sandy", ("Cube",), 0.0)
 
 
@@ -470,18 +471,18 @@ def test_the_world(scene, tmp_path):
     world.effects.add().enabled = False
     scene.gravity = (0, 1, -3)
     folder, _ = exported(scene, tmp_path)
-    ground = folder.scene.ground
+    ground = folder.model.ground
     assert (ground.friction, ground.static_friction, ground.restitution) == (0.7, 0.7, 0.25)
     assert ground.point == (0, 0, -1)
     assert ground.normal == pytest.approx((0, -0.5, math.sqrt(0.75)), abs=1e-6)
-    assert folder.scene.gravity == (0, 1, -3)
-    assert [effect.name for effect in folder.scene.effects] == ["wind"]
-    assert folder.scene.effects[0].objects == ("Cube",)
+    assert folder.model.gravity == (0, 1, -3)
+    assert [effect.name for effect in folder.model.effects] == ["wind"]
+    assert folder.model.effects[0].objects == ("Cube",)
     prepared(folder)
     world.use_ground, scene.use_gravity = False, False
     folder, _ = exported(scene, tmp_path)
-    assert folder.scene.ground is None
-    assert folder.scene.gravity == (0, 0, 0)
+    assert folder.model.ground is None
+    assert folder.model.gravity == (0, 0, 0)
     entry.targets.add().item = plane
     refused(scene, tmp_path / "other", "effect 1 (wind)", "'plane'")
 
@@ -491,8 +492,8 @@ def test_animated_gravity_becomes_a_track(scene, tmp_path):
     animate(scene, "gravity", (0, 0, -9), (0, 0, -1))
     scene.frame_set(7)
     folder, _ = exported(scene, tmp_path)
-    assert folder.scene.gravity == (0, 0, -9)
-    track = folder.scene.gravity_track
+    assert folder.model.gravity == (0, 0, -9)
+    track = folder.model.gravity_track
     assert track[0].value == (0, 0, -9)
     assert track[-1].value == (0, 0, -1)
     assert len(track) == 9
@@ -513,15 +514,15 @@ def test_the_unit_scale_turns_everything_into_metres_and_cancels_in_the_mesh(sce
     assert cube.size_m == pytest.approx(1)
     assert cube.velocity == (0.5, 0, 0)
     assert cube.pins[0].high == pytest.approx((0.1, 0.1, 1.1))
-    assert folder.scene.gravity == (0, 0, -9.81)
-    assert folder.scene.ground.point == (0, 0, 0.2)
+    assert folder.model.gravity == (0, 0, -9.81)
+    assert folder.model.ground.point == (0, 0, 0.2)
     # A sample in mesh space, back through the object's own matrix, is where Blender has it.
     back = np.linalg.inv(np.array(cube.world_from_mesh))
     mesh_space = loaded.vertices @ back[:3, :3].T + back[:3, 3]
     assert np.abs(mesh_space - np.array([v.co for v in item.data.vertices])).max() < 1e-6
     scene.unit_settings.system = "NONE"
     scene.physgen.world.ground_point = (0, 0, 0)
-    assert exported(scene, tmp_path)[0].scene.gravity == (0, 0, -981)
+    assert exported(scene, tmp_path)[0].model.gravity == (0, 0, -981)
 
 
 def test_the_camera_comes_back_as_it_was_made(scene, tmp_path):
@@ -531,7 +532,7 @@ def test_the_camera_comes_back_as_it_was_made(scene, tmp_path):
         width=200, height=120, fx=190.0, fy=200.0, cx=93.0, cy=63.5, world_from_camera=tuple(map(tuple, pose))
     )
     bridge_camera.add_camera(scene, made, (200, 120))
-    found = exported(scene, tmp_path)[0].scene.camera
+    found = exported(scene, tmp_path)[0].model.camera
     points = np.random.default_rng(0).normal((0, 0, 0), 0.5, (20, 3)) + made.position + np.array(pose)[:3, 2] * 4
     assert np.abs(found.project(points) - made.project(points)).max() < 1e-3
 
@@ -551,7 +552,7 @@ def test_a_second_export_replaces_the_first_and_nothing_else(scene, tmp_path):
 
 def test_a_scene_with_a_photo_is_never_overwritten(scene, tmp_path):
     add()
-    with_photo = dataclasses.replace(exported(scene, tmp_path)[0].scene, photo="photo.png", background="background.png")
+    with_photo = dataclasses.replace(exported(scene, tmp_path)[0].model, photo="photo.png", background="background.png")
     save_scene(tmp_path / "scene", with_photo)
     before = (tmp_path / "scene" / "scene.json").read_bytes()
     with pytest.raises(InputError, match="photo"):
@@ -574,7 +575,7 @@ def test_the_second_scene_of_a_file_is_exported_as_it_is(scene, tmp_path):
     folder, objects = exported(other, tmp_path)
     assert set(objects) == {"there"}
     assert load_object_mesh(folder, objects["there"]).vertices.mean(axis=0) == pytest.approx((3, 0, 1))
-    assert folder.scene.gravity_track[-1].value == (0, 0, -1)
+    assert folder.model.gravity_track[-1].value == (0, 0, -1)
     assert bpy.context.scene == scene
 
 

@@ -11,9 +11,9 @@ import time
 import cv2
 import numpy as np
 import pytest
-from physgen.batch.farm import local
-from physgen.batch.farm.graph import make_plan
-from physgen.batch.farm.jobs import load_job
+from physgen.batch.farm import local_runner
+from physgen.batch.farm.planning.job_file import load_job
+from physgen.batch.farm.planning.task_graph import make_plan
 from physgen.batch.farm.runners import FarmOptions
 
 pytest.importorskip("bpy")
@@ -99,7 +99,7 @@ def test_whatever_is_killed_costs_a_retry_and_nothing_else(job):
             for pid in processes(str(job.parent), *victims.pop(event["task"])):
                 os.kill(pid, signal.SIGKILL)
 
-    outcomes = local.run(plan, FarmOptions(workers=2, threads=1), hear, lambda: False)
+    outcomes = local_runner.run_local(plan, FarmOptions(workers=2, threads=1), hear, lambda: False)
     assert [o.task for o in outcomes] == IDS and not victims
     # On a busy machine the bake ends before its scheduler does, and is kept too.
     kept = outcomes[2].state == "kept"

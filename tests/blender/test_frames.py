@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The loop over frames: what is skipped, what is resumed, what is refused; the script; the video."""
 
 import json
@@ -7,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physgen.sim.composite.transfer import bytes_to_linear, read_rgb
+from physgen.sim.composite.srgb import bytes_to_linear, read_rgb
 from physgen.sim.errors import Cancelled, InputError
 
 bpy = pytest.importorskip("bpy")
-import cv2  # noqa: E402
-from physgen.physgen_addon.bridge.frame_file import Part, write_exr, write_png  # noqa: E402
-from physgen.physgen_addon.bridge.frame_range import parse_range  # noqa: E402
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
-from physgen.physgen_addon.bridge.video import encode  # noqa: E402
+import cv2
+from physgen.physgen_addon.frames.frame_files import Part, write_exr, write_png
+from physgen.physgen_addon.frames.frame_index import parse_frame_range
+from physgen.physgen_addon.frames.video_encoding import encode_video
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.physgen_addon.render.renderer import Renderer
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = RenderOptions(samples=1, scale=0.5, motion_blur=0)
@@ -92,13 +93,13 @@ def test_unusable_input_is_named(world, bake, tmp_path):
     ("text", "numbers"), [(None, [1, 2, 3, 4, 5]), ("2-4", [2, 3, 4]), ("5,1", [1, 5]), ("1-5x2", [1, 3, 5])]
 )
 def test_ranges(text, numbers):
-    assert parse_range(text, 1, 5) == numbers
+    assert parse_frame_range(text, 1, 5) == numbers
 
 
 @pytest.mark.parametrize("text", ["", "x", "3-1", "1-5x0", "0", "6", "-1", "1-"])
 def test_ranges_that_are_none(text):
     with pytest.raises(InputError, match="frames"):
-        parse_range(text, 1, 5)
+        parse_frame_range(text, 1, 5)
 
 
 def as_tagged(rgb):
@@ -129,7 +130,7 @@ def test_video_keeps_number_size_and_colours(tmp_path, suffix, size):
         else:
             write_png(paths[-1], pixels)
     clip = tmp_path / f"clip{suffix}"
-    encode(paths, clip, fps=23.976)
+    encode_video(paths, clip, fps=23.976)
     video = cv2.VideoCapture(str(clip))
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(23.976, abs=0.01)
     for colour in colours:

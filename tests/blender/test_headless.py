@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The scripts of ``batch`` as processes: arguments, exit codes, signals, and where modules and Pythons are found."""
 
 import json
@@ -12,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physgen.sim.cache.lock import folder_lock
-from physgen.sim.cache.manifest import MANIFEST_FILE
-from physgen.sim.composite.transfer import read_rgb
+from physgen.sim.cache.bake_folder import MANIFEST_FILE
+from physgen.sim.cache.folder_lock import folder_lock
+from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
 
 BATCH = Path(__file__).resolve().parents[2] / "batch"
 QUICK = ["--samples", "1", "--scale", "0.25", "--threads", "1", "--json"]
@@ -122,10 +123,10 @@ def test_what_blender_lacks_is_named_and_taken_from_where_somebody_says(world, b
     assert "-m pip install --target " in message and f'"numpy=={np.__version__}"' in message
     code, said, complaints = ended(found)
     assert code == 0, complaints
-    assert f"is taken from {sys.executable}" in json.loads(said.splitlines()[0])["message"]
+    assert f"are taken from {sys.executable}" in json.loads(said.splitlines()[0])["message"]
     elsewhere = start(tmp_path, *bare, BATCH / "render.py", *arguments, PHYSGEN_PACKAGES=str(tmp_path / "gone"))
     code, said, _ = ended(elsewhere)
-    assert code == 3 and "which is no folder" in json.loads(said)["message"]
+    assert code == 3 and "which is not a folder" in json.loads(said)["message"]
 
 
 def test_a_verb_that_simulates_becomes_the_python_that_can(bare, tmp_path):

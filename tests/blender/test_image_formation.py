@@ -1,16 +1,17 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Rendered frames against the photo and against what Cycles renders of the true world."""
 
 import numpy as np
 import pytest
-from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.transfer import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
+from physgen.sim.composite.image_metrics import psnr
+from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge.caches import open_bake  # noqa: E402
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.bridge.renderer import Renderer  # noqa: E402
-from scipy import ndimage  # noqa: E402
+from physgen.physgen_addon.playback.point_caches import open_bake
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.physgen_addon.render.renderer import Renderer
+from scipy import ndimage
 
 SHIFT = (-0.07, 0.03, 0.0)
 LIFTED = (0.0, 0.0, 0.004)
@@ -49,7 +50,7 @@ def test_rest_is_the_photo_and_motion_is_the_truth(world, frames):
 
 
 def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
-    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.scene)
+    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.model)
     pictures = []
     for crop in (True, False):
         renderer = Renderer(world.folder, opened, RenderOptions(samples=64, crop=crop))
@@ -61,7 +62,7 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
 
 
 def test_out_of_view_is_the_background_alone(world, bake):
-    opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.scene)
+    opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.model)
     renderer = Renderer(world.folder, opened, RenderOptions(samples=4, grain=False))
     gone = linear_to_bytes(renderer.frame(1).beauty)
     renderer.close()

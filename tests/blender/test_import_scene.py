@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """A scene folder in Blender: the same picture through the camera, the same vertices, the same physics; or no change."""
 
 import dataclasses
@@ -12,20 +13,22 @@ import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
-from mathutils import Vector  # noqa: E402
-from physgen.physgen_addon.bridge import import_scene as bridge  # noqa: E402
-from physgen.physgen_addon.bridge.photo_image import load_photo_image  # noqa: E402
-from physgen.physgen_addon.operators.draw_box import add_box  # noqa: E402
-from physgen.physgen_addon.operators.photo import set_photo  # noqa: E402
-from physgen.physgen_addon.photo_request import arguments, scene_folder  # noqa: E402
-from physgen.physgen_addon.props.material import get_material  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
-from physgen.sim.scene.folder import SceneFolder, load_scene, save_scene  # noqa: E402
-from physgen.sim.scene.materials import load_preset  # noqa: E402
-from physgen.sim.scene.meshes import load_object_mesh  # noqa: E402
-from physgen.sim.scene.model import Box, Contact, Effect, Ground, Key, Motion  # noqa: E402
+import physgen
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+from physgen.physgen_addon.operators.photo_ops import (
+    add_box,
+    set_photo,
+)
+from physgen.physgen_addon.photo.photo_image import load_photo_image
+from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
+from physgen.physgen_addon.props.material_props import get_material
+from physgen.physgen_addon.scene_io import import_scene as bridge
+from physgen.sim.errors import InputError
+from physgen.sim.scene.folder import Scene, load_scene, save_scene
+from physgen.sim.scene.material import load_preset
+from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.model import Box, Contact, Effect, Ground, Key, Motion
 
 KINDS = ("objects", "meshes", "materials", "images", "lights", "cameras", "worlds", "collections", "actions")
 
@@ -45,10 +48,10 @@ def copy(world, tmp_path):
     return load_scene(root)
 
 
-def changed(folder: SceneFolder, *, scene=None, **item) -> SceneFolder:
+def changed(folder: Scene, *, scene=None, **item) -> Scene:
     """``folder`` with other fields of its object and of the scene."""
-    body = dataclasses.replace(folder.scene.objects[0], **item)
-    return save_scene(folder.root, dataclasses.replace(folder.scene, objects=(body,), **(scene or {})))
+    body = dataclasses.replace(folder.model.objects[0], **item)
+    return save_scene(folder.root, dataclasses.replace(folder.model, objects=(body,), **(scene or {})))
 
 
 def census():
@@ -66,9 +69,9 @@ def test_the_camera_sees_what_the_photo_shows(copy):
     scene = bpy.context.scene
     bridge.import_scene(scene, copy.root)
     bpy.context.view_layer.update()
-    camera = copy.scene.camera
+    camera = copy.model.camera
     assert (scene.render.resolution_x, scene.render.resolution_y) == (camera.width, camera.height)
-    points = load_object_mesh(copy, copy.scene.objects[0]).vertices[::97]
+    points = load_object_mesh(copy, copy.model.objects[0]).vertices[::97]
     seen = np.array([world_to_camera_view(scene, scene.camera, Vector(point)) for point in points])
     pixels = np.column_stack([seen[:, 0] * camera.width, (1 - seen[:, 1]) * camera.height])
     assert np.abs(pixels - camera.project(points)[:, :2]).max() < 0.01
@@ -78,7 +81,7 @@ def test_vertices_keep_their_order_and_place_and_the_origin_is_the_centre_of_mas
     copy = changed(copy, world_from_mesh=((0, 0.0, 2, 0.3), (2, 0.0, 0, -7), (0, 2.0, 0, 5), (0, 0, 0, 1.0)))
     item = bridge.import_scene(bpy.context.scene, copy.root).objects["ball"]
     bpy.context.view_layer.update()
-    mesh = load_object_mesh(copy, copy.scene.objects[0])
+    mesh = load_object_mesh(copy, copy.model.objects[0])
     assert np.abs(world_vertices(item) - mesh.vertices).max() < 1e-6
     corners = [list(face.vertices) for face in item.data.polygons[:50]]
     assert corners == mesh.faces[:50].tolist()
@@ -97,9 +100,9 @@ def test_the_texture_is_packed_and_laid_as_the_file_says(copy):
     item = bridge.import_scene(bpy.context.scene, copy.root).objects["ball"]
     assert all(image.packed_file is not None for image in bpy.data.images)
     texture = item.data.materials[0].node_tree.nodes.active.image
-    assert tuple(texture.size) == (copy.scene.camera.width, copy.scene.camera.height)
+    assert tuple(texture.size) == (copy.model.camera.width, copy.model.camera.height)
     # The fixture's texture is the photo as the camera sees it: UVs are the vertices' own pixels.
-    pixels = copy.scene.camera.project(load_object_mesh(copy, copy.scene.objects[0]).vertices)
+    pixels = copy.model.camera.project(load_object_mesh(copy, copy.model.objects[0]).vertices)
     uv = np.empty(2 * len(item.data.loops), dtype=np.float32)
     item.data.uv_layers["photo"].data.foreach_get("uv", uv)
     corner = np.empty(len(item.data.loops), dtype=np.int32)
@@ -118,8 +121,8 @@ def test_light_meets_the_albedo_where_there_is_one(copy):
     photo, lit = colours_of(bridge.import_scene(bpy.context.scene, copy.root).objects["ball"])
     assert lit == photo
     (copy.root / "albedo").mkdir()
-    Image.new("RGB", (copy.scene.camera.width, copy.scene.camera.height), (200, 100, 50)).save(
-        copy.root / "albedo" / f"{PurePosixPath(copy.scene.objects[0].mesh).stem}.png"
+    Image.new("RGB", (copy.model.camera.width, copy.model.camera.height), (200, 100, 50)).save(
+        copy.root / "albedo" / f"{PurePosixPath(copy.model.objects[0].mesh).stem}.png"
     )
     item = bridge.import_scene(bpy.context.scene, copy.root).objects["ball"]
     photo, lit = colours_of(item)
@@ -133,7 +136,7 @@ def test_light_meets_the_albedo_where_there_is_one(copy):
 def test_a_damaged_albedo_is_named_and_nothing_is_left(copy):
     before = census()
     (copy.root / "albedo").mkdir()
-    path = copy.root / "albedo" / f"{PurePosixPath(copy.scene.objects[0].mesh).stem}.png"
+    path = copy.root / "albedo" / f"{PurePosixPath(copy.model.objects[0].mesh).stem}.png"
     path.write_bytes(b"no picture")
     with pytest.raises(InputError, match="albedo"):
         bridge.import_scene(bpy.context.scene, copy.root)
@@ -141,7 +144,7 @@ def test_a_damaged_albedo_is_named_and_nothing_is_left(copy):
 
 
 def test_cycles_renders_the_photo_again(copy, world, tmp_path):
-    from physgen.physgen_addon.bridge import compat
+    from physgen.physgen_addon import compat
 
     compat.enable_cycles()
     scene = bpy.context.scene
@@ -151,7 +154,7 @@ def test_cycles_renders_the_photo_again(copy, world, tmp_path):
     scene.render.image_settings.file_format = "PNG"
     bpy.ops.render.render(write_still=True)
     seen = np.asarray(Image.open(tmp_path / "seen.png").convert("RGBA")).astype(float)
-    inside = np.asarray(Image.open(copy.file(copy.scene.objects[0].mask))) > 127
+    inside = np.asarray(Image.open(copy.file(copy.model.objects[0].mask))) > 127
     core = inside & (seen[..., 3] == 255)
     assert core.sum() > 0.9 * inside.sum()
     # Between the pixels' centres colours are interpolated, so a few grey values of noise in the photo average out.
@@ -171,9 +174,9 @@ def test_background_world_sun_and_ground(copy):
     assert scene.view_settings.view_transform == "Standard"
     sun = next(item for item in collection.objects if item.type == "LIGHT")
     toward = sun.matrix_world.to_3x3() @ Vector((0, 0, 1))
-    assert np.allclose(toward, copy.scene.light.sun_direction, atol=1e-5)
+    assert np.allclose(toward, copy.model.light.sun_direction, atol=1e-5)
     # White all round lights open ground with π; the sun's share is of that, on ground that it meets at an angle.
-    assert sun.data.energy == pytest.approx(1.5 * math.pi / copy.scene.light.sun_direction[2], rel=1e-5)
+    assert sun.data.energy == pytest.approx(1.5 * math.pi / copy.model.light.sun_direction[2], rel=1e-5)
     ground = scene.physgen.world.ground_object
     assert ground.is_shadow_catcher
     assert ground.matrix_world.translation.z == pytest.approx(0, abs=1e-7)
@@ -257,7 +260,7 @@ def test_a_moving_collider_is_animated(copy):
     scene.render.fps, scene.render.fps_base = 20, 1.0
     item = bridge.import_scene(scene, copy.root).objects["ball"]
     first = scene.physgen.simulation.frame_start
-    rest = load_object_mesh(copy, copy.scene.objects[0]).vertices
+    rest = load_object_mesh(copy, copy.model.objects[0]).vertices
     for share in (0.0, 0.35, 0.5, 1.0):
         frame = first + 20 * share
         scene.frame_set(int(frame), subframe=frame - int(frame))
@@ -292,12 +295,12 @@ def test_two_scenes_of_one_file_do_not_disturb_each_other(copy):
 
 
 def damage_glb(folder):
-    path = folder.file(folder.scene.objects[0].mesh)
+    path = folder.file(folder.model.objects[0].mesh)
     path.write_bytes(path.read_bytes()[:-2000])
 
 
 def damage_texture(folder):
-    path = folder.file(folder.scene.objects[0].mesh)
+    path = folder.file(folder.model.objects[0].mesh)
     content = path.read_bytes()
     start = content.index(b"\x89PNG")
     path.write_bytes(content[: start + 4] + bytes(60) + content[start + 64 :])
@@ -441,7 +444,7 @@ def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
     item = scene.physgen.photo_root.objects["ball"]
     assert max(item.dimensions) == pytest.approx(0.1, rel=0.01)
-    assert load_scene(tmp_path / "ball_scene").scene.objects[0].name == item.physgen.source
+    assert load_scene(tmp_path / "ball_scene").model.objects[0].name == item.physgen.source
     assert (scene.render.resolution_x, scene.render.resolution_y) == (320, 240)
 
 
@@ -466,5 +469,5 @@ def test_an_output_folder_of_physgen3d_becomes_a_scene_in_the_worker(world, tmp_
     bpy.context.view_layer.update()
     assert tuple(item.dimensions) == pytest.approx((0.5, 0.5, 0.5), rel=1e-5)
     assert world_vertices(item)[:, 2].min() == pytest.approx(0, abs=1e-6)
-    with pytest.raises(RuntimeError, match=r"there is no transform\.json"):
+    with pytest.raises(RuntimeError, match=r"contains no transform\.json"):
         bpy.ops.physgen.import_physgen3d(directory=str(tmp_path))

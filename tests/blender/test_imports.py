@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a Blender must have: to enable the extension nothing, to render what ``batch/modules.py`` promises."""
+"""What a Blender must have: to enable the extension nothing, to render what ``batch/blender_script.py`` promises."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ import sys
 import pytest
 
 pytest.importorskip("bpy")
-from physgen.batch.modules import RENDERING
+from physgen.batch.blender_script import RENDER_MODULES
 from physgen.sim.app.requirements import REQUIREMENTS
 
 
@@ -24,5 +24,5 @@ def test_enabling_needs_numpy_alone():
 
 
 def test_rendering_needs_no_more_than_it_says():
-    code = "import physgen.physgen_addon.bridge.frames, physgen.physgen_addon.bridge.video"
-    run_without(set(REQUIREMENTS) - {"numpy", *RENDERING}, code)
+    code = "import physgen.physgen_addon.render.render_frames, physgen.physgen_addon.frames.video_encoding"
+    run_without(set(REQUIREMENTS) - {"numpy", *RENDER_MODULES}, code)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Which Python simulates: the one that somebody named or none, and what is said where it cannot."""
 
 import shlex
@@ -7,9 +8,9 @@ import sys
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import interpreter  # noqa: E402
-from physgen.physgen_addon.props import preferences  # noqa: E402
+import physgen
+from physgen.physgen_addon import interpreter
+from physgen.physgen_addon.props import preferences
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +65,8 @@ def test_what_is_no_python_is_quoted():
 def test_why_blenders_own_will_not_do():
     reason = interpreter.why_not((3, 14), "", "it lacks numpy")
     assert "no build for Blender's Python 3.14: name a Python 3.11 to 3.13" in reason
-    assert "without what simulates: install the zip that has it" in interpreter.why_not((3, 13), "", "it lacks taichi")
+    lacking = interpreter.why_not((3, 13), "", "it lacks taichi")
+    assert "without its simulation packages: install the zip that has them" in lacking
     assert "(Taichi does not load)" in interpreter.why_not((3, 11), "/wheels", "Taichi does not load")
 
 

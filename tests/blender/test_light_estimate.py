@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Light found in photos that Cycles takes under known suns, by the ordinary way from photo to scene."""
 
 import pytest
 
 bpy = pytest.importorskip("bpy")
-from physgen.benchmarks.light import WANTED_DEG, WANTED_SHARE, Case, measure  # noqa: E402
+from physgen.benchmarks.light import WANTED_DEG, WANTED_SHARE, Case, measure
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Frames as EXR with all layers, against what is known of them; the same frames as PNG; chunks as a video."""
 
 import dataclasses
@@ -9,18 +10,21 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from physgen.sim.cache.manifest import load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
-from physgen.sim.composite.transfer import linear_to_bytes, read_rgb
+from physgen.sim.composite.srgb import linear_to_bytes, read_rgb
 from physgen.sim.scene.meshes import load_object_mesh
 
 bpy = pytest.importorskip("bpy")
-import cv2  # noqa: E402
-from physgen.physgen_addon.bridge.exr import read_layers  # noqa: E402
-from physgen.physgen_addon.bridge.frame_file import Part, write_exr  # noqa: E402
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.ledger import Ledger  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+import cv2
+from physgen.physgen_addon.frames.frame_files import (
+    Part,
+    read_layers,
+    write_exr,
+)
+from physgen.physgen_addon.frames.frame_index import FrameIndex
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIFTS = [(0, 0, 0), (0.02, 0, 0.01), (0.02, 0, 0.01), (0.05, 0.02, 0.01)]
@@ -40,7 +44,7 @@ def test_layers_hold_the_frame_and_where_everything_goes(world, bake, tmp_path):
     channels = read_layers(layered[1])
     height, width = channels["R"].shape
     y, x = np.mgrid[:height, :width] + 0.5
-    camera = world.folder.scene.camera
+    camera = world.folder.model.camera
     centre = np.array([0.02, 0.0, 0.05]) + SHIFTS[1]
 
     # The picture is what the layers make, and what the PNG shows.
@@ -91,7 +95,7 @@ def test_particles_have_the_id_of_their_object_and_flow(world, bake, tmp_path, l
     centre, apart, step = np.array([0.02, 0.0, 0.05]), np.array([0.0, 0.0, 0.06]), np.array([0.03, 0.0, 0.0])
     side = np.arange(-0.03, 0.031, 0.012)
     rest = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3) + centre
-    skin = load_object_mesh(world.folder, world.folder.scene.objects[0]).vertices
+    skin = load_object_mesh(world.folder, world.folder.model.objects[0]).vertices
     torn = (skin - centre) * [3.0, 3.0, 0.05] + centre
     folder = bake([(0, 0, 0)] * 3)
     for name, samples in (
@@ -108,7 +112,7 @@ def test_particles_have_the_id_of_their_object_and_flow(world, bake, tmp_path, l
     (path,) = render_frames(world.folder, folder, tmp_path / "out", options, frames="2")
     channels = read_layers(path)
     seen = channels["object_id.X"] == 1
-    camera = world.folder.scene.camera
+    camera = world.folder.model.camera
     columns, rows = (camera.project(rest + apart)[:, :2].T / 2).astype(int)
     assert seen[rows, columns].mean() > 0.6
     y, x = np.mgrid[: seen.shape[0], : seen.shape[1]] + 0.5
@@ -122,7 +126,7 @@ def test_chunks_become_one_video_in_a_process_of_its_own(tmp_path):
     chunks = []
     for first in (1, 4):
         chunks.append(tmp_path / f"{first}")
-        ledger = Ledger(chunks[-1], suffix=".exr", fps=12.5)
+        ledger = FrameIndex(chunks[-1], suffix=".exr", fps=12.5)
         for number in range(first, first + 3):
             light = np.full((48, 64, 3), number / 10, np.float32)
             write_exr(ledger.path(number), [Part(name="beauty", channels=("R", "G", "B"), pixels=light)], fps=12.5)

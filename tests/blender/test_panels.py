@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """What stands behind the panels: operators, the list that follows the viewport, presets, effects, rendering."""
 
 import dataclasses
@@ -8,38 +9,34 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from mathutils import Vector  # noqa: E402
-from physgen import physgen_addon  # noqa: E402
-from physgen.batch.blender_script import add_script_options  # noqa: E402
-from physgen.batch.render import build_parser  # noqa: E402
-from physgen.batch.render_arguments import render_options  # noqa: E402
-from physgen.physgen_addon import text  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
-from physgen.physgen_addon.operators import render  # noqa: E402
-from physgen.physgen_addon.panels.render import RESULTS  # noqa: E402
-from physgen.physgen_addon.panels.sidebar import is_in  # noqa: E402
-from physgen.physgen_addon.props import presets  # noqa: E402
-from physgen.physgen_addon.props.body import bodies  # noqa: E402
-from physgen.physgen_addon.props.material import (  # noqa: E402
-    LAW_FIELDS,
-    get_material,
-    is_modified,
-)
-from physgen.physgen_addon.props.scene import EFFECT_ITEMS, effect_values  # noqa: E402
-from physgen.sim.effects.registry import effect  # noqa: E402
-from physgen.sim.scene.matter import LAWS  # noqa: E402
+import physgen
+from mathutils import Vector
+from physgen import physgen_addon
+from physgen.batch.blender_script import add_script_options
+from physgen.batch.commands.render_commands import render_options
+from physgen.batch.render import build_parser
+from physgen.physgen_addon import text
+from physgen.physgen_addon.operators import render_ops
+from physgen.physgen_addon.panels.render_panel import RESULTS
+from physgen.physgen_addon.panels.sidebar import is_in
+from physgen.physgen_addon.props import material_props
+from physgen.physgen_addon.props.body_props import bodies
+from physgen.physgen_addon.props.material_props import LAW_FIELDS, get_material, is_modified
+from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS, effect_values
+from physgen.physgen_addon.render.render_options import RenderOptions
+from physgen.sim.effects.registry import effect
+from physgen.sim.scene.material import LAWS
 
 
 @pytest.fixture(autouse=True)
 def addon(fresh_blender, tmp_path, monkeypatch):
     """The user's own presets are in a folder of the test."""
-    monkeypatch.setattr(presets, "own_folder", lambda *, create=False: own_folder(tmp_path, create))
-    presets.forget()
+    monkeypatch.setattr(material_props, "own_folder", lambda *, create=False: own_folder(tmp_path, create))
+    material_props.forget_presets()
     physgen.register()
     yield
     physgen.unregister()
-    presets.forget()
+    material_props.forget_presets()
 
 
 def own_folder(tmp_path, create=False):
@@ -91,7 +88,7 @@ def test_panels_are_in_the_order_of_work():
     mine = [p for p in panels if p.bl_space_type == "VIEW_3D" and not getattr(p, "bl_parent_id", "")]
     tops = {p.bl_label: p.bl_order for p in mine}
     assert sorted(tops, key=tops.get) == [
-        *("Scene", "Objects", "Fit Together", "Motion", "World", "Simulate", "Render", "Diagnose")
+        *("Scene", "Objects", "Compose Objects", "Motion", "World", "Simulate", "Render", "Diagnose")
     ]
     assert len(set(tops.values())) == 8
 
@@ -100,9 +97,9 @@ def registered_groups():
     return [
         kind
         for module in physgen_addon._modules()
-        for kind in module.CLASSES
+        for kind in physgen_addon.registered_classes(module)
         if issubclass(kind, bpy.types.PropertyGroup)
-        and kind.__module__.endswith((".body", ".material", ".rendering", ".scene"))
+        and kind.__module__.endswith((".body_props", ".material_props", ".render_props", ".scene_props"))
     ]
 
 
@@ -230,7 +227,7 @@ def test_colliders():
 
 def test_a_changed_number_is_seen_and_taken_back():
     material = a_body().physgen.material
-    for name in presets._SHIPPED.good:
+    for name in material_props._SHIPPED.good:
         material.preset = name
         assert material.preset == name and not is_modified(material), name
     material.preset = "rubber"
@@ -255,13 +252,13 @@ def test_a_preset_of_ones_own(tmp_path):
     other = a_body("other").physgen.material
     other.preset = "My clay"
     assert get_material(other) == get_material(material) and other.density == 1234.5
-    with pytest.raises(RuntimeError, match="that PhysGen brings"):
+    with pytest.raises(RuntimeError, match="is a shipped preset"):
         bpy.ops.physgen.save_preset(name="CLAY")
     with pytest.raises(RuntimeError, match="preset name"):
         bpy.ops.physgen.save_preset(name="a/b")
     assert bpy.ops.physgen.delete_preset(name="My clay") == {"FINISHED"}
     assert material.preset == "custom" and material.density == 1234.5
-    with pytest.raises(RuntimeError, match="deleted already"):
+    with pytest.raises(RuntimeError, match="already be deleted"):
         bpy.ops.physgen.delete_preset(name="My clay")
     assert not list(own_folder(tmp_path).iterdir())
 
@@ -275,16 +272,18 @@ def test_a_preset_is_kept_by_name_where_it_is_missing(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     for path in own_folder(tmp_path).iterdir():
         path.unlink()
-    presets.forget()
+    material_props.forget_presets()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     material = bpy.data.objects["ball"].physgen.material
     assert (material.preset, material.law, material.density) == ("é oak", "rigid", 777)
     assert not is_modified(material) and get_material(material).preset == "é oak"
-    assert ("é oak", "é oak (missing)") in [item[:2] for item in presets.items(material.preset_name)]
+    assert ("é oak", "é oak (missing)") in [item[:2] for item in material_props.preset_items(material.preset_name)]
     material.preset = "é oak"
     assert material.density == 777
     material.preset = "rubber"
-    assert material.density == 1100 and "é oak" not in [item[0] for item in presets.items(material.preset_name)]
+    assert material.density == 1100 and "é oak" not in [
+        item[0] for item in material_props.preset_items(material.preset_name)
+    ]
 
 
 def test_broken_presets_are_listed_and_change_nothing(tmp_path):
@@ -292,9 +291,12 @@ def test_broken_presets_are_listed_and_change_nothing(tmp_path):
     (folder / "bad.toml").write_bytes(b"\xff[[")
     (folder / "rubber.toml").write_text("density = 1.0")
     (folder / "good.toml").write_text("density = 2.0")
-    presets.forget()
+    material_props.forget_presets()
     material = a_body().physgen.material
-    assert set(presets.own_presets().broken) == {"bad", "rubber"} and presets.find("rubber").density == 1100
+    assert (
+        set(material_props.own_presets().broken) == {"bad", "rubber"}
+        and material_props.find_preset("rubber").density == 1100
+    )
     material.preset = "broken:bad"
     assert material.preset == "medium" and material.density == 1000
     material.preset = "good"
@@ -525,7 +527,7 @@ def flags_of(scene, monkeypatch):
         given.extend(command)
         return {"event": "done"}
 
-    monkeypatch.setattr(render, "run_stage", stage)
+    monkeypatch.setattr(render_ops, "run_stage", stage)
     with pytest.raises(RuntimeError, match="is not there"):
         bpy.ops.physgen.render_still()
     parser = build_parser()
@@ -583,12 +585,12 @@ def test_what_cannot_be_rendered_says_why(world, bake, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="not saved yet"):
         bpy.ops.physgen.render_video()
     state.rendering.output = str(tmp_path / "out")
-    monkeypatch.setitem(render.NEEDED, "no_such_module", "Something")
+    monkeypatch.setitem(render_ops.NEEDED, "no_such_module", "Something")
     with pytest.raises(RuntimeError, match="lacks Something"):
         bpy.ops.physgen.render_video()
 
 
 def test_the_command_is_of_this_blender():
-    command = render.render_command()
-    assert command[1:] == [str(render.SCRIPT)] and Path(command[0]).is_file()
-    assert render.SCRIPT.is_file()
+    command = render_ops.render_command()
+    assert command[1:] == [str(render_ops.SCRIPT)] and Path(command[0]).is_file()
+    assert render_ops.SCRIPT.is_file()

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Masks and the horizon, painted and dragged over a photo: as events, as Blender keeps them, as they are drawn."""
 
 import math
@@ -12,13 +13,14 @@ import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon.mask_painting import Painting, ellipse, extent  # noqa: E402
-from physgen.physgen_addon.operators import set_horizon  # noqa: E402
-from physgen.physgen_addon.operators.draw_box import add_box  # noqa: E402
-from physgen.physgen_addon.operators.paint_mask import PHYSGEN_OT_paint_mask  # noqa: E402
-from physgen.physgen_addon.operators.photo import set_photo  # noqa: E402
-from physgen.physgen_addon.photo_masks import (  # noqa: E402
+import physgen
+from physgen.physgen_addon.operators import mask_horizon_ops
+from physgen.physgen_addon.operators.mask_horizon_ops import PHYSGEN_OT_paint_mask
+from physgen.physgen_addon.operators.photo_ops import (
+    add_box,
+    set_photo,
+)
+from physgen.physgen_addon.photo.photo_image import (
     first_mask,
     mask_size,
     read_mask_image,
@@ -26,10 +28,14 @@ from physgen.physgen_addon.photo_masks import (  # noqa: E402
     widen,
     write_masks,
 )
-from physgen.physgen_addon.photo_request import mask_files, scene_folder  # noqa: E402
-from physgen.physgen_addon.photo_scene import take_camera  # noqa: E402
-from physgen.sim.reconstruct.cut.given import read_mask  # noqa: E402
-from physgen.sim.reconstruct.view.camera import camera_above_ground  # noqa: E402
+from physgen.physgen_addon.photo.photo_maths import Painting, ellipse, extent
+from physgen.physgen_addon.photo.photo_request import (
+    mask_files,
+    scene_folder,
+    take_camera,
+)
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -261,7 +267,7 @@ def test_painting_stops_when_its_box_is_gone(window, photo):
 
 def test_the_horizon_follows_the_mouse(window, photo):
     photo.has_found, photo.found_horizon = True, 0.2
-    operator = operate(set_horizon.PHYSGEN_OT_set_horizon)
+    operator = operate(mask_horizon_ops.PHYSGEN_OT_set_horizon)
     operator.invoke(window, event("NONE"))
     modal = partial(operator.modal, window)
     assert photo.camera == "HORIZON" and modal(event("MOUSEMOVE", 0.5, 0.9, "NOTHING")) == {"PASS_THROUGH"}
@@ -284,20 +290,20 @@ def test_the_horizon_follows_the_mouse(window, photo):
 
 
 def test_the_horizon_that_was_found_is_where_a_correction_begins(photo):
-    assert set_horizon.horizon_shown(photo) is None
+    assert mask_horizon_ops.horizon_shown(photo) is None
     take_camera(photo, camera_above_ground(320, 240, 300.0, math.radians(35)))
     expected = 0.5 - 300.0 * math.tan(math.radians(35)) / 240
     assert photo.found_horizon == pytest.approx(expected, abs=1e-4)
     assert math.degrees(photo.found_pitch) == pytest.approx(35, abs=1e-3)
-    ends, _, label = set_horizon.horizon_shown(photo)
+    ends, _, label = mask_horizon_ops.horizon_shown(photo)
     assert ends == pytest.approx((expected, expected), abs=1e-4) and "as found" in label
-    set_horizon.take_over(photo)
+    mask_horizon_ops.take_over(photo)
     assert photo.camera == "HORIZON" and photo.horizon == pytest.approx(expected, abs=1e-4)
-    set_horizon.drag(photo, (photo.horizon, photo.roll), 0.9, 0.1)
-    left, right = set_horizon.horizon_shown(photo)[0]
+    mask_horizon_ops.drag(photo, (photo.horizon, photo.roll), 0.9, 0.1)
+    left, right = mask_horizon_ops.horizon_shown(photo)[0]
     assert (left, right) == pytest.approx((expected, expected + 0.1), abs=1e-4) and photo.roll > 0
     # What was told stays when it is taken up again.
-    set_horizon.take_over(photo)
+    mask_horizon_ops.take_over(photo)
     assert photo.horizon == pytest.approx(expected + 0.05, abs=1e-4)
 
 
@@ -314,11 +320,8 @@ sys.stdout.write("ready\\n")
 sys.stdout.flush()
 import numpy as np
 from mathutils import Matrix
-from physgen.physgen_addon import kept_changes  # noqa: E402
-from physgen.physgen_addon.bridge.import_scene import import_scene  # noqa: E402
-from physgen.physgen_addon.mask_painting import Painting, ellipse
-from physgen.physgen_addon.operators.paint_mask import draw_brush, draw_tint, tint_texture
-from physgen.physgen_addon.operators.set_horizon import TOLD, draw_horizon
+from physgen.physgen_addon.photo.photo_maths import Painting, ellipse
+from physgen.physgen_addon.operators.mask_horizon_ops import TOLD, draw_brush, draw_horizon, draw_tint, tint_texture
 wide, high = 320, 240
 screen = gpu.types.GPUOffScreen(wide, high)
 with screen.bind():

@@ -5,15 +5,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from physgen.sim.cache.manifest import load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
-from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.transfer import read_mask, read_rgb
+from physgen.sim.composite.image_metrics import psnr
+from physgen.sim.composite.srgb import read_mask, read_rgb
 from physgen.sim.scene.meshes import load_object_mesh
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon.bridge.frames import render_frames  # noqa: E402
-from physgen.physgen_addon.bridge.options import RenderOptions  # noqa: E402
+from physgen.physgen_addon.render.render_frames import render_frames
+from physgen.physgen_addon.render.render_options import RenderOptions
 
 RADIUS, CENTRE = 0.05, np.array([0.02, 0.0, 0.05])
 """Of the world's ball."""
@@ -38,7 +38,7 @@ def hue(pixels):
 
 @pytest.mark.parametrize("look", ["grains", "surface"])
 def test_it_is_the_photo_until_it_falls_apart_and_wears_its_colours_then(world, bake, tmp_path, look):
-    vertices = load_object_mesh(world.folder, world.folder.scene.objects[0]).vertices
+    vertices = load_object_mesh(world.folder, world.folder.model.objects[0]).vertices
     rest, spread, flat = heap(vertices)
     folder = bake([(0, 0, 0)] * 2)
     lifted = np.array([0.0, 0.0, 0.05])
@@ -62,7 +62,7 @@ def test_it_is_the_photo_until_it_falls_apart_and_wears_its_colours_then(world, 
     assert psnr(whole, read_rgb(skin[0])) > 50
     assert psnr(apart, read_rgb(skin[1])) < 35
     # The heap is where its particles are, in the ball's colour and not the floor's, whatever the light.
-    columns, rows = np.rint(world.folder.scene.camera.project(flat + np.array([0, 0, 0.01]))[:, :2]).astype(int).T
+    columns, rows = np.rint(world.folder.model.camera.project(flat + np.array([0, 0, 0.01]))[:, :2]).astype(int).T
     ball = hue(first[read_mask(world.folder.file("masks/ball.png"))])
     floor = hue(world.background[rows, columns])
     assert np.linalg.norm(hue(apart[rows, columns]) - ball) < np.linalg.norm(floor - ball) / 2

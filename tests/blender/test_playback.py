@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Playing bakes by Blender's own means: particles as grains or a surface, motion blur, out to other programs."""
 
 from pathlib import Path
@@ -6,13 +7,17 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import bake_record, bake_state, paths  # noqa: E402
-from physgen.physgen_addon.bake_record import BakeRecord, Look  # noqa: E402
-from physgen.physgen_addon.bridge import caches, compat, playback, points  # noqa: E402
-from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest  # noqa: E402
-from physgen.sim.cache.pc2 import Pc2Writer  # noqa: E402
+import physgen
+from physgen.physgen_addon import (
+    bake_state,
+    compat,
+    paths,
+)
+from physgen.physgen_addon.playback import bake_record, particles, point_caches, show_bake
+from physgen.physgen_addon.playback.bake_record import BakeRecord, Look
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.pc2 import Pc2Writer
 
 FRAMES, START = 4, 10
 STEP = np.array([0.3, 0.0, 0.0])
@@ -114,7 +119,7 @@ def test_particles_stand_in_for_what_flows(a_bake, law):
     shape = bake_record.SURFACE if law == "fluid" else bake_record.GRAINS
     record = a_bake(law, look=Look(name="Cube", shape=shape, from_frame=START))
     assert bake_state.refresh(bpy.context.scene).status == "baked"
-    item = points.find(bpy.context.scene, "Cube")
+    item = particles.find(bpy.context.scene, "Cube")
     before, _ = evaluated(START - 1, "Cube")
     assert len(before) == 8 and len(evaluated(START - 1, item.name)[0]) == 0
     assert len(evaluated(START, "Cube")[0]) == 0
@@ -126,15 +131,15 @@ def test_particles_stand_in_for_what_flows(a_bake, law):
     assert last.max(axis=0) - last.min(axis=0) == pytest.approx([0.75] * 3, abs=0.15)
     assert len(last) == len(lattice()) if law == "sand" else len(last) > 100
     assert item.parent == bpy.data.objects["Cube"]
-    playback.hide(bpy.context.scene)
-    assert len(evaluated(START, "Cube")[0]) == 8 and points.find(bpy.context.scene, "Cube") is None
+    show_bake.hide(bpy.context.scene)
+    assert len(evaluated(START, "Cube")[0]) == 8 and particles.find(bpy.context.scene, "Cube") is None
     assert not len(bpy.data.objects["Cube"].modifiers) and record.path.is_dir()
 
 
 def test_what_turns_to_sand_is_itself_until_then(a_bake):
     a_bake(look=Look(name="Cube", shape=bake_record.GRAINS, from_frame=START + 2))
     bake_state.refresh(bpy.context.scene)
-    name = points.find(bpy.context.scene, "Cube").name
+    name = particles.find(bpy.context.scene, "Cube").name
     for frame, counts in ((START + 1, (8, 0)), (START + 2, (0, len(lattice())))):
         assert (len(evaluated(frame, "Cube")[0]), len(evaluated(frame, name)[0])) == counts
     moved, _ = evaluated(START + 1, "Cube")
@@ -146,11 +151,11 @@ def test_looks_follow_from_the_matter():
     item = bpy.context.object
     for law, shape in (("sand", "grains"), ("snow", "grains"), ("fluid", "surface"), ("rigid", "mesh")):
         item.physgen.material.law = law
-        assert playback.look_of(item, "Cube", 5) == Look(
+        assert show_bake.look_of(item, "Cube", 5) == Look(
             name="Cube", shape=shape, from_frame=5 if shape != "mesh" else 0
         )
     item.physgen.material.law, item.physgen.sandy, item.physgen.sandy_frame = "fixed_corotated", True, 9
-    assert playback.look_of(item, "Cube", 5) == Look(name="Cube", shape="grains", from_frame=9)
+    assert show_bake.look_of(item, "Cube", 5) == Look(name="Cube", shape="grains", from_frame=9)
 
 
 def test_the_spacing_of_particles_is_found_in_lattices_and_thin_walls():
@@ -167,10 +172,10 @@ def test_a_file_with_a_bake_plays_without_the_extension(a_bake):
     physgen.unregister()
     try:
         bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-        name = next(item.name for item in bpy.data.objects if points.POINTS_OF in item)
+        name = next(item.name for item in bpy.data.objects if particles.POINTS_OF in item)
         last, _ = evaluated(START + FRAMES - 1, name)
         # Grains stray evenly up to 16.5 mm: five times the standard error of the mean of all of them.
-        off = 5 * points.STRAY * points.GRAIN * 0.05 / np.sqrt(3 * len(lattice()))
+        off = 5 * particles.STRAY * particles.GRAIN * 0.05 / np.sqrt(3 * len(lattice()))
         assert len(last) == len(lattice()) and last[:, 0].mean() == pytest.approx(2 * 0.3 * (FRAMES - 1), abs=off)
     finally:
         physgen.register()
@@ -279,4 +284,4 @@ def test_this_file_made_independent_is_no_longer_physgens(a_bake):
     assert bake_state.refresh(scene).status == "none"
     assert not bpy.data.objects["Cube"].physgen.enabled
     assert len(evaluated(START, "Cube particles")[0]) == len(lattice())
-    assert Path(bpy.path.abspath(bpy.data.objects["Cube"].modifiers[caches.MODIFIER].filepath)).is_file()
+    assert Path(bpy.path.abspath(bpy.data.objects["Cube"].modifiers[point_caches.MODIFIER].filepath)).is_file()

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Live preview and arrows without a window: the client driven by hand, against the real worker."""
 
 import sys
@@ -8,16 +9,18 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import gizmo_maths as maths  # noqa: E402
-from physgen.physgen_addon.gizmos import SHOW_ARROWS  # noqa: E402
-from physgen.physgen_addon.interpreter import cli_command  # noqa: E402
-from physgen.physgen_addon.preview import live, watch  # noqa: E402
-from physgen.physgen_addon.preview.clip import Clip  # noqa: E402
-from physgen.physgen_addon.preview.session import Session  # noqa: E402
-from physgen.physgen_addon.preview.shading import colours  # noqa: E402
-from physgen.sim.cache.pc2 import Pc2Writer  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
+import physgen
+from physgen.physgen_addon import gizmos as maths
+from physgen.physgen_addon.gizmos import SHOW_ARROWS
+from physgen.physgen_addon.interpreter import cli_command
+from physgen.physgen_addon.preview import live_preview, preview_session
+from physgen.physgen_addon.preview.preview_session import (
+    Clip,
+    Session,
+    shade_vertices,
+)
+from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.errors import InputError
 
 WAIT_S = 120.0
 
@@ -122,33 +125,33 @@ def test_the_operator_needs_a_body_and_toggles():
     assert not bpy.ops.physgen.toggle_preview.poll()
     add_body()
     assert bpy.ops.physgen.toggle_preview() == {"FINISHED"}
-    session = live.session()
+    session = live_preview.session()
     assert session is not None and session.scene() == bpy.context.scene
     bpy.context.scene.name = "renamed"
     assert session.scene() == bpy.context.scene
     assert bpy.ops.physgen.toggle_preview() == {"FINISHED"}
-    assert live.session() is None
+    assert live_preview.session() is None
     assert session.join(WAIT_S)
 
 
 def test_another_file_ends_the_preview():
     add_body()
     bpy.ops.physgen.toggle_preview()
-    session = live.session()
+    session = live_preview.session()
     bpy.ops.wm.read_homefile(app_template="", use_empty=True)
-    assert live.session() is None and session.join(WAIT_S)
+    assert live_preview.session() is None and session.join(WAIT_S)
 
 
 def test_numbers_change_numbers_and_shapes_change_shapes():
     ball = add_body()
     scene = bpy.context.scene
-    numbers, shapes = watch.numbers(scene), watch.shapes(scene)
+    numbers, shapes = preview_session.watched_numbers(scene), preview_session.watched_shapes(scene)
     ball.physgen.velocity.x = 2.0
     ball.physgen.material.density = 500.0
     ball.physgen.own_surface = True
     scene.physgen.world.friction = 0.1
     scene.gravity.z = -1.0
-    changed = set(watch.numbers(scene)) - set(numbers)
+    changed = set(preview_session.watched_numbers(scene)) - set(numbers)
     assert {text.split("=")[0] for text in changed} == {
         "Ball.velocity",
         "Ball.density",
@@ -159,11 +162,11 @@ def test_numbers_change_numbers_and_shapes_change_shapes():
         "ground.friction",
         "scene.gravity",
     }
-    assert watch.shapes(scene) == shapes
+    assert preview_session.watched_shapes(scene) == shapes
     ball.data.vertices[0].co.x += 0.01
-    bent = watch.shapes(scene)
+    bent = preview_session.watched_shapes(scene)
     ball.location.x += 1.0
-    assert len({shapes, bent, watch.shapes(scene)}) == 3
+    assert len({shapes, bent, preview_session.watched_shapes(scene)}) == 3
 
 
 def test_a_clip_waits_for_the_worker_and_then_begins_again(tmp_path):
@@ -189,7 +192,7 @@ def test_a_clip_waits_for_the_worker_and_then_begins_again(tmp_path):
 
 def test_the_lit_side_is_brighter():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
-    up, down = (colours(points, np.array([face], dtype=np.int32)) for face in ((0, 1, 2), (2, 1, 0)))
+    up, down = (shade_vertices(points, np.array([face], dtype=np.int32)) for face in ((0, 1, 2), (2, 1, 0)))
     assert (up[:, :3] > 1.5 * down[:, :3]).all() and (up[:, 3] == down[:, 3]).all()
 
 

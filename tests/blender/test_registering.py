@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Enabling the extension needs bpy and numpy, under whatever name Blender gives the package."""
 
 import subprocess
@@ -10,8 +11,8 @@ pytest.importorskip("bpy")
 ROOT = Path(__file__).resolve().parents[2]
 
 ENABLE = """
-import importlib.abc, importlib.util, sys, types
-import bpy
+import importlib.abc, importlib.util, sys, types  # noqa: E402
+import bpy  # noqa: E402
 
 class Forbidden(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """What goes wrong around a bake is said where it is looked for, in words; nothing of it is a traceback or a hang."""
 
 import contextlib
@@ -14,20 +15,20 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import bake_record, bake_state, interpreter, jobs, paths  # noqa: E402
-from physgen.physgen_addon.bake_record import BakeRecord, Look  # noqa: E402
-from physgen.physgen_addon.bridge import caches, playback, points  # noqa: E402
-from physgen.physgen_addon.bridge.export import export_scene  # noqa: E402
-from physgen.physgen_addon.bridge.export_names import export_names  # noqa: E402
-from physgen.physgen_addon.bridge.export_world import effects as exported_effects  # noqa: E402
-from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
-from physgen.physgen_addon.operators.bake import Bake  # noqa: E402
-from physgen.physgen_addon.props.scene import known_effect  # noqa: E402
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest  # noqa: E402
-from physgen.sim.cache.pc2 import Pc2Writer  # noqa: E402
-from physgen.sim.effects.registry import effects as all_effects  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
+import physgen
+from physgen.physgen_addon import background_jobs, bake_state, interpreter, paths
+from physgen.physgen_addon.operators.bake_ops import Bake
+from physgen.physgen_addon.playback import bake_record, particles, point_caches, show_bake
+from physgen.physgen_addon.playback.bake_record import BakeRecord, Look
+from physgen.physgen_addon.props.scene_props import known_effect
+from physgen.physgen_addon.scene_io.export_animation import export_names
+from physgen.physgen_addon.scene_io.export_scene import export_scene
+from physgen.physgen_addon.scene_io.export_world import effects as exported_effects
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.effects.registry import effects as all_effects
+from physgen.sim.errors import InputError
 
 FRAMES, START, PARTICLES = 3, 10, 20
 posix = pytest.mark.skipif(os.name == "nt", reason="scripts of the shell")
@@ -37,7 +38,7 @@ posix = pytest.mark.skipif(os.name == "nt", reason="scripts of the shell")
 def addon(fresh_blender):
     physgen.register()
     yield
-    jobs.unregister()
+    background_jobs.unregister_jobs()
     with contextlib.suppress(RuntimeError, AttributeError):
         physgen.unregister()
 
@@ -111,7 +112,7 @@ def claim(offset, number):
     [
         ("Cube.pc2", lambda path: path.unlink(), "there is no such point cache"),
         ("Cube.pc2", cut, "cut off"),
-        ("Cube.pc2", claim(16, 2**31 - 1), "garbage"),
+        ("Cube.pc2", claim(16, 2**31 - 1), "is invalid"),
         ("Cube.pc2", claim(28, 1), "1 of 3 frames are there"),
         ("Cube.points.pc2", cut, "cut off"),
         ("Cube.points.pc2", claim(16, 1), "has 1 vertices instead of 20"),
@@ -123,7 +124,7 @@ def test_a_damaged_bake_is_not_called_baked(folder, file, change, words):
     state = found()
     assert state.status == "missing"
     assert re.search(words, state.trouble), state
-    assert bpy.ops.physgen.free_bake() == {"FINISHED"} and caches.MODIFIER not in cube().modifiers
+    assert bpy.ops.physgen.free_bake() == {"FINISHED"} and point_caches.MODIFIER not in cube().modifiers
 
 
 @pytest.mark.parametrize("pid", ["1e400", "9" * 30, "-1", "[1]", '"x"'])
@@ -161,7 +162,7 @@ def test_records_and_manifests_of_random_bytes_are_survived(folder):
         path.write_bytes(data)
         bpy.ops.wm.open_mainfile(filepath=blend)
         assert found().status in ("baked", "paused", "stale", "missing"), (attempt, bytes(data[:300]))
-        playback.hide(scene())
+        show_bake.hide(scene())
         assert found().status in ("none", "baked", "paused", "stale", "missing"), (attempt, bytes(data[:300]))
         scene().frame_set(START + 1)
 
@@ -183,18 +184,18 @@ def test_a_modifier_before_the_cache_is_named(folder):
 
 
 def test_an_object_that_has_lost_its_cache_or_has_it_switched_off_is_named(folder):
-    cube().modifiers[caches.MODIFIER].show_viewport = False
+    cube().modifiers[point_caches.MODIFIER].show_viewport = False
     assert "is switched off" in found().trouble
-    cube().modifiers.remove(cube().modifiers[caches.MODIFIER])
+    cube().modifiers.remove(cube().modifiers[point_caches.MODIFIER])
     assert "Cube has lost its modifier" in found().trouble
-    playback.show(scene(), bake_state.shown_record(scene()))
+    show_bake.show(scene(), bake_state.shown_record(scene()))
     assert found().trouble == ""
 
 
 def test_scenes_that_share_objects_say_whose_bake_plays(folder):
     first = scene()
     bpy.ops.scene.new(type="LINK_COPY")
-    cube().modifiers[caches.MODIFIER].frame_start = 99
+    cube().modifiers[point_caches.MODIFIER].frame_start = 99
     assert "Cube plays another bake" in bake_state.refresh(first).trouble
 
 
@@ -264,7 +265,7 @@ def test_an_effect_of_another_version_is_named_and_can_be_removed(folder):
 
 
 def test_a_panel_that_is_drawn_first_does_not_hide_that_a_bake_is_to_be_found(folder):
-    playback.hide(scene())
+    show_bake.hide(scene())
     bake_state.forget()
     bake_state.mark_dirty()
     assert bake_state.state(scene()).status == "none"
@@ -299,7 +300,7 @@ def test_operators_say_what_is_missing_and_never_break(what, capfd, monkeypatch)
 
 
 def test_lost_bakes_are_looked_for_where_none_is_shown(folder, tmp_path):
-    playback.hide(scene())
+    show_bake.hide(scene())
     (tmp_path / "empty").mkdir()
     with pytest.raises(RuntimeError, match="a bake of this scene is not in there"):
         bpy.ops.physgen.relink_caches(directory=str(tmp_path / "empty"))
@@ -323,7 +324,7 @@ def test_a_bake_that_cannot_be_deleted_stays_in_the_scene(folder):
     (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "host": "elsewhere"}))
     with pytest.raises(RuntimeError, match="elsewhere"):
         bpy.ops.physgen.free_bake()
-    assert caches.MODIFIER in cube().modifiers and points.find(scene(), "Cube") is not None
+    assert point_caches.MODIFIER in cube().modifiers and particles.find(scene(), "Cube") is not None
     assert scene().physgen.simulation.bake
 
 
@@ -384,7 +385,7 @@ def test_one_that_does_not_answer_is_given_up(python, text, monkeypatch):
     [
         (f"echo {GOOD}", "ended with code 0"),
         (f'echo {GOOD}; case "$*" in *bake*) kill -SEGV $$;; esac', "it crashed"),
-        (f'echo {GOOD}; case "$*" in *bake*) kill -KILL $$;; esac', "memory runs out"),
+        (f'echo {GOOD}; case "$*" in *bake*) kill -KILL $$;; esac', "memory ran out"),
         (f'echo {GOOD}; case "$*" in *bake*) head -c 30000000 /dev/zero; exit 3;; esac', "ended with code 3"),
     ],
 )
@@ -406,7 +407,7 @@ def test_a_python_that_is_gone_when_it_is_needed_is_named(python, tmp_path):
     path.write_text("\x7fELF")
     with pytest.raises(RuntimeError, match=r"python: cannot be started"):
         bpy.ops.physgen.bake("EXEC_DEFAULT")
-    assert jobs.running() is None
+    assert background_jobs.running() is None
 
 
 # Blender under it
@@ -431,7 +432,7 @@ def test_the_extension_may_be_disabled_while_a_bake_runs(python, tmp_path):
     job = live.begin(bpy.context)
     assert live.tick() is None
     physgen.unregister()
-    assert live.tick() == {"CANCELLED"} and jobs.running() is None
+    assert live.tick() == {"CANCELLED"} and background_jobs.running() is None
     give_up = time.monotonic() + 30
     while not job.has_ended and time.monotonic() < give_up:
         time.sleep(0.05)
@@ -451,7 +452,7 @@ def test_a_fault_of_ours_is_reported_and_ends_the_job(caplog):
     give_up = time.monotonic() + 30
     while (result := live.tick()) is None and time.monotonic() < give_up:
         time.sleep(0.05)
-    assert result == {"CANCELLED"} and jobs.running() is None
+    assert result == {"CANCELLED"} and background_jobs.running() is None
     assert "has failed (KeyError: 'nothing')" in live.said[-1][1] and "KeyError" in caplog.text
 
 

@@ -11,19 +11,30 @@ import pytest
 import trimesh
 
 bpy = pytest.importorskip("bpy")
-import physgen  # noqa: E402
-from physgen.physgen_addon import bake_record  # noqa: E402
-from physgen.physgen_addon.bridge import caches, compat, import_splats, playback, splats  # noqa: E402
-from physgen.physgen_addon.bridge.export import export_scene  # noqa: E402
-from physgen.physgen_addon.bridge.fingerprint import fingerprint  # noqa: E402
-from physgen.physgen_addon.bridge.import_scene import import_scene, remove_import  # noqa: E402
-from physgen.sim.errors import InputError  # noqa: E402
-from physgen.sim.gaussians.moving import half_axes, placed  # noqa: E402
-from physgen.sim.gaussians.ply.read import read_splats  # noqa: E402
-from physgen.sim.gaussians.ply.write import write_splats  # noqa: E402
-from physgen.sim.gaussians.splats import Splats  # noqa: E402
-from physgen.sim.scene.folder import load_scene, save_scene  # noqa: E402
-from physgen.sim.scene.model import Camera, Scene, SceneObject  # noqa: E402
+import physgen
+from physgen.physgen_addon import compat
+from physgen.physgen_addon.playback import (
+    bake_record,
+    point_caches,
+    show_bake,
+    splats,
+)
+from physgen.physgen_addon.scene_io import import_scene as import_splats
+from physgen.physgen_addon.scene_io.export_scene import export_scene
+from physgen.physgen_addon.scene_io.import_scene import import_scene, remove_import
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+from physgen.sim.errors import InputError
+from physgen.sim.gaussians.splat_ply import (
+    read_splats,
+    write_splats,
+)
+from physgen.sim.gaussians.splats import (
+    Splats,
+    half_axes,
+    transform_splats,
+)
+from physgen.sim.scene.folder import load_scene, save_scene
+from physgen.sim.scene.model import Camera, SceneModel, SceneObject
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
 TURNED = ((0.0, -2.0, 0.0, 0.1), (2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 0.25), (0.0, 0.0, 0.0, 1.0))
@@ -61,7 +72,7 @@ def a_folder(tmp_path):
         name="ball", mesh="meshes/ball.glb", splats="splats/ball.ply", world_from_mesh=TURNED, size_m=0.2
     )
     camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=30.0, cy=20.0, world_from_camera=LOOKING_AWAY)
-    return save_scene(root, Scene(camera=camera, objects=(item,), photo=None, background=None))
+    return save_scene(root, SceneModel(camera=camera, objects=(item,), photo=None, background=None))
 
 
 def seen(body, frame=1):
@@ -90,12 +101,12 @@ def assert_shows(matrices, wanted):
 
 def test_a_splat_object_is_seen_as_its_ellipsoids(a_folder):
     (item,) = import_splats.import_splats(bpy.context.scene, a_folder.root)
-    assert_shows(seen(item), placed(some(), np.array(TURNED)))
+    assert_shows(seen(item), transform_splats(some(), np.array(TURNED)))
     assert item.hide_render and item.physgen.enabled and item.physgen.role == "dynamic"
     item.location.x += 1.0
     bpy.context.view_layer.update()
     shift = np.array([1.0, 0.0, 0.0])
-    there = placed(some(), np.array(TURNED))
+    there = transform_splats(some(), np.array(TURNED))
     assert_shows(seen(item), there.changed(centres=there.centres + shift))
 
 
@@ -109,7 +120,7 @@ def test_the_choice_is_ellipsoids_points_or_the_mesh(a_folder):
     radii = np.array([point.radius for point in geometry.pointcloud.points])
     assert len(radii) == COUNT
     # Through the matrix of the body nothing is scaled: it is in the mesh.
-    wanted = placed(some(), np.array(TURNED)).scales.mean(axis=1) * splats.DOT
+    wanted = transform_splats(some(), np.array(TURNED)).scales.mean(axis=1) * splats.DOT
     np.testing.assert_allclose(radii, wanted, rtol=1e-3)
     item.physgen.splats_as = "MESH"
     assert cloud.hide_render and not item.hide_render
@@ -120,9 +131,9 @@ def test_the_choice_is_ellipsoids_points_or_the_mesh(a_folder):
 def test_splats_go_out_as_they_came_in(a_folder, tmp_path):
     (item,) = import_splats.import_splats(bpy.context.scene, a_folder.root)
     before = fingerprint(bpy.context.scene)
-    (source,) = export_scene(bpy.context.scene, tmp_path / "out").scene.objects
-    back = placed(read_splats(tmp_path / "out" / source.splats), np.array(source.world_from_mesh))
-    wanted = placed(some(), np.array(TURNED))
+    (source,) = export_scene(bpy.context.scene, tmp_path / "out").model.objects
+    back = transform_splats(read_splats(tmp_path / "out" / source.splats), np.array(source.world_from_mesh))
+    wanted = transform_splats(some(), np.array(TURNED))
     np.testing.assert_allclose(back.centres, wanted.centres, atol=1e-7)
     # Blender's own way between sRGB and light is not exact, to a sixteenth of a step of 8 bits.
     np.testing.assert_allclose(back.colours, wanted.colours, atol=2.5e-4)
@@ -131,7 +142,7 @@ def test_splats_go_out_as_they_came_in(a_folder, tmp_path):
     np.testing.assert_allclose(back.covariances() / size, wanted.covariances() / size, atol=1e-4)
     bpy.data.objects.remove(splats.find(item))
     assert fingerprint(bpy.context.scene) != before
-    assert export_scene(bpy.context.scene, tmp_path / "out").scene.objects[0].splats is None
+    assert export_scene(bpy.context.scene, tmp_path / "out").model.objects[0].splats is None
     assert not (tmp_path / "out" / source.splats).exists()
 
 
@@ -148,11 +159,11 @@ def test_a_bake_plays_on_the_splats_also_without_the_add_on(a_folder, tmp_path):
     name = bake_record.manifest_of(folder).objects[0].splats_folder
     for frame in (3, 5, 6):
         own = read_splats(folder / name / f"{frame - 2:04d}.ply")
-        assert_shows(seen(item, frame), placed(own, np.array(item.matrix_world)))
+        assert_shows(seen(item, frame), transform_splats(own, np.array(item.matrix_world)))
     fallen = seen(item, 6)[:, 2, 3].mean() - seen(item, 3)[:, 2, 3].mean()
     assert fallen < -0.05
-    playback.hide(scene)
-    assert caches.MODIFIER not in splats.find(item).modifiers
+    show_bake.hide(scene)
+    assert point_caches.MODIFIER not in splats.find(item).modifiers
     assert bpy.ops.physgen.bake() == {"FINISHED"}
     last = seen(item, 6)
     bpy.ops.wm.save_mainfile()
@@ -168,11 +179,11 @@ def test_a_photos_scene_brings_its_splats(a_folder):
     for name in ("photo.png", "background.png"):
         picture.save(filepath=str(a_folder.root / name))
     bpy.data.images.remove(picture)
-    photo = dataclasses.replace(a_folder.scene, photo="photo.png", background="background.png")
+    photo = dataclasses.replace(a_folder.model, photo="photo.png", background="background.png")
     save_scene(a_folder.root, photo)
     collection = import_scene(bpy.context.scene, a_folder.root)
     item = next(item for item in collection.all_objects if item.physgen.enabled)
-    assert_shows(seen(item), placed(some(), np.array(TURNED)))
+    assert_shows(seen(item), transform_splats(some(), np.array(TURNED)))
     assert bpy.context.scene.cycles.transparent_max_bounces >= splats.BOUNCES
     remove_import(bpy.context.scene, collection)
     assert not [item for item in bpy.data.objects if splats.SPLATS in item]
@@ -242,8 +253,8 @@ def test_a_file_of_splats_becomes_an_object(tmp_path):
 
 
 def test_folders_without_splats_are_refused(a_folder):
-    item = dataclasses.replace(a_folder.scene.objects[0], splats=None)
-    save_scene(a_folder.root, dataclasses.replace(a_folder.scene, objects=(item,)))
+    item = dataclasses.replace(a_folder.model.objects[0], splats=None)
+    save_scene(a_folder.root, dataclasses.replace(a_folder.model, objects=(item,)))
     before = len(bpy.data.objects)
     with pytest.raises(InputError, match="no object in it has splats"):
         import_splats.import_splats(bpy.context.scene, a_folder.root)

@@ -11,7 +11,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.cache.bake_folder import load_manifest
 
 pytest.importorskip("bpy")
 
@@ -61,7 +61,15 @@ def state(work):
 def job(photo, tmp_path_factory):
     """A finished job; tests that change it work on what it leaves, in the order of this file."""
     work = tmp_path_factory.mktemp("job") / "Arbeit mit Ümlaut"
-    return work, run(photo, work)
+    events = run(photo, work)
+    shutil.copytree(work, work.parent / "prepared", ignore=shutil.ignore_patterns("frames", "*.mp4"))
+    return work, events
+
+
+@pytest.fixture(scope="module")
+def prepared(job):
+    """That job as it was before its first frame: for tests of what happens from there on. To be copied."""
+    return job[0].parent / "prepared"
 
 
 def test_a_photo_becomes_a_video(job, photo):
@@ -107,8 +115,9 @@ def test_another_material_bakes_again_without_reconstructing(job, photo):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_goes_on(job, photo, tmp_path, how):
+def test_a_stopped_run_goes_on(prepared, photo, tmp_path, how):
     work = tmp_path / "work"
+    shutil.copytree(prepared, work)
     process = subprocess.Popen(command(photo, work), stdout=subprocess.PIPE, text=True)
     for line in process.stdout:
         event = json.loads(line)

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The scripts of ``batch`` in a real Blender without a window: exit codes, output, signals, other files, same pictures.
 
     python tests/real_blender/headless.py SCENE BAKE [--blender blender] [--frames-of DIR] [--out DIR]
 
 SCENE and BAKE: a scene folder and a bake of it with at least three frames. --frames-of: frames 1 to 3 that another
-Blender has made with ``SAME``, compared where this Python has OpenCV. Needs the standard library only. docs/headless.md
+Blender has made with ``SAME``, compared where this Python has OpenCV. Needs the standard library only. docs/farm.md
 says how Blender gets the modules that rendering imports. Exit code 0 when all is as it should be.
 """
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Inside another Blender that lacks the extension: the same frame of each saved file is the same picture."""
 
 from __future__ import annotations

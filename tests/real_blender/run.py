@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The extension in a real Blender with its windows open: install, work, save, open again without it, look at it.
 
     python tests/real_blender/run.py [--zip ZIP] [--blender blender] [--python PYTHON] [--out DIR]
 
 Needs the standard library only, so that it also runs where nothing but Blender is installed. Without a display it
-starts Xvfb. docs/extension.md says how to set up a container for it. Everything is written below DIR: ``report.json``,
+starts Xvfb. docs/blender.md says how to set up a container for it. Everything is written below DIR: ``report.json``,
 logs, ``screens/*.png``, the .blend and the two pictures of the same frame. Exit code 0 when all steps passed.
 """
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Inside Blender: its windows, the sidebar, the preferences, and pictures of them."""
 
 from __future__ import annotations

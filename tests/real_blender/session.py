@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Inside Blender: steps as generators that Blender's timers drive, so that windows draw and modal operators run."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Inside Blender, with the extension: an artist's work from an empty file to a saved one, and pictures on the way.
 
 More steps: write a generator function and name it in STEPS.
@@ -69,7 +70,7 @@ def python_found():
     preferences().python = TASK["python"]
     with screens.focus():
         assert bpy.ops.physgen.check_python("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.jobs").running
+    running = extension("physgen_addon.background_jobs").running
     yield from session.until(lambda: running() is None, 120, "the check of the interpreter")
     assert preferences().check == "YES", preferences().check_text
     yield from screens.shoot_preferences(SCREENS, "2_preferences_found", TASK["addon"])
@@ -108,7 +109,7 @@ def bake(name: str) -> session.Step:
     """Bake live, with a picture in the middle and one at the end; the longest time without an answer, in seconds."""
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.jobs").running
+    running = extension("physgen_addon.background_jobs").running
     job = running()
     yield from session.until(lambda: running() is None or (job.fraction or 0) > 0.2, 200, "the bake to begin")
     if running() is not None:
@@ -188,7 +189,7 @@ def photographed():
     cube.scale, cube.location, cube.rotation_euler = (0.1, 0.1, 0.1), (0.0, 0.0, 0.1), (0.0, 0.0, 0.5)
     for name, colour in (("red", (0.7, 0.05, 0.03, 1.0)), ("grey", (0.6, 0.6, 0.55, 1.0))):
         material = bpy.data.materials.new(name)
-        extension("physgen_addon.bridge.compat").node_tree(material)
+        extension("physgen_addon.compat").node_tree(material)
         material.node_tree.nodes.clear()
         shader = material.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
         shader.inputs["Color"].default_value = colour
@@ -204,8 +205,8 @@ def photographed():
     scene.render.resolution_x, scene.render.resolution_y = 480, 360
     render(OUT / "photo.png")
     bpy.ops.wm.read_homefile()
-    jobs, interpreter = extension("physgen_addon.jobs"), extension("physgen_addon.interpreter")
-    python, stage = preferences().python, extension("sim.app.process").run_stage
+    jobs, interpreter = extension("physgen_addon.background_jobs"), extension("physgen_addon.interpreter")
+    python, stage = preferences().python, extension("sim.app.stage_process").run_stage
     words = ["reconstruct", str(OUT / "photo.png"), "--box", "150,60,330,260", "--size", "0.3"]
 
     def work(on_event, cancelled):
@@ -239,7 +240,7 @@ def imported():
 
 def rendered():
     """A frame of it rendered into the photo, with all layers, as the panel does it; shown in a window of its own."""
-    own = extension("physgen_addon.operators.render")
+    own = extension("physgen_addon.operators.render_ops")
     if own.missing_modules():
         return {"skipped": f"this Blender lacks {', '.join(own.missing_modules())}"}
     rendering = bpy.context.scene.physgen.rendering
@@ -247,7 +248,7 @@ def rendered():
     windows = set(bpy.context.window_manager.windows)
     with screens.focus():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.jobs").running
+    running = extension("physgen_addon.background_jobs").running
     job = running()
     yield from session.until(lambda: running() is None, 300, "the still")
     job.result()

@@ -5,7 +5,7 @@ import dataclasses
 
 import trimesh
 from physgen.sim.scene.folder import save_scene
-from physgen.sim.scene.model import Camera, Scene, SceneObject
+from physgen.sim.scene.model import Camera, SceneModel, SceneObject
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
 CAMERA = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=30.0, cy=20.0, world_from_camera=LOOKING_AWAY)
@@ -18,7 +18,7 @@ def a_scene(root, meshes, **changes):
         mesh.export(root / f"meshes/{name}.ply")
         made = SceneObject(name=name, mesh=f"meshes/{name}.ply", size_m=0.1, occlusion_order=len(meshes) - number)
         items.append(dataclasses.replace(made, **changes.get(name, {})))
-    return save_scene(root, Scene(camera=CAMERA, objects=tuple(items), photo=None, background=None))
+    return save_scene(root, SceneModel(camera=CAMERA, objects=tuple(items), photo=None, background=None))
 
 
 def ball(x, radius=0.05, z=0.05):

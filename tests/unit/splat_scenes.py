@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from physgen.sim.gaussians.views.orbit import orbit_camera
-from physgen.sim.gaussians.views.view import View
+from physgen.sim.gaussians.views.posed_images import View, orbit_camera
 
 RED, BLUE = np.array([0.85, 0.2, 0.15]), np.array([0.15, 0.25, 0.8])
 

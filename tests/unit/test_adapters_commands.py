@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct.adapters import resolve
-from physgen.sim.reconstruct.adapters.command_file import read_command_file
+from physgen.sim.reconstruct.adapters.adapter_registry import read_command_file
 from PIL import Image
 
 WIDTH, HEIGHT = 40, 30
@@ -104,7 +104,7 @@ def test_it_runs_where_nothing_of_ours_is(tmp_path, monkeypatch):
 
 BAD = {
     "dies": ("inpainter", "print('no CUDA device'); sys.exit(7)", "code 7.*no CUDA device"),
-    "crashes": ("inpainter", "import signal; os.kill(os.getpid(), signal.SIGKILL)", "code -9.*said nothing"),
+    "crashes": ("inpainter", "import signal; os.kill(os.getpid(), signal.SIGKILL)", "code -9.*no output"),
     "writes nothing": ("inpainter", "pass", "wrote no filled.png"),
     "writes garbage": ("inpainter", "open(output, 'wb').write(b'\\x89PNG garbage')", "no readable PNG"),
     "writes a pipe": ("inpainter", "os.mkfifo(output)", "wrote no filled.png"),
@@ -148,7 +148,7 @@ BAD = {
     "an array that ends": (
         "depth_estimator",
         f"import numpy as np; np.save(output, np.ones(({HEIGHT}, {WIDTH}))); os.truncate(output, 500)",
-        "takes 9600",
+        "needs 9600",
     ),
     "a mesh of garbage": ("mesher", "open(output, 'wb').write(b'glTF' + bytes(40))", "not a readable mesh"),
     "no mesh": ("mesher", "open(output, 'w').close()", "not a readable mesh"),

@@ -13,11 +13,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from physgen.batch.doctor import adapter_findings
+from physgen.batch.commands.doctor import adapter_findings
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.adapters import Depth, object_crop, resolve
-from physgen.sim.reconstruct.adapters.checked import checked_depth, checked_masks
-from physgen.sim.reconstruct.adapters.names import spec_files
+from physgen.sim.reconstruct.adapters.adapter_registry import spec_files
+from physgen.sim.reconstruct.adapters.protocols import checked_depth, checked_masks
 from PIL import Image
 
 WIDTH, HEIGHT = 24, 16
@@ -109,9 +109,9 @@ def test_functions_of_an_installed_module(module, monkeypatch):
 BAD = {
     "breaks": "failed with KeyError: 'weights'",
     "leaves": "failed with SystemExit: no GPU",
-    "wrong_size": r"gave an array of \(15, 24, 3\)",
+    "wrong_size": r"returned an array of \(15, 24, 3\)",
     "floats": "float64, expected",
-    "nothing": "gave NoneType",
+    "nothing": "returned NoneType",
 }
 
 
@@ -131,7 +131,7 @@ def test_mistakes_of_a_function_are_told_as_its_own(module, name):
         ("{module}", "give python:MODULE:FUNCTION"),
         ("/nowhere/x.py:fill", "no file /nowhere/x.py"),
         ("no_such_module_anywhere:fill", "cannot be imported.*no_such_module_anywhere"),
-        ("", "names nothing"),
+        ("", "has no target"),
     ],
 )
 def test_what_cannot_be_the_stage_is_refused_at_once(module, target, words):
@@ -187,9 +187,9 @@ def test_names_of_an_installed_package(module, tmp_path):
     (info / "entry_points.txt").write_text("[physgen.adapters]\ninpainter.theirs = mine:fill\nnonsense = mine:fill\n")
     code = (
         "import json, numpy as np; from physgen.sim.reconstruct.adapters import resolve\n"
-        "from physgen.sim.reconstruct.adapters.found import found_adapters\n"
+        "from physgen.sim.reconstruct.adapters.adapter_registry import list_adapters\n"
         "f = resolve('inpainter', 'theirs')(np.zeros((4, 4, 3), np.uint8), np.eye(4, dtype=bool))\n"
-        "print(json.dumps([f.tolist(), [(a.stage, a.name, a.usable) for a in found_adapters()]]))"
+        "print(json.dumps([f.tolist(), [(a.stage, a.name, a.usable) for a in list_adapters()]]))"
     )
     path = os.pathsep.join([str(tmp_path), *(p for p in sys.path if p)])
     result = subprocess.run(
@@ -216,7 +216,7 @@ def test_a_picture_of_other_proportions_is_refused(tmp_path):
     Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(tmp_path / "p.png")
     with pytest.raises(InputError, match="64x64 pixels, the photo 24x16"):
         resolve("inpainter", f"picture:{tmp_path / 'p.png'}")(PIXELS, HOLE)
-    with pytest.raises(InputError, match="no depth_estimator"):
+    with pytest.raises(InputError, match="not a depth_estimator"):
         resolve("depth_estimator", f"picture:{tmp_path / 'p.png'}")
     with pytest.raises(InputError, match="no such photo"):
         resolve("inpainter", f"picture:{tmp_path / 'q.png'}")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.adapters import resolve
-from physgen.sim.reconstruct.adapters.lama import square_around
+from physgen.sim.reconstruct.adapters.lama_adapter import square_around
 
 pytest.importorskip("onnxruntime")
 FLOAT, FLOAT16 = 1, 10
@@ -193,8 +193,8 @@ def test_the_square_around_a_hole_lies_in_the_picture():
 
 
 BAD = {
-    "no model": (b"not a model at all", "no model that onnxruntime can read"),
-    "nothing": (b"", "no model that onnxruntime can read"),
+    "no model": (b"not a model at all", "not a model that onnxruntime can read"),
+    "nothing": (b"", "not a model that onnxruntime can read"),
     "three inputs": (
         model(
             [("Add", ["image", "mask"], "x"), ("Add", ["x", "more"], "output")],
@@ -238,12 +238,12 @@ def test_a_model_that_answers_nonsense(load):
         [("image", FLOAT, [1, 3, 64, 64]), ("mask", FLOAT, [1, 1, 64, 64])],
         [("output", FLOAT, [1, 3, 1, 1])],
     )
-    with pytest.raises(InputError, match=r"gave \(1, 3, 1, 1\)"):
+    with pytest.raises(InputError, match=r"returned \(1, 3, 1, 1\)"):
         load(pooled)(picture, hole)
 
 
 def test_a_model_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="nothing is downloaded"):
         resolve("inpainter", f"lama:{tmp_path / 'no.onnx'}")
-    with pytest.raises(InputError, match="no segmenter"):
+    with pytest.raises(InputError, match="not a segmenter"):
         resolve("segmenter", f"lama:{tmp_path / 'no.onnx'}")

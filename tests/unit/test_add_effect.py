@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a diagnosis found, put into a scene folder, and the two bakes around it."""
 
 import json
@@ -19,14 +20,14 @@ from physgen.sim.effects.registry import effects
 from physgen.sim.errors import Cancelled, InputError, SimulationError
 from physgen.sim.events import ignore, never
 from physgen.sim.scene.folder import load_scene, save_scene
-from physgen.sim.scene.model import Camera, Effect, Scene, SceneObject
+from physgen.sim.scene.model import Camera, Effect, SceneModel, SceneObject
 
 POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, -0.6, 0.8, -1.0), (0.0, -0.8, -0.6, 1.0), (0.0, 0.0, 0.0, 1.0))
 DRAG = {"air_drag": {"drag_per_mass": 0.041}}
 
 
 def a_scene(*scene_effects):
-    return Scene(
+    return SceneModel(
         camera=Camera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, world_from_camera=POSE),
         objects=(
             SceneObject(name="cup", mesh="cup.stl", size_m=0.1),
@@ -107,7 +108,7 @@ def test_what_concerns_the_recording_is_refused(name):
 def test_out_of_range_is_refused_with_both_names(folder):
     before = (folder / "scene.json").read_bytes()
     with pytest.raises(InputError, match="effect 'air_drag': drag_per_mass is -1"):
-        add_effects(folder, {"air_drag": {"drag_per_mass": -1.0}})
+        add_effects(load_scene(folder), {"air_drag": {"drag_per_mass": -1.0}})
     assert (folder / "scene.json").read_bytes() == before
 
 
@@ -132,7 +133,7 @@ class Bakes:
         self.seen = []
 
     def __call__(self, scene, out, on_event, cancelled):
-        self.seen.append((out.name, [e.name for e in load_scene(scene).scene.effects]))
+        self.seen.append((out.name, [e.name for e in load_scene(scene).model.effects]))
         error = self.errors.pop(0) if self.errors else None
         if error is not None:
             raise error
@@ -165,13 +166,13 @@ def test_a_bake_that_is_there_is_not_made_again(folder):
 
 @pytest.mark.parametrize("errors", [[SimulationError("no")], [Cancelled("no")], [None, SimulationError("no")]])
 def test_a_failure_leaves_the_scene_as_it_was(folder, errors):
-    before = load_scene(folder).scene
+    before = load_scene(folder).model
     with pytest.raises((SimulationError, Cancelled)):
         add_and_bake(a_request(folder), Bakes(*errors), ignore, never)
-    assert load_scene(folder).scene == before
+    assert load_scene(folder).model == before
 
 
 def test_cancelling_the_second_bake_keeps_the_effect_so_that_it_can_go_on(folder):
     with pytest.raises(Cancelled):
         add_and_bake(a_request(folder), Bakes(None, Cancelled("no")), ignore, never)
-    assert [e.name for e in load_scene(folder).scene.effects] == ["air_drag"]
+    assert [e.name for e in load_scene(folder).model.effects] == ["air_drag"]

@@ -9,15 +9,14 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.composite.transfer import bytes_to_linear, linear_to_bytes
-from physgen.sim.reconstruct.appearance.albedo import albedo_of
-from physgen.sim.reconstruct.appearance.doubt import division_exponent
-from physgen.sim.reconstruct.appearance.estimate import estimate_appearance
-from physgen.sim.reconstruct.options import ObjectRequest
-from physgen.sim.reconstruct.physics.apply import decide
-from physgen.sim.reconstruct.physics.by_name import shipped_names
-from physgen.sim.reconstruct.shape.texture import TexturedSurface, crop_texture
-from physgen.sim.reconstruct.view import camera as cameras
+from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
+from physgen.sim.reconstruct.appearance.albedo import compute_albedo, division_exponent
+from physgen.sim.reconstruct.appearance.appearance_estimate import estimate_appearance
+from physgen.sim.reconstruct.camera import ground_camera as cameras
+from physgen.sim.reconstruct.reasoning.material_decision import decide_materials
+from physgen.sim.reconstruct.reasoning.material_names import shipped_names
+from physgen.sim.reconstruct.reconstruct_options import ObjectRequest
+from physgen.sim.reconstruct.shape.body_texture import TexturedSurface, crop_texture
 from physgen.sim.scene.model import Light
 
 RADIUS, MIDDLE = 0.3, np.array([0.0, 1.6, 0.3])
@@ -92,7 +91,7 @@ def body(pixels, mask):
 
 
 def physics(kind=None):
-    return decide([ObjectRequest(box=(0, 0, 9, 9), kind=kind)], [None], None, shipped_names())[0]
+    return decide_materials([ObjectRequest(box=(0, 0, 9, 9), kind=kind)], [None], None, shipped_names())[0]
 
 
 @cache
@@ -169,7 +168,7 @@ def test_a_wrong_sun_makes_the_albedo_no_less_even_than_the_photo():
 
 def test_nothing_is_whiter_than_white():
     bright = np.random.default_rng(2).uniform(0.5, 1.0, (20, 20, 3))
-    albedo, exponent = albedo_of(bright, np.full((20, 20, 3), 0.4), None, np.ones((20, 20), bool))
+    albedo, exponent = compute_albedo(bright, np.full((20, 20, 3), 0.4), None, np.ones((20, 20), bool))
     assert exponent == 1.0
     found = bytes_to_linear(albedo)
     assert np.percentile(found.max(axis=2), 99.5) == pytest.approx(0.95, abs=0.01)

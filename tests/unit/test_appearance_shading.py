@@ -7,15 +7,19 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.reconstruct.appearance.around import summed_around
-from physgen.sim.reconstruct.appearance.creased import creased
-from physgen.sim.reconstruct.appearance.occlusion import Occluders
-from physgen.sim.reconstruct.appearance.reflection import sky_lobe, sun_lobe
-from physgen.sim.reconstruct.appearance.shading import shade
-from physgen.sim.reconstruct.appearance.surroundings import Surroundings, lattice, surroundings
-from physgen.sim.reconstruct.appearance.visible import seen_faces, visible_pixels
-from physgen.sim.reconstruct.light.cast import surface_points
-from physgen.sim.reconstruct.view import camera as cameras
+from physgen.sim.reconstruct.appearance.albedo import seen_faces, split_creases, visible_pixels
+from physgen.sim.reconstruct.appearance.object_shading import (
+    LocalLighting,
+    Occluders,
+    local_lighting,
+    shade,
+    sky_lobe,
+    sphere_directions,
+    spherical_convolution,
+    sun_lobe,
+)
+from physgen.sim.reconstruct.camera import ground_camera as cameras
+from physgen.sim.reconstruct.lighting.ground_lighting import surface_points
 from physgen.sim.scene.equirectangular import directions
 from physgen.sim.scene.model import Light
 
@@ -28,7 +32,7 @@ def scene(strength=1.0, ground=0.4, sky=(1.0, 1.0, 1.0)):
     background = np.full((180, 240, 3), ground, np.float32)
     radiance = np.ones((32, 64, 3), np.float32) * np.float32(sky)
     light = Light(sun_direction=tuple(SUN) if strength else None, sun_strength=strength, sun_angle=0.02)
-    return surroundings(VIEW, background, np.array([0.0, 1.6, 0.0]), 0.5, radiance, light)
+    return local_lighting(VIEW, background, np.array([0.0, 1.6, 0.0]), 0.5, radiance, light)
 
 
 def sphere(height):
@@ -88,7 +92,7 @@ def test_a_convex_body_has_no_shadow_on_its_lit_side():
     mesh = sphere(0.3)
     normals = (mesh[0] - mesh[0].mean(axis=0)) / 0.3
     occluders = Occluders(surface_points(*mesh), mesh[0], normals)
-    for direction in lattice(24):
+    for direction in sphere_directions(24):
         cosine = normals @ direction
         reached = occluders.reached(direction)
         assert reached[cosine > 0.25].min() > 0.9
@@ -98,12 +102,12 @@ def test_a_convex_body_has_no_shadow_on_its_lit_side():
 
 def test_normals_are_smooth_on_a_ball_and_not_around_a_box():
     vertices, faces = sphere(0.0)
-    ball = creased(vertices, faces)
+    ball = split_creases(vertices, faces)
     assert len(ball.vertices) == len(vertices)
     radial = (ball.vertices - vertices.mean(axis=0)) / 0.3
     assert (ball.normals * radial).sum(axis=1).min() > 0.999
     box = trimesh.creation.box((1.0, 2.0, 3.0))
-    found = creased(np.asarray(box.vertices), np.asarray(box.faces))
+    found = split_creases(np.asarray(box.vertices), np.asarray(box.faces))
     assert len(found.vertices) == 24
     assert np.sort(np.abs(found.normals), axis=1) == pytest.approx(np.tile([0.0, 0.0, 1.0], (24, 1)))
     assert (found.vertices[found.faces] == np.asarray(box.vertices)[box.faces]).all()
@@ -162,9 +166,9 @@ def given_back(roughness, cosine, steps=300):
 @pytest.mark.parametrize("roughness", [0.4, 0.6, 1.0])
 def test_the_sun_s_reflection_gives_back_what_microfacets_do(roughness, cosine):
     normal, view = np.array([[0.0, 0.0, 1.0]]), np.array([[math.sqrt(1 - cosine**2), 0.0, cosine]])
-    lights = lattice(6000)
+    lights = sphere_directions(6000)
     lights = lights[lights[:, 2] > 0]
-    bare = Surroundings(np.zeros((32, 64, 3)), BLACK, SUN, 1.0, 0.01, np.ones(3))
+    bare = LocalLighting(np.zeros((32, 64, 3)), BLACK, SUN, 1.0, 0.01, np.ones(3))
     # The mean over a disc that is the whole sky. A sun of radiance over π 1 is irradiance π.
     mean = sun_lobe(bare, normal, view, roughness, 1.0, lights)[0] / math.pi
     assert mean * 2 * math.pi == pytest.approx(given_back(roughness, cosine), abs=0.01)
@@ -180,12 +184,14 @@ def test_a_sum_around_is_the_one_over_all_pairs_of_pixels(alpha2):
         return np.maximum(cosine, 0) / (1 + alpha2 - cosine) ** 2
 
     pairs = weight(np.clip(flat @ flat.T, -1, 1)) * solid.ravel()
-    assert summed_around(picture, weight).reshape(-1, 3) == pytest.approx(pairs @ picture.reshape(-1, 3), rel=1e-9)
+    assert spherical_convolution(picture, weight).reshape(-1, 3) == pytest.approx(
+        pairs @ picture.reshape(-1, 3), rel=1e-9
+    )
 
 
 def test_a_mirror_in_even_light_looks_as_that():
-    even = Surroundings(np.ones((32, 64, 3)), np.ones(3), None, 0.0, 0.1, np.ones(3))
-    normals = lattice(200)
+    even = LocalLighting(np.ones((32, 64, 3)), np.ones(3), None, 0.0, 0.1, np.ones(3))
+    normals = sphere_directions(200)
     views = normals.copy()
     assert sky_lobe(even, normals, views, 0.1, 1.0) == pytest.approx(np.ones((200, 3)), abs=0.06)
     varnish = sky_lobe(even, normals, views, 0.1, 0.04)

@@ -7,16 +7,18 @@ import cv2
 import numpy as np
 import pytest
 from physgen.sim.composite.inpaint import FillOptions
-from physgen.sim.reconstruct.background.border import blend
-from physgen.sim.reconstruct.background.bounds import bounded
-from physgen.sim.reconstruct.background.fill import fill_background
-from physgen.sim.reconstruct.background.grain import as_grainy
-from physgen.sim.reconstruct.background.leftover import left_over
-from physgen.sim.reconstruct.background.shading import logarithms
-from physgen.sim.reconstruct.background.surface_edges import edges_through
-from physgen.sim.reconstruct.background.trial import choose, likeness, trial_holes
-from physgen.sim.reconstruct.background.ways import WAYS, Task
-from physgen.sim.reconstruct.view.camera import camera_above_ground, on_ground
+from physgen.sim.reconstruct.background.background_inpainting import blend, fill_background, leftover_shadow
+from physgen.sim.reconstruct.background.inpainting_methods import (
+    METHODS,
+    InpaintingTask,
+    choose_method,
+    match_grain,
+    similarity,
+    trial_holes,
+)
+from physgen.sim.reconstruct.background.surface_edges import edges_behind
+from physgen.sim.reconstruct.background.surface_inpainting import clamp_to_surroundings, logarithms
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 
 WIDTH, HEIGHT = 200, 150
 
@@ -50,14 +52,16 @@ def wood(seed, mean):
 def test_a_floor_in_perspective_is_filled_from_above_and_a_flat_picture_is_not():
     hole = disc(100, 85, 22)
     nothing = np.zeros_like(hole)
-    floor = choose(Task(checks(), hole, nothing, camera(), FillOptions()), ("by rows", "as ground"))
+    floor = choose_method(InpaintingTask(checks(), hole, nothing, camera(), FillOptions()), ("by rows", "as ground"))
     assert floor.way == "as ground"
     assert floor.scores["as ground"] > floor.scores["by rows"] + 1.0
     assert floor.certain > 1.0
     # Stripes that are equal all over the photo are no pattern of a plane in perspective.
     columns = np.arange(WIDTH)[None, :] * np.ones((HEIGHT, 1))
     stripes = np.where((columns // 6) % 2 > 0, 180.0, 80.0)[..., None] * np.ones(3)
-    flat = choose(Task(stripes.astype(np.float32), hole, nothing, camera(), FillOptions()), ("by rows", "as ground"))
+    flat = choose_method(
+        InpaintingTask(stripes.astype(np.float32), hole, nothing, camera(), FillOptions()), ("by rows", "as ground")
+    )
     assert flat.way == "by rows"
 
 
@@ -89,11 +93,11 @@ def test_softness_and_glow_lose_against_the_right_texture():
     hole = disc(100, 75, 30)
     soft = np.where(hole[..., None], cv2.GaussianBlur(truth, (0, 0), 8.0), truth)
     other = np.where(hole[..., None], np.roll(truth, 1, axis=1), truth)
-    assert likeness(truth, truth, hole) > likeness(other, truth, hole) > likeness(soft, truth, hole)
+    assert similarity(truth, truth, hole) > similarity(other, truth, hole) > similarity(soft, truth, hole)
     # Of equal squared error, the one without details loses.
     error = float(np.sqrt(np.square(soft - truth)[hole].mean()))
     shifted = np.where(hole[..., None], truth + error, truth)
-    assert likeness(shifted, truth, hole) > likeness(soft, truth, hole) + 1.0
+    assert similarity(shifted, truth, hole) > similarity(soft, truth, hole) + 1.0
 
 
 @pytest.mark.parametrize("border", [50, 62])
@@ -105,7 +109,7 @@ def test_a_table_ends_before_a_cluttered_room(border):
     photo = np.where(np.arange(HEIGHT)[:, None, None] < border, room, table).astype(np.float32)
     hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
     hole[25:105, 80:130] = True
-    (edge,) = edges_through(logarithms(photo), hole, hole)
+    (edge,) = edges_behind(logarithms(photo), hole, hole)
     line = (edge.c - edge.a * np.array([80.0, 130.0])) / edge.b
     assert np.abs(line - border).max() < 2.5
     found = fill_background(np.clip(photo, 0, 255).astype(np.uint8), hole, hole, camera(25.0)).astype(float)
@@ -117,7 +121,7 @@ def test_a_table_ends_before_a_cluttered_room(border):
 def test_grain_of_wood_is_no_border():
     hole = disc(100, 75, 35)
     for seed in range(3):
-        assert edges_through(logarithms(wood(seed, 120.0)), hole, hole) == []
+        assert edges_behind(logarithms(wood(seed, 120.0)), hole, hole) == []
 
 
 def test_no_glow_and_no_gloom_that_is_not_seen_around():
@@ -125,7 +129,7 @@ def test_no_glow_and_no_gloom_that_is_not_seen_around():
     around = 120.0 + 10.0 * np.linspace(-1, 1, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
     for colour in ((1.8, 1.0, 0.6), (0.4, 0.4, 0.4), (1.0, 1.0, 1.0)):
         filled = np.where(hole[..., None], around * np.array(colour), around).astype(np.float32)
-        kept = np.exp(bounded(np.log(filled), hole, ~hole))
+        kept = np.exp(clamp_to_surroundings(np.log(filled), hole, ~hole))
         assert np.abs(kept[~hole] - filled[~hole]).max() < 1e-3
         deep = disc(100, 75, 20)
         assert kept[deep].min() > 100.0
@@ -138,14 +142,14 @@ def test_shadow_outside_of_the_hole_is_no_source():
     hole = disc(100, 60, 32)
     shade = disc(100, 66, 34) & ~hole
     photo[shade] *= 0.25
-    found = left_over(logarithms(photo), hole, hole)
+    found = leftover_shadow(logarithms(photo), hole, hole)
     assert (found & shade).sum() > 0.8 * shade.sum()
     assert (found & ~shade).sum() < 0.5 * shade.sum()
     filled = fill_background(np.clip(photo, 0, 255).astype(np.uint8), hole, hole, camera(60.0))
     assert filled[hole].mean() > 110.0
     assert (filled[disc(100, 60, 30)] < 60).mean() < 0.01
     # Dark checks are part of the floor: they are seen farther away as well.
-    assert left_over(logarithms(checks()), hole, hole).sum() == 0
+    assert leftover_shadow(logarithms(checks()), hole, hole).sum() == 0
 
 
 def test_nothing_is_led_up_to_shade():
@@ -169,18 +173,20 @@ def test_a_soft_filling_becomes_as_grainy_as_its_surroundings():
     def detail(picture):
         return float((picture - cv2.GaussianBlur(picture, (0, 0), 1.0))[deep].std())
 
-    matched = as_grainy(soft, hole, ~hole)
+    matched = match_grain(soft, hole, ~hole)
     assert abs(detail(matched) / detail(photo) - 1.0) < 0.25
     assert detail(soft) < 0.65 * detail(photo)
     flat = np.where(hole[..., None], np.float32(120.0), photo)
-    assert np.isfinite(as_grainy(flat, hole, ~hole)).all()
+    assert np.isfinite(match_grain(flat, hole, ~hole)).all()
 
 
-@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("way", list(METHODS))
 def test_every_way_fills_and_leaves_the_rest(way):
     picture = checks()
     hole = disc(100, 85, 18)
-    task = Task(np.where(hole[..., None], np.float32(-500.0), picture), hole, disc(30, 30, 10), camera(), FillOptions())
-    filled, again = WAYS[way](task), WAYS[way](task)
+    task = InpaintingTask(
+        np.where(hole[..., None], np.float32(-500.0), picture), hole, disc(30, 30, 10), camera(), FillOptions()
+    )
+    filled, again = METHODS[way](task), METHODS[way](task)
     assert (filled[hole] > 20.0).all()
     assert (filled == again).all()

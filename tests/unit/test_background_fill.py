@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from physgen.sim.composite.inpaint import FillOptions
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.background.border import blend
-from physgen.sim.reconstruct.background.conditional import conditional_mean, foreseen
-from physgen.sim.reconstruct.background.fill import fill_background
-from physgen.sim.reconstruct.background.shading import logarithms
-from physgen.sim.reconstruct.background.surface_edges import edges_through
-from physgen.sim.reconstruct.background.top_view import inside_photo, seen_from_above, seen_in_photo, views_of
-from physgen.sim.reconstruct.view.camera import camera_above_ground, on_ground
+from physgen.sim.reconstruct.background.background_inpainting import blend, fill_background
+from physgen.sim.reconstruct.background.surface_edges import edges_behind
+from physgen.sim.reconstruct.background.surface_inpainting import logarithms
+from physgen.sim.reconstruct.background.texture_prediction import conditional_mean, predict_texture
+from physgen.sim.reconstruct.background.top_view import to_photo, to_top_view, top_views, visible_in_photo
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 
 WIDTH, HEIGHT = 240, 180
 
@@ -71,7 +70,7 @@ def test_a_floor_ends_at_its_wall_behind_the_object():
     thing, hole = disc(120, 86, 24), disc(120, 86, 30)
     photo = truth.copy()
     photo[thing] = 20
-    edges = edges_through(logarithms(photo.astype(np.float32)), hole, hole)
+    edges = edges_behind(logarithms(photo.astype(np.float32)), hole, hole)
     assert len(edges) == 1
     assert (edges[0].below(hole.shape) != floor)[hole].mean() < 0.02
     found = fill_background(photo, hole, thing, camera(20.0))
@@ -79,7 +78,7 @@ def test_a_floor_ends_at_its_wall_behind_the_object():
     assert decibels(found, truth, hole) > flat + 4.0
     # On one surface there is no edge to be found.
     plain = np.full((HEIGHT, WIDTH, 3), 120.0, np.float32) + grain.astype(np.float32)
-    assert edges_through(logarithms(plain), hole, hole) == []
+    assert edges_behind(logarithms(plain), hole, hole) == []
 
 
 def test_what_is_barred_is_no_source():
@@ -109,13 +108,13 @@ def test_a_view_from_above_and_back_is_the_photo():
     view = camera(30.0)
     photo = cv2.GaussianBlur(tiles(view), (0, 0), 1.0).astype(np.float32)
     hole = disc(120, 130, 25)
-    ((above, part),) = views_of(view, hole, 400_000)
+    ((above, part),) = top_views(view, hole, 400_000)
     assert (part == hole).all()
     rows, columns = slice(100, 160), slice(90, 150)
-    back = seen_in_photo(seen_from_above(photo, above), above, rows, columns)
+    back = to_photo(to_top_view(photo, above), above, rows, columns)
     inner = hole[rows, columns]
     assert np.abs(back - photo[rows, columns])[inner].mean() < 2.0
-    assert not inside_photo(above, hole).all()
+    assert not visible_in_photo(above, hole).all()
 
 
 def test_waves_are_foreseen_and_noise_is_not():
@@ -123,11 +122,11 @@ def test_waves_are_foreseen_and_noise_is_not():
     wave = np.sin(rows / 3.0 + columns / 5.0)
     values = np.repeat(wave[..., None], 3, axis=2).astype(np.float32) * np.array([1.0, 0.5, 0.2], np.float32)
     hole = disc(55, 45, 14, wave.shape)
-    found, certain = foreseen(np.where(hole[..., None], 9.0, values), ~hole, hole)
+    found, certain = predict_texture(np.where(hole[..., None], 9.0, values), ~hole, hole)
     assert certain > 0.8
     assert np.square(found - values)[hole].mean() < 0.15 * np.square(values[hole]).mean()
     noise = np.random.default_rng(2).normal(size=values.shape).astype(np.float32)
-    found, certain = foreseen(noise, ~hole, hole)
+    found, certain = predict_texture(noise, ~hole, hole)
     assert certain < 0.1
     assert np.abs(found[hole]).mean() < 0.3
     assert (conditional_mean(noise, np.zeros_like(hole), 0.5) == 0).all()

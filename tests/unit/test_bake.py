@@ -12,13 +12,13 @@ import sys
 import numpy as np
 import pytest
 from physgen.sim.app import bake as bake_module
-from physgen.sim.app import worker
+from physgen.sim.app import bake_worker
 from physgen.sim.app.bake import bake
-from physgen.sim.app.bake_inputs import BakeOptions
-from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.cache.bake_folder import load_manifest
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import Cancelled, InputError, SimulationError
-from physgen.sim.scene.folder import save_scene
+from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect, Ground, Key, Light, Material, Motion
 
@@ -31,9 +31,9 @@ def caches(out):
 
 def test_a_thrown_ball_flies_as_it_should(ball_scene, tmp_path):
     folder = ball_scene(velocity=(0.3, 0.0, 1.0))
-    manifest = bake(folder.root, tmp_path / "bake", QUICK)
+    manifest = bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest
     cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
-    mesh = load_object_mesh(folder, folder.scene.objects[0])
+    mesh = load_object_mesh(folder, folder.model.objects[0])
     assert (manifest.state, manifest.frames_done, cache.sample_count) == ("complete", 6, 6)
     assert np.array_equal(cache.sample(0), mesh.vertices.astype(np.float32)), "frame 1 is the scene at rest"
     time = 5 / 24
@@ -49,7 +49,7 @@ def test_a_ball_of_clay_is_dented_and_its_skin_follows(ball_scene, tmp_path):
     """Thrown down at 5 m/s it stays flat at the foot: lower than 95 % of itself, wider than before, whole and above the
     ground; and it is still as flat a tenth of a second later (1 % of the diameter)."""
     folder = ball_scene(preset="clay", velocity=(0.0, 0.0, -5.0))
-    bake(folder.root, tmp_path / "bake", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
     cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
     rest, middle, last = (np.ptp(cache.sample(i), axis=0) for i in (0, 3, 5))
     assert last[2] < 0.95 * rest[2] and last[0] > rest[0]
@@ -61,10 +61,15 @@ def test_a_ball_of_clay_is_dented_and_its_skin_follows(ball_scene, tmp_path):
 def test_a_moving_collider_is_baked_where_it_goes(ball_scene, tmp_path):
     folder = ball_scene(count=2, velocity=(0.0, 0.0, 0.0))
     keys = (Key(time_s=0.0, value=(0.0, 0.0, 0.0)), Key(time_s=1.0, value=(0.0, 2.4, 0.0)))
-    wall = dataclasses.replace(folder.scene.objects[1], role="collider", motion=Motion(translations=keys))
-    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(folder.scene.objects[0], wall)))
+    wall = dataclasses.replace(folder.model.objects[1], role="collider", motion=Motion(translations=keys))
+    save_scene(folder.root, dataclasses.replace(folder.model, objects=(folder.model.objects[0], wall)))
     notices = []
-    bake(folder.root, tmp_path / "bake", dataclasses.replace(QUICK, frames=3), notices.append)
+    bake(
+        load_scene(folder.root),
+        out=tmp_path / "bake",
+        options=dataclasses.replace(QUICK, frames=3),
+        on_event=notices.append,
+    )
     cache = Pc2Reader(tmp_path / "bake" / "ball1.pc2")
     np.testing.assert_allclose(cache.sample(2) - cache.sample(0), np.tile([0.0, 0.2, 0.0], (642, 1)), atol=1e-6)
     assert any("about" in n.get("message", "") and "MiB" in n.get("message", "") for n in notices), "what it will cost"
@@ -73,43 +78,43 @@ def test_a_moving_collider_is_baked_where_it_goes(ball_scene, tmp_path):
 def test_nothing_changed_nothing_done(ball_scene, tmp_path):
     folder = ball_scene()
     out = tmp_path / "bake"
-    first = bake(folder.root, out, QUICK)
+    first = bake(load_scene(folder.root), out=out, options=QUICK).manifest
     before = {p: p.stat().st_mtime_ns for p in out.iterdir()}
     notices = []
-    bake(folder.root, out, QUICK, notices.append)
+    bake(load_scene(folder.root), out=out, options=QUICK, on_event=notices.append)
     assert {p: p.stat().st_mtime_ns for p in out.iterdir()} == before
     assert "up to date" in notices[-1]["message"]
     # Light does not move anything, matter does.
-    save_scene(folder.root, dataclasses.replace(folder.scene, light=Light(sun_strength=3.0)))
-    assert bake_module.is_up_to_date(folder.root, out, QUICK)
-    stiffer = dataclasses.replace(folder.scene.objects[0], material=Material(youngs_modulus=1e5, density=200.0))
-    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(stiffer,)))
-    assert not bake_module.is_up_to_date(folder.root, out, QUICK)
-    assert bake(folder.root, out, QUICK).inputs_hash != first.inputs_hash
+    save_scene(folder.root, dataclasses.replace(folder.model, light=Light(sun_strength=3.0)))
+    assert bake_module.is_up_to_date(load_scene(folder.root), out, QUICK)
+    stiffer = dataclasses.replace(folder.model.objects[0], material=Material(youngs_modulus=1e5, density=200.0))
+    save_scene(folder.root, dataclasses.replace(folder.model, objects=(stiffer,)))
+    assert not bake_module.is_up_to_date(load_scene(folder.root), out, QUICK)
+    assert bake(load_scene(folder.root), out=out, options=QUICK).manifest.inputs_hash != first.inputs_hash
 
 
 def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
     folder = ball_scene(velocity=(0.0, 0.0, -1.0))
-    bake(folder.root, tmp_path / "whole", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "whole", options=QUICK)
     asked = iter([False] * 14 + [True])
     with pytest.raises(Cancelled, match="run it again"):
-        bake(folder.root, tmp_path / "parts", QUICK, cancelled=lambda: next(asked))
+        bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, cancelled=lambda: next(asked))
     stopped = load_manifest(tmp_path / "parts")
     assert stopped.state == "cancelled" and 0 < stopped.frames_done < 6
     notices = []
-    bake(folder.root, tmp_path / "parts", QUICK, notices.append)
+    bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, on_event=notices.append)
     assert any("continuing" in n.get("message", "") for n in notices)
     assert caches(tmp_path / "parts") == caches(tmp_path / "whole")
 
 
 def test_a_killed_worker_costs_a_rerun_and_nothing_else(ball_scene, tmp_path):
     folder = ball_scene()
-    job = worker.BakeJob(
+    job = bake_worker.BakeJob(
         scene=str(folder.root), out=str(tmp_path / "bake"), options=dataclasses.replace(QUICK, frames=400)
     )
-    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
     process = subprocess.Popen(
-        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")], stdout=subprocess.PIPE
+        [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")], stdout=subprocess.PIPE
     )
     for line in process.stdout:
         if json.loads(line).get("done", 0) >= 3:
@@ -118,20 +123,20 @@ def test_a_killed_worker_costs_a_rerun_and_nothing_else(ball_scene, tmp_path):
     process.wait()
     process.stdout.close()
     assert load_manifest(tmp_path / "bake").state == "running"
-    assert not bake_module.is_up_to_date(folder.root, tmp_path / "bake", job.options)
+    assert not bake_module.is_up_to_date(load_scene(folder.root), tmp_path / "bake", job.options)
     # Another length is another bake: the half-written one gives way.
-    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
     assert Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count == 6
 
 
 def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
     folder = ball_scene()
-    job = worker.BakeJob(
+    job = bake_worker.BakeJob(
         scene=str(folder.root), out=str(tmp_path / "bake"), options=dataclasses.replace(QUICK, frames=400)
     )
-    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
     process = subprocess.Popen(
-        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")], stdout=subprocess.PIPE
+        [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")], stdout=subprocess.PIPE
     )
     events = []
     for line in process.stdout:
@@ -147,9 +152,9 @@ def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
 def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until):
     """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and is in no later bake's way."""
     folder = ball_scene()
-    job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
-    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
-    command = [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")]
+    job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
+    (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
+    command = [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "TI_OFFLINE_CACHE": "0"})
     events = []
     for line in process.stdout:
@@ -158,19 +163,19 @@ def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until
             process.terminate()
     assert process.wait() == 130
     assert (events[-1]["event"], events[-1]["kind"]) == ("error", "Cancelled")
-    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
 
 
 def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
     folder = ball_scene()
     asked = iter([False] * 14 + [True])
     with pytest.raises(Cancelled):
-        bake(folder.root, tmp_path / "bake", QUICK, cancelled=lambda: next(asked))
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK, cancelled=lambda: next(asked))
     checkpoint = tmp_path / "bake" / bake_module.CHECKPOINT_FILE
     for content in (b"", b"garbage", checkpoint.read_bytes()[: checkpoint.stat().st_size // 2]):
         checkpoint.write_bytes(content)
         save = load_manifest(tmp_path / "bake")
-        assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+        assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
         bake_module.save_manifest(tmp_path / "bake", save)
 
 
@@ -179,17 +184,17 @@ def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.txt").write_text("years of work")
     with pytest.raises(InputError, match="holds other files"):
-        bake(folder.root, tmp_path / "home", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "home", options=QUICK)
     assert [p.name for p in (tmp_path / "home").iterdir()] == ["thesis.txt"]
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is a file"):
-        bake(folder.root, tmp_path / "file", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "file", options=QUICK)
 
 
 def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
     folder = ball_scene()
-    job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
-    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
+    (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
     # A limit on file size fails writes as a full disk does, from the operating system.
     limit = 3 * 642 * 12
 
@@ -198,7 +203,7 @@ def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
 
     environment = {**os.environ, "TI_OFFLINE_CACHE": "0"}
     result = subprocess.run(
-        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")],
+        [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")],
         capture_output=True,
         preexec_fn=small_files,
         env=environment,
@@ -209,26 +214,26 @@ def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
     assert (result.returncode, last["kind"]) == (3, "InputError") and "free space" in last["message"], result.stderr[
         -800:
     ]
-    assert not bake_module.is_up_to_date(folder.root, tmp_path / "bake", QUICK)
-    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+    assert not bake_module.is_up_to_date(load_scene(folder.root), tmp_path / "bake", QUICK)
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
 
 
 def test_effects_of_the_scene_reach_the_engine(ball_scene, tmp_path):
     """Buoyancy that carries the whole weight: the ball stays where it is. An effect that nobody knows is refused."""
     floating = Effect(name="buoyancy", parameters=(("fraction", 1.0),))
     folder = ball_scene(velocity=(0.0, 0.0, 0.0), effects=(floating,))
-    bake(folder.root, tmp_path / "bake", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
     cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
     np.testing.assert_allclose(cache.sample(5), cache.sample(0), atol=1e-5)
-    save_scene(folder.root, dataclasses.replace(folder.scene, effects=(Effect(name="witchcraft"),)))
+    save_scene(folder.root, dataclasses.replace(folder.model, effects=(Effect(name="witchcraft"),)))
     with pytest.raises(InputError, match="witchcraft"):
-        bake(folder.root, tmp_path / "other", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "other", options=QUICK)
 
 
 def test_a_wooden_ball_keeps_its_shape_and_bounces_as_told(ball_scene, tmp_path):
     """A rigid body through the whole bake: the baked mesh moves as one; with restitution 1 it comes up again."""
     folder = ball_scene(preset="wood", velocity=(0.0, 0.0, -2.0), ground=Ground(restitution=1.0))
-    bake(folder.root, tmp_path / "bake", dataclasses.replace(QUICK, frames=8))
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=dataclasses.replace(QUICK, frames=8))
     cache = Pc2Reader(tmp_path / "bake" / "ball0.pc2")
     rest = cache.sample(0) - cache.sample(0).mean(axis=0)
     heights = []
@@ -243,9 +248,9 @@ def test_a_wooden_ball_keeps_its_shape_and_bounces_as_told(ball_scene, tmp_path)
 
 def test_surfaces_and_goals_of_objects_are_baked(ball_scene, tmp_path):
     folder = ball_scene(velocity=(1.0, 0.0, 0.0))
-    item = dataclasses.replace(folder.scene.objects[0], friction=0.1, goal_stiffness=400.0, goal_damping=0.5)
-    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item,)))
-    assert bake(folder.root, tmp_path / "bake", QUICK).state == "complete"
+    item = dataclasses.replace(folder.model.objects[0], friction=0.1, goal_stiffness=400.0, goal_damping=0.5)
+    save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
 
 
 def test_an_open_mesh_is_refused_by_its_objects_name(ball_scene, tmp_path):
@@ -256,7 +261,7 @@ def test_an_open_mesh_is_refused_by_its_objects_name(ball_scene, tmp_path):
     mesh.update_faces(np.arange(len(mesh.faces)) > 10)
     mesh.export(folder.root / "meshes" / "ball0.glb")
     with pytest.raises(InputError, match="object ball0"):
-        bake(folder.root, tmp_path / "bake", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
 
 
 def test_two_bakes_into_one_folder_at_once(ball_scene, tmp_path):
@@ -266,8 +271,9 @@ def test_two_bakes_into_one_folder_at_once(ball_scene, tmp_path):
 from pathlib import Path
 from physgen.sim.app.bake import bake
 from physgen.sim.errors import InputError
+from physgen.sim.scene.folder import load_scene
 try:
-    bake(Path({str(folder.root)!r}), Path({str(tmp_path / "bake")!r}))
+    bake(load_scene(Path({str(folder.root)!r})), out={str(tmp_path / "bake")!r})
 except InputError as error:
     print(error)
 """
@@ -279,7 +285,7 @@ def test_a_run_that_diverges_names_the_body_and_keeps_the_good_frames(ball_scene
     folder = ball_scene()
     asked = iter([False] * 14 + [True])
     with pytest.raises(Cancelled):
-        bake(folder.root, tmp_path / "bake", QUICK, cancelled=lambda: next(asked))
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK, cancelled=lambda: next(asked))
     good = load_manifest(tmp_path / "bake").frames_done
     # Fault injection: the engine goes on from a state in which a particle has lost its velocity.
     checkpoint = tmp_path / "bake" / bake_module.CHECKPOINT_FILE
@@ -288,7 +294,7 @@ def test_a_run_that_diverges_names_the_body_and_keeps_the_good_frames(ball_scene
     state["state.v"][100] = np.nan
     np.savez(checkpoint, **state)
     with pytest.raises(SimulationError, match="ball0"):
-        bake(folder.root, tmp_path / "bake", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
     manifest = load_manifest(tmp_path / "bake")
     assert manifest.state == "cancelled" and manifest.frames_done >= good > 0
     assert Pc2Reader(tmp_path / "bake" / "ball0.pc2").sample_count == manifest.frames_done
@@ -297,4 +303,4 @@ def test_a_run_that_diverges_names_the_body_and_keeps_the_good_frames(ball_scene
 def test_a_run_that_would_take_for_ever_is_refused_before_it_starts(ball_scene, tmp_path):
     folder = ball_scene(velocity=(0.0, 0.0, 1e9))
     with pytest.raises(InputError, match=r"time steps.*velocity"):
-        bake(folder.root, tmp_path / "bake", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)

@@ -9,9 +9,16 @@ import textwrap
 
 import numpy as np
 import pytest
-from physgen.sim.cache.folder import disk_use, free_bake, remove_leftovers
-from physgen.sim.cache.lock import folder_lock
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import (
+    BakedObject,
+    BakeManifest,
+    disk_usage,
+    free_bake,
+    load_manifest,
+    remove_leftovers,
+    save_manifest,
+)
+from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 
@@ -68,7 +75,7 @@ def test_a_manifest_says_space_and_points_and_old_ones_say_neither(tmp_path):
 def test_what_it_takes_is_what_is_free_again(tmp_path):
     bake = a_bake(tmp_path / "bake")
     files = [p for p in bake.rglob("*") if p.is_file()]
-    assert disk_use(bake) == sum(p.stat().st_size for p in files) > 3 * 32
+    assert disk_usage(bake) == sum(p.stat().st_size for p in files) > 3 * 32
     assert free_bake(bake) > 0
     assert not bake.exists() and tmp_path.is_dir()
     with pytest.raises(InputError, match="no bake there"):
@@ -116,7 +123,7 @@ def test_a_bake_that_runs_is_not_freed(tmp_path):
     code = textwrap.dedent(f"""
         import sys
         from pathlib import Path
-        from physgen.sim.cache.lock import folder_lock
+        from physgen.sim.cache.folder_lock import folder_lock
         with folder_lock(Path({str(bake)!r})):
             print("held", flush=True)
             sys.stdin.read()

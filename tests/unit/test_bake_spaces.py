@@ -14,16 +14,15 @@ import pytest
 import trimesh
 from physgen.batch.cli import main
 from physgen.sim.app import bake as bake_module
-from physgen.sim.app import worker
+from physgen.sim.app import bake_worker
 from physgen.sim.app.bake import bake
 from physgen.sim.app.bake_estimate import bake_cost, estimate_bake
-from physgen.sim.app.bake_inputs import BakeOptions, inputs_hash
-from physgen.sim.cache.folder import disk_use
-from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.app.bake_options import BakeOptions, inputs_hash
+from physgen.sim.cache.bake_folder import disk_usage, load_manifest
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.scene.folder import save_scene
-from physgen.sim.scene.materials import load_preset
+from physgen.sim.scene.folder import load_scene, save_scene
+from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect, Material
 
@@ -47,14 +46,16 @@ def crooked(folder):
     """The ball of the scene under the crooked matrix, resting in its middle in the mesh file."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     mesh.export(folder.root / "meshes" / "ball0.obj")
-    item = dataclasses.replace(folder.scene.objects[0], mesh="meshes/ball0.obj", world_from_mesh=CROOKED)
-    return save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item,)))
+    item = dataclasses.replace(folder.model.objects[0], mesh="meshes/ball0.obj", world_from_mesh=CROOKED)
+    return save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
 
 
 def test_samples_in_the_meshs_space_are_the_worlds_seen_through_the_matrix(ball_scene, tmp_path):
     folder = crooked(ball_scene(velocity=(0.5, 0.0, 1.0)))
-    bake(folder.root, tmp_path / "world", QUICK)
-    manifest = bake(folder.root, tmp_path / "mesh", dataclasses.replace(QUICK, space="mesh"))
+    bake(load_scene(folder.root), out=tmp_path / "world", options=QUICK)
+    manifest = bake(
+        load_scene(folder.root), out=tmp_path / "mesh", options=dataclasses.replace(QUICK, space="mesh")
+    ).manifest
     assert [item.space for item in manifest.objects] == ["mesh"]
     world, mesh = samples(tmp_path / "world" / "ball0.pc2"), samples(tmp_path / "mesh" / "ball0.pc2")
     in_file = trimesh.load(folder.root / "meshes" / "ball0.obj", process=False).vertices
@@ -70,13 +71,13 @@ def test_a_mirrored_stretched_object_is_filled_like_the_same_shape_made_so(ball_
     """Not inside out, no lighter: particles and volume as of a mesh file that has the crooked shape itself."""
     folder = crooked(ball_scene())
     by_matrix = estimate_bake(folder, QUICK)
-    mesh = load_object_mesh(folder, folder.scene.objects[0])
+    mesh = load_object_mesh(folder, folder.model.objects[0])
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     grown = abs(np.linalg.det(np.array(CROOKED)[:3, :3]))
     assert made.volume == pytest.approx(grown * 4 / 3 * np.pi * 0.05**3, rel=0.02)
     made.export(folder.root / "meshes" / "made.ply")
-    item = dataclasses.replace(folder.scene.objects[0], mesh="meshes/made.ply", world_from_mesh=np.eye(4).tolist())
-    by_file = estimate_bake(save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item,))), QUICK)
+    item = dataclasses.replace(folder.model.objects[0], mesh="meshes/made.ply", world_from_mesh=np.eye(4).tolist())
+    by_file = estimate_bake(save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,))), QUICK)
     assert by_matrix.warnings == by_file.warnings == ()
     body, same = by_matrix.setup.bodies[0], by_file.setup.bodies[0]
     np.testing.assert_allclose(body.positions, same.positions, atol=1e-6)
@@ -96,8 +97,8 @@ def test_a_mirrored_stretched_object_is_filled_like_the_same_shape_made_so(ball_
 )
 def test_what_flows_gets_its_particles(ball_scene, material, effects, points):
     folder = ball_scene(effects=effects)
-    item = dataclasses.replace(folder.scene.objects[0], material=material)
-    folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item,)))
+    item = dataclasses.replace(folder.model.objects[0], material=material)
+    folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
     with_points, without = bake_cost(folder, POINTS), bake_cost(folder, QUICK)
     extra = with_points.disk_bytes - without.disk_bytes
     assert extra == (12 * 4 * with_points.prepared.particle_count if points else 0)
@@ -106,7 +107,7 @@ def test_what_flows_gets_its_particles(ball_scene, material, effects, points):
 def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_scene, tmp_path, monkeypatch):
     folder = crooked(ball_scene(preset="sand", velocity=(0.0, 0.0, -1.0)))
     options = dataclasses.replace(POINTS, space="mesh")
-    whole = bake(folder.root, tmp_path / "whole", options)
+    whole = bake(load_scene(folder.root), out=tmp_path / "whole", options=options).manifest
     item = whole.objects[0]
     assert (item.points_file, item.points) == ("ball0.points.pc2", whole.particles)
     particles = samples(tmp_path / "whole" / "ball0.points.pc2")
@@ -116,7 +117,7 @@ def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_s
     np.testing.assert_allclose(particles[0] @ matrix[:3, :3].T + matrix[:3, 3], rest, atol=5e-7)
     middles = [(p @ matrix[:3, :3].T + matrix[:3, 3]).mean(axis=0)[2] for p in particles]
     assert middles[3] < middles[0] - 0.01, "it falls"
-    assert disk_use(tmp_path / "whole") <= bake_cost(folder, options).disk_bytes
+    assert disk_usage(tmp_path / "whole") <= bake_cost(folder, options).disk_bytes
 
     # Stopped again and again, in the middle of frames, with the state kept as often as can be.
     monkeypatch.setattr(bake_module, "KEEP_SECONDS", 0.0)
@@ -124,7 +125,12 @@ def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_s
     for _ in range(20):
         left = iter([False] * 100)
         try:
-            bake(folder.root, tmp_path / "parts", options, cancelled=lambda left=left: next(left, True))
+            bake(
+                load_scene(folder.root),
+                out=tmp_path / "parts",
+                options=options,
+                cancelled=lambda left=left: next(left, True),
+            )
         except Cancelled:
             stops += 1
             continue
@@ -134,8 +140,8 @@ def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_s
 
     # Without the wish the file goes, and a complete bake that misses it is none.
     (tmp_path / "whole" / "ball0.points.pc2").unlink()
-    assert not bake_module.is_up_to_date(folder.root, tmp_path / "whole", options)
-    bake(folder.root, tmp_path / "parts", dataclasses.replace(options, points=False, frames=1))
+    assert not bake_module.is_up_to_date(load_scene(folder.root), tmp_path / "whole", options)
+    bake(load_scene(folder.root), out=tmp_path / "parts", options=dataclasses.replace(options, points=False, frames=1))
     assert list(caches(tmp_path / "parts")) == ["ball0.pc2"]
 
 
@@ -153,7 +159,7 @@ def test_frames_can_be_played_as_they_arrive(ball_scene, tmp_path, monkeypatch):
                 cache.sample(event["done"] - 1)
             seen.append((event["done"], manifest.frames_done))
 
-    bake(folder.root, out, POINTS, look)
+    bake(load_scene(folder.root), out=out, options=POINTS, on_event=look)
     assert seen == [(1, 1), (2, 2), (3, 3), (4, 4)]
 
 
@@ -161,15 +167,16 @@ def test_a_bake_that_is_killed_again_and_again_ends_with_the_same_bytes(ball_sce
     """SIGKILL in the middle of frames, writes and checkpoints, of a process that checkpoints after every frame."""
     folder = ball_scene(preset="sand", velocity=(0.0, 0.0, -1.0))
     options = dataclasses.replace(POINTS, frames=6)
-    bake(folder.root, tmp_path / "whole", options)
+    bake(load_scene(folder.root), out=tmp_path / "whole", options=options)
     code = f"""
 import json, sys
 from pathlib import Path
 from physgen.sim.app import bake as module
+from physgen.sim.scene.folder import load_scene
 module.CHECKPOINT_SECONDS = module.KEEP_SECONDS = module.MANIFEST_SECONDS = 0.0
 options = module.BakeOptions(frames=6, fps=24.0, quality="preview", points=True)
-module.bake(Path({str(folder.root)!r}), Path({str(tmp_path / "parts")!r}), options,
-            lambda event: print(json.dumps(event), flush=True))
+module.bake(load_scene(Path({str(folder.root)!r})), out={str(tmp_path / "parts")!r}, options=options,
+            on_event=lambda event: print(json.dumps(event), flush=True))
 """
     continued = 0
     for kill_at in (1, 4):
@@ -186,7 +193,7 @@ module.bake(Path({str(folder.root)!r}), Path({str(tmp_path / "parts")!r}), optio
         for name in manifest.files:
             assert len(samples(tmp_path / "parts" / name)) >= manifest.frames_done
     assert continued == 1
-    assert bake(folder.root, tmp_path / "parts", options).state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "parts", options=options).manifest.state == "complete"
     assert caches(tmp_path / "parts") == caches(tmp_path / "whole")
     left = sorted(p.relative_to(tmp_path / "parts").as_posix() for p in (tmp_path / "parts").rglob("*") if p.is_file())
     assert left == ["ball0.pc2", "ball0.points.pc2", "manifest.json", "metrics.json"]
@@ -195,8 +202,8 @@ module.bake(Path({str(folder.root)!r}), Path({str(tmp_path / "parts")!r}), optio
 def test_a_disk_that_is_full_of_particles_keeps_what_was_good(ball_scene, tmp_path):
     folder = ball_scene(preset="sand")
     particles = estimate_bake(folder, POINTS).particle_count
-    job = worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=POINTS)
-    (tmp_path / "job.json").write_text(json.dumps(worker.job_to_json(job)))
+    job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=POINTS)
+    (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
     # The mesh's cache fits, two and a half samples of the particles do.
     limit = 32 + 30 * particles
     assert limit > 32 + 4 * 12 * 642
@@ -205,7 +212,7 @@ def test_a_disk_that_is_full_of_particles_keeps_what_was_good(ball_scene, tmp_pa
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     result = subprocess.run(
-        [sys.executable, "-m", worker.MODULE, str(tmp_path / "job.json")],
+        [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")],
         capture_output=True,
         preexec_fn=small_files,
         env={**os.environ, "TI_OFFLINE_CACHE": "0"},
@@ -217,19 +224,22 @@ def test_a_disk_that_is_full_of_particles_keeps_what_was_good(ball_scene, tmp_pa
     manifest = load_manifest(tmp_path / "bake")
     assert (manifest.state, manifest.frames_done) == ("cancelled", 2)
     assert all(len(samples(tmp_path / "bake" / name)) >= 2 for name in manifest.files)
-    assert bake(folder.root, tmp_path / "bake", POINTS).state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=POINTS).manifest.state == "complete"
 
 
 def test_a_place_that_cannot_be_written_is_named(ball_scene, tmp_path):
     folder = ball_scene(preset="sand")
     out = tmp_path / "bake"
-    bake(folder.root, out, dataclasses.replace(POINTS, frames=1))
+    bake(load_scene(folder.root), out=out, options=dataclasses.replace(POINTS, frames=1))
     (out / "ball0.points.pc2").unlink()
     (out / "ball0.points.pc2").mkdir()
     with pytest.raises(InputError, match=r"bake: cannot be written"):
-        bake(folder.root, out, dataclasses.replace(POINTS, frames=2))
+        bake(load_scene(folder.root), out=out, options=dataclasses.replace(POINTS, frames=2))
     (out / "ball0.points.pc2").rmdir()
-    assert bake(folder.root, out, dataclasses.replace(POINTS, frames=2)).state == "complete"
+    assert (
+        bake(load_scene(folder.root), out=out, options=dataclasses.replace(POINTS, frames=2)).manifest.state
+        == "complete"
+    )
 
 
 def test_too_little_room_for_the_particles_is_said_before_it_starts(ball_scene, tmp_path, monkeypatch):
@@ -239,7 +249,7 @@ def test_too_little_room_for_the_particles_is_said_before_it_starts(ball_scene, 
     usage = shutil.disk_usage(tmp_path)._replace(free=mesh_only + 2**27)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     with pytest.raises(InputError, match="MiB are free"):
-        bake(folder.root, tmp_path / "bake", many)
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=many)
 
 
 def test_without_photo_and_floor_a_body_falls_on_for_ever(ball_scene, tmp_path, capsys):
@@ -247,7 +257,7 @@ def test_without_photo_and_floor_a_body_falls_on_for_ever(ball_scene, tmp_path, 
     (folder.root / "photo.png").unlink()
     (folder.root / "background.png").unlink()
     out = tmp_path / "bake"
-    bake(folder.root, out, dataclasses.replace(QUICK, frames=13))
+    bake(load_scene(folder.root), out=out, options=dataclasses.replace(QUICK, frames=13))
     fallen = samples(out / "ball0.pc2")
     # The lower edge of the ball stood 2 mm above where the ground would be. 0.5 % of ½gt², as in free fall elsewhere.
     expected = 0.5 * 9.81 * 0.5**2
@@ -291,15 +301,15 @@ def test_old_scenes_hash_as_they_did(ball_scene):
     """Bakes of earlier versions stay up to date: the hash of a scene whose every field is fixed here."""
     folder = ball_scene()
     (folder.root / "meshes" / "ball0.glb").write_bytes(b"stands for a mesh")
-    item = dataclasses.replace(folder.scene.objects[0], material=Material())
-    folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item,)))
+    item = dataclasses.replace(folder.model.objects[0], material=Material())
+    folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
     assert inputs_hash(folder, QUICK) == "a23202dafc4ed5c65c904e33d63aaa26c3dfb6eef62d39c7a6a824e92e774aa1"
 
 
 def test_blenders_process_can_ask_what_is_out_of_date():
     """Without SciPy and trimesh, which Blender has not, and without Taichi, which must not be there."""
     code = (
-        "import sys, physgen.sim.app.bake_inputs, physgen.sim.cache.folder, physgen.sim.cache.pc2\n"
+        "import sys, physgen.sim.app.bake_options, physgen.sim.cache.bake_folder, physgen.sim.cache.pc2\n"
         "print([n for n in ('scipy', 'trimesh', 'taichi', 'cv2', 'PIL', 'skimage') if n in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 from physgen.sim.app.bake import bake, is_up_to_date
 from physgen.sim.app.bake_estimate import bake_cost
-from physgen.sim.app.bake_inputs import BakeOptions
-from physgen.sim.cache.folder import disk_use, free_bake
-from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.cache.bake_folder import disk_usage, free_bake, load_manifest
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.gaussians.moving import from_points, placed
-from physgen.sim.gaussians.ply.read import read_splats
-from physgen.sim.gaussians.ply.write import write_splats
-from physgen.sim.gaussians.splats import Splats
+from physgen.sim.gaussians.splat_ply import read_splats, write_splats
+from physgen.sim.gaussians.splats import Splats, from_points, transform_splats
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.model import Key, Material, Motion
 from scipy.spatial import cKDTree
@@ -43,10 +40,10 @@ def splat_scene(ball_scene):
             colours=random.uniform(0, 1, (count, 3)),
         )
         write_splats(folder.root / "splats" / "ball0.ply", splats)
-        item = dataclasses.replace(folder.scene.objects[0], splats="splats/ball0.ply", **(changes or {}))
+        item = dataclasses.replace(folder.model.objects[0], splats="splats/ball0.ply", **(changes or {}))
         if matrix is not None:
             item = dataclasses.replace(item, world_from_mesh=matrix)
-        return save_scene(folder.root, dataclasses.replace(folder.scene, objects=(item, *folder.scene.objects[1:])))
+        return save_scene(folder.root, dataclasses.replace(folder.model, objects=(item, *folder.model.objects[1:])))
 
     return make
 
@@ -66,7 +63,7 @@ def assert_covariances(splats, wanted, tolerance):
 
 def test_falling_splats_fall_and_keep_their_shape(splat_scene, tmp_path):
     folder = splat_scene(velocity=(0.3, 0.0, 1.0))
-    manifest = bake(folder.root, tmp_path / "bake", QUICK)
+    manifest = bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest
     rest, last = frames(tmp_path / "bake")[0], frames(tmp_path / "bake")[-1]
     file = read_splats(folder.file("splats/ball0.ply"))
     np.testing.assert_allclose(rest.centres, file.centres, atol=1e-8)
@@ -89,7 +86,7 @@ def test_each_covariance_follows_the_matter_around_it(splat_scene, tmp_path):
     """A ball of clay thrown at the ground. F at a splat is found from its neighbours' centres alone: the affine map
     that takes them from the first frame to the last. It is only that of their mean, hence the tolerance."""
     folder = splat_scene(count=3000, preset="clay", velocity=(0.0, 0.0, -5.0))
-    bake(folder.root, tmp_path / "bake", dataclasses.replace(QUICK, frames=3))
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=dataclasses.replace(QUICK, frames=3))
     rest, _, last = frames(tmp_path / "bake", 3)
     inner = np.flatnonzero(np.linalg.norm(rest.centres - CENTRE, axis=1) < 0.035)
     near = cKDTree(rest.centres).query(rest.centres[inner], k=24)[1]
@@ -107,9 +104,10 @@ def test_each_covariance_follows_the_matter_around_it(splat_scene, tmp_path):
 def test_a_rigid_ball_turns_its_splats(splat_scene, tmp_path):
     folder = splat_scene(height=0.4, changes={"material": Material(law="rigid"), "spin": (0.0, 9.0, 0.0)})
     write_splats(
-        folder.file("splats/ball0.ply"), placed(read_splats(folder.file("splats/ball0.ply")), up_by(0.4 - 0.052))
+        folder.file("splats/ball0.ply"),
+        transform_splats(read_splats(folder.file("splats/ball0.ply")), up_by(0.4 - 0.052)),
     )
-    bake(folder.root, tmp_path / "bake", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
     rest, last = frames(tmp_path / "bake")[0], frames(tmp_path / "bake")[-1]
     angle = 9.0 * 3 / 24
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
@@ -126,12 +124,12 @@ def up_by(height):
 def test_in_the_space_of_the_mesh_splats_begin_as_the_file_has_them(splat_scene, tmp_path):
     matrix = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     folder = splat_scene(matrix=matrix)
-    bake(folder.root, tmp_path / "mesh", dataclasses.replace(QUICK, space="mesh"))
-    bake(folder.root, tmp_path / "world", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "mesh", options=dataclasses.replace(QUICK, space="mesh"))
+    bake(load_scene(folder.root), out=tmp_path / "world", options=QUICK)
     file = read_splats(folder.file("splats/ball0.ply"))
     assert np.array_equal(frames(tmp_path / "mesh")[0].centres, file.centres)
     for own, world in zip(frames(tmp_path / "mesh"), frames(tmp_path / "world"), strict=True):
-        there = placed(own, np.array(matrix))
+        there = transform_splats(own, np.array(matrix))
         np.testing.assert_allclose(there.centres, world.centres, atol=1e-7)
         assert_covariances(there, world.covariances(), 1e-4)
 
@@ -142,11 +140,11 @@ def test_splats_of_a_collider_go_where_it_goes(splat_scene, tmp_path):
         count=50, changes={"role": "collider", "velocity": (0, 0, 0), "motion": Motion(rotations=keys, pivot=(0, 0, 0))}
     )
     other = dataclasses.replace(
-        folder.scene.objects[0], name="faller", role="dynamic", motion=None, splats=None, velocity=(0, 0, 0)
+        folder.model.objects[0], name="faller", role="dynamic", motion=None, splats=None, velocity=(0, 0, 0)
     )
     other = dataclasses.replace(other, world_from_mesh=tuple(map(tuple, up_by(0.3).tolist())))
-    save_scene(folder.root, dataclasses.replace(folder.scene, objects=(*folder.scene.objects, other)))
-    bake(folder.root, tmp_path / "bake", QUICK)
+    save_scene(folder.root, dataclasses.replace(folder.model, objects=(*folder.model.objects, other)))
+    bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
     rest, last = frames(tmp_path / "bake")[0], frames(tmp_path / "bake")[-1]
     angle = np.pi / 2 * 3 / 24
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
@@ -156,37 +154,37 @@ def test_splats_of_a_collider_go_where_it_goes(splat_scene, tmp_path):
 
 def test_a_stopped_bake_goes_on_to_the_same_bytes_and_a_lost_frame_is_baked_again(splat_scene, tmp_path):
     folder = splat_scene(count=50)
-    bake(folder.root, tmp_path / "whole", QUICK)
+    bake(load_scene(folder.root), out=tmp_path / "whole", options=QUICK)
     asked = iter([False] * 14 + [True])
     with pytest.raises(Cancelled):
-        bake(folder.root, tmp_path / "parts", QUICK, cancelled=lambda: next(asked))
+        bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, cancelled=lambda: next(asked))
     done = load_manifest(tmp_path / "parts").frames_done
     assert 0 < done < 4
     # As a kill in the middle of a frame leaves them.
     (tmp_path / "parts/ball0.splats" / f".{done + 1:04d}.partial-1.ply").write_bytes(b"half")
     (tmp_path / "parts/ball0.splats" / f"{done + 1:04d}.ply").write_bytes(b"of another time")
     notices = []
-    bake(folder.root, tmp_path / "parts", QUICK, notices.append)
+    bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, on_event=notices.append)
     assert any("continuing" in n.get("message", "") for n in notices)
     assert everything(tmp_path / "parts") == everything(tmp_path / "whole")
     out = tmp_path / "whole"
-    assert is_up_to_date(folder.root, out, QUICK)
+    assert is_up_to_date(load_scene(folder.root), out, QUICK)
     (out / "ball0.splats/0002.ply").unlink()
-    assert not is_up_to_date(folder.root, out, QUICK)
+    assert not is_up_to_date(load_scene(folder.root), out, QUICK)
     shorter = dataclasses.replace(QUICK, frames=2)
-    bake(folder.root, out, shorter)
+    bake(load_scene(folder.root), out=out, options=shorter)
     assert {path.name for path in (out / "ball0.splats").iterdir()} == {"0001.ply", "0002.ply"}
-    write_splats(folder.file("splats/ball0.ply"), read_splats(folder.file("splats/ball0.ply")).chosen(np.arange(40)))
-    assert not is_up_to_date(folder.root, out, shorter)
+    write_splats(folder.file("splats/ball0.ply"), read_splats(folder.file("splats/ball0.ply")).subset(np.arange(40)))
+    assert not is_up_to_date(load_scene(folder.root), out, shorter)
 
 
 def test_what_it_takes_on_the_disk_is_told_before_and_freed_after(splat_scene, tmp_path):
     folder, out = splat_scene(count=2000), tmp_path / "bake"
     told = bake_cost(folder, QUICK).disk_bytes
-    bake(folder.root, out, QUICK)
+    bake(load_scene(folder.root), out=out, options=QUICK)
     files = [path for path in out.rglob("*") if path.is_file()]
     took = sum(path.stat().st_size for path in files)
-    assert disk_use(out) == took
+    assert disk_usage(out) == took
     particles = load_manifest(out).particles
     # The rest is for two checkpoints, which are gone, and what is rounded up.
     assert took <= told <= 1.05 * took + 2 * 190 * particles
@@ -197,9 +195,11 @@ def test_what_it_takes_on_the_disk_is_told_before_and_freed_after(splat_scene, t
 
 def test_splats_of_another_place_are_refused(splat_scene, tmp_path):
     folder = splat_scene(count=50)
-    write_splats(folder.file("splats/ball0.ply"), placed(read_splats(folder.file("splats/ball0.ply")), up_by(5.0)))
+    write_splats(
+        folder.file("splats/ball0.ply"), transform_splats(read_splats(folder.file("splats/ball0.ply")), up_by(5.0))
+    )
     with pytest.raises(InputError, match="far from the mesh"):
-        bake(folder.root, tmp_path / "bake", QUICK)
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK)
 
 
 @pytest.mark.parametrize("name", ["../ball0.ply", "/etc/ball0.ply", "a\\b.ply", "c:x.ply"])
@@ -213,12 +213,12 @@ def test_a_scene_names_splats_inside_its_folder_only(splat_scene, name):
 
 def test_what_cannot_have_splats_is_said(splat_scene):
     folder = splat_scene(count=5)
-    item = folder.scene.objects[0]
-    assert load_scene(folder.root).scene == folder.scene
+    item = folder.model.objects[0]
+    assert load_scene(folder.root).model == folder.model
     with pytest.raises(InputError, match="PLY file of splats"):
         dataclasses.replace(item, splats="splats/ball0.glb")
     with pytest.raises(InputError, match="vertices_file"):
         dataclasses.replace(item, role="collider", motion=Motion(vertices_file="track.npz"))
     folder.file("splats/ball0.ply").unlink()
-    with pytest.raises(InputError, match="not there"):
+    with pytest.raises(InputError, match="which is missing"):
         load_scene(folder.root)

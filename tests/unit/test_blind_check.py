@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The blind check without its simulators: quotas, the seal, the score, and what the diagnosing process gets to see."""
 
+import argparse
 import dataclasses
 import hashlib
 import json
@@ -12,11 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.blind import BlindCheckOptions, blind_check, score_table
-from physgen.sim.diagnose.blind.case import BlindCase, TrialTruth, Truth
-from physgen.sim.diagnose.blind.plan import LEAST_CASES, plan_cases
-from physgen.sim.diagnose.blind.score import calibration_error, rank_auc, score_report, total
-from physgen.sim.diagnose.blind.seal import break_seal, publish, seal, verify
+from physgen.batch.commands.diagnosis_commands import add_blind_check, run_blind_check
+from physgen.blind_check import BlindCheckOptions, blind_check, score_table
+from physgen.blind_check.case import BlindCase, TrialTruth, Truth
+from physgen.blind_check.check import LEAST_CASES, plan_cases
+from physgen.blind_check.scoring import calibration_error, rank_auc, score_report, total_score
+from physgen.blind_check.seal import break_seal, publish, seal, verify
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.errors import InputError
 from physgen.sim.events import never
@@ -143,7 +145,7 @@ def test_totals_of_reports_made_by_hand(tmp_path):
         _scored(tmp_path, _truth("unknown", ()), "unknown", probability=0.95),
         _scored(tmp_path, two, "friction", probability=0.95, effects=["friction"]),
     ]
-    score = total(rows, seed=7, digest="d")
+    score = total_score(rows, seed=7, digest="d")
     assert score.right_first == pytest.approx(4 / 6)
     assert score.false_alarms == 0.5 and score.abstentions == 1.0
     assert score.two_cause_recall == 0.5 and score.two_cause_both == 0.0
@@ -158,7 +160,7 @@ def test_totals_of_reports_made_by_hand(tmp_path):
 def test_a_missing_report_is_wrong_and_named(tmp_path):
     truth = _truth()
     row = score_report("c", tmp_path / "nothing", truth.label(), truth.arrays(), 1.0)
-    score = total([row])
+    score = total_score([row])
     assert row.verdict is None and not row.right
     assert score.confusion["wind"] == {"no report": 1} and score.closed_median == 0.0
 
@@ -310,8 +312,22 @@ def test_a_seed_repeats_the_cases_and_fresh_ones_differ(tmp_path):
     assert rows(None)[0] != rows(None)[0]
 
 
+def test_the_command_says_the_numbers_of_the_check():
+    parser = argparse.ArgumentParser()
+    add_blind_check(parser)
+    assert parser.parse_args([]).cases == BlindCheckOptions().cases
+    assert f"{LEAST_CASES} or more (default {BlindCheckOptions().cases})" in parser.format_help().replace("\n", " ")
+
+
+def test_without_the_optional_package_the_command_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "physgen.blind_check", None)
+    options = argparse.Namespace(cases=4, seed=None, budget=None, out=None)
+    with pytest.raises(InputError, match=r"pip install 'physgen\[blind\]'"):
+        run_blind_check(options, lambda event: None, never)
+
+
 def test_bad_options_are_refused(tmp_path):
     with pytest.raises(InputError, match="seed is -1"):
         BlindCheckOptions(seed=-1)
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         BlindCheckOptions(out=tmp_path)

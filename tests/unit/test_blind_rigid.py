@@ -8,10 +8,17 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from physgen.sim.diagnose.blind.observe import Lens, draw_camera, project
-from physgen.sim.diagnose.blind.rigid_cases import rigid_case
-from physgen.sim.diagnose.blind.rigid_causes import KNOWN
-from physgen.sim.diagnose.blind.rigid_world import Body, RigidWorld, State, bounce_of_damping, damping_of_bounce, move
+from physgen.blind_check.case import Lens, draw_camera, project
+from physgen.blind_check.mujoco_world import (
+    Body,
+    RigidWorld,
+    State,
+    bounce_of_damping,
+    damping_of_bounce,
+    simulate_rigid,
+)
+from physgen.blind_check.rigid_cases import rigid_case
+from physgen.blind_check.rigid_causes import KNOWN_CAUSES
 from physgen.sim.diagnose.capture import load_capture, save_capture
 
 BALL = Body(shape="sphere", half=(0.04, 0.04, 0.04), density=400.0)
@@ -34,7 +41,7 @@ def _world(body=BALL, **changes):
 
 
 def test_free_flight_is_a_parabola_to_a_micrometre():
-    motion = move(_world(), _state(5.0, (1, 2, 3), (4, 5, 6)), TIMES)
+    motion = simulate_rigid(_world(), _state(5.0, (1, 2, 3), (4, 5, 6)), TIMES)
     fallen = 5 + 3 * TIMES - 4.905 * TIMES**2
     exact = np.column_stack([TIMES, 2 * TIMES, fallen])
     assert np.abs(motion.position - exact).max() < 1e-6
@@ -44,7 +51,7 @@ def test_free_flight_is_a_parabola_to_a_micrometre():
 @pytest.mark.parametrize("restitution", [0.25, 0.5, 0.75])
 def test_a_ball_bounces_to_e_squared_of_its_height(restitution):
     times = np.linspace(0, 0.6, 601)
-    motion = move(_world(restitution=restitution), _state(0.54), times)
+    motion = simulate_rigid(_world(restitution=restitution), _state(0.54), times)
     height = motion.position[:, 2] - 0.04
     first = int(np.argmin(height[:400]))
     assert np.sqrt(height[first:].max() / 0.5) == pytest.approx(restitution, abs=0.03)
@@ -59,7 +66,7 @@ def test_damping_and_bounce_are_inverse_and_a_free_spring_loses_nothing():
 
 def test_a_sliding_cube_is_braked_by_mu_g():
     times = np.arange(40) / 100
-    motion = move(_world(CUBE), _state(0.04, (1.5, 0, 0)), times)
+    motion = simulate_rigid(_world(CUBE), _state(0.04, (1.5, 0, 0)), times)
     exact = 1.5 * times - 0.5 * 0.3 * 9.81 * times**2
     assert np.abs(motion.position[:, 0] - exact).max() < 0.02 * exact[-1]
     # It rattles on its edges, so not each single frame has a contact.
@@ -68,8 +75,8 @@ def test_a_sliding_cube_is_braked_by_mu_g():
 
 def test_a_rolling_ball_keeps_rolling_unless_something_resists():
     start = _state(0.04, (1, 0, 0), (0, 25, 0))
-    plain = move(_world(), start, TIMES).position[:, 0]
-    held = move(_world(rolling=0.02 * 0.04), start, TIMES).position[:, 0]
+    plain = simulate_rigid(_world(), start, TIMES).position[:, 0]
+    held = simulate_rigid(_world(rolling=0.02 * 0.04), start, TIMES).position[:, 0]
     assert np.abs(plain - TIMES).max() < 1e-3
     # The torque -b N brakes the rolling ball by b g R / (R² + k²), k² = 2 R² / 5.
     lost = TIMES[-1] - held[-1]
@@ -78,7 +85,9 @@ def test_a_rolling_ball_keeps_rolling_unless_something_resists():
 
 def test_adhesion_takes_its_work_from_the_bounce():
     times, pull, reach = np.linspace(0, 0.5, 501), 30.0, 0.005
-    free, held = (move(_world(adhesion=a), _state(0.54), times).position[:, 2] - 0.04 for a in (None, (pull, reach)))
+    free, held = (
+        simulate_rigid(_world(adhesion=a), _state(0.54), times).position[:, 2] - 0.04 for a in (None, (pull, reach))
+    )
     low = int(np.argmin(free[:400]))
     # Work per mass: pull times half the reach, and as much as gravity does over the height that is lost.
     assert free[low:].max() - held[low:].max() == pytest.approx(pull * reach / 2 / 9.81, rel=0.25)
@@ -86,24 +95,24 @@ def test_adhesion_takes_its_work_from_the_bounce():
 
 def test_a_pellet_keeps_the_loaded_centre_on_the_parabola():
     fraction, at = 0.5, (0.03, 0.0, 0.0)
-    motion = move(_world(pellet=(fraction, at)), _state(5.0, spin=(0, 0, 10)), TIMES)
+    motion = simulate_rigid(_world(pellet=(fraction, at)), _state(5.0, spin=(0, 0, 10)), TIMES)
     centre = motion.position + motion.rotation @ (np.array(at) * fraction / (1 + fraction))
     speed = 10 * 0.03 * fraction / (1 + fraction)
     exact = np.column_stack([0.01 + 0 * TIMES, speed * TIMES, 5 - 4.905 * TIMES**2])
     assert np.abs(centre - exact).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", sorted(set(KNOWN) - {"camera_pose", "time_scale"}))
+@pytest.mark.parametrize("name", sorted(set(KNOWN_CAUSES) - {"camera_pose", "time_scale"}))
 def test_every_cause_changes_the_motion_and_more_with_its_strength(name):
     rng = np.random.default_rng(3)
     world = _world(BALL)
-    cause = KNOWN[name](world, rng)
+    cause = KNOWN_CAUSES[name](world, rng)
     starts = {"roll": _state(0.04, (1, 0, 0), (0, 25, 0)), "slide": _state(0.04, (1.5, 0, 0))}
     state = starts.get(cause.styles[0], _state(0.3, (1, 0.5, 0.5), (3, 4, 15)))
-    plain = move(world, state, TIMES).points(np.eye(3) * 0.04)
+    plain = simulate_rigid(world, state, TIMES).points(np.eye(3) * 0.04)
     sizes = []
     for strength in (cause.low, cause.low * 3):
-        moved = move(cause.change(strength, world), state, TIMES).points(np.eye(3) * 0.04)
+        moved = simulate_rigid(cause.change(strength, world), state, TIMES).points(np.eye(3) * 0.04)
         sizes.append(np.linalg.norm(moved - plain, axis=2).mean())
     assert 1e-6 < sizes[0] < sizes[1]
 

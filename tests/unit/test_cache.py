@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from physgen.sim.cache.lock import LOCK_FILE, folder_lock
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.folder_lock import LOCK_FILE, folder_lock
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 
@@ -158,7 +158,7 @@ def test_of_many_that_find_a_dead_lock_one_holds_the_folder_at_a_time(tmp_path):
     code = """
 import sys, time
 from pathlib import Path
-from physgen.sim.cache.lock import folder_lock
+from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.errors import InputError
 folder = Path(sys.argv[1])
 for _ in range(40):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The camera's path: where it leads, what is refused, and that a damaged file never passes."""
 
 import copy
@@ -9,14 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.scene.camera_move import Offset, is_still, moved, reach
 from physgen.sim.scene.camera_path import (
+    CameraOffset,
     CameraPath,
     MoveKey,
     PoseKey,
-    cameras,
-    interpolated,
+    interpolate_keys,
+    is_still,
     load_camera_path,
+    offset_camera,
+    reach,
+    sample_cameras,
     save_camera_path,
     swing,
 )
@@ -34,18 +38,22 @@ def photo_camera(pitch_deg=25.0):
 
 def follow(path, count=5, camera=None):
     camera = camera or photo_camera()
-    return cameras(path, camera, ground=Ground(), pivot=PIVOT, first_frame=1, count=count, fps=24.0)
+    return sample_cameras(path, camera, ground=Ground(), pivot=PIVOT, first_frame=1, count=count, fps=24.0)
 
 
 @settings(max_examples=50, deadline=None)
 @given(azimuth=st.floats(-29, 29), elevation=st.floats(-5, 29), dolly=st.floats(-0.29, 0.29))
 def test_around_the_pivot_and_nearer(azimuth, elevation, dolly):
     camera = photo_camera()
-    there = moved(camera, Offset(azimuth_deg=azimuth, elevation_deg=elevation, dolly=dolly), pivot=PIVOT, normal=UP)
+    there = offset_camera(
+        camera, CameraOffset(azimuth_deg=azimuth, elevation_deg=elevation, dolly=dolly), pivot=PIVOT, normal=UP
+    )
     # The pivot stays where it is in the picture, at the distance that was asked for.
     assert there.project(PIVOT)[:2] == pytest.approx(camera.project(PIVOT)[:2], abs=1e-6)
     assert reach(camera, there, PIVOT)[1] == pytest.approx(dolly, abs=1e-9)
-    alone = reach(camera, moved(camera, Offset(elevation_deg=elevation), pivot=PIVOT, normal=UP), PIVOT)[0]
+    alone = reach(camera, offset_camera(camera, CameraOffset(elevation_deg=elevation), pivot=PIVOT, normal=UP), PIVOT)[
+        0
+    ]
     assert alone == pytest.approx(abs(elevation), rel=0.02, abs=1e-6)
 
 
@@ -53,7 +61,7 @@ def test_signs_are_what_people_expect():
     camera = photo_camera()
 
     def there(**offset):
-        return moved(camera, Offset(**offset), pivot=PIVOT, normal=UP)
+        return offset_camera(camera, CameraOffset(**offset), pivot=PIVOT, normal=UP)
 
     assert there(azimuth_deg=10).position[0] > camera.position[0]
     assert there(elevation_deg=10).position[2] > camera.position[2]
@@ -82,7 +90,7 @@ def test_no_move_is_the_photos_own_camera_itself():
 
 def test_poses_lead_where_they_say_and_seconds_are_frames():
     camera = photo_camera()
-    end = moved(camera, Offset(azimuth_deg=8.0, dolly=-0.05), pivot=PIVOT, normal=UP)
+    end = offset_camera(camera, CameraOffset(azimuth_deg=8.0, dolly=-0.05), pivot=PIVOT, normal=UP)
     keys = [PoseKey(time_s=t, world_from_camera=c.world_from_camera) for t, c in ((0.0, camera), (4 / 24, end))]
     found = follow(CameraPath(poses=tuple(keys)), camera=camera)
     assert found[0] is camera
@@ -99,9 +107,9 @@ def test_poses_lead_where_they_say_and_seconds_are_frames():
 def test_interpolation_meets_its_keys_and_never_overshoots(values, widths, smooth):
     times = np.cumsum([0.0, *widths])[: len(values)]
     column = np.array(values)[:, None]
-    assert interpolated(times, column, times, smooth=smooth)[:, 0] == pytest.approx(values, abs=1e-9)
+    assert interpolate_keys(times, column, times, smooth=smooth)[:, 0] == pytest.approx(values, abs=1e-9)
     dense = np.linspace(-1.0, times[-1] + 1.0, 200)
-    found = interpolated(times, column, dense, smooth=smooth)[:, 0]
+    found = interpolate_keys(times, column, dense, smooth=smooth)[:, 0]
     index = np.clip(np.searchsorted(times, dense, side="right") - 1, 0, len(times) - 2)
     low, high = np.minimum(column[index, 0], column[index + 1, 0]), np.maximum(column[index, 0], column[index + 1, 0])
     assert (found >= low - 1e-9).all()

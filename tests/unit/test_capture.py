@@ -108,7 +108,7 @@ def test_pixels_need_a_camera(tmp_path):
         ({"colour": 3}, "colour: unknown field"),
         ({"trials": [{"name": "a", "file": "../../etc/x.npz", "role": "fit"}]}, "without '..'"),
         ({"trials": [{"name": "take01", "file": "take01.npz", "role": "test"}]}, "role is 'test'"),
-        ({"trials": [{"name": "take02", "file": "take02.npz", "role": "predict"}]}, "nothing to learn"),
+        ({"trials": [{"name": "take02", "file": "take02.npz", "role": "predict"}]}, "nothing to fit to"),
         ({"trials": [{"name": "take01", "file": "take01.npz", "role": "fit"}] * 2}, "two are called 'take01'"),
         ({"trials": [{"name": "a", "file": "none.npz", "role": "fit"}]}, "no such file"),
     ],
@@ -154,7 +154,7 @@ def test_objects_are_never_unpickled(folder):
 
 def test_an_archive_that_unpacks_to_too_much_is_refused_unread(folder, monkeypatch):
     monkeypatch.setattr("physgen.sim.diagnose.capture.MAX_TRIAL_BYTES", 1000)
-    with pytest.raises(InputError, match="shorten the take"):
+    with pytest.raises(InputError, match="shorten the trial"):
         load_capture(folder)
 
 

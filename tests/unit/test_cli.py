@@ -10,19 +10,31 @@ import cv2
 import numpy as np
 import pytest
 from physgen.batch.cli import build_parser, main
-from physgen.sim.app.bake_inputs import BakeOptions
-from physgen.sim.app.worker import MODULE, BakeJob, job_to_json
-from physgen.sim.cache.folder import disk_use
-from physgen.sim.cache.manifest import load_manifest
+from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.app.bake_worker import BakeJob, job_to_json
+from physgen.sim.cache.bake_folder import disk_usage, load_manifest
 from physgen.sim.scene.folder import load_scene
 
 
-def physgen(*arguments):
+def in_a_process(*arguments):
     """Run the command in a process of its own; exit code, events and standard error."""
     command = [sys.executable, "-m", "physgen.batch.cli", *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     events = [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
     return result.returncode, events, result.stderr
+
+
+@pytest.fixture
+def physgen(capfd):
+    """Run the command in this process; exit code, events and standard error."""
+
+    def run(*arguments):
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        output, errors = capfd.readouterr()
+        return code, [json.loads(line) for line in output.splitlines() if line.startswith("{")], errors
+
+    return run
 
 
 @pytest.fixture
@@ -116,14 +128,19 @@ def test_effects_are_listed_for_people_and_for_machines(capsys):
         (["run", "{photo}", "--box", "1,1,9,9", "--set", "object_1.density=-1", "--out", "{tmp}/v.mp4"], "density"),
     ],
 )
-def test_bad_input_is_exit_3_and_names_itself(arguments, words, tmp_path, photo):
+def test_bad_input_is_exit_3_and_names_itself(arguments, words, tmp_path, photo, physgen):
     code, _, errors = physgen(*(a.format(tmp=tmp_path, photo=photo) for a in arguments))
     assert code == 3 and errors.startswith("error: ") and words in errors, errors
     assert "Traceback" not in errors
     assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith(".")) == [photo.name]
 
 
-def test_stages_one_by_one(tmp_path, photo):
+def test_exit_code_and_error_leave_the_process(tmp_path):
+    code, events, errors = in_a_process("bake", tmp_path, "--out", tmp_path / "b")
+    assert code == 3 and not events and errors.startswith("error: ") and "scene.json" in errors, errors
+
+
+def test_stages_one_by_one(tmp_path, photo, physgen):
     scene, bake = tmp_path / "scene", tmp_path / "bake"
     reconstruct = [
         "reconstruct",
@@ -141,7 +158,7 @@ def test_stages_one_by_one(tmp_path, photo):
     code, events, errors = physgen(*reconstruct, "--preset", "soft", "--velocity", "0,0,0.8")
     assert code == 0, errors
     assert events[-1] == {"event": "done", "scene": str(scene)}
-    ball = load_scene(scene).scene.objects[0]
+    ball = load_scene(scene).model.objects[0]
     assert (ball.name, ball.material.preset, ball.velocity) == ("ball", "soft", (0.0, 0.0, 0.8))
     assert ball.size_m == pytest.approx(0.08, rel=0.02)
 
@@ -159,7 +176,7 @@ def test_stages_one_by_one(tmp_path, photo):
     assert cost["event"] == "done" and cost["particles"] == first.particles and cost["substeps"] > 0
     assert cost["seconds"] > 0 and cost["memory_bytes"] > 2**20 and isinstance(cost["warnings"], list)
     # Nothing that a bake of four frames leaves is larger than what was said.
-    assert cost["disk_bytes"] >= disk_use(bake)
+    assert cost["disk_bytes"] >= disk_usage(bake)
     assert physgen("estimate", scene, *heavy)[1][-1] == cost
     assert (scene / "scene.json").read_bytes() == said
     code, events, errors = physgen("bake", scene, "--estimate", "--set", "ball.velocity=0,0,1e7")
@@ -175,7 +192,7 @@ def test_stages_one_by_one(tmp_path, photo):
 
     # What is not said is not remembered: the same command gives the same scene, whatever ran before.
     physgen(*reconstruct)
-    ball = load_scene(scene).scene.objects[0]
+    ball = load_scene(scene).model.objects[0]
     assert (ball.material.preset, ball.velocity) == ("rubber", (0.0, 0.0, 0.0)), "as things called ball are"
 
     # The same again: nothing.
@@ -185,7 +202,7 @@ def test_stages_one_by_one(tmp_path, photo):
 
 
 def test_doctor_finds_this_environment_fit():
-    code, events, errors = physgen("doctor", "--json")
+    code, events, errors = in_a_process("doctor", "--json")
     report = {name: ok for name, ok, _ in events[-1]["report"]}
     assert report["simulation"] and report["numpy"], errors
     assert (code == 0) == all(report.values())
@@ -210,11 +227,11 @@ def test_a_reader_that_leaves_is_no_crash(photo, tmp_path):
     assert process.wait() == 130 and b"Traceback" not in errors, errors
 
 
-def test_a_bake_is_of_the_scene_that_was_asked_for(photo, tmp_path):
+def test_a_bake_is_of_the_scene_that_was_asked_for(photo, tmp_path, physgen):
     scene = tmp_path / "scene"
     physgen("reconstruct", photo, "--box", "105,85,215,195", "--out", scene)
     job = BakeJob(scene=str(scene), out=str(tmp_path / "b"), options=BakeOptions(frames=2), expected_inputs="0" * 64)
     (tmp_path / "job.json").write_text(json.dumps(job_to_json(job)))
-    command = [sys.executable, "-m", MODULE, str(tmp_path / "job.json")]
+    command = [sys.executable, "-m", "physgen.sim.app.bake_worker", str(tmp_path / "job.json")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 3 and "changed by another run" in json.loads(result.stdout.splitlines()[-1])["message"]

@@ -8,16 +8,16 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.composite.metrics import psnr
+from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.errors import Cancelled, InputError, SimulationError
-from physgen.sim.gaussians.compose.asset import Piece, Reference
-from physgen.sim.gaussians.compose.compose import compose
-from physgen.sim.gaussians.compose.options import METHODS, ComposeOptions
-from physgen.sim.gaussians.compose.orbit import orbit
-from physgen.sim.gaussians.physics.penetration import penetration_of_meshes
+from physgen.sim.gaussians.compose.compose_options import METHODS, ComposeOptions
+from physgen.sim.gaussians.compose.composition import compose
+from physgen.sim.gaussians.compose.composition_parts import CompositionPart, Reference
+from physgen.sim.gaussians.compose.penetration import penetration_of_meshes
+from physgen.sim.gaussians.mesh_to_splats import splats_on_mesh
 from physgen.sim.gaussians.raster.rasteriser import Rasteriser
-from physgen.sim.gaussians.sample import splats_on_mesh
 from physgen.sim.gaussians.splats import joined
+from physgen.sim.gaussians.views.posed_images import orbit_cameras
 from physgen.sim.mpm.colliders import Surface
 
 SIZE = 64
@@ -27,7 +27,7 @@ SHORT = ComposeOptions(steps=20, size=SIZE, cells=16, substeps=10)
 
 def piece(name, mesh, colour, count=700):
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    return Piece(
+    return CompositionPart(
         name=name,
         splats=splats_on_mesh(vertices, faces, colour(vertices), count),
         surface=Surface(vertices=vertices, faces=faces),
@@ -66,7 +66,7 @@ def ball():
 
 @pytest.fixture(scope="module")
 def reference(ring, ball):
-    camera = orbit(np.concatenate([ring.splats.centres, ball.splats.centres]), SIZE)[0]
+    camera = orbit_cameras(np.concatenate([ring.splats.centres, ball.splats.centres]), SIZE)[0]
     pixels = Rasteriser().render(joined([ball.splats, ring.splats]), camera).colour.astype(np.float64)
     return Reference(camera=camera, pixels=np.clip(pixels, 0, 1), backdrop=np.ones_like(pixels))
 
@@ -89,11 +89,11 @@ def test_methods_do_what_they_are_for(ring, ball, reference):
     left, quality, astray = {}, {}, {}
     for method in METHODS:
         result = compose([ring, begin], reference=reference, options=dataclasses.replace(SHORT, method=method))
-        assert result.pieces[0] is ring and result.pieces[1].name == "ball"
+        assert result.parts[0] is ring and result.parts[1].name == "ball"
         assert [record.step for record in result.history] == list(range(SHORT.steps))
-        left[method] = overlap(result.pieces) / before
-        quality[method] = seen(result.pieces, reference.camera, truth)
-        way = result.pieces[1].splats.centres - ball.splats.centres
+        left[method] = overlap(result.parts) / before
+        quality[method] = seen(result.parts, reference.camera, truth)
+        way = result.parts[1].splats.centres - ball.splats.centres
         astray[method] = np.sqrt((way**2).sum(axis=1).mean())
     started = seen([ring, begin], reference.camera, truth)
     assert left["pse-sds"] <= 0.01 and left["ppps"] <= 0.01
@@ -110,14 +110,14 @@ def test_equal_input_gives_equal_bytes(ring, ball, reference):
     first, second = (compose([ring, swollen(ball)], reference=reference, options=options) for _ in range(2))
     for name in ("centres", "scales", "rotations"):
         np.testing.assert_array_equal(
-            getattr(first.pieces[1].splats, name), getattr(second.pieces[1].splats, name), err_msg=name
+            getattr(first.parts[1].splats, name), getattr(second.parts[1].splats, name), err_msg=name
         )
-    np.testing.assert_array_equal(first.pieces[1].surface.vertices, second.pieces[1].surface.vertices)
+    np.testing.assert_array_equal(first.parts[1].surface.vertices, second.parts[1].surface.vertices)
 
 
 def test_what_is_not_moved_is_kept(ring, ball, reference):
     begin = swollen(ball)
-    after = compose([ring, begin], reference=reference, options=dataclasses.replace(SHORT, steps=2)).pieces[1]
+    after = compose([ring, begin], reference=reference, options=dataclasses.replace(SHORT, steps=2)).parts[1]
     np.testing.assert_array_equal(after.splats.colours, begin.splats.colours)
     np.testing.assert_array_equal(after.splats.opacities, begin.splats.opacities)
     np.testing.assert_array_equal(after.surface.faces, begin.surface.faces)
@@ -134,11 +134,11 @@ def test_of_three_the_later_yield_to_all_before(ring, ball):
     options = dataclasses.replace(SHORT, method="ppps", steps=8)
     begin = [ring, upper, swollen(ball)]
     result = compose(begin, reference=None, options=options)
-    assert [one.name for one in result.pieces] == ["ring", "upper", "ball"]
-    assert result.pieces[0] is ring
+    assert [one.name for one in result.parts] == ["ring", "upper", "ball"]
+    assert result.parts[0] is ring
     for count in (2, 3):
-        assert overlap(result.pieces[:count]) <= 0.01 * overlap(begin)
-    assert {record.piece for record in result.history} == {"upper", "ball"}
+        assert overlap(result.parts[:count]) <= 0.01 * overlap(begin)
+    assert {record.part for record in result.history} == {"upper", "ball"}
 
 
 class Broken:
@@ -152,7 +152,7 @@ def test_a_broken_guidance_is_said(ring, ball, reference):
     options = dataclasses.replace(SHORT, steps=2)
     result = compose([ring, swollen(ball)], reference=reference, guidance={"ball": Broken()}, options=options)
     assert any("Broken" in note for note in result.notes)
-    assert np.isfinite(result.pieces[1].splats.centres).all()
+    assert np.isfinite(result.parts[1].splats.centres).all()
     with pytest.raises(SimulationError, match="Broken"):
         compose(
             [ring, swollen(ball)],
@@ -167,7 +167,7 @@ def test_what_cannot_be_composed_is_said(ring, ball, reference):
         compose([ring], reference=reference)
     with pytest.raises(InputError, match="without a picture"):
         compose([ring, ball], reference=None)
-    with pytest.raises(InputError, match="no piece of that name"):
+    with pytest.raises(InputError, match="no deformable object has that name"):
         compose([ring, ball], reference=reference, guidance={"ring": Broken()})
     holed = dataclasses.replace(ring, surface=Surface(vertices=ring.surface.vertices, faces=ring.surface.faces[1:]))
     with pytest.raises(InputError, match="ring"):
@@ -175,4 +175,4 @@ def test_what_cannot_be_composed_is_said(ring, ball, reference):
     with pytest.raises(Cancelled):
         compose([ring, swollen(ball)], reference=reference, options=SHORT, cancelled=lambda: True)
     with pytest.raises(InputError, match="has 3 splats"):
-        dataclasses.replace(ball, splats=ball.splats.chosen(np.arange(3)))
+        dataclasses.replace(ball, splats=ball.splats.subset(np.arange(3)))

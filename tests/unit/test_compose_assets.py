@@ -9,13 +9,19 @@ import math
 
 import numpy as np
 import pytest
-from physgen.benchmarks.assets import fields, sheet, table
-from physgen.benchmarks.assets.cameras import FITTING, HELD_OUT, REFERENCE, RING, cameras
-from physgen.benchmarks.assets.catalogue import NAMES, asset
-from physgen.benchmarks.assets.meshing import meshed
-from physgen.benchmarks.assets.penetration import common_volume, overlap, volume
-from physgen.benchmarks.assets.pictures import kept_as, shown
-from physgen.benchmarks.assets.warp import Bulge, Warp
+from physgen.benchmarks.compose_assets import results, sdf
+from physgen.benchmarks.compose_assets.catalogue import NAMES, asset
+from physgen.benchmarks.compose_assets.pictures import (
+    FITTING,
+    HELD_OUT,
+    REFERENCE,
+    RING,
+    cache_name,
+    cameras,
+    renderings,
+)
+from physgen.benchmarks.compose_assets.sdf import Bulge, Warp, mesh_of
+from physgen.benchmarks.compose_assets.trial import common_volume, overlap, volume
 from PIL import Image
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -64,7 +70,7 @@ def test_overlap_of_two_balls_is_the_lens_between_them():
     first, second, apart = 0.05, 0.04, 0.07
     parts = []
     for centre, radius in ((0.0, first), (apart, second)):
-        vertices, faces = meshed(fields.ball((centre, 0, 0), radius), (-0.06,) * 3, (0.12, 0.06, 0.06), 0.002)
+        vertices, faces = mesh_of(sdf.sphere((centre, 0, 0), radius), (-0.06,) * 3, (0.12, 0.06, 0.06), 0.002)
         parts.append(dataclasses.replace(asset("bowl").background, vertices=vertices, faces=faces, colours=vertices))
     a, b = parts
     check_closed_manifold(a)
@@ -81,11 +87,11 @@ def test_overlap_of_two_balls_is_the_lens_between_them():
 @pytest.mark.parametrize(
     "field",
     [
-        fields.ball((0.01, 0, 0), 0.03),
-        fields.cone((0, 0, 0), (0.03, 0.01, 0.05), 0.02, 0.008),
-        fields.block((0, 0, 0.01), (0.02, 0.03, 0.01), 0.004),
-        fields.tyre((0, 0, 0), 0.03, 0.01, (1.0, 1.0, 0.3)),
-        fields.turned([(0.01, 0.0), (0.03, 0.0), (0.02, 0.04), (0.01, 0.03)], 0.002),
+        sdf.sphere((0.01, 0, 0), 0.03),
+        sdf.cone((0, 0, 0), (0.03, 0.01, 0.05), 0.02, 0.008),
+        sdf.box_sdf((0, 0, 0.01), (0.02, 0.03, 0.01), 0.004),
+        sdf.torus((0, 0, 0), 0.03, 0.01, (1.0, 1.0, 0.3)),
+        sdf.revolved([(0.01, 0.0), (0.03, 0.0), (0.02, 0.04), (0.01, 0.03)], 0.002),
     ],
 )
 def test_distances_of_solids_are_distances(field):
@@ -135,13 +141,13 @@ def test_cameras_ring_the_asset_and_hold_it():
 
 def test_folder_changes_with_what_is_seen():
     item = asset("bowl")
-    name = kept_as(item, 128)
-    assert name == kept_as(item, 128) and name.startswith("bowl-128-")
+    name = cache_name(item, 128)
+    assert name == cache_name(item, 128) and name.startswith("bowl-128-")
     paler = dataclasses.replace(item.background, colours=0.9 * item.background.colours)
     larger = item.background.moved(1.01 * item.background.vertices)
-    others = {kept_as(dataclasses.replace(item, background=other), 128) for other in (paler, larger)}
-    assert len({name, kept_as(item, 256), *others}) == 4
-    assert [sub for sub, _, _ in shown(item)] == ["composition", "ball", "bowl"]
+    others = {cache_name(dataclasses.replace(item, background=other), 128) for other in (paler, larger)}
+    assert len({name, cache_name(item, 256), *others}) == 4
+    assert [sub for sub, _, _ in renderings(item)] == ["composition", "ball", "bowl"]
 
 
 def row(method, psnr, after, **changes):
@@ -159,7 +165,7 @@ def row(method, psnr, after, **changes):
         "stays_together": True,
         "cpu_s": 10.0,
     }
-    return table.Row(**{**values, **changes})
+    return results.Row(**{**values, **changes})
 
 
 ROWS = [
@@ -172,8 +178,8 @@ ROWS = [
 
 
 def test_means_are_over_assets_in_the_papers_order():
-    found = table.means([*ROWS, row("start", 20.0, 2e-6)])
-    assert [mean.method for mean in found] == [*table.METHODS, "start"]
+    found = results.means([*ROWS, row("start", 20.0, 2e-6)])
+    assert [mean.method for mean in found] == [*results.METHODS, "start"]
     best = found[0]
     assert (best.assets, best.stay_together) == (2, 1)
     assert best.psnr_reference == pytest.approx(32.0) and best.cpu_s == pytest.approx(15.0)
@@ -182,10 +188,10 @@ def test_means_are_over_assets_in_the_papers_order():
 
 
 def test_verdicts_say_what_is_and_what_is_not_so():
-    assert [verdict.good for verdict in table.verdicts(ROWS)] == [True, True, True, True]
+    assert [verdict.good for verdict in results.verdicts(ROWS)] == [True, True, True, True]
     worse = [row("pse-sds", 29.0, 1e-6), *ROWS[3:]]
-    assert [verdict.good for verdict in table.verdicts(worse)] == [False, False, False, False]
-    assert table.verdicts([row("sds", 20.0, 0.0)]) == ()
+    assert [verdict.good for verdict in results.verdicts(worse)] == [False, False, False, False]
+    assert results.verdicts([row("sds", 20.0, 0.0)]) == ()
 
 
 def test_nothing_left_of_nothing():
@@ -194,14 +200,14 @@ def test_nothing_left_of_nothing():
 
 
 def test_tables_show_every_number_once_in_its_column():
-    lines = table.text(ROWS).splitlines()
+    lines = results.text(ROWS).splitlines()
     assert lines[0].split()[:3] == ["asset", "method", "PSNR"]
     assert any(line.startswith("pse-sds") and "29.79" in line and "32.00" in line for line in lines)
-    assert "Part123 17.52" in table.text(ROWS) and "25.02" in table.markdown(ROWS)
-    for block in table.markdown(ROWS).split("\n\n"):
+    assert "Part123 17.52" in results.text(ROWS) and "25.02" in results.markdown(ROWS)
+    for block in results.markdown(ROWS).split("\n\n"):
         if block.startswith("|"):
             assert len({line.count("|") for line in block.strip().splitlines()}) == 1
-    document = table.document([*ROWS, row("sds", math.inf, 0.0)])
+    document = results.document([*ROWS, row("sds", math.inf, 0.0)])
     again = json.loads(json.dumps(document, allow_nan=False))
     assert again["rows"][1]["left"] == 0 and again["rows"][-1]["psnr_reference"] is None
     assert again["paper"]["table_2_psnr_db"]["ppps+sds"] == 20.74
@@ -209,10 +215,12 @@ def test_tables_show_every_number_once_in_its_column():
 
 def test_contact_sheet_has_a_place_for_every_picture(tmp_path):
     red = np.broadcast_to(np.array([1.0, 0.0, 0.0]), (64, 64, 3))
-    line = sheet.Line(title="ring", truth=red, start=red, methods={"sds": red, "ppps": None}, captions={"sds": "30 dB"})
-    sheet.contact_sheet([line, line], tmp_path / "sheet.png")
+    line = results.Line(
+        title="ring", truth=red, start=red, methods={"sds": red, "ppps": None}, captions={"sds": "30 dB"}
+    )
+    results.contact_sheet([line, line], tmp_path / "sheet.png")
     pixels = np.asarray(Image.open(tmp_path / "sheet.png"))
-    tall = sheet.SIDE + sheet.LABEL
-    assert pixels.shape == (2 * tall, 4 * sheet.SIDE, 3)
-    middles = pixels[tall + sheet.LABEL + sheet.SIDE // 2, sheet.SIDE // 2 :: sheet.SIDE]
+    tall = results.SIDE + results.LABEL
+    assert pixels.shape == (2 * tall, 4 * results.SIDE, 3)
+    middles = pixels[tall + results.LABEL + results.SIDE // 2, results.SIDE // 2 :: results.SIDE]
     assert middles.tolist() == [[255, 0, 0]] * 3 + [[255, 255, 255]]

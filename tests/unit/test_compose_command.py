@@ -6,8 +6,8 @@ import json
 import pytest
 import trimesh
 from physgen.batch import cli
-from physgen.batch.compositions import _lines
-from physgen.sim.gaussians.compose.options import ComposeOptions
+from physgen.batch.commands.compose_commands import _lines
+from physgen.sim.gaussians.compose.compose_options import ComposeOptions
 
 from .compose_scenes import a_scene, ball
 
@@ -34,11 +34,11 @@ def test_the_defaults_are_the_optimisers():
     ("arguments", "words"),
     [
         ((), "has no photo"),
-        (("--no-picture", "--method", "sds"), "looks at the picture"),
+        (("--no-picture", "--method", "sds"), "needs the picture"),
         (("--no-picture", "--steps", "0"), "steps is 0"),
         (("--no-picture", "--objects", "a,c"), "there is no 'c'"),
         (("--no-picture",), "do not touch: they are 20 cm apart"),
-        (("--no-picture", "--guidance", "exact:nowhere"), "there is no nowhere"),
+        (("--no-picture", "--guidance", "exact:nowhere"), "no such folder nowhere"),
     ],
 )
 def test_bad_input_is_exit_3(tmp_path, capsys, arguments, words):
@@ -71,5 +71,5 @@ def test_the_numbers_are_for_people():
     }
     assert _lines(record) == [
         "a and b: penetration 29 → 0 cm³ (5.6 → 0 %), deepest 20 → 0 mm",
-        "a, b: likeness to the photo 14.48 → ∞ dB, SSIM 0.760 → 1.000",
+        "a, b: similarity to the photo 14.48 → ∞ dB, SSIM 0.760 → 1.000",
     ]

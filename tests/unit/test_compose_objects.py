@@ -4,11 +4,10 @@
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.compose_ground import holds, with_ground
-from physgen.sim.app.compose_objects import groups, read_body
+from physgen.sim.app.compose_inputs import contact_groups, ground_supports, read_compose_object, with_ground_slab
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.distance import signed_distance
+from physgen.sim.mpm.geometry.signed_distance import signed_distance
 from physgen.sim.scene.model import Ground
 
 from .compose_scenes import a_scene, ball
@@ -20,19 +19,19 @@ def names(group):
 
 def test_those_that_touch_hang_together_frontmost_first(tmp_path):
     meshes = {"a": ball(0), "b": ball(0.09), "far": ball(1), "c": ball(0.18), "x": ball(3), "y": ball(3.05)}
-    found = groups(a_scene(tmp_path / "s", meshes), (), cells=40)
+    found = contact_groups(a_scene(tmp_path / "s", meshes), (), cells=40)
     # What is listed last has the smallest occlusion order.
     assert sorted(map(names, found)) == [["c", "b", "a"], ["y", "x"]]
     folder = a_scene(tmp_path / "t", meshes, a={"role": "collider"})
-    assert sorted(map(names, groups(folder, (), cells=40))) == [["a", "c", "b"], ["y", "x"]]
-    assert names(groups(folder, ("a", "b"), cells=40)[0]) == ["a", "b"]
+    assert sorted(map(names, contact_groups(folder, (), cells=40))) == [["a", "c", "b"], ["y", "x"]]
+    assert names(contact_groups(folder, ("a", "b"), cells=40)[0]) == ["a", "b"]
 
 
 def test_the_one_that_passes_through_at_an_edge_is_found(tmp_path):
     """A thin wire through a coarse box: no vertex of either is near the other."""
     wire = trimesh.creation.cylinder(radius=0.001, height=2.0)
     folder = a_scene(tmp_path / "s", {"box": trimesh.creation.box((0.3, 0.3, 0.3)), "wire": wire})
-    assert names(groups(folder, (), cells=40)[0]) == ["wire", "box"]
+    assert names(contact_groups(folder, (), cells=40)[0]) == ["wire", "box"]
 
 
 @pytest.mark.parametrize(
@@ -40,7 +39,7 @@ def test_the_one_that_passes_through_at_an_edge_is_found(tmp_path):
     [
         ((), "'b' and 'a' do not touch: they are 20 cm apart"),
         (("a", "b"), "'a' and 'b' do not touch: they are 20 cm apart"),
-        (("a",), "give two or more"),
+        (("a",), "give at least two"),
         (("a", "a"), "every object once"),
         (("a", "q"), "there is no 'q'"),
     ],
@@ -48,29 +47,29 @@ def test_the_one_that_passes_through_at_an_edge_is_found(tmp_path):
 def test_what_does_not_touch_is_said_with_the_distance(tmp_path, chosen, words):
     folder = a_scene(tmp_path / "s", {"a": ball(0), "b": ball(0.3)})
     with pytest.raises(InputError, match=words):
-        groups(folder, chosen, cells=40)
+        contact_groups(folder, chosen, cells=40)
 
 
 def test_what_cannot_be_fitted_is_refused(tmp_path):
     inner = a_scene(tmp_path / "in", {"seed": ball(0, 0.02), "fruit": ball(0)})
-    with pytest.raises(InputError, match="'seed': is wholly inside 'fruit'"):
-        groups(inner, (), cells=40)
+    with pytest.raises(InputError, match="'seed': is completely inside 'fruit'"):
+        contact_groups(inner, (), cells=40)
     bowl = ball(0.08)
     bowl.update_faces(np.arange(len(bowl.faces)) > 5)
     with pytest.raises(InputError, match=r"'bowl': mesh is not closed.*fill its holes"):
-        groups(a_scene(tmp_path / "open", {"a": ball(0), "bowl": bowl}), (), cells=40)
+        contact_groups(a_scene(tmp_path / "open", {"a": ball(0), "bowl": bowl}), (), cells=40)
     fixed = a_scene(tmp_path / "fixed", {"a": ball(0), "b": ball(0.08)}, b={"role": "collider"})
-    with pytest.raises(InputError, match="'b': is a collider and yields to nobody"):
-        groups(fixed, ("a", "b"), cells=40)
+    with pytest.raises(InputError, match="'b': is a collider and cannot be deformed"):
+        contact_groups(fixed, ("a", "b"), cells=40)
     two = a_scene(tmp_path / "two", {"a": ball(0), "b": ball(0.09), "c": ball(1), "d": ball(1.09)})
     with pytest.raises(InputError, match="do not touch"):
-        groups(two, ("a", "b", "c", "d"), cells=40)
+        contact_groups(two, ("a", "b", "c", "d"), cells=40)
 
 
 def test_a_mirrored_mesh_has_its_faces_outward(tmp_path):
     mirror = ((-2.0, 0, 0, 1), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0))
     folder = a_scene(tmp_path / "s", {"a": ball(0)}, a={"world_from_mesh": mirror})
-    surface = read_body(folder, folder.scene.objects[0]).surface
+    surface = read_compose_object(folder, folder.model.objects[0]).surface
     assert trimesh.Trimesh(surface.vertices, surface.faces).volume > 0
 
 
@@ -80,11 +79,13 @@ def test_the_ground_is_part_of_what_stays():
     tilted = np.array([0.0, 0.6, 0.8])
     for normal in ((0.0, 0.0, 1.0), tuple(tilted)):
         ground = Ground(normal=normal, point=(0.0, 0.0, -0.02))
-        both = with_ground(Surface(vertices=stays.vertices, faces=stays.faces), ground, [yields])
+        both = with_ground_slab(Surface(vertices=stays.vertices, faces=stays.faces), ground, [yields])
         lattice = signed_distance(both, 0.005, margin=0.0)
         below = np.array([0.09, 0.0, -0.02]) - 0.01 * np.asarray(normal)
         distance, way = lattice.at(np.array([below, (0.0, 0.0, 0.05)]))
         assert distance[0] == pytest.approx(-0.01, abs=1e-4) and distance[1] < 0
         assert way[0] / np.linalg.norm(way[0]) == pytest.approx(normal, abs=0.02)
-    assert holds(Ground(), yields) and not holds(None, yields)
-    assert not holds(Ground(point=(0, 0, 0.05)), yields) and not holds(Ground(point=(0, 0, -1)), yields)
+    assert ground_supports(Ground(), yields) and not ground_supports(None, yields)
+    assert not ground_supports(Ground(point=(0, 0, 0.05)), yields) and not ground_supports(
+        Ground(point=(0, 0, -1)), yields
+    )

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.compose.asset import Reference
-from physgen.sim.gaussians.compose.compose import scaled
-from physgen.sim.gaussians.compose.options import ComposeOptions
-from physgen.sim.gaussians.compose.orbit import orbit
-from physgen.sim.gaussians.compose.rates import CAP, Rate
+from physgen.sim.gaussians.compose.compose_options import ComposeOptions
+from physgen.sim.gaussians.compose.composition import MAX_STEP, StepScale, scaled_reference
+from physgen.sim.gaussians.compose.composition_parts import Reference
+from physgen.sim.gaussians.views.posed_images import orbit_cameras
 
 
 @pytest.mark.parametrize(
@@ -32,21 +31,21 @@ def test_options_out_of_range_are_named(changes, said):
 @given(st.floats(1e-12, 1e12), st.integers(0, 2**32 - 1))
 def test_steps_do_not_depend_on_the_unit_of_the_loss(unit, seed):
     gradients = np.random.default_rng(seed).normal(size=(300, 3))
-    one = Rate(first=0.1, last=0.5, steps=10).steps_down(gradients, 0)
-    np.testing.assert_allclose(Rate(first=0.1, last=0.5, steps=10).steps_down(unit * gradients, 0), one, rtol=1e-9)
+    one = StepScale(first=0.1, last=0.5, steps=10).steps_down(gradients, 0)
+    np.testing.assert_allclose(StepScale(first=0.1, last=0.5, steps=10).steps_down(unit * gradients, 0), one, rtol=1e-9)
     # Downhill, and the fastest hundredth as far as was asked for.
     assert (np.sum(one * gradients, axis=1) < 0).all()
     assert np.quantile(np.linalg.norm(one, axis=1), 0.99) == pytest.approx(0.1, rel=1e-6)
 
 
 def test_the_factor_is_kept_and_fades():
-    rate, gradients = Rate(first=1.0, last=0.1, steps=11), np.ones((50, 3))
+    rate, gradients = StepScale(first=1.0, last=0.1, steps=11), np.ones((50, 3))
     first = rate.steps_down(gradients, 0)
     np.testing.assert_allclose(rate.steps_down(0.5 * gradients, 0), 0.5 * first)
     np.testing.assert_allclose(rate.steps_down(gradients, 10), 0.1 * first)
     far = rate.steps_down(1e6 * gradients, 0)
-    np.testing.assert_allclose(np.linalg.norm(far, axis=1), CAP)
-    np.testing.assert_array_equal(Rate(first=0.0, last=1.0, steps=3).steps_down(gradients, 0), 0.0)
+    np.testing.assert_allclose(np.linalg.norm(far, axis=1), MAX_STEP)
+    np.testing.assert_array_equal(StepScale(first=0.0, last=1.0, steps=3).steps_down(gradients, 0), 0.0)
     np.testing.assert_array_equal(rate.steps_down(0 * gradients, 3), 0.0)
 
 
@@ -54,7 +53,7 @@ def test_the_factor_is_kept_and_fades():
 def test_an_orbit_sees_everything(seed):
     random = np.random.default_rng(seed)
     points = random.normal(size=(60, 3)) * random.uniform(0.01, 2.0, 3) + random.normal(size=3)
-    for camera in orbit(points, 64):
+    for camera in orbit_cameras(points, 64):
         seen = camera.project(points)
         assert (seen[:, 2] > 0).all()
         assert seen[:, :2].min() > 0 and seen[:, :2].max() < 64
@@ -63,14 +62,14 @@ def test_an_orbit_sees_everything(seed):
 
 
 def test_a_reference_is_made_smaller_with_its_camera():
-    camera = orbit(np.eye(3), 400)[0]
+    camera = orbit_cameras(np.eye(3), 400)[0]
     pixels = np.zeros((400, 400, 3))
     pixels[:, 200:] = 1.0
-    small = scaled(Reference(camera=camera, pixels=pixels, backdrop=np.ones((400, 400, 3))), 100)
+    small = scaled_reference(Reference(camera=camera, pixels=pixels, backdrop=np.ones((400, 400, 3))), 100)
     assert small.pixels.shape == (100, 100, 3) and small.pixels[:, 50:].min() == 1.0
     point = np.array([[0.3, 0.2, 0.5]])
     np.testing.assert_allclose(small.camera.project(point)[:, :2], camera.project(point)[:, :2] / 4)
     again = Reference(camera=camera, pixels=pixels, backdrop=pixels)
-    assert scaled(again, 400) is again
+    assert scaled_reference(again, 400) is again
     with pytest.raises(InputError, match="reference pixels have shape"):
         Reference(camera=camera, pixels=pixels[:10], backdrop=pixels)

@@ -7,20 +7,18 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.compose import compose_scene
-from physgen.sim.app.compose_picture import reference_of
-from physgen.sim.app.compose_request import ComposeRequest
+from physgen.sim.app.compose_inputs import photo_reference
+from physgen.sim.app.compose_scene import compose
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.gaussians.compose.options import ComposeOptions
-from physgen.sim.gaussians.moving import placed
-from physgen.sim.gaussians.ply.read import read_splats
-from physgen.sim.gaussians.ply.write import write_splats
-from physgen.sim.gaussians.sample import splats_on_mesh
+from physgen.sim.gaussians.compose.compose_options import ComposeOptions, ComposeRequest
+from physgen.sim.gaussians.mesh_to_splats import splats_on_mesh
+from physgen.sim.gaussians.splat_ply import read_splats, write_splats
+from physgen.sim.gaussians.splats import transform_splats
 from physgen.sim.mpm.colliders import Surface
 from physgen.sim.scene.folder import load_scene, save_scene
-from physgen.sim.scene.glb import read_textured_mesh
 from physgen.sim.scene.meshes import load_object_mesh
-from physgen.sim.scene.model import Camera, Ground, Scene, SceneObject
+from physgen.sim.scene.model import Camera, Ground, SceneModel, SceneObject
+from physgen.sim.scene.textured_mesh import read_textured_mesh
 from PIL import Image
 
 RADIUS = 0.05
@@ -62,26 +60,26 @@ def scene(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
     surface = Surface(vertices=np.asarray(ball.vertices) + shift, faces=np.asarray(ball.faces))
     splats = splats_on_mesh(surface.vertices, surface.faces, np.full((len(ball.vertices), 3), 0.3), 300, seed=1)
-    write_splats(root / "splats/right.ply", placed(splats, np.linalg.inv(np.asarray(TURNED))))
+    write_splats(root / "splats/right.ply", transform_splats(splats, np.linalg.inv(np.asarray(TURNED))))
     items = tuple(
         SceneObject(
             name=name, mesh=f"meshes/{name}.glb", size_m=0.1, world_from_mesh=TURNED, occlusion_order=order, splats=file
         )
         for name, order, file in (("right", 1, "splats/right.ply"), ("left", 0, None))
     )
-    return save_scene(root, Scene(camera=CAMERA, objects=items, ground=Ground(), photo=None, background=None))
+    return save_scene(root, SceneModel(camera=CAMERA, objects=items, ground=Ground(), photo=None, background=None))
 
 
 def world(folder, name):
-    item = next(item for item in folder.scene.objects if item.name == name)
+    item = next(item for item in folder.model.objects if item.name == name)
     return load_object_mesh(folder, item).vertices
 
 
 def test_what_passes_through_is_pushed_out_and_the_rest_stays(scene, tmp_path):
     out, said = tmp_path / "out", []
     request = ComposeRequest(options=PHYSICS, picture=False, splats=1000)
-    folder = compose_scene(scene.root, out, request, said.append)
-    assert folder.root == out and load_scene(out).scene == folder.scene
+    folder = compose(load_scene(scene.root), out=out, request=request, on_event=said.append)
+    assert folder.root == out and load_scene(out).model == folder.model
     # The frontmost stays, byte for byte, and so does everything that is no matter of places.
     assert (out / "meshes/left.glb").read_bytes() == (scene.root / "meshes/left.glb").read_bytes()
     assert sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()) == [
@@ -105,13 +103,15 @@ def test_what_passes_through_is_pushed_out_and_the_rest_stays(scene, tmp_path):
     assert inside.max() < 0.2 * OVERLAP
     # It went to the right, did not leave the ground downward, and took its splats along.
     assert moved[:, 0].mean() > world(scene, "right")[:, 0].mean() and moved[:, 2].min() > -0.001
-    old, new = (placed(read_splats(root / "splats/right.ply"), np.asarray(TURNED)) for root in (scene.root, out))
+    old, new = (
+        transform_splats(read_splats(root / "splats/right.ply"), np.asarray(TURNED)) for root in (scene.root, out)
+    )
     way = (moved - world(scene, "right")).mean(axis=0)
     assert (new.centres - old.centres).mean(axis=0) == pytest.approx(way, abs=0.3 * np.linalg.norm(way))
     assert np.array_equal(new.colours, old.colours)
     assert {event["stage"] for event in said} == {"composing"}
     # The same again, over the first, comes out the same.
-    compose_scene(scene.root, out, request)
+    compose(load_scene(scene.root), out=out, request=request)
     assert json.loads((out / "compose.json").read_text()) == record
 
 
@@ -122,19 +122,19 @@ def test_the_picture_is_the_photo_but_for_the_objects(scene):
     mask[20:40, 30:50] = 255
     for name, picture in (("photo", photo), ("background", background), ("left", mask), ("right", mask)):
         Image.fromarray(picture).save(root / f"{name}.png")
-    items = tuple(dataclasses.replace(item, mask=f"{item.name}.png") for item in scene.scene.objects)
+    items = tuple(dataclasses.replace(item, mask=f"{item.name}.png") for item in scene.model.objects)
     folder = save_scene(
-        root, dataclasses.replace(scene.scene, objects=items, photo="photo.png", background="background.png")
+        root, dataclasses.replace(scene.model, objects=items, photo="photo.png", background="background.png")
     )
-    reference = reference_of(folder, items, size=48)
+    reference = photo_reference(folder, items, size=48)
     assert (reference.camera.width, reference.camera.height, reference.camera.fx) == (48, 32, 85.0)
     assert np.allclose(reference.pixels, 200 / 255) and reference.backdrop[15, 20] == pytest.approx(90 / 255)
     assert reference.backdrop[5, 5] == pytest.approx(200 / 255)
-    bare = reference_of(folder, scene.scene.objects, size=500)
+    bare = photo_reference(folder, scene.model.objects, size=500)
     assert bare.camera == CAMERA and np.allclose(bare.backdrop, 90 / 255)
     Image.fromarray(photo[:10]).save(root / "background.png")
     with pytest.raises(InputError, match=r"background.png: has 96x10 pixels, the scene's camera 96x64"):
-        reference_of(folder, items, size=48)
+        photo_reference(folder, items, size=48)
 
 
 def test_what_cannot_be_is_refused_and_leaves_nothing(scene, tmp_path):
@@ -144,28 +144,28 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(scene, tmp_path):
     mine.mkdir()
     (mine / "scene.json").write_text("{}")
     for out, words in (
-        (root, "is the scene itself"),
-        (root / "out", "in or around it"),
-        (tmp_path, "in or around it"),
-        (mine, "holds something that is no composition"),
-        (root / "scene.json", "in or around it"),
+        (root, "is the scene, inside it or a parent of it"),
+        (root / "out", "inside it or a parent of it"),
+        (tmp_path, "inside it or a parent of it"),
+        (mine, "holds something other than a composition"),
+        (root / "scene.json", "inside it or a parent of it"),
     ):
         with pytest.raises(InputError, match=words):
-            compose_scene(root, out, physics)
+            compose(load_scene(root), out=out, request=physics)
     out = tmp_path / "out"
     with pytest.raises(InputError, match=r"has no photo.*--no-picture"):
-        compose_scene(root, out)
+        compose(load_scene(root), out=out)
     with pytest.raises(InputError, match="there is no 'cup'"):
-        compose_scene(root, out, dataclasses.replace(physics, objects=("left", "cup")))
+        compose(load_scene(root), out=out, request=dataclasses.replace(physics, objects=("left", "cup")))
     with pytest.raises(Cancelled):
-        compose_scene(root, out, physics, cancelled=lambda: True)
-    for guidance, words in (("model", "write exact:FOLDER"), ("exact:/nowhere", "there is no")):
+        compose(load_scene(root), out=out, request=physics, cancelled=lambda: True)
+    for guidance, words in (("model", "write exact:FOLDER"), ("exact:/nowhere", "no such folder")):
         with pytest.raises(InputError, match=words):
-            compose_scene(root, out, dataclasses.replace(physics, guidance=guidance))
+            compose(load_scene(root), out=out, request=dataclasses.replace(physics, guidance=guidance))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "scene"] and (mine / "scene.json").read_text() == "{}"
     for changes, words in (
         ({"splats": 1}, "splats is 1: give 100"),
-        ({"options": ComposeOptions()}, "method pse-sds looks at the picture"),
+        ({"options": ComposeOptions()}, "method pse-sds needs the picture"),
         ({"prompt": "a frog"}, "only a guidance diffusers"),
     ):
         with pytest.raises(InputError, match=words):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Image formation on small arrays."""
 
 import itertools
@@ -5,15 +6,15 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.composite import layers, rest, transfer
-from physgen.sim.composite.metrics import psnr
+from physgen.sim.composite import compositing, disocclusion, srgb
+from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.errors import InputError
 
 
 def test_every_byte_survives_linear_light():
     values = np.arange(256, dtype=np.uint8)
-    assert np.array_equal(transfer.linear_to_bytes(transfer.bytes_to_linear(values)), values)
-    assert transfer.srgb_to_linear(np.array(0.5)) == pytest.approx(0.21404, abs=1e-5)
+    assert np.array_equal(srgb.linear_to_bytes(srgb.bytes_to_linear(values)), values)
+    assert srgb.srgb_to_linear(np.array(0.5)) == pytest.approx(0.21404, abs=1e-5)
 
 
 def test_psnr():
@@ -27,14 +28,14 @@ def test_psnr():
 def test_shrinking_averages_light():
     image = np.zeros((2, 2, 3), np.float32)
     image[0, 0] = 1.0
-    assert transfer.resized(image, 1, 1)[0, 0, 0] == pytest.approx(0.25)
+    assert srgb.resized(image, 1, 1)[0, 0, 0] == pytest.approx(0.25)
 
 
 def test_unreadable_images_are_named(tmp_path):
     (tmp_path / "bad.png").write_bytes(b"\x89PNG nothing")
     for name in ("bad.png", "missing.png"):
         with pytest.raises(InputError, match=name):
-            transfer.read_rgb(tmp_path / name)
+            srgb.read_rgb(tmp_path / name)
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def scene():
 
 def ground(scene, shadow, at_rest):
     photo, background, mask, rest_shadow = scene
-    return layers.ground_layer(
+    return compositing.ground_layer(
         photo=photo,
         background=background,
         shadow=shadow,
@@ -82,22 +83,22 @@ def test_light_ratio_is_one_at_rest_and_continues_beyond_the_outline():
     alpha = np.zeros((20, 20), np.float32)
     alpha[5:15, 5:15] = 1.0
     alpha[5, 5:15] = 0.1
-    ratio = layers.light_ratio(alpha[..., None] * np.float32(0.5) * np.ones(3, np.float32), alpha)
+    ratio = compositing.light_ratio(alpha[..., None] * np.float32(0.5) * np.ones(3, np.float32), alpha)
     assert np.allclose(ratio[4:16, 4:16], 0.5, atol=1e-3)
     assert np.allclose(ratio[0, 0], 1.0)
 
 
 def test_compose_mixes_by_coverage():
-    layer = layers.empty_layer(2, 1)
+    layer = compositing.empty_layer(2, 1)
     layer.alpha[0, 0] = 0.25
     layer.texture[0, 0] = 0.25
-    result = layers.compose(layer, np.full((1, 2, 3), 0.4, np.float32))
+    result = compositing.compose(layer, np.full((1, 2, 3), 0.4, np.float32))
     assert result[0, 0, 0] == pytest.approx(0.25 + 0.75 * 0.4)
     assert result[0, 1, 0] == pytest.approx(0.4)
 
 
 def test_rest_weight_fades_smoothly_from_one_to_zero():
-    weights = [rest.rest_weight(d) for d in np.linspace(0, 0.2, 100)]
+    weights = [disocclusion.rest_weight(d) for d in np.linspace(0, 0.2, 100)]
     assert weights[0] == 1.0
     assert weights[-1] == 0.0
     assert all(a >= b for a, b in itertools.pairwise(weights))
@@ -107,10 +108,10 @@ def test_rest_weight_fades_smoothly_from_one_to_zero():
 def test_shares_sum_to_one_and_rest_is_exactly_one():
     places = np.zeros((3, 10, 12), bool)
     places[0, 2, 2] = places[1, 8, 9] = True
-    shares = rest.influence(list(places))
+    shares = disocclusion.influence(list(places))
     assert np.allclose(shares.sum(0), 1)
-    assert (rest.rest_map(shares, [1.0, 1.0, 1.0]) == 1.0).all()
-    moved = rest.rest_map(shares, [0.0, 1.0, 1.0])
+    assert (disocclusion.rest_map(shares, [1.0, 1.0, 1.0]) == 1.0).all()
+    moved = disocclusion.rest_map(shares, [0.0, 1.0, 1.0])
     assert moved[2, 2] < 0.1 < 0.9 < moved[8, 9]
 
 
@@ -118,7 +119,7 @@ def test_the_rim_gives_way_where_its_outline_moves():
     mask = np.zeros((30, 40), bool)
     mask[10:20, 10:30] = True
     corners = np.array([[10.0, 15.0], [30.0, 15.0]])
-    rim = rest.Rim(rest.rim_strength(mask, mask), corners)
+    rim = disocclusion.Rim(disocclusion.rim_strength(mask, mask), corners)
     weights = np.ones(mask.shape, np.float32)
     rim.apply(weights, corners)
     assert (weights == 1).all()
@@ -130,7 +131,7 @@ def test_the_rim_gives_way_where_its_outline_moves():
 
 def test_contact_is_the_foot():
     vertices = np.array([[0, 0, z] for z in np.linspace(0, 1, 11)])
-    contact = rest.contact_vertices(vertices, np.array([0, 0, 1.0]))
+    contact = disocclusion.contact_vertices(vertices, np.array([0, 0, 1.0]))
     assert contact.sum() == 2
     moved = vertices + np.array([0.3, 0.0, 0.0])
-    assert rest.contact_displacement(vertices, moved, contact, 1.0) == pytest.approx(0.3)
+    assert disocclusion.contact_displacement(vertices, moved, contact, 1.0) == pytest.approx(0.3)

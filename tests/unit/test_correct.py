@@ -3,13 +3,13 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
 from physgen.batch.cli import main
-from physgen.sim.app.correct import correct_scene, require_stamp
-from physgen.sim.app.light import LightRequest, set_light
-from physgen.sim.app.reconstruct import STAMP_FILE, reconstruct_scene, set_physics
+from physgen.sim.app.reconstruct import STAMP_FILE, Physics, correct, reconstruct, require_stamp, set_physics
+from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.folder import load_scene
@@ -31,14 +31,26 @@ def draw_photo():
     return np.clip(image, 0, 255).astype(np.uint8), ball, crate
 
 
-@pytest.fixture
-def scene(tmp_path):
-    Image.fromarray(draw_photo()[0]).save(tmp_path / "photo.png")
+@pytest.fixture(scope="module")
+def reconstructed(tmp_path_factory):
+    """A folder with a photo and its scene; to be copied."""
+    folder = tmp_path_factory.mktemp("reconstructed")
+    Image.fromarray(draw_photo()[0]).save(folder / "photo.png")
     requests = [
         ObjectRequest(box=BALL, name="left", size_m=0.1, shape="inflated"),
         ObjectRequest(box=CRATE, name="right", shape="inflated"),
     ]
-    reconstruct_scene(tmp_path / "photo.png", requests, tmp_path / "scene", QUICK)
+    reconstruct(folder / "photo.png", requests, out=folder / "scene", options=QUICK)
+    return folder
+
+
+@pytest.fixture
+def scene(reconstructed, tmp_path):
+    """A scene that came from the photo beside it."""
+    shutil.copytree(reconstructed, tmp_path, dirs_exist_ok=True)
+    stamp = tmp_path / "scene" / STAMP_FILE
+    assert require_stamp(tmp_path / "scene").photo == reconstructed / "photo.png"
+    stamp.write_text(json.dumps(json.loads(stamp.read_text()) | {"photo": str(tmp_path / "photo.png")}))
     return tmp_path / "scene"
 
 
@@ -59,13 +71,13 @@ def corrected(scene, **changes):
     """Correct fields of the object ``left``; the stages that were computed again."""
     before, stamp = stages(scene), require_stamp(scene)
     first = dataclasses.replace(stamp.objects[0], **changes)
-    correct_scene(scene, [first, *stamp.objects[1:]], stamp.options)
+    correct(load_scene(scene), objects=[first, *stamp.objects[1:]], options=stamp.options)
     return changed(scene, before)
 
 
 def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_path):
     assert corrected(scene, size_m=0.3) == set()
-    assert load_scene(scene).scene.objects[0].size_m == pytest.approx(0.3)
+    assert load_scene(scene).model.objects[0].size_m == pytest.approx(0.3)
     assert corrected(scene, back="flat") == {"mesh", "look"}
     mask = draw_photo()[1].copy()
     mask[:60] = False
@@ -75,29 +87,33 @@ def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_
     assert {"background", "mesh", "shadows"} <= again
     assert (np.asarray(Image.open(scene / "masks" / "left.png")) > 0).sum() == mask.sum()
     before, stamp = stages(scene), require_stamp(scene)
-    correct_scene(scene, stamp.objects, dataclasses.replace(stamp.options, pitch_deg=None, horizon_y=-0.2))
+    correct(
+        load_scene(scene),
+        objects=stamp.objects,
+        options=dataclasses.replace(stamp.options, pitch_deg=None, horizon_y=-0.2),
+    )
     assert changed(scene, before) >= {"mesh", "shadows", "background"} and "segment" not in changed(scene, before)
 
 
 def test_matter_motion_and_light_that_were_changed_since_stay(scene):
-    set_physics(scene, presets=["hard", "soft"], velocities=[(1.0, 0.0, 2.0)])
-    set_light(scene, LightRequest(sun_direction=(0.0, 0.3, 1.0), sun_strength=2.0))
-    before = load_scene(scene).scene
+    set_physics(load_scene(scene), Physics(presets=("hard", "soft"), velocities=((1.0, 0.0, 2.0),)))
+    set_light(load_scene(scene), request=LightRequest(sun_direction=(0.0, 0.3, 1.0), sun_strength=2.0))
+    before = load_scene(scene).model
     corrected(scene, size_m=0.2)
-    after = load_scene(scene).scene
+    after = load_scene(scene).model
     assert [item.material for item in after.objects] == [item.material for item in before.objects]
     assert after.objects[0].velocity == (1.0, 0.0, 2.0)
     assert after.light == before.light
     # A thing that turns out to be another one is made of other matter; the other keeps its own.
     corrected(scene, kind="orange")
-    after = load_scene(scene).scene
+    after = load_scene(scene).model
     assert after.objects[0].material != before.objects[0].material
     assert after.objects[1].material == before.objects[1].material
 
 
 def test_on_the_command_line(scene, capsys):
     assert main(["correct", str(scene), "--size", "right=0.5", "--kind", "left=orange", "--report", "--json"]) == 0
-    sizes = [item.size_m for item in load_scene(scene).scene.objects]
+    sizes = [item.size_m for item in load_scene(scene).model.objects]
     assert sizes[1] == pytest.approx(0.5, rel=0.6)
     page = (scene / "report.html").read_text(encoding="utf-8")
     assert "orange" in page and page.count("data:image/jpeg;base64,") >= 8
@@ -111,7 +127,7 @@ def test_a_scene_that_cannot_say_where_it_comes_from_is_refused(scene, tmp_path)
     (tmp_path / "photo.png").rename(tmp_path / "gone.png")
     stamp = require_stamp(scene)
     with pytest.raises(InputError, match="no longer there"):
-        correct_scene(scene, stamp.objects, stamp.options)
+        correct(load_scene(scene), objects=stamp.objects, options=stamp.options)
     for garbage in ("{}", "[1]", "nonsense", json.dumps({"inputs_hash": "x", "photo": 3})):
         (scene / STAMP_FILE).write_text(garbage, encoding="utf-8")
         with pytest.raises(InputError, match=STAMP_FILE):

@@ -9,12 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.diagnose import diagnosis as files
-from physgen.sim.diagnose.analysis import CandidateFit, Discrepancy, Estimate, Interval
-from physgen.sim.diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, Gap, TrialArrays, Verdict, Where
-from physgen.sim.diagnose.evidence import Weighing, weigh
-from physgen.sim.diagnose.experiments import next_experiment
-from physgen.sim.diagnose.places import where_of
-from physgen.sim.diagnose.summary import summary_of
+from physgen.sim.diagnose.diagnosis import (
+    NONE,
+    UNKNOWN,
+    CandidateFit,
+    Diagnosis,
+    Discrepancy,
+    Estimate,
+    Gap,
+    Localisation,
+    PhaseInterval,
+    TrialArrays,
+    Verdict,
+)
+from physgen.sim.diagnose.gap_metrics import localise
+from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
+from physgen.sim.diagnose.report.wording import verdict_summary
+from physgen.sim.diagnose.suggested_experiments import next_experiment
 from physgen.sim.errors import InputError
 
 from .test_capture import a_capture, a_trial
@@ -45,7 +56,9 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=None):
 
 def weighed(*candidates, nominal_evidence=0.0, nominal_misfit=1.0, weighing=None):
     nominal = fit(evidence=nominal_evidence, misfit=nominal_misfit)
-    return weigh(Found(nominal=nominal, refitted=nominal, candidates=candidates), weighing or Weighing())
+    return compare_models(
+        Found(nominal=nominal, refitted=nominal, candidates=candidates), weighing or ComparisonSettings()
+    )
 
 
 def test_a_plain_winner_wins():
@@ -122,8 +135,8 @@ def discrepancy(trial, scores):
         point_score=np.tile(scores[:, None], (1, count)),
         residual=np.zeros_like(trial.observed),
         intervals=(
-            Interval(start_s=float(trial.times[0]), end_s=float(trial.times[10]), phase="flight"),
-            Interval(start_s=float(trial.times[10]), end_s=float(trial.times[-1]), phase="contact"),
+            PhaseInterval(start_s=float(trial.times[0]), end_s=float(trial.times[10]), phase="flight"),
+            PhaseInterval(start_s=float(trial.times[10]), end_s=float(trial.times[-1]), phase="contact"),
         ),
         directions={"normal": 1.0, "along_velocity": 0.0, "along_gravity": 0.0, "other": 0.0},
     )
@@ -132,7 +145,7 @@ def discrepancy(trial, scores):
 def test_shares_of_time_follow_the_scores():
     capture = a_capture(a_trial())
     scores = np.where(np.arange(20) < 10, 3.0, 1.0)
-    where = where_of(capture, {"take01": discrepancy(capture.trials[0], scores)})
+    where = localise(capture, {"take01": discrepancy(capture.trials[0], scores)})
     assert [i.phase for i in where.intervals] == ["flight", "contact"]
     # The first frame and the last stand for half a frame: 9.5 frames of 3 against 9.5 of 1.
     assert where.intervals[0].share == pytest.approx(0.75) and where.objects[0].share == 1.0
@@ -141,7 +154,7 @@ def test_shares_of_time_follow_the_scores():
 
 def test_no_discrepancy_is_no_division_by_zero():
     capture = a_capture(a_trial())
-    where = where_of(capture, {"take01": discrepancy(capture.trials[0], np.zeros(20))})
+    where = localise(capture, {"take01": discrepancy(capture.trials[0], np.zeros(20))})
     assert sum(i.share for i in where.intervals) == pytest.approx(1.0)
     assert sum(where.direction.values()) == pytest.approx(1.0)
 
@@ -159,17 +172,17 @@ GAP = Gap(
 
 def test_the_verdict_in_words():
     verdict = Verdict(effect="time_scale", probability=0.6, alternatives=("buoyancy",), effects=("time_scale",))
-    text = summary_of(verdict, GAP)
+    text = verdict_summary(verdict, GAP)
     assert "clock" in text and "buoyancy" in text and "60 %" in text and "89 %" in text
     unsure = dataclasses.replace(GAP, resolvable=False)
-    assert "too near the noise" in summary_of(verdict, unsure)
-    assert "explains" in summary_of(Verdict(effect=NONE, probability=0.9), GAP)
-    assert "no effect known" in summary_of(Verdict(effect=UNKNOWN, probability=0.9), GAP)
+    assert "too close to the noise" in verdict_summary(verdict, unsure)
+    assert "explains" in verdict_summary(Verdict(effect=NONE, probability=0.9), GAP)
+    assert "no known effect" in verdict_summary(Verdict(effect=UNKNOWN, probability=0.9), GAP)
 
 
 def test_every_effect_has_words_and_an_experiment():
-    from physgen.sim.diagnose.evidence import kind_of
-    from physgen.sim.diagnose.report.words import LABELS
+    from physgen.sim.diagnose.model_comparison import kind_of
+    from physgen.sim.diagnose.report.wording import LABELS
     from physgen.sim.effects.registry import effects
 
     vocabulary = [name for name in effects() if name != "sandy"]
@@ -202,7 +215,7 @@ def a_diagnosis(capture):
         gap=GAP,
         controls={"wrong_effect_rms_m": math.nan, "last_residual_rms_m": 0.1},
         next_experiment=None,
-        where=Where(objects=(), intervals=(), direction={}),
+        where=Localisation(objects=(), intervals=(), direction={}),
         trials={"take01": arrays},
         summary="Missing is air drag.",
     )

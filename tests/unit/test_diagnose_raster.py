@@ -6,8 +6,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.report.colour_map import colours, hex_colour
-from physgen.sim.diagnose.report.raster import View, rasterise, simplified
+from physgen.sim.diagnose.report.object_heatmaps import View, colours, hex_colour, rasterise, simplified
 
 FRONT = View(azimuth=0, elevation=0)
 

@@ -15,27 +15,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.analysis import Estimate
 from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.diagnosis import (
     Diagnosis,
+    Estimate,
     Gap,
     IntervalShare,
+    Localisation,
     ObjectShare,
     RankedEffect,
     TrialArrays,
     Verdict,
-    Where,
 )
-from physgen.sim.diagnose.report import parameter_text, pictures, write_report
-from physgen.sim.diagnose.report.gap import growth
-from physgen.sim.diagnose.report.object_picture import object_scores
-from physgen.sim.diagnose.report.quantities import number_text, percent_text, quantity_text
-from physgen.sim.diagnose.report.scene_entry import scene_effects
-from physgen.sim.diagnose.report.tracks import camera_plane
-from physgen.sim.diagnose.report.words import headline
+from physgen.sim.diagnose.report import diagnosis_figures, parameter_text, write_report
+from physgen.sim.diagnose.report.diagnosis_figures import growth
+from physgen.sim.diagnose.report.diagnosis_page import scene_effects
+from physgen.sim.diagnose.report.object_heatmaps import object_scores
+from physgen.sim.diagnose.report.trajectory_plots import camera_plane
+from physgen.sim.diagnose.report.wording import headline, number_text, percent_text, quantity_text
 from physgen.sim.effects.registry import effects
-from physgen.sim.page.markup import Picture, clean, element, text
+from physgen.sim.html import Picture, clean, element, text
 
 NAN = math.nan
 FILES = {"report.html", "timeline.svg", "object.svg", "ranking.svg", "gap.svg", "tracks.svg"}
@@ -157,7 +156,7 @@ def case(*takes, objects=None, camera=None, **changes):
         ),
         controls={"wrong_effect_rms_m": 0.014, "last_residual_rms_m": 0.041},
         next_experiment="Throw it both ways.",
-        where=Where(
+        where=Localisation(
             objects=tuple(ObjectShare(name=o.name, share=1 / len(objects)) for o in objects),
             intervals=tuple(
                 IntervalShare(trial=t.name, start_s=0.1, end_s=0.2, phase="flight", share=0.5) for t, _ in takes
@@ -240,7 +239,7 @@ def test_a_report_is_whole_and_says_the_verdict(tmp_path):
     text = said(page)
     assert "Air drag: very likely the cause" in text and "The air slows it down." in text
     assert "54\u00a0mm" in text and "2.7\u00a0mm" in text and "Throw it both ways." in text
-    assert "cannot tell it from wind" in text
+    assert "cannot distinguish it from wind" in text
     assert "drag per mass 0.0405\u00a01/m (95\u00a0%: 0.0381 to 0.0429)" in text
     assert '{"name": "air_drag", "parameters": {"drag_per_mass": 0.0405}}' in text
     assert "Add found effect and bake" in text
@@ -357,7 +356,7 @@ def test_scores_of_points_come_from_all_takes_of_their_object():
 
 
 EMPTY = {
-    "no takes": {"trials": {}, "where": Where(objects=(), intervals=(), direction={})},
+    "no takes": {"trials": {}, "where": Localisation(objects=(), intervals=(), direction={})},
     "no candidates": {"effects": ()},
     "no words": {"summary": "", "next_experiment": None, "controls": {}},
 }
@@ -439,7 +438,7 @@ def anything(draw):
             numerics_rms_m=draw(NUMBERS),
         ),
         controls=draw(st.dictionaries(TEXTS, NUMBERS, max_size=2)),
-        where=Where(
+        where=Localisation(
             objects=(ObjectShare(name="cube", share=draw(NUMBERS)),),
             intervals=tuple(draw(st.lists(intervals, max_size=3))),
             direction=draw(st.dictionaries(TEXTS, NUMBERS, max_size=2)),
@@ -453,7 +452,7 @@ def anything(draw):
 @given(anything())
 def test_any_diagnosis_gives_a_page(tmp_path_factory, built):
     # The picture of the object takes most of the time; other tests draw it.
-    with patch.object(pictures, "object_pictures", lambda *_: [FLAT]):
+    with patch.object(diagnosis_figures, "object_pictures", lambda *_: [FLAT]):
         written(*built, tmp_path_factory.mktemp("report"))
 
 

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.rigid import fit_rigid
-from physgen.sim.diagnose.rigid.body import rigid_body
-from physgen.sim.diagnose.rigid.candidates import FREEDOMS, Scene
-from physgen.sim.diagnose.rigid.turning import between, moved, to_matrix
-from physgen.sim.diagnose.rigid.worlds import SLOTS, Launcher
+from physgen.sim.diagnose.rigid.observed_poses import as_matrix, perturbed, state_difference
+from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
+from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
 from physgen.sim.effects.registry import effect
 
 RADIUS = 0.04
@@ -42,14 +41,14 @@ def scene_of(thing, trials=(), friction=0.3, restitution=0.5, sigma=1e-4):
         camera=None,
         trials=tuple(trials),
     )
-    return Scene(capture=capture, body=rigid_body(thing), middle=np.zeros(3))
+    return BodyScene(capture=capture, body=rigid_body(thing), middle=np.zeros(3))
 
 
 def run(scene, state, times, **changes):
     import dataclasses
 
     numbers = scene.numbers([dataclasses.replace(scene.base, **changes)])
-    return Launcher(body=scene.body, threads=1).run(np.atleast_2d(state), numbers, [np.asarray(times)])[0]
+    return RigidWorlds(body=scene.body, threads=1).run(np.atleast_2d(state), numbers, [np.asarray(times)])[0]
 
 
 def state(place, velocity=(0, 0, 0), spin=(0, 0, 0)):
@@ -76,7 +75,7 @@ def test_free_flight_is_the_parabola(velocity, spin):
 def test_a_spinning_brick_keeps_energy_and_angular_momentum():
     scene = scene_of(box((0.06, 0.1, 0.2)))
     found = run(scene, state((0, 0, 50), (0, 0, 0), (0.1, 9.0, 0.1)), np.linspace(0.05, 1.0, 20))
-    turn = to_matrix(found[:, 3:7])
+    turn = as_matrix(found[:, 3:7])
     inertia = turn @ scene.body.inertia @ turn.swapaxes(1, 2)
     momentum = np.einsum("tij,tj->ti", inertia, found[:, 10:13])
     energy = 0.5 * np.sum(momentum * found[:, 10:13], axis=1)
@@ -146,12 +145,12 @@ def test_changes_of_states_are_undone_by_their_difference():
     rng = np.random.default_rng(1)
     some = np.concatenate([rng.normal(size=3), [1, 0, 0, 0], rng.normal(size=6)])
     change = 0.3 * rng.normal(size=12)
-    assert between(some, moved(some, change)) == pytest.approx(change, abs=1e-12)
+    assert state_difference(some, perturbed(some, change)) == pytest.approx(change, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", sorted(set(FREEDOMS) - {"camera_pose"}))
+@pytest.mark.parametrize("name", sorted(set(CANDIDATE_EFFECTS) - {"camera_pose"}))
 def test_values_are_what_the_effect_takes(name):
-    freedom, scene = FREEDOMS[name], scene_of(box())
+    freedom, scene = CANDIDATE_EFFECTS[name], scene_of(box())
     z = np.full(freedom.size, 0.3)
     setting = freedom.change(scene, scene.base, z)
     assert effect(name).checked(freedom.values(scene, setting, z))
@@ -159,7 +158,7 @@ def test_values_are_what_the_effect_takes(name):
 
 
 def test_an_offset_centre_moves_the_centre_of_mass():
-    freedom, scene = FREEDOMS["mass_offset"], scene_of(box())
+    freedom, scene = CANDIDATE_EFFECTS["mass_offset"], scene_of(box())
     z = np.array([0.5, 0.0, 0.0, 0.0])
     setting = freedom.change(scene, scene.base, z)
     values = freedom.values(scene, setting, z)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
-from physgen.sim.diagnose.rigid.body import rigid_body
-from physgen.sim.diagnose.rigid.candidates import Scene
-from physgen.sim.diagnose.rigid.observation import project, rigid_turn, sights
-from physgen.sim.diagnose.rigid.resting import height, resting_state
-from physgen.sim.diagnose.rigid.turning import from_vector, to_matrix
+from physgen.sim.diagnose.rigid.observed_poses import as_matrix, fit_rotation, from_rotvec, observe_body, project
+from physgen.sim.diagnose.rigid.resting_contact import height, resting_state
+from physgen.sim.diagnose.rigid.rigid_candidates import BodyScene
+from physgen.sim.diagnose.rigid.rigid_simulator import rigid_body
 
 SIZE = (0.12, 0.08, 0.05)
 LENS = {"width": 1280, "height": 720, "fx": 1200.0, "fy": 1200.0, "cx": 640.0, "cy": 360.0}
@@ -33,9 +32,9 @@ def filmed(lift):
     belief = ObjectBelief(name="body", mesh="body.obj", density_kg_m3=500.0, stiffness="hard")
     thing = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
     times = np.arange(len(lift)) / 240
-    yaw = from_vector((0.3 + 2.0 * times)[:, None] * np.array([0.0, 0.0, 1.0]))
+    yaw = from_rotvec((0.3 + 2.0 * times)[:, None] * np.array([0.0, 0.0, 1.0]))
     middle = np.stack([-0.1 + 0.8 * times - 1.5 * times**2, 0.02 * np.ones_like(times), SIZE[2] / 2 + lift], axis=1)
-    points = middle[:, None] + np.einsum("fij,kj->fki", to_matrix(yaw), mesh.vertices)
+    points = middle[:, None] + np.einsum("fij,kj->fki", as_matrix(yaw), mesh.vertices)
     noise = np.random.default_rng(1).normal(scale=0.4, size=(*points.shape[:2], 2))
     trial = Trial(
         name="take",
@@ -55,7 +54,7 @@ def filmed(lift):
         trials=(trial,),
     )
     body = rigid_body(thing)
-    return Scene(capture=capture, body=body, middle=np.zeros(3)), sights(capture, trial, 0, body.center)
+    return BodyScene(capture=capture, body=body, middle=np.zeros(3)), observe_body(capture, trial, 0, body.center)
 
 
 def test_a_box_that_slides_is_on_the_ground_from_the_start():
@@ -74,7 +73,7 @@ def test_a_box_that_rises_does_not_lie():
 
 def test_height_changes_as_its_slope_says():
     scene, _ = filmed(np.zeros(5))
-    state = np.array([0.0, 0.0, 0.1, *from_vector(np.array([0.3, 0.2, 0.1])), *np.zeros(6)])
+    state = np.array([0.0, 0.0, 0.1, *from_rotvec(np.array([0.3, 0.2, 0.1])), *np.zeros(6)])
     here, slope = height(scene, state)
     moved = state.copy()
     moved[2] += 0.01
@@ -85,5 +84,5 @@ def test_height_changes_as_its_slope_says():
 def test_the_nearest_turn_of_turned_points_is_theirs():
     rng = np.random.default_rng(0)
     places = rng.normal(size=(6, 3))
-    turn = to_matrix(from_vector(rng.normal(size=3)))
-    assert rigid_turn(places, places @ turn.T) == pytest.approx(turn, abs=1e-9)
+    turn = as_matrix(from_rotvec(rng.normal(size=3)))
+    assert fit_rotation(places, places @ turn.T) == pytest.approx(turn, abs=1e-9)

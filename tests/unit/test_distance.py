@@ -11,12 +11,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.mpm import distance, soundness
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.contact_points import surface_points
-from physgen.sim.mpm.distance import DistanceLattice, overlap, signed_distance
-from physgen.sim.mpm.mass import MassProperties, mass_properties, solid_mass_properties
-from physgen.sim.mpm.soundness import check_surface, thin_share
+from physgen.sim.mpm.geometry import mesh_checks
+from physgen.sim.mpm.geometry import signed_distance as distance
+from physgen.sim.mpm.geometry.mass_properties import MassProperties, mass_properties, solid_mass_properties
+from physgen.sim.mpm.geometry.mesh_checks import check_surface, thin_share
+from physgen.sim.mpm.geometry.signed_distance import DistanceLattice, overlap, signed_distance
+from physgen.sim.mpm.rigid.collision_shapes import surface_points
 from scipy.spatial import cKDTree
 
 EPS32 = float(np.finfo(np.float32).eps)
@@ -607,11 +608,11 @@ def test_unusable_surfaces_are_input_errors_that_name_the_thing():
 def test_too_many_pairs_are_tested_in_part_and_that_is_said(monkeypatch):
     mesh = joined(turned(ball(subdivisions=3)), ball(subdivisions=3, at=(0.1, 0, 0)))
     assert not any("were tested" in line for line in check_surface(mesh, name="balls"))
-    monkeypatch.setattr(soundness, "MAX_PAIRS", 100)
+    monkeypatch.setattr(mesh_checks, "MAX_PAIRS", 100)
     said = check_surface(mesh, name="balls")
     assert any("100 of about" in line for line in said)
     assert said == check_surface(mesh, name="balls")
-    monkeypatch.setattr(soundness, "MAX_NEIGHBOURS", 1000)
+    monkeypatch.setattr(mesh_checks, "MAX_NEIGHBOURS", 1000)
     assert any("were tested" in line for line in check_surface(mesh, name="balls"))
 
 
@@ -636,7 +637,7 @@ def test_the_thin_share_is_that_of_the_thin_part():
 def test_the_thin_share_does_not_depend_on_how_much_work_is_allowed(monkeypatch):
     mesh = surface(trimesh.creation.annulus(0.45, 0.5, 0.3, sections=64))
     full = thin_share(mesh, 0.08)
-    monkeypatch.setattr(soundness, "MAX_NEIGHBOURS", 5000)
+    monkeypatch.setattr(mesh_checks, "MAX_NEIGHBOURS", 5000)
     assert 0.3 < thin_share(mesh, 0.08) == pytest.approx(full, abs=0.15)
 
 

@@ -13,18 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.effects.camera_pose import true_camera
-from physgen.sim.effects.mass_offset import pellet_width
-from physgen.sim.effects.registry import KINDS, apply_effects, effect, effect_to_json, effects
-from physgen.sim.effects.schema import SECTIONS
-from physgen.sim.effects.stiffness import factor_for, youngs_modulus
-from physgen.sim.effects.time_scale import true_times
-from physgen.sim.errors import InputError
-from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.colliders import Collider, Surface
-from physgen.sim.mpm.contacts import GROUND_NAME, ContactTable, SurfaceContact
-from physgen.sim.mpm.forces import BodyForces
-from physgen.sim.mpm.materials import (
+from physgen.sim.constitutive import (
     ElasticMaterial,
     FluidMaterial,
     NeoHookeanMaterial,
@@ -33,9 +22,18 @@ from physgen.sim.mpm.materials import (
     SnowMaterial,
     VonMisesMaterial,
 )
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.effects.camera_pose import true_camera
+from physgen.sim.effects.mass_offset import pellet_width
+from physgen.sim.effects.registry import KINDS, apply_effects, effect, effect_to_json, effects
+from physgen.sim.effects.schema import SECTIONS
+from physgen.sim.effects.stiffness import factor_for, youngs_modulus
+from physgen.sim.effects.time_scale import true_times
+from physgen.sim.errors import InputError
+from physgen.sim.mpm.bodies import BodyForces, BodyParticles
+from physgen.sim.mpm.colliders import Collider, Surface, Track
+from physgen.sim.mpm.solver_options import Ground
+from physgen.sim.mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact
+from physgen.sim.mpm.world_setup import WorldSetup
 from physgen.sim.scene.model import Effect as SceneEffect
 from scipy.spatial.transform import Rotation
 
@@ -165,13 +163,13 @@ def test_every_effect_documents_itself(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_effect_is_in_the_documentation(name):
-    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8")
     rows = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
     assert len(rows) == 1 and all(f"`{p.name}`" in rows[0] for p in effect(name).parameters)
 
 
 def test_there_is_no_file_without_an_entry():
-    helpers = {"__init__", "schema", "changes", "registry"}
+    helpers = {"__init__", "schema", "setup_changes", "registry"}
     assert {path.stem for path in (ROOT / "sim" / "effects").glob("*.py")} - helpers == set(NAMES)
 
 

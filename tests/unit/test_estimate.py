@@ -3,14 +3,13 @@
 
 import numpy as np
 import pytest
+from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.errors import InputError
-from physgen.sim.mpm import estimate as module
+from physgen.sim.mpm import cost_estimate as module
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
-from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
-from physgen.sim.mpm.options import SolverOptions
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.mpm.colliders import Surface, Track
+from physgen.sim.mpm.cost_estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from physgen.sim.mpm.solver_options import SolverOptions
 
 POINTS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)])
 SOFT = ElasticMaterial(density=1000.0, youngs_modulus=1e6, poisson_ratio=0.25)

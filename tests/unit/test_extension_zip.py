@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The zip that Blender installs, built from this tree without the network, and its manifest as Blender reads it."""
 
 import ast
@@ -48,20 +49,17 @@ OPTIONAL = {"blender_version_max", "website", "copyright", "permissions", "tags"
 
 
 @pytest.fixture
-def setup(monkeypatch):
-    """The scripts of ``setup/``, which import each other as neighbours."""
+def extension(monkeypatch):
+    """The script ``setup/extension.py`` as a module."""
     monkeypatch.syspath_prepend(str(ROOT / "setup"))
     import extension
-    import extension_files
-    import extension_wheels
 
-    return extension, extension_files, extension_wheels
+    return extension
 
 
 @pytest.fixture
-def archive(setup, tmp_path):
-    _, files, _ = setup
-    files.write_zip(ROOT, tmp_path / "out" / "physgen.zip", {}, [])
+def archive(extension, tmp_path):
+    extension.write_zip(ROOT, tmp_path / "out" / "physgen.zip", {}, [])
     with zipfile.ZipFile(tmp_path / "out" / "physgen.zip") as opened:
         yield opened
 
@@ -94,9 +92,8 @@ def check_manifest(manifest):
         assert wheel.startswith("./wheels/") and 5 <= len(PurePosixPath(wheel).name.split("-")) <= 6, wheel
 
 
-def test_the_manifest_of_the_tree_is_one_that_blender_takes(setup):
-    _, files, _ = setup
-    manifest = files.read_manifest(ROOT)
+def test_the_manifest_of_the_tree_is_one_that_blender_takes(extension):
+    manifest = extension.read_manifest(ROOT)
     patterns = manifest.pop("build")["paths_exclude_pattern"]
     assert len(patterns) == len(set(patterns))
     check_manifest(manifest)
@@ -107,12 +104,22 @@ def test_the_manifest_of_the_tree_is_one_that_blender_takes(setup):
 def test_the_zip_holds_the_program_and_nothing_else(archive):
     names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
-    assert tops == {"__init__.py", "blender_manifest.toml", "README.md", "batch", "physgen_addon", "presets", "sim"}
-    assert {PurePosixPath(name).suffix for name in names} == {".py", ".toml", ".md", ".js"}
+    own = {"__init__.py", "blender_manifest.toml", "batch", "physgen_addon", "presets", "sim"}
+    licences = {name for name in names if name.startswith("LICENSE")}
+    assert licences == {"LICENSE", "LICENSES/GPL-3.0-or-later.txt", "LICENSES/MIT.txt"}
+    assert tops == own | {"README.md", "LICENSE", "LICENSES"}
+    assert {PurePosixPath(name).suffix for name in names if name not in licences} == {
+        ".py",
+        ".toml",
+        ".md",
+        ".js",
+        ".html",
+    }
     tree = {
         p.relative_to(ROOT).as_posix() for top in ("batch", "physgen_addon", "sim") for p in ROOT.glob(f"{top}/**/*.py")
     }
     tree |= {p.relative_to(ROOT).as_posix() for p in ROOT.glob("presets/**/*.toml")}
+    tree |= {p.relative_to(ROOT).as_posix() for top in ("batch", "sim") for p in ROOT.glob(f"{top}/**/*.html")}
     assert tree <= set(names)
     assert len(names) == len({name.lower() for name in names}), "names that differ in case only collide on Windows"
 
@@ -139,14 +146,13 @@ def test_its_manifest_says_what_is_in_it(archive):
     assert f'"{manifest["version"]}"' in archive.read("sim/version.py").decode()
 
 
-def test_a_zip_with_wheels_lists_them_and_where_it_runs(setup, tmp_path):
-    _, files, _ = setup
+def test_a_zip_with_wheels_lists_them_and_where_it_runs(extension, tmp_path):
     wheels = [tmp_path / f"{name}-1.0-cp313-cp313-win_amd64.whl" for name in ("taichi", "scipy", "pillow", "trimesh")]
     for wheel in wheels:
         wheel.write_bytes(b"wheel")
     fields = {"platforms": ["windows-x64"], "blender_version_min": "5.1.0", "blender_version_max": "6.0.0"}
-    files.write_zip(ROOT, tmp_path / "a.zip", fields, wheels)
-    files.write_zip(ROOT, tmp_path / "b.zip", fields, wheels)
+    extension.write_zip(ROOT, tmp_path / "a.zip", fields, wheels)
+    extension.write_zip(ROOT, tmp_path / "b.zip", fields, wheels)
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes(), "the same tree, the same zip"
     with zipfile.ZipFile(tmp_path / "a.zip") as opened:
         manifest = tomllib.loads(opened.read("blender_manifest.toml").decode())
@@ -169,19 +175,17 @@ def test_a_zip_with_wheels_lists_them_and_where_it_runs(setup, tmp_path):
         ("sim/a.zip", False, False),
     ],
 )
-def test_patterns_leave_out_what_they_do_for_blender(setup, path, folder, out):
-    _, files, _ = setup
-    patterns = files.read_manifest(ROOT)["build"]["paths_exclude_pattern"]
-    assert files._left_out(Path(path), folder, patterns) is out
+def test_patterns_leave_out_what_they_do_for_blender(extension, path, folder, out):
+    patterns = extension.read_manifest(ROOT)["build"]["paths_exclude_pattern"]
+    assert extension._left_out(Path(path), folder, patterns) is out
 
 
-def test_every_zip_is_for_a_python_and_a_numpy_that_its_blender_has(setup):
-    extension, _, wheels = setup
+def test_every_zip_is_for_a_python_and_a_numpy_that_its_blender_has(extension):
     assert len(extension.NAMES) == 1 + 2 * 3 and extension.default_zips()[0] == "any"
     for line in extension.LINES.values():
-        names = {re.split("[<>=]", item)[0] for item in wheels.requirements(ROOT, line.python)}
+        names = {re.split("[<>=]", item)[0] for item in extension.requirements(ROOT, line.python)}
         assert {"taichi", "trimesh", "openimageio"} <= names
-        assert len(names) == len(wheels.requirements(ROOT, line.python)), "one line a package"
-    old, new = wheels.requirements(ROOT, "3.11"), wheels.requirements(ROOT, "3.13")
+        assert len(names) == len(extension.requirements(ROOT, line.python)), "one line a package"
+    old, new = extension.requirements(ROOT, "3.11"), extension.requirements(ROOT, "3.13")
     assert "numpy>=1.26,<2" in old and "numpy>=1.26" in new, "markers are those of Blender's Python"
-    assert "numpy" in wheels.SHIPPED and wheels._plain("Charset_Normalizer") in wheels.SHIPPED
+    assert "numpy" in extension.SHIPPED and extension._plain("Charset_Normalizer") in extension.SHIPPED

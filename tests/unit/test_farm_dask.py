@@ -12,14 +12,12 @@ from pathlib import Path
 import distributed
 import psutil
 import pytest
-from physgen.batch.farm import dask_worker
-from physgen.batch.farm.cluster_options import ClusterOptions
-from physgen.batch.farm.dask_cluster import shares, slurm_cluster
-from physgen.batch.farm.dask_farm import run
-from physgen.batch.farm.dask_security import check_trust
-from physgen.batch.farm.runners import FarmOptions
-from physgen.batch.farm.task import Plan, Task
-from physgen.sim.app.process import own_command
+from physgen.batch.farm import dask_cluster, dask_worker
+from physgen.batch.farm.dask_cluster import check_trust, slurm_cluster, worker_shares
+from physgen.batch.farm.dask_runner import run_dask
+from physgen.batch.farm.planning.plan import Plan, Task
+from physgen.batch.farm.runners import ClusterOptions, FarmOptions
+from physgen.sim.app.stage_process import own_command
 from physgen.sim.errors import InputError
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
@@ -51,7 +49,10 @@ def a_worker(address, *arguments, command=None, cwd=None):
     command = command or own_command("batch.farm.dask_worker")
     process = subprocess.Popen([*command, address, *arguments], cwd=cwd, stderr=subprocess.DEVNULL)
     try:
-        yield process
+        with pytest.MonkeyPatch.context() as patch:
+            # On a busy machine it takes longer to start than a farm is waited for.
+            patch.setattr(dask_cluster, "CONNECT_S", 120.0)
+            yield process
     finally:
         process.terminate()
         process.wait()
@@ -92,7 +93,7 @@ def test_a_killed_worker_and_a_killed_command_cost_a_retry_and_nothing_else(ball
         a_task("d", "effects", "wind", needs=("c", "a/bake")),
     )
     killer = Killer(worker_of="a/bake", command_of="b")
-    outcomes = run(plan, FarmOptions(farm="dask", workers=2), killer, never)
+    outcomes = run_dask(plan, FarmOptions(farm="dask", workers=2), killer, never)
     assert killer.worker_of is killer.command_of is None
     assert [(o.task, o.state, o.attempts) for o in outcomes] == [
         ("a/bake", "done", 2),
@@ -118,12 +119,12 @@ def test_strangers_are_refused(tmp_path):
     with a_scheduler() as address:
         with a_worker(address) as worker:
             greedy = a_plan(tmp_path, a_task("y", "effects", slots={"gpu": 1}))
-            with pytest.raises(InputError, match="takes gpu=1, and no worker has that"):
-                run(greedy, FarmOptions(farm=address), ignore, never)
+            with pytest.raises(InputError, match="needs gpu=1, and no worker has that"):
+                run_dask(greedy, FarmOptions(farm=address), ignore, never)
             open_ports = [c.laddr for c in psutil.Process(worker.pid).net_connections() if c.status == "LISTEN"]
             assert open_ports and {place.ip for place in open_ports} == {"127.0.0.1"}
         with a_worker(address, command=other), pytest.raises(InputError, match=rf"PhysGen 0\.0\.7.*PhysGen {VERSION}"):
-            run(plan, FarmOptions(farm=address), ignore, never)
+            run_dask(plan, FarmOptions(farm=address), ignore, never)
         elsewhere = tmp_path / "elsewhere"
         elsewhere.mkdir()
         # A folder that is another one for every process, as an unmounted share is.
@@ -133,9 +134,9 @@ def test_strangers_are_refused(tmp_path):
             a_worker(address, cwd=elsewhere),
             pytest.raises(InputError, match="does not see /proc/self/cwd"),
         ):
-            run(plan, FarmOptions(farm=address), ignore, never)
+            run_dask(plan, FarmOptions(farm=address), ignore, never)
     with pytest.raises(InputError, match="no scheduler answers"):
-        run(plan, FarmOptions(farm="tcp://127.0.0.1:9"), ignore, never)
+        run_dask(plan, FarmOptions(farm="tcp://127.0.0.1:9"), ignore, never)
 
 
 def test_tls_and_a_wish_to_stop(ball_scene, tmp_path):
@@ -163,22 +164,22 @@ def test_tls_and_a_wish_to_stop(ball_scene, tmp_path):
                 a_task("b", "effects", "wind"),
                 a_task("c", "effects", "wind", needs=("a/bake",)),
             )
-            outcomes = run(plan, options, stop_when_it_moves, stop.is_set)
+            outcomes = run_dask(plan, options, stop_when_it_moves, stop.is_set)
             assert [(o.state, o.attempts) for o in outcomes[::2]] == [("cancelled", 1), ("cancelled", 0)]
             assert outcomes[1].state in ("cancelled", "done")
             assert not psutil.Process(worker.pid).children()
-            again = run(a_plan(tmp_path, plan.tasks[1]), options, ignore, never)
+            again = run_dask(a_plan(tmp_path, plan.tasks[1]), options, ignore, never)
             assert again[0].state in ("done", "kept")
         with pytest.raises(InputError, match="--tls-ca is missing"):
-            run(plan, FarmOptions(farm=address), ignore, never)
+            run_dask(plan, FarmOptions(farm=address), ignore, never)
         gone = ClusterOptions(**{**pems, "tls_key": tmp_path / "gone.pem"})
         with pytest.raises(InputError, match=r"gone\.pem: there is no such file"):
-            run(plan, FarmOptions(farm=address, cluster=gone), ignore, never)
+            run_dask(plan, FarmOptions(farm=address, cluster=gone), ignore, never)
         mixed = ClusterOptions(**{**pems, "tls_key": tmp_path / "ca.pem"})
         with pytest.raises(InputError, match="give PEM files that belong together"):
-            run(plan, FarmOptions(farm=address, cluster=mixed), ignore, never)
-    with pytest.raises(InputError, match="is of no use with tcp://"):
-        run(plan, FarmOptions(farm="tcp://127.0.0.1:9", cluster=ClusterOptions(**pems)), ignore, never)
+            run_dask(plan, FarmOptions(farm=address, cluster=mixed), ignore, never)
+    with pytest.raises(InputError, match="is unused with tcp://"):
+        run_dask(plan, FarmOptions(farm="tcp://127.0.0.1:9", cluster=ClusterOptions(**pems)), ignore, never)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
@@ -198,13 +199,13 @@ def test_another_machine_in_the_clear_has_to_be_trusted(host, capsys):
 def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'physgen\[farm\]'"):
-        run(a_plan(tmp_path, a_task("x", "effects")), FarmOptions(farm="dask", workers=1), ignore, never)
+        run_dask(a_plan(tmp_path, a_task("x", "effects")), FarmOptions(farm="dask", workers=1), ignore, never)
 
 
 def test_slots_are_dealt_out_in_portions_that_are_of_use():
-    assert shares({"gpu": 1}, {"gpu": 3}, 2) == [{"gpu": 2}, {"gpu": 1}]
-    assert shares({"gpu": 2}, {"gpu": 5}, 3) == [{"gpu": 2}, {"gpu": 2}, {}]
-    assert shares({}, {}, 2) == [{}, {}]
+    assert worker_shares({"gpu": 1}, {"gpu": 3}, 2) == [{"gpu": 2}, {"gpu": 1}]
+    assert worker_shares({"gpu": 2}, {"gpu": 5}, 3) == [{"gpu": 2}, {"gpu": 2}, {}]
+    assert worker_shares({}, {}, 2) == [{}, {}]
 
 
 def test_workers_of_slurm_ask_for_what_the_tasks_take(tmp_path):

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 import quickjs
-from physgen.batch.farm.flamenco import TASK_TYPES, export
-from physgen.batch.farm.records import record_path
+from physgen.batch.farm.flamenco_export import TASK_TYPES, export_flamenco
+from physgen.batch.farm.planning.plan import STAGES, Plan, Task
 from physgen.batch.farm.runners import FarmOptions
-from physgen.batch.farm.task import STAGES, Plan, Task
+from physgen.batch.farm.task_execution import record_path
 from physgen.sim.errors import InputError
 from physgen.sim.version import VERSION
 
@@ -42,7 +42,7 @@ def a_plan(root):
 def test_the_job_compiles_to_its_tasks_and_their_commands_run(tmp_path):
     plan = a_plan(tmp_path / "a folder's name")
     plan.root.mkdir()
-    script, job_file, plan_file = export(plan, FarmOptions(out=tmp_path / "out"))
+    script, job_file, plan_file = export_flamenco(plan, FarmOptions(out=tmp_path / "out"))
     job = json.loads(job_file.read_text())
     assert job["type"] == script.stem.replace("_", "-")
     engine = quickjs.Context()
@@ -70,5 +70,5 @@ def test_every_stage_has_a_type_that_workers_of_flamenco_take():
 
 def test_braces_in_the_path_are_refused_for_they_are_variables(tmp_path):
     with pytest.raises(InputError, match="braces"):
-        export(a_plan(tmp_path / "{jobs}"), FarmOptions(out=tmp_path / "out"))
+        export_flamenco(a_plan(tmp_path / "{jobs}"), FarmOptions(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

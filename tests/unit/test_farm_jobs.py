@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import build_parser
-from physgen.batch.farm.graph import frame_chunks, make_plan, range_text
-from physgen.batch.farm.jobs import MAX_BYTES, load_job
-from physgen.physgen_addon.bridge.frame_range import parse_range
+from physgen.batch.farm.planning.job_file import MAX_BYTES, load_job
+from physgen.batch.farm.planning.task_graph import frame_chunks, make_plan, range_text
+from physgen.physgen_addon.frames.frame_index import parse_frame_range
 from physgen.sim.errors import InputError
 from physgen.sim.scene.camera_path import save_camera_path, swing
 
@@ -107,12 +107,12 @@ def test_the_example_of_the_documentation_works(tmp_path):
         (HEAD.replace('"job"', '"../job"') + SCENE, "name: is '../job': give a name of letters"),
         (HEAD + 'out = "../x"\n' + SCENE, r"out: file name '../x': must be relative"),
         (HEAD + 'out = "/tmp"\n' + SCENE, r"out: file name '/tmp'"),
-        (HEAD + 'out = "."\n' + SCENE, "a folder of its own"),
-        (HEAD + 'out = "--x"\n' + SCENE, "a folder of its own"),
-        (HEAD + SCENE + SCENE, r"scenes\[1\].name: 'cup' is there twice"),
+        (HEAD + 'out = "."\n' + SCENE, "a separate folder"),
+        (HEAD + 'out = "--x"\n' + SCENE, "a separate folder"),
+        (HEAD + SCENE + SCENE, r"scenes\[1\].name: 'cup' is used twice"),
         (HEAD + SCENE.replace('"cup"', '"summary"', 1), "'summary': give a name"),
         (HEAD + SCENE + 'scene = "x"', "either photo, with boxes, or scene"),
-        (HEAD + '[[scenes]]\nname = "a"\nscene = "x"\nnames = ["cup"]', "names: is for a photo"),
+        (HEAD + '[[scenes]]\nname = "a"\nscene = "x"\nnames = ["cup"]', "names: applies to a photo"),
         (HEAD + '[[scenes]]\nname = "a"\nscene = "x"', "there is no such file"),
         (HEAD + SCENE.replace("cup.png", "mug.png"), "there is no 'photos/mug.png'"),
         (HEAD + SCENE.replace("photos/", "/etc/"), "must be relative"),
@@ -130,7 +130,7 @@ def test_the_example_of_the_documentation_works(tmp_path):
         (HEAD + SCENE + "set = { density = 3 }", "write OBJECT.FIELD"),
         (HEAD + SCENE + "set = { cup.density = 2020-01-01 }", "set.cup.density: expected numbers"),
         (HEAD + SCENE + "matrix = { seeds = [] }", "matrix.seeds: expected a list with at least one value"),
-        (HEAD + SCENE + "matrix = { seeds = [1, 1] }", r"seeds\[1\]: 1 is there twice"),
+        (HEAD + SCENE + "matrix = { seeds = [1, 1] }", r"seeds\[1\]: 1 is given twice"),
         (HEAD + SCENE + "matrix = { speeds = [1] }", "matrix.speeds: unknown"),
         (HEAD + SCENE + f"matrix = {{ seeds = {list(range(200))}, cup.density = {list(range(1, 101))} }}", "20000 var"),
         (HEAD + SCENE + "variants = []", "at least one table"),
@@ -216,7 +216,7 @@ def test_damaged_files_are_read_or_refused(job, noise, seed):
 def test_chunks_are_all_frames_in_order_and_the_command_reads_them(frames, size):
     chunks = frame_chunks(frames, size)
     assert [n for chunk in chunks for n in chunk] == frames and max(map(len, chunks)) <= size
-    assert all(parse_range(range_text(chunk), 1, 200) == list(chunk) for chunk in chunks)
+    assert all(parse_frame_range(range_text(chunk), 1, 200) == list(chunk) for chunk in chunks)
 
 
 def test_the_graph_is_what_the_commands_take(job, ball_scene, tmp_path):

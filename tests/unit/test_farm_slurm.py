@@ -12,14 +12,11 @@ import sys
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.batch.farm.cluster_options import ClusterOptions
-from physgen.batch.farm.one import listed, main
-from physgen.batch.farm.plan_file import load_plan, save_plan
-from physgen.batch.farm.records import record_path
-from physgen.batch.farm.runners import FarmOptions
-from physgen.batch.farm.slurm import export
-from physgen.batch.farm.slurm_arrays import MOST_IN_ARRAY, dependency, indices, task_arrays
-from physgen.batch.farm.task import STAGES, Plan, Task
+from physgen.batch.farm.planning.plan import STAGES, Plan, Task, load_plan, save_plan
+from physgen.batch.farm.run_task import listed_task, main
+from physgen.batch.farm.runners import ClusterOptions, FarmOptions
+from physgen.batch.farm.slurm_export import MOST_IN_ARRAY, array_indices, dependency, export_slurm, task_arrays
+from physgen.batch.farm.task_execution import record_path
 from physgen.sim.errors import InputError
 from physgen.sim.version import VERSION
 
@@ -70,12 +67,12 @@ GOOD = {"id": "a", "stage": "bake", "argv": ["effects"]}
         ({"inputs": ["C:/x"]}, "leads out"),
         ({"inputs": ["a\\b"]}, "leads out"),
         ({"farm_folder": ".."}, "leads out"),
-        ({"id": "../a"}, "is no name"),
-        ({"id": "a\nb"}, "is no name"),
-        ({"id": "a//b"}, "is no name"),
+        ({"id": "../a"}, "is not a valid name"),
+        ({"id": "a\nb"}, "is not a valid name"),
+        ({"id": "a//b"}, "is not a valid name"),
         ({"stage": "burn"}, "known are"),
-        ({"needs": ["b"]}, "is no task before it"),
-        ({"needs": ["a"]}, "is no task before it"),
+        ({"needs": ["b"]}, "is not an earlier task"),
+        ({"needs": ["a"]}, "is not an earlier task"),
         ({"argv": []}, "expected 1 to"),
         ({"argv": ["a\0b"]}, "zero bytes"),
         ({"slots": [{"name": "gpu", "count": 0}]}, "expected 1 to"),
@@ -177,7 +174,7 @@ def test_arrays_are_few_and_of_the_size_that_slurm_takes():
         ("variant", 500),
         ("bake", 500),
     ]
-    assert [indices(array) for array in arrays] == ["0", "0-999", "0-999", "0-499", "0-499"]
+    assert [array_indices(array) for array in arrays] == ["0", "0-999", "0-999", "0-499", "0-499"]
 
 
 STAND_IN = f"""#!{sys.executable}
@@ -234,7 +231,7 @@ def test_the_scripts_carry_out_the_plan_and_a_failure_holds_back_what_needs_it_a
     )
     wanted = ClusterOptions(queue="short", memory="500M", walltime="0:10:00", cores=2, sbatch=("--qos=low",))
     plan = a_plan(root, *tasks)
-    for path in export(plan, FarmOptions(out=tmp_path / "scripts", cluster=wanted, retries=0)):
+    for path in export_slurm(plan, FarmOptions(out=tmp_path / "scripts", cluster=wanted, retries=0)):
         if path.suffix in (".sh", ".sbatch"):
             subprocess.run(["bash", "-n", path], check=True)
     assert (tmp_path / "scripts/submit.sh").stat().st_mode & stat.S_IXUSR
@@ -263,7 +260,7 @@ def test_the_scripts_carry_out_the_plan_and_a_failure_holds_back_what_needs_it_a
 def test_what_cannot_be_submitted_whole_is_taken_back(tmp_path):
     plan = a_plan(tmp_path / "root", a_task("a", "bake"), a_task("b", "render", "a"))
     (tmp_path / "root").mkdir()
-    export(plan, FarmOptions(out=tmp_path / "scripts"))
+    export_slurm(plan, FarmOptions(out=tmp_path / "scripts"))
     code, asked = submit(tmp_path / "scripts", tmp_path, full_at="101")
     assert code == 1
     assert list(asked.values())[1:] == [["scancel", "100"]]
@@ -271,10 +268,10 @@ def test_what_cannot_be_submitted_whole_is_taken_back(tmp_path):
 
 def test_a_number_outside_the_list_is_refused(tmp_path):
     (tmp_path / "list").write_text("a\nb\n")
-    assert listed(tmp_path / "list", "1") == "b"
+    assert listed_task(tmp_path / "list", "1") == "b"
     for number in ("2", "-1", "x", "٣", ""):
         with pytest.raises(InputError, match="has no line"):
-            listed(tmp_path / "list", number)
+            listed_task(tmp_path / "list", number)
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,12 @@ from html.parser import HTMLParser
 
 import cv2
 import numpy as np
-from physgen.batch.farm.monitor import Monitor
-from physgen.batch.farm.page import MOST_ROWS, duration, summary_page
-from physgen.batch.farm.records import log_path
+from physgen.batch.farm.job_monitor import HEIGHT, Monitor, make_strip
+from physgen.batch.farm.planning.plan import Outcome, Plan, Task
 from physgen.batch.farm.runners import ended_event, started_event
-from physgen.batch.farm.strip import HEIGHT, make_strip
-from physgen.batch.farm.summary import STATES, summarize
-from physgen.batch.farm.task import Outcome, Plan, Task
-from physgen.physgen_addon.bridge.frame_file import Part, write_exr
+from physgen.batch.farm.summary_page import MOST_ROWS, STATES, format_duration, summarize, summary_page
+from physgen.batch.farm.task_execution import log_path
+from physgen.physgen_addon.frames.frame_files import Part, write_exr
 from physgen.sim.version import VERSION
 
 EVIL = '</pre><script>alert("x")</script><img src=x onerror=y>'
@@ -106,4 +104,4 @@ def test_a_strip_is_made_again_only_for_other_frames(tmp_path):
     cv2.imwrite(str(frames[0]), np.full((60, 80, 3), 255, np.uint8))
     assert make_strip(frames, out) and cv2.imread(str(out))[5, 5].min() > 200
     assert not make_strip([tmp_path / "none.png"], tmp_path / "b.jpg")
-    assert [duration(s) for s in (0.04, 12.4, 200, 18123)] == ["0.0 s", "12 s", "3:20 min", "5:02 h"]
+    assert [format_duration(s) for s in (0.04, 12.4, 200, 18123)] == ["0.0 s", "12 s", "3:20 min", "5:02 h"]

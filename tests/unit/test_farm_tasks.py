@@ -12,23 +12,26 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.batch.farm.execute import execute
-from physgen.batch.farm.local import _Board, run
-from physgen.batch.farm.log import EARLIER_BYTES, HEAD_BYTES, TAIL_BYTES, TaskLog, log_end
-from physgen.batch.farm.records import (
+from physgen.batch.farm.local_runner import _Board, run_local
+from physgen.batch.farm.planning.plan import Outcome, Plan, Task, is_worth_retrying
+from physgen.batch.farm.runners import FarmOptions, find_runner
+from physgen.batch.farm.task_execution import (
+    EARLIER_BYTES,
+    HEAD_BYTES,
+    TAIL_BYTES,
     Record,
+    TaskLog,
+    execute_task,
     input_hashes,
-    kept_record,
     load_record,
+    log_end,
     log_path,
     produced_hashes,
     record_path,
     save_record,
+    up_to_date_record,
 )
-from physgen.batch.farm.retry import is_worth_retrying
-from physgen.batch.farm.runners import FarmOptions, find_runner
-from physgen.batch.farm.task import Outcome, Plan, Task
-from physgen.sim.cache.manifest import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
@@ -48,7 +51,7 @@ def variant(name, source="scene", **changes):
 
 
 def carry_out(task, root, **changes):
-    return execute(task, root, **{"version": VERSION, "worker": "here", **changes})
+    return execute_task(task, root, **{"version": VERSION, "worker": "here", **changes})
 
 
 def test_a_task_is_done_once_and_again_when_something_changed(ball_scene, tmp_path):
@@ -100,7 +103,7 @@ def test_what_a_task_cannot_do_is_in_its_outcome(ball_scene, tmp_path):
     outside = carry_out(variant("a", id="../../a"), tmp_path)
     assert outside.state == "failed" and "without '..'" in outside.message
     less = carry_out(variant("a", produces=("out/a/video.mp4",)), tmp_path)
-    assert (less.state, less.exit_code) == ("failed", 1) and "left no out/a/video.mp4" in less.message
+    assert (less.state, less.exit_code) == ("failed", 1) and "did not write out/a/video.mp4" in less.message
     wrong = carry_out(variant("a", argv=("variant", "scene", "--presto")), tmp_path)
     assert (wrong.state, wrong.exit_code) == ("failed", 2) and "--out" in wrong.message
     (tmp_path / "locked").write_text("a file")
@@ -130,13 +133,13 @@ def test_a_failure_costs_what_depends_on_it_and_nothing_else(ball_scene, tmp_pat
     tasks = (bad, after, last, variant("good"))
     plan = Plan(name="p", root=tmp_path, version=VERSION, tasks=tasks)
     events = []
-    outcomes = run(plan, FarmOptions(workers=2), events.append, never)
+    outcomes = run_local(plan, FarmOptions(workers=2), events.append, never)
     assert [o.state for o in outcomes] == ["failed", "skipped", "skipped", "done"]
     assert outcomes[0].attempts == 1, "bad input is not worth another attempt"
     assert all(bad.id in outcome.message for outcome in outcomes[1:3])
     ended = [e["task"] for e in events if e["event"] == "task" and e["state"] != "started"]
     assert sorted(ended) == sorted(t.id for t in tasks)
-    assert [o.state for o in run(plan, FarmOptions(), ignore, lambda: True)] == ["cancelled"] * 4
+    assert [o.state for o in run_local(plan, FarmOptions(), ignore, lambda: True)] == ["cancelled"] * 4
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals as on Unix")
@@ -172,15 +175,17 @@ def test_a_damaged_record_is_none(tmp_path_factory, noise, seed):
     fields = {"task": "a/b", "version": VERSION, "argv": ("x",), "seconds": 1.0, "cpu_seconds": 2.0, "worker": "w"}
     record = Record(**fields, inputs=input_hashes(task, root), produced=produced_hashes(task, root))
     save_record(task, root, record)
-    assert kept_record(task, root, VERSION) == record
+    assert up_to_date_record(task, root, VERSION) == record
     path = record_path(task, root)
     content = bytearray(path.read_bytes())
     at = seed % len(content)
     content[at : at + 1 + len(noise) // 2] = noise
     path.write_bytes(bytes(content))
-    assert kept_record(task, root, VERSION) in (None, record) or load_record(task, root).produced == record.produced
+    assert (
+        up_to_date_record(task, root, VERSION) in (None, record) or load_record(task, root).produced == record.produced
+    )
     path.write_bytes(noise)
-    assert kept_record(task, root, VERSION) is None
+    assert up_to_date_record(task, root, VERSION) is None
 
 
 def test_what_is_worth_another_attempt():
@@ -199,8 +204,8 @@ def test_an_unknown_farm_is_refused(farm):
 
 def test_more_of_a_slot_than_there_is_is_refused(tmp_path):
     plan = Plan(name="p", root=tmp_path, version=VERSION, tasks=(variant("a", slots={"gpu": 2}),))
-    with pytest.raises(InputError, match="wants 2 of the slot 'gpu', there are 1"):
-        run(plan, FarmOptions(), ignore, never)
+    with pytest.raises(InputError, match="needs 2 of the slot 'gpu', there are 1"):
+        run_local(plan, FarmOptions(), ignore, never)
 
 
 @st.composite

@@ -11,9 +11,9 @@ import socket
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.guidance.clip import MEAN, SPREAD, ClipScores
-from physgen.sim.gaussians.guidance.diffusers_folder import DiffusersGuidance, DiffusersOptions
-from physgen.sim.gaussians.guidance.protocol import Seen
+from physgen.sim.gaussians.guidance.clip_scores import CLIP_MEAN, CLIP_STD, ClipScores
+from physgen.sim.gaussians.guidance.diffusers_guidance import DiffusersGuidance, DiffusersOptions
+from physgen.sim.gaussians.guidance.score_distillation import RenderedView
 from physgen.sim.scene.model import IDENTITY4, Camera
 
 torch = pytest.importorskip("torch")
@@ -153,7 +153,7 @@ def no_network(monkeypatch):
 def seen(size=(16, 16), subject="frog", seed=0):
     picture = np.random.default_rng(seed).uniform(0, 1, (*size, 3))
     camera = Camera(width=size[1], height=size[0], fx=9.0, fy=9.0, cx=8.0, cy=8.0, world_from_camera=IDENTITY4)
-    return Seen(picture=picture, camera=camera, subject=subject)
+    return RenderedView(picture=picture, camera=camera, subject=subject)
 
 
 def latents(pipe, picture):
@@ -262,7 +262,7 @@ def test_folders_that_cannot_be_used_are_told(models, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "all.safetensors").write_bytes(b"")
     cases = [
-        (tmp_path / "nowhere", "there is no such folder"),
+        (tmp_path / "nowhere", "no such folder"),
         (tmp_path / "all.safetensors", "is a file"),
         (tmp_path / "empty", "has no model_index.json"),
         (edited(text, tmp_path / "a", index, _class_name="FluxPipeline"), "is a FluxPipeline: give one of"),
@@ -270,7 +270,7 @@ def test_folders_that_cannot_be_used_are_told(models, tmp_path):
         (edited(text, tmp_path / "c", noise, prediction_type="flow"), "predicts 'flow'"),
         (edited(text, tmp_path / "d", noise, trained_betas=[0.5] * 3), "alphas_cumprod has shape"),
         (edited(text, tmp_path / "e", "unet/config.json", block_out_channels=[8, 32]), "cannot be used|lack"),
-        (edited(pixels, tmp_path / "f", "unet/config.json", num_class_embeds=3), "lack|told a class"),
+        (edited(pixels, tmp_path / "f", "unet/config.json", num_class_embeds=3), "lack|conditioned on a class"),
     ]
     whole = tmp_path / "g"
     shutil.copytree(text, whole)
@@ -359,7 +359,7 @@ def test_clip_scores_are_the_models_own(clip):
     model, words, folder = clip
     scores = ClipScores(folder)
     a, b = (np.random.default_rng(i).uniform(0, 1, (12, 12, 3)) for i in range(2))
-    pixels = (np.stack([a, b]) - MEAN) / SPREAD
+    pixels = (np.stack([a, b]) - CLIP_MEAN) / CLIP_STD
     ids = words("a frog", padding="max_length", max_length=20, truncation=True, return_tensors="pt").input_ids
     with torch.no_grad():
         answer = model(input_ids=ids, pixel_values=torch.tensor(pixels.transpose(0, 3, 1, 2), dtype=torch.float32))
@@ -375,7 +375,7 @@ def test_clip_scores_are_the_models_own(clip):
 
 def test_clip_folders_that_cannot_be_used_are_told(clip, models, tmp_path):
     _, _, folder = clip
-    with pytest.raises(InputError, match="there is no such folder"):
+    with pytest.raises(InputError, match="no such folder"):
         ClipScores(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"has no config\.json"):
         ClipScores(models("text")[1])

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The horizon over the photo and the camera of the reconstruction are the same thing, said in two ways."""
 
 import math
@@ -5,8 +6,8 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.physgen_addon import asking
-from physgen.physgen_addon.horizon_maths import (
+from physgen.physgen_addon.photo import photo_consent
+from physgen.physgen_addon.photo.photo_maths import (
     HIGHEST,
     LOWEST,
     dragged,
@@ -17,8 +18,14 @@ from physgen.physgen_addon.horizon_maths import (
     pitch_of_camera,
     usual,
 )
-from physgen.sim.reconstruct.options import ReconstructOptions
-from physgen.sim.reconstruct.view.camera import camera_above_ground, focal_of_fov, horizon_at_edges, pitch_of_horizon
+from physgen.sim.reconstruct.camera.ground_camera import (
+    camera_above_ground,
+    focal_of_fov,
+    horizon_at_edges,
+)
+from physgen.sim.reconstruct.reconstruct_options import ReconstructOptions
+
+from .horizon_formulas import pitch_of_horizon
 
 sizes = st.sampled_from([(640, 480), (480, 640), (500, 500)])
 rolls = st.floats(math.radians(-40), math.radians(40))
@@ -87,14 +94,14 @@ def test_a_usual_photo_is_one_that_looks_down_at_a_table():
     ],
 )
 def test_only_this_machine_may_be_asked_offline(url, here):
-    assert asking.is_allowed(url, online=False) is here
-    assert asking.is_allowed(url, online=True)
+    assert photo_consent.is_allowed(url, online=False) is here
+    assert photo_consent.is_allowed(url, online=True)
 
 
 def test_an_agreement_is_about_one_scene_and_one_address():
-    asking.agree(7, "https://a", agreed=True)
-    assert asking.is_agreed(7, "https://a") and not asking.is_agreed(8, "https://a")
-    asking.agree(7, "https://b", agreed=True)
-    assert asking.is_agreed(7, "https://b") and not asking.is_agreed(7, "https://a")
-    asking.agree(7, "https://b", agreed=False)
-    assert not asking.is_agreed(7, "https://b")
+    photo_consent.agree(7, "https://a", agreed=True)
+    assert photo_consent.is_agreed(7, "https://a") and not photo_consent.is_agreed(8, "https://a")
+    photo_consent.agree(7, "https://b", agreed=True)
+    assert photo_consent.is_agreed(7, "https://b") and not photo_consent.is_agreed(7, "https://a")
+    photo_consent.agree(7, "https://b", agreed=False)
+    assert not photo_consent.is_agreed(7, "https://b")

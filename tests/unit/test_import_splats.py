@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.app.import_splats import import_splats
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.moving import placed, quaternions
-from physgen.sim.gaussians.ply.read import read_splats
-from physgen.sim.gaussians.ply.write import write_splats
-from physgen.sim.gaussians.splats import Splats, joined
-from physgen.sim.importers.splat_surface import surface_of
-from physgen.sim.scene.glb import read_textured_mesh
+from physgen.sim.gaussians.splat_ply import read_splats, write_splats
+from physgen.sim.gaussians.splats import Splats, joined, quaternions, transform_splats
+from physgen.sim.importers.splat_scene import import_splats, splat_surface
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.textured_mesh import read_textured_mesh
 from scipy.spatial import cKDTree
 
 
@@ -49,7 +46,7 @@ def quiet(message):
 )
 def test_a_hollow_cloud_becomes_the_solid_that_it_shows(mesh, bound):
     """Volume within a half cell of the grid all around (a ninety-sixth of the size)."""
-    found = surface_of(on_surface(mesh, 12_000), "thing", quiet)
+    found = splat_surface(on_surface(mesh, 12_000), "thing", quiet)
     body = trimesh.Trimesh(found.vertices, found.faces, process=False)
     assert body.is_watertight and body.is_winding_consistent and found.inside.all()
     assert abs(body.volume / mesh.volume - 1) < bound
@@ -64,7 +61,7 @@ def test_the_shape_does_not_depend_on_unit_and_place():
     splats = on_surface(trimesh.creation.icosphere(3), 3000)
     matrix = np.diag([1e3, 1e3, 1e3, 1.0])
     matrix[:3, 3] = 5e4
-    one, other = surface_of(splats, "thing", quiet), surface_of(placed(splats, matrix), "thing", quiet)
+    one, other = splat_surface(splats, "thing", quiet), splat_surface(transform_splats(splats, matrix), "thing", quiet)
     assert np.array_equal(one.faces, other.faces)
     np.testing.assert_allclose(other.vertices, one.vertices * 1e3 + 5e4, rtol=1e-6)
 
@@ -83,7 +80,7 @@ def test_floaters_fog_and_holes_do_not_matter():
     )
     fog = floating.changed(centres=floating.centres / 30, scales=np.full((40, 3), 2.0))
     said = []
-    found = surface_of(joined([splats.chosen(hole), floating, fog]), "ball", said.append)
+    found = splat_surface(joined([splats.subset(hole), floating, fog]), "ball", said.append)
     body = trimesh.Trimesh(found.vertices, found.faces, process=False)
     assert body.is_watertight and abs(body.volume / ball.volume - 1) < 0.05
     assert found.inside[: hole.sum()].all() and not found.inside[hole.sum() :].any()
@@ -93,20 +90,20 @@ def test_floaters_fog_and_holes_do_not_matter():
 def test_what_encloses_nothing_is_as_thick_as_its_splats():
     """A sheet: nothing inside, but not nothing."""
     said = []
-    found = surface_of(on_surface(trimesh.creation.box((2.0, 2.0, 1e-4)), 6000), "leaf", said.append)
+    found = splat_surface(on_surface(trimesh.creation.box((2.0, 2.0, 1e-4)), 6000), "leaf", said.append)
     body = trimesh.Trimesh(found.vertices, found.faces, process=False)
     assert body.is_watertight and 0.005 < body.volume / 4.0 < 0.1
-    assert any("enclose nothing" in text for text in said)
+    assert any("enclose no volume" in text for text in said)
 
 
 def test_what_shows_no_body_is_refused():
     splats = on_surface(trimesh.creation.icosphere(2), 200)
-    with pytest.raises(InputError, match="nothing to see"):
-        surface_of(splats.changed(opacities=np.full(200, 0.01)), "ghost", quiet)
+    with pytest.raises(InputError, match="nothing is visible"):
+        splat_surface(splats.changed(opacities=np.full(200, 0.01)), "ghost", quiet)
     with pytest.raises(InputError, match="no extent"):
-        surface_of(splats.changed(centres=np.zeros((200, 3))), "dot", quiet)
+        splat_surface(splats.changed(centres=np.zeros((200, 3))), "dot", quiet)
     with pytest.raises(InputError, match="dense"):
-        surface_of(splats.changed(opacities=np.full(200, 0.11), scales=np.full((200, 3), 1e-4)), "dust", quiet)
+        splat_surface(splats.changed(opacities=np.full(200, 0.11), scales=np.full((200, 3), 1e-4)), "dust", quiet)
 
 
 @pytest.mark.parametrize("up", ["y-down", "x", "z-down"])
@@ -119,19 +116,19 @@ def test_it_stands_upright_on_the_ground(tmp_path, up):
     red = np.where(pole.centres[:, 2:] > 0.5, [[0.9, 0.1, 0.1]], [[0.2, 0.3, 0.9]])
     matrix = turn.copy()
     matrix[:3, 3] = 7.0
-    write_splats(tmp_path / "pole.ply", placed(pole.changed(colours=red), matrix))
+    write_splats(tmp_path / "pole.ply", transform_splats(pole.changed(colours=red), matrix))
     folder = import_splats(tmp_path / "pole.ply", tmp_path / "scene", size_m=0.4, up=up)
-    (item,) = folder.scene.objects
+    (item,) = folder.model.objects
     mesh = load_object_mesh(folder, item)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0).max(), 0.4, rtol=1e-6)
     np.testing.assert_allclose(
         [*(mesh.vertices.max(0) + mesh.vertices.min(0))[:2], mesh.vertices[:, 2].min()], 0, atol=1e-6
     )
-    splats = placed(read_splats(folder.file(item.splats)), np.array(item.world_from_mesh))
+    splats = transform_splats(read_splats(folder.file(item.splats)), np.array(item.world_from_mesh))
     is_red = splats.colours[:, 0] > 0.5
     assert splats.centres[is_red, 2].min() > 0.298 and splats.centres[~is_red, 2].max() < 0.302
     assert np.linalg.det(np.array(item.world_from_mesh)[:3, :3]) > 0
-    seen = folder.scene.camera.project(mesh.vertices)
+    seen = folder.model.camera.project(mesh.vertices)
     assert (seen[:, :2] > 0).all() and (seen[:, :2] < (960, 720)).all()
     file = trimesh.load(folder.file(item.mesh), process=False, force="mesh")
     top = mesh.vertices[:, 2] > 0.35

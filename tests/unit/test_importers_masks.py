@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from physgen.sim.arrays import read_npy, read_npz
 from physgen.sim.errors import InputError
+from physgen.sim.importers.coco_masks import mask_from_polygons, mask_from_rle
 from physgen.sim.importers.masks import read_masks
-from physgen.sim.importers.rle import mask_from_polygons, mask_from_rle
+from physgen.sim.npz import read_npy, read_npz
 from PIL import Image
 
 WIDTH, HEIGHT = 60, 40
@@ -217,18 +217,21 @@ BAD = {
     "objects.npy": (lambda p: np.save(p, np.array([print])), "holds object"),
     "text.npy": (lambda p: np.save(p, np.array(["a"])), "holds <U1"),
     "vector.npy": (lambda p: np.save(p, np.ones(5)), r"shape \(5,\)"),
-    "short.npy": (lambda p: (np.save(p, MASKS), p.write_bytes(p.read_bytes()[:500])), "takes 4800"),
+    "short.npy": (lambda p: (np.save(p, MASKS), p.write_bytes(p.read_bytes()[:500])), "needs 4800"),
     "nan.npy": (lambda p: np.save(p, np.full((2, HEIGHT, WIDTH), np.nan)), "not finite"),
     "empty.npy": (lambda p: np.save(p, MASKS & False), "mask object_0 is empty"),
     "many.npy": (lambda p: np.save(p, np.ones((5000, 2, 3), bool)), "5000 masks"),
     "bomb.npz": (bomb, "MiB allowed"),
     "garbage.npz": (lambda p: p.write_bytes(b"PK\3\4 garbage"), "not readable as .npz"),
-    "none.npz": (lambda p: np.savez(p, scores=np.ones(3)), "holds no mask"),
+    "none.npz": (lambda p: np.savez(p, scores=np.ones(3)), "contains no mask"),
     "object.json": (lambda p: p.write_text("{}"), "expected a list of masks"),
     "number.json": (lambda p: p.write_text("[3]"), "expected a list of masks"),
     "box.json": (lambda p: p.write_text('[{"bbox": [1, 2, 3, 4]}]'), "no segmentation"),
     "runs.json": (lambda p: p.write_text('[{"segmentation": {"size": [4, 4], "counts": [3, 4]}}]'), "do not add up"),
-    "minus.json": (lambda p: p.write_text('[{"segmentation": {"size": [4, 4], "counts": [20, -4]}}]'), "whole numbers"),
+    "minus.json": (
+        lambda p: p.write_text('[{"segmentation": {"size": [4, 4], "counts": [20, -4]}}]'),
+        "non-negative integers",
+    ),
     "huge.json": (
         lambda p: p.write_text('[{"segmentation": {"size": [99999999, 99999999], "counts": [1]}}]'),
         "expected height and width",
@@ -236,14 +239,14 @@ BAD = {
     "cut.json": (lambda p: p.write_text('[{"segmentation": {"size": [4, 4], "counts": "P"}}]'), "middle of a number"),
     "chain.json": (
         lambda p: p.write_text(json.dumps([{"segmentation": {"size": [4, 4], "counts": "o" * 99}}])),
-        "where no number goes on",
+        "contain an unexpected",
     ),
     "polygon.json": (lambda p: p.write_text('[{"segmentation": [[1, 2, 3]]}]'), "at least three points"),
     "deep.json": (lambda p: p.write_text("[" * 10**5), "not readable as JSON"),
-    "garbage.png": (lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n garbage"), "no readable picture"),
+    "garbage.png": (lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n garbage"), "not a readable image"),
     "black.png": (lambda p: Image.new("L", (WIDTH, HEIGHT)).save(p), "is empty"),
-    "folder": (lambda p: p.mkdir(), "holds no PNG"),
-    "masks.exr": (lambda p: p.write_bytes(b""), "masks are a folder of PNGs"),
+    "folder": (lambda p: p.mkdir(), "contains no PNG"),
+    "masks.exr": (lambda p: p.write_bytes(b""), "give a folder of PNGs"),
 }
 
 
@@ -257,7 +260,7 @@ def test_garbage_is_named(tmp_path, name):
 
 
 def test_what_is_not_there(tmp_path):
-    with pytest.raises(InputError, match="no such masks"):
+    with pytest.raises(InputError, match="no such file or folder"):
         read(tmp_path / "x.png")
 
 

@@ -8,13 +8,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.app.import_physgen import import_physgen, object_requests, with_motion
 from physgen.sim.errors import InputError
-from physgen.sim.importers.physgen import read_physgen
+from physgen.sim.importers.physgen import import_physgen, object_requests, read_physgen, with_motion
 from physgen.sim.importers.yaml_fields import MAX_YAML_BYTES, number, read_yaml
 from physgen.sim.reconstruct import ReconstructOptions
-from physgen.sim.scene.folder import SceneFolder, save_scene
-from physgen.sim.scene.model import Camera, Ground, Scene, SceneObject
+from physgen.sim.scene.folder import Scene, save_scene
+from physgen.sim.scene.model import Camera, Ground, SceneModel, SceneObject
 from PIL import Image
 
 WIDTH, HEIGHT = 160, 120
@@ -108,7 +107,7 @@ def cubes(tmp_path, distance, focal=200.0):
     pose = ((1.0, 0, 0, 0), (0, 0, 1.0, -distance), (0, -1.0, 0, 0.25), (0, 0, 0, 1.0))
     camera = Camera(width=WIDTH, height=HEIGHT, fx=focal, fy=focal, cx=80, cy=60, world_from_camera=pose)
     objects = tuple(SceneObject(name=name, mesh=f"meshes/{name}.obj", size_m=0.5) for name in ("ball", "box"))
-    return save_scene(tmp_path, Scene(camera=camera, objects=objects, ground=Ground()))
+    return save_scene(tmp_path, SceneModel(camera=camera, objects=objects, ground=Ground()))
 
 
 @pytest.mark.parametrize("distance", [0.5, 2.0, 30.0])
@@ -158,25 +157,25 @@ def test_the_whole_way(root, tmp_path, capsys):
     out = tmp_path / "scene"
     events = []
     folder = import_physgen(root, out, options=ReconstructOptions(mesh_vertices=500, sun=False), on_event=events.append)
-    assert isinstance(folder, SceneFolder) and [o.name for o in folder.scene.objects] == ["ball", "toy box"]
+    assert isinstance(folder, Scene) and [o.name for o in folder.model.objects] == ["ball", "toy box"]
     notices = " ".join(e["message"] for e in events if e["event"] == "notice")
     for words in ("1 walls (edge_list)", "not used: animation_frames", "ratios are kept"):
         assert words in notices
-    found = np.asarray(Image.open(folder.file(folder.scene.objects[1].mask))) > 127
+    found = np.asarray(Image.open(folder.file(folder.model.objects[1].mask))) > 127
     truth = np.asarray(Image.open(root / "mask.png")) == 3
     assert (found & truth).sum() / (found | truth).sum() > 0.9
-    assert folder.scene.objects[0].velocity[0] > 0 > folder.scene.objects[1].velocity[0]
-    assert folder.scene.objects[0].velocity[2] > 0
+    assert folder.model.objects[0].velocity[0] > 0 > folder.model.objects[1].velocity[0]
+    assert folder.model.objects[0].velocity[2] > 0
     assert list(tmp_path.glob(".scene*")) == []
     assert main(["import", str(root), "--out", str(tmp_path / "no"), "--settings", "x.yaml"]) != 0
-    assert "leave the flag out" in capsys.readouterr().err
+    assert "omit the flag" in capsys.readouterr().err
 
 
 BAD = {
     "no object": ("obj_info: {}", "obj_info: expected 1 to 256"),
     "a list": ("- 1\n- 2", "expected keys and values"),
     "no pixels": ("obj_info: {77: {label: x}}", "no pixel of that number"),
-    "a number that is none": ("obj_info: {-1: {label: x}}", "'-1' is no number"),
+    "a number that is none": ("obj_info: {-1: {label: x}}", "'-1' is not the number"),
     "a mass of nothing": ("obj_info: {1: {mass: 0}}", r"obj_info\[1\].mass is 0: expected a number"),
     "a mass of text": ("obj_info: {1: {mass: heavy}}", "mass is 'heavy'"),
     "friction below 0": ("obj_info: {1: {friction: -1}}", "friction is -1"),
@@ -204,9 +203,9 @@ def test_missing_and_damaged_files_are_named(root, tmp_path, name):
     assert not (tmp_path / "scene").exists()
 
 
-def test_a_folder_of_nobody(tmp_path, capsys):
+def test_a_folder_of_neither_program(tmp_path, capsys):
     assert main(["import", str(tmp_path), "--out", str(tmp_path / "x")]) != 0
-    assert "holds neither transform.json" in capsys.readouterr().err
+    assert "contains neither transform.json" in capsys.readouterr().err
 
 
 def yaml_of(path, text):

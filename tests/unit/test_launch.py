@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from physgen.sim.app import requirements
-from physgen.sim.app.process import child_environment, own_command
+from physgen.sim.app.stage_process import child_environment, own_command
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -20,7 +20,7 @@ def tree(tmp_path):
     """A tree of another version: the launcher, and a module that says who it is and starts itself once more."""
     app = tmp_path / "träe 2" / "sim" / "app"
     app.mkdir(parents=True)
-    for name in ("launch.py", "process.py"):
+    for name in ("launch.py", "stage_process.py"):
         (app / name).write_text((ROOT / "sim" / "app" / name).read_text(encoding="utf-8"), encoding="utf-8")
     for name in ("errors.py", "events.py"):
         text = (ROOT / "sim" / name).read_text(encoding="utf-8")
@@ -29,7 +29,7 @@ def tree(tmp_path):
         (folder / "__init__.py").touch()
     (app / "who.py").write_text(
         "import os, subprocess, sys, json\n"
-        "from .process import own_command\n"
+        "from .stage_process import own_command\n"
         "try: import only_here\n"
         "except ImportError: only_here = None\n"
         "print(json.dumps([__file__, __package__, os.getcwd(), only_here is not None, sys.argv[1:]]), flush=True)\n"

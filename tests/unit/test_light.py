@@ -9,12 +9,12 @@ import OpenImageIO as oiio
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from physgen.sim.app.light import LightRequest, set_light
-from physgen.sim.app.reconstruct import reconstruct_scene
+from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.light.photo_environment import photo_environment
-from physgen.sim.reconstruct.view.camera import camera_above_ground
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.lighting.light_estimate import photo_environment
 from physgen.sim.scene.environment import (
     prepared,
     read_environment,
@@ -25,7 +25,7 @@ from physgen.sim.scene.environment import (
 )
 from physgen.sim.scene.equirectangular import LUMINANCE, directions
 from physgen.sim.scene.folder import load_scene, save_scene
-from physgen.sim.scene.model import Ground, Light, Scene, SceneObject
+from physgen.sim.scene.model import Ground, Light, SceneModel, SceneObject
 from PIL import Image
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -178,33 +178,39 @@ def scene(tmp_path):
     Image.fromarray(grey).save(root / "background.png")
     Image.fromarray(mask).save(root / "masks" / "box.png")
     item = SceneObject(name="box", mesh="meshes/box.obj", size_m=0.1, mask="masks/box.png")
-    save_scene(root, Scene(camera=CAMERA, objects=(item,), light=Light(sun_direction=(0.0, 0.0, 1.0))))
+    save_scene(root, SceneModel(camera=CAMERA, objects=(item,), light=Light(sun_direction=(0.0, 0.0, 1.0))))
     return root
 
 
 def test_a_sun_is_set_changed_and_taken_away(scene):
-    light = set_light(scene, LightRequest(sun_direction=(3.0, 0.0, 4.0), sun_angle_deg=2.0)).scene.light
+    light = set_light(
+        load_scene(scene), request=LightRequest(sun_direction=(3.0, 0.0, 4.0), sun_angle_deg=2.0)
+    ).model.light
     assert light.sun_direction == pytest.approx((0.6, 0.0, 0.8))
     assert light.sun_angle == pytest.approx(math.radians(2))
-    assert set_light(scene, LightRequest(sun_strength=3.0)).scene.light == dataclasses.replace(light, sun_strength=3.0)
-    assert set_light(scene, LightRequest(sun=False)).scene.light.sun_direction is None
-    assert load_scene(scene).scene.light.sun_direction is None
+    assert set_light(load_scene(scene), request=LightRequest(sun_strength=3.0)).model.light == dataclasses.replace(
+        light, sun_strength=3.0
+    )
+    assert set_light(load_scene(scene), request=LightRequest(sun=False)).model.light.sun_direction is None
+    assert load_scene(scene).model.light.sun_direction is None
     with pytest.raises(InputError, match="no sun"):
-        set_light(scene, LightRequest(sun_strength=1.0))
+        set_light(load_scene(scene), request=LightRequest(sun_strength=1.0))
     with pytest.raises(InputError, match="below the ground"):
-        set_light(scene, LightRequest(sun_direction=(1.0, 0.0, -0.5)))
+        set_light(load_scene(scene), request=LightRequest(sun_direction=(1.0, 0.0, -0.5)))
 
 
 def test_an_environment_replaces_the_old_one_and_its_file(scene, tmp_path):
     write_environment(tmp_path / "sun.exr", spot_map([0.6, 0, 0.8]))
     write_environment(tmp_path / "even.exr", np.ones((32, 64, 3), np.float32))
     said = []
-    first = set_light(scene, LightRequest(environment=tmp_path / "sun.exr"), said.append).scene.light
+    first = set_light(
+        load_scene(scene), request=LightRequest(environment=tmp_path / "sun.exr"), on_event=said.append
+    ).model.light
     # Its own sun is enough.
     assert first.sun_direction is None and any("sun of its own" in event["message"] for event in said)
-    second = set_light(scene, LightRequest(environment=tmp_path / "even.exr")).scene.light
+    second = set_light(load_scene(scene), request=LightRequest(environment=tmp_path / "even.exr")).model.light
     assert [path.name for path in (scene / "light").iterdir()] == [second.environment.removeprefix("light/")]
-    assert load_scene(scene).scene.light == second
+    assert load_scene(scene).model.light == second
 
 
 def test_what_fails_leaves_the_scene_as_it_was(scene, tmp_path):
@@ -215,7 +221,7 @@ def test_what_fails_leaves_the_scene_as_it_was(scene, tmp_path):
         LightRequest(environment=tmp_path / "even.exr", sun_direction=(0.0, 1.0, -1.0)),
     ):
         with pytest.raises(InputError):
-            set_light(scene, request)
+            set_light(load_scene(scene), request=request)
         assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before
 
 
@@ -245,21 +251,23 @@ def test_a_photo_is_reconstructed_under_a_file_and_again_when_the_file_changes(t
     options = ReconstructOptions(environment=sky, pitch_deg=30.0, mesh_vertices=600, patch_radius=2)
     said = []
 
-    def reconstruct():
+    def once():
         said.clear()
         request = ObjectRequest(box=(30, 20, 85, 70))
-        return reconstruct_scene(tmp_path / "photo.png", [request], tmp_path / "scene", options, said.append)
+        return reconstruct(
+            tmp_path / "photo.png", [request], out=tmp_path / "scene", options=options, on_event=said.append
+        )
 
     with pytest.raises(InputError, match="no such file"):
-        reconstruct()
+        once()
     assert not (tmp_path / "scene").exists()
     write_environment(sky, spot_map([0.8, 0, 0.6]))
-    folder = reconstruct()
-    assert folder.scene.light.sun_direction is None
-    kept = read_environment(folder.file(folder.scene.light.environment))
+    folder = once()
+    assert folder.model.light.sun_direction is None
+    kept = read_environment(folder.file(folder.model.light.environment))
     assert brightest(kept) @ [0, 0.8, 0.6] > 0.999
-    reconstruct()
+    once()
     assert any("up to date" in event.get("message", "") for event in said)
     write_environment(sky, spot_map([0, 0, 1]))
-    reconstruct()
+    once()
     assert not any("up to date" in event.get("message", "") for event in said)

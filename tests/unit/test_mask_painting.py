@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Brush strokes in a mask, against the geometry that they stand for."""
 
 import math
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.physgen_addon.mask_painting import MOST_SHOWN, Painting, ellipse, extent, resized, stamp, tint
+from physgen.physgen_addon.photo.photo_maths import MOST_SHOWN, Painting, ellipse, extent, resized, stamp, tint
 
 WIDTH, HEIGHT = 40, 30
 inside_x, inside_y = st.floats(-20, 60, width=32), st.floats(-20, 50, width=32)

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.moving import (
-    MOST_STRETCH,
+from physgen.sim.gaussians.splats import (
+    MAX_STRETCH,
+    Splats,
     bind_splats,
+    deform_splats,
+    deformed_half_axes,
     from_half_axes,
     half_axes,
-    moved,
-    moved_half_axes,
-    placed,
+    transform_splats,
 )
-from physgen.sim.gaussians.splats import Splats
 from scipy.spatial.transform import Rotation
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -56,7 +56,7 @@ def test_affine_motion_is_exact(seed):
     if np.linalg.det(a) <= 1e-3:
         return
     splats, rest = some(seed=seed), particles()
-    found = moved(splats, bind_splats(splats, rest), rest @ a.T + shift, everywhere(a, len(rest)))
+    found = deform_splats(splats, bind_splats(splats, rest), rest @ a.T + shift, everywhere(a, len(rest)))
     np.testing.assert_allclose(found.centres, splats.centres @ a.T + shift, atol=1e-12)
     assert_covariances(found, a @ splats.covariances() @ a.T)
     assert np.array_equal(found.opacities, splats.opacities) and np.array_equal(found.colours, splats.colours)
@@ -67,7 +67,7 @@ def test_affine_motion_is_exact(seed):
 def test_rigid_motion_keeps_scales_in_their_order(seed):
     turn = Rotation.random(random_state=seed).as_matrix()
     splats, rest = some(seed=seed), particles()
-    found = moved(splats, bind_splats(splats, rest), rest @ turn.T, everywhere(turn, len(rest)))
+    found = deform_splats(splats, bind_splats(splats, rest), rest @ turn.T, everywhere(turn, len(rest)))
     np.testing.assert_allclose(found.scales, splats.scales, rtol=1e-10)
     np.testing.assert_allclose(found.axes(), turn @ splats.axes(), atol=1e-10)
 
@@ -99,7 +99,7 @@ def test_bending_turns_each_splat_with_its_place():
         return places, f
 
     splats = some()
-    found = moved(splats, bind_splats(splats, rest), *rolled(rest))
+    found = deform_splats(splats, bind_splats(splats, rest), *rolled(rest))
     places, f = rolled(splats.centres)
     spacing = 0.2 / len(rest) ** (1 / 3)
     assert np.abs(found.centres - places).max() < spacing**2 / radius * 2
@@ -118,7 +118,7 @@ def test_floaters_and_broken_gradients_do_not_count():
     gradients[lost[60:100]] = np.nan
     gradients[lost[100:130]] = -np.eye(3)
     gradients[lost[130:]] = 0.0
-    found = moved(splats, bind_splats(splats, rest), positions, gradients)
+    found = deform_splats(splats, bind_splats(splats, rest), positions, gradients)
     assert_covariances(found, splats.covariances())
     np.testing.assert_allclose(found.centres, splats.centres, atol=2e-3)
 
@@ -126,22 +126,22 @@ def test_floaters_and_broken_gradients_do_not_count():
 @pytest.mark.parametrize("gradient", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
 def test_where_no_gradient_is_sound_splats_keep_their_shape(gradient):
     splats, rest = some(), particles()
-    found = moved(splats, bind_splats(splats, rest), rest, everywhere(gradient, len(rest)))
+    found = deform_splats(splats, bind_splats(splats, rest), rest, everywhere(gradient, len(rest)))
     assert_covariances(found, splats.covariances())
 
 
 def test_torn_matter_makes_no_needles():
     splats, rest = some(), particles()
     stretch = np.diag([100.0, 1.0, 1.0])
-    _, axes = moved_half_axes(splats, bind_splats(splats, rest), rest @ stretch, everywhere(stretch, len(rest)))
-    wanted = np.diag([MOST_STRETCH, 1.0, 1.0]) @ half_axes(splats)
+    _, axes = deformed_half_axes(splats, bind_splats(splats, rest), rest @ stretch, everywhere(stretch, len(rest)))
+    wanted = np.diag([MAX_STRETCH, 1.0, 1.0]) @ half_axes(splats)
     np.testing.assert_allclose(axes, wanted, rtol=1e-9, atol=1e-15)
 
 
 def test_placing_stretches_shears_and_mirrors():
     splats = some()
     matrix = np.array([[-2.0, 0.3, 0.0, 1.0], [0.0, 1.0, 0.5, 2.0], [0.0, 0.0, 0.7, 3.0], [0.0, 0.0, 0.0, 1.0]])
-    found, a = placed(splats, matrix), matrix[:3, :3]
+    found, a = transform_splats(splats, matrix), matrix[:3, :3]
     np.testing.assert_allclose(found.centres, splats.centres @ a.T + [1.0, 2.0, 3.0])
     assert_covariances(found, a @ splats.covariances() @ a.T)
     np.testing.assert_allclose(np.linalg.det(found.axes()), 1.0, atol=1e-9)
@@ -149,4 +149,4 @@ def test_placing_stretches_shears_and_mirrors():
 
 def test_a_binding_of_other_splats_is_refused():
     with pytest.raises(InputError, match="bind these"):
-        moved(some(3), bind_splats(some(4), particles()), particles(), everywhere(np.eye(3), 2000))
+        deform_splats(some(3), bind_splats(some(4), particles()), particles(), everywhere(np.eye(3), 2000))

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: MIT
 """What this project changes in Taichi is given up, never insisted on, where Taichi is another."""
 
 from types import SimpleNamespace
 
 import pytest
-from physgen.sim.mpm import runtime
+from physgen.sim.mpm.kernels import runtime
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 

@@ -9,7 +9,7 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.mpm.sampling import sample_interior
+from physgen.sim.mpm.geometry.interior_sampling import sample_interior
 
 
 def test_a_box_gets_its_lattice():

@@ -8,20 +8,20 @@ import sys
 
 import numpy as np
 import pytest
+from physgen.sim.constitutive import ElasticMaterial
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.materials import ElasticMaterial
-from physgen.sim.mpm.options import SolverOptions
-from physgen.sim.mpm.placement import fit_similarity
+from physgen.sim.mpm.solver_options import SolverOptions, fit_similarity
 
 MATERIAL = ElasticMaterial(density=1000.0, youngs_modulus=1e6, poisson_ratio=0.25)
 CUBE = np.array([[x, y, z] for x in (0.0, 0.3) for y in (0.0, 0.2) for z in (0.5, 0.6)])
 
 
 def test_preparing_a_simulation_does_not_import_taichi():
-    modules = ("sampling", "bodies", "options", "placement", "diagnostics")
+    modules = ("geometry.interior_sampling", "bodies", "solver_options", "world_setup", "cost_estimate", "diagnostics")
+    names = [*(f"mpm.{m}" for m in modules), "constitutive"]
     code = ";".join(
-        [f"import physgen.sim.mpm.{m}" for m in modules] + ["import sys; assert 'taichi' not in sys.modules"]
+        [f"import physgen.sim.{name}" for name in names] + ["import sys; assert 'taichi' not in sys.modules"]
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -8,20 +8,17 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.errors import InputError
-from physgen.sim.mpm import runtime
-from physgen.sim.mpm import solid_layout as at
-from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.colliders import Collider, Surface
-from physgen.sim.mpm.contacts import ContactTable, SurfaceContact
-from physgen.sim.mpm.curvature import patches
-from physgen.sim.mpm.forces import BodyForces
-from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
-from physgen.sim.mpm.options import Ground, SolverOptions
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.solid_shapes import points_of
-from physgen.sim.mpm.solids import Solids
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.mpm.bodies import BodyForces, BodyParticles
+from physgen.sim.mpm.colliders import Collider, Surface, Track
+from physgen.sim.mpm.kernels import runtime
+from physgen.sim.mpm.rigid import rigid_layout as at
+from physgen.sim.mpm.rigid.collision_shapes import patches, points_of
+from physgen.sim.mpm.rigid.rigid_bodies import RigidBodies
+from physgen.sim.mpm.solver_options import Ground, SolverOptions
+from physgen.sim.mpm.surface_contact import ContactTable, SurfaceContact
+from physgen.sim.mpm.world_setup import WorldSetup
 
 SCALE = 20.0
 ORIGIN = (-1.0, -1.0, -1.0)
@@ -47,12 +44,12 @@ def collider(name: str = "table", **motion: object) -> Collider:
     return Collider(name=name, surface=surface_of(trimesh.creation.box((1.0, 1.0, 0.2))), **motion)
 
 
-def solids(*setups: WorldSetup) -> Solids:
+def solids(*setups: WorldSetup) -> RigidBodies:
     runtime.ensure_started(SolverOptions(grid=64))
-    return Solids(setups, [SCALE] * len(setups), [ORIGIN] * len(setups))
+    return RigidBodies(setups, [SCALE] * len(setups), [ORIGIN] * len(setups))
 
 
-def row(world: Solids, name: str, array: str, stride: int) -> np.ndarray:
+def row(world: RigidBodies, name: str, array: str, stride: int) -> np.ndarray:
     return world.arrays[array].to_numpy().reshape(-1, stride)[world.index(0, name)]
 
 
@@ -136,9 +133,9 @@ def test_body_waits_for_its_start():
 def test_bad_input_is_named():
     setup = WorldSetup(bodies=(cube(),))
     with pytest.raises(InputError, match="give one of each"):
-        Solids([setup], [1.0, 2.0], [ORIGIN])
+        RigidBodies([setup], [1.0, 2.0], [ORIGIN])
     with pytest.raises(InputError, match=r"scale is 0\.0"):
-        Solids([setup], [0.0], [ORIGIN])
+        RigidBodies([setup], [0.0], [ORIGIN])
     world = solids(setup)
     with pytest.raises(InputError, match="no rigid body or collider 'cup'"):
         world.pose(0, "cup")

@@ -4,13 +4,12 @@
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.errors import Cancelled, SimulationError
 from physgen.sim.mpm.bodies import BodyParticles
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
-from physgen.sim.mpm.options import Ground, SolverOptions
-from physgen.sim.mpm.placement import fit_similarity
-from physgen.sim.mpm.sampling import sample_interior
+from physgen.sim.mpm.geometry.interior_sampling import sample_interior
+from physgen.sim.mpm.solver_options import Ground, SolverOptions, fit_similarity
 from physgen.sim.mpm.world import World
 
 SOFT = ElasticMaterial(density=1000.0, youngs_modulus=1e5, poisson_ratio=0.3)

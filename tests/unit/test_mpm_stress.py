@@ -19,17 +19,18 @@ def reference(F: np.ndarray, two_mu: float, lam: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def evaluate():
-    from physgen.sim.mpm import runtime
-    from physgen.sim.mpm.constitutive import fixed_corotated
-    from physgen.sim.mpm.layout import Matrices, Scalars, mat3
-    from physgen.sim.mpm.options import SolverOptions
+    from physgen.sim.constitutive import ElasticMaterial
+    from physgen.sim.mpm.kernels import runtime
+    from physgen.sim.mpm.kernels.layout import Matrices, Scalars, mat3, vec4
+    from physgen.sim.mpm.solver_options import SolverOptions
 
     runtime.ensure_started(SolverOptions())
+    stress = ElasticMaterial.device().stress
 
     @ti.kernel
     def kernel(two_mu: ti.f32, lam: ti.f32, F: Matrices, tau: Matrices, modulus: Scalars):
         for p in range(F.shape[0]):
-            t, m = fixed_corotated(F[p], two_mu, lam)
+            t, m, _ = stress(F[p], F[p], 0.0, two_mu, lam, vec4(0.0))
             tau[p] = t
             modulus[p] = m
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Files of frames, sequences of them, contact sheets, and what ``physgen encode`` refuses."""
 
 import itertools
@@ -11,13 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.batch import cli
-from physgen.physgen_addon.bridge.contact_sheet import played, write_sheet
-from physgen.physgen_addon.bridge.exr import read_layers
-from physgen.physgen_addon.bridge.formats import FrameFormat
-from physgen.physgen_addon.bridge.frame_file import Part, encoded, read_picture, write_exr, write_png
-from physgen.physgen_addon.bridge.ledger import Ledger
-from physgen.physgen_addon.bridge.sequence import gather
-from physgen.sim.composite.transfer import bytes_to_linear
+from physgen.physgen_addon.frames.contact_sheet import played, write_contact_sheet
+from physgen.physgen_addon.frames.frame_files import Part, encoded, read_layers, read_picture, write_exr, write_png
+from physgen.physgen_addon.frames.frame_index import FrameIndex, gather_frames
+from physgen.physgen_addon.render.render_options import FrameFormat
+from physgen.sim.composite.srgb import bytes_to_linear
 from physgen.sim.errors import InputError
 from PIL import Image
 
@@ -61,7 +60,7 @@ FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from physgen.physgen_addon.bridge.frame_file import Part, write_exr, write_png
+from physgen.physgen_addon.frames.frame_files import Part, write_exr, write_png
 from physgen.sim.errors import InputError
 noise = np.random.default_rng(0).integers(0, 256, (90, 90, 3), dtype=np.uint8)
 part = Part(name="beauty", channels=("R", "G", "B"), pixels=noise / np.float32(255))
@@ -150,7 +149,7 @@ def test_formats_that_are_none(values, words):
 
 def frames(folder, numbers, *, fps=None, suffix=".png"):
     """A folder of tiny frames as rendering leaves it, each of another grey."""
-    ledger = Ledger(folder, suffix=suffix, fps=fps)
+    ledger = FrameIndex(folder, suffix=suffix, fps=fps)
     for number in numbers:
         write_png(ledger.path(number), np.full((30, 40, 3), 9 * number, np.uint8))
         ledger.record(number, "inputs")
@@ -159,12 +158,12 @@ def frames(folder, numbers, *, fps=None, suffix=".png"):
 
 def test_chunks_are_one_sequence(tmp_path):
     late, early = frames(tmp_path / "b", [4, 5], fps=30.0), frames(tmp_path / "a", [1, 2, 3], fps=30.0)
-    found = gather([late, early])
+    found = gather_frames([late, early])
     assert found.numbers == (1, 2, 3, 4, 5)
     assert [path.parent for path in found.paths] == [early] * 3 + [late] * 2
     assert found.fps == found.own_fps == 30.0
     # Every other frame at half the rate: things move as fast as they did.
-    thinned = gather([late, early], frames="1-5x2")
+    thinned = gather_frames([late, early], frames="1-5x2")
     assert (thinned.numbers, thinned.own_fps) == ((1, 3, 5), 15.0)
 
 
@@ -183,17 +182,17 @@ def test_sequences_that_are_refused(tmp_path):
         ([tmp_path / "none"], {}, "no folder of frames"),
     ):
         with pytest.raises(InputError, match=words):
-            gather(folders, **arguments)
-    assert gather([gap], allow_gaps=True).numbers == (5, 9)
+            gather_frames(folders, **arguments)
+    assert gather_frames([gap], allow_gaps=True).numbers == (5, 9)
     (whole / "0002.exr").write_bytes(b"")
     with pytest.raises(InputError, match=r"both 0002\.exr and 0002\.png"):
-        gather([whole])
+        gather_frames([whole])
 
 
 def test_a_folder_holds_frames_of_one_kind(tmp_path):
     folder = frames(tmp_path / "out", [1])
     with pytest.raises(InputError, match=r"holds frames as 0001\.png; choose another folder"):
-        Ledger(folder, suffix=".exr")
+        FrameIndex(folder, suffix=".exr")
 
 
 @given(
@@ -207,7 +206,7 @@ def test_a_strange_ledger_knows_no_rate_and_breaks_nothing(tmp_path_factory, con
     folder = tmp_path_factory.mktemp("strange")
     write_png(folder / "0001.png", PIXELS)
     (folder / "frames.json").write_bytes(content)
-    fps = gather([folder]).fps
+    fps = gather_frames([folder]).fps
     assert fps is None or 0 < fps < np.inf
 
 
@@ -224,8 +223,8 @@ def test_a_sheet_plays_every_frame_and_each_tile_ends_where_the_next_began(count
 
 @pytest.mark.parametrize("suffix", [".png", ".webp"])
 def test_a_sheet_shows_stills_that_move(tmp_path, suffix):
-    found = gather([frames(tmp_path / "f", range(1, 14))])
-    write_sheet(found.paths, found.numbers, tmp_path / f"sheet{suffix}", fps=25.0, columns=2, rows=2, width=84)
+    found = gather_frames([frames(tmp_path / "f", range(1, 14))])
+    write_contact_sheet(found.paths, found.numbers, tmp_path / f"sheet{suffix}", fps=25.0, columns=2, rows=2, width=84)
     with Image.open(tmp_path / f"sheet{suffix}") as sheet:
         assert sheet.n_frames == 4
         seen, times = [], []
@@ -244,7 +243,7 @@ def test_a_sheet_shows_stills_that_move(tmp_path, suffix):
     ("arguments", "words"),
     [
         (["--out", "clip.gif"], ".mp4, .webm, .png or .webp"),
-        (["--out", "0009.png"], "the name of a frame"),
+        (["--out", "0009.png"], "is a frame's name"),
         (["--out", "clip.mp4", "--tiles", "3x2"], "--tiles: is for contact sheets"),
         (["--out", "clip.webm", "--fps", "nan"], "fps is nan"),
         (["--out", "sheet.png", "--tiles", "3"], "columns and rows"),

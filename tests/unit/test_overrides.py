@@ -6,15 +6,15 @@ import dataclasses
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from physgen.sim.app.reconstruct import set_all_physics, set_physics
+from physgen.sim.app.reconstruct import Physics, set_all_physics, set_physics
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene
-from physgen.sim.scene.materials import load_preset
+from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.overrides import apply_overrides, check_overrides
 
 
 def changed(folder, *overrides):
-    return apply_overrides(folder.scene, overrides)
+    return apply_overrides(folder.model, overrides)
 
 
 def test_fields_of_objects_materials_ground_and_scene(ball_scene):
@@ -36,7 +36,7 @@ def test_fields_of_objects_materials_ground_and_scene(ball_scene):
     ball = scene.objects[1]
     assert (ball.roughness, ball.fill, ball.velocity, len(ball.pins)) == (0.25, False, (0.0, -1.0, 2.5), 1)
     assert (scene.ground.static_friction, scene.gravity) == (0.6, (0.0, 0.0, -1.62))
-    assert changed(folder) is folder.scene
+    assert changed(folder) is folder.model
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_what_cannot_be_set_is_named(ball_scene, text, words):
 @given(st.text(max_size=40))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 def test_garbage_is_an_input_error(ball_scene, text):
-    scene = ball_scene().scene
+    scene = ball_scene().model
     for override in (text, f"ball0.{text}", f"ball0.friction={text}"):
         try:
             apply_overrides(scene, [override])
@@ -77,7 +77,7 @@ def test_garbage_is_an_input_error(ball_scene, text):
 
 def test_the_same_command_gives_the_same_scene_whatever_ran_before(ball_scene):
     root = ball_scene().root
-    first = set_all_physics(root, presets=["soft"]).scene
+    first = set_all_physics(load_scene(root), Physics(presets=("soft",))).model
     more = [
         "ball0.friction=0.1",
         "ground.friction=0.9",
@@ -85,12 +85,17 @@ def test_the_same_command_gives_the_same_scene_whatever_ran_before(ball_scene):
         "ball0.density=77",
         "ball0.role=collider",
     ]
-    assert set_all_physics(root, presets=["soft"], overrides=more).scene.objects[0].material.density == 77
-    assert set_all_physics(root, presets=["soft"]).scene == first == load_scene(root).scene
+    assert (
+        set_all_physics(load_scene(root), Physics(presets=("soft",), overrides=tuple(more)))
+        .model.objects[0]
+        .material.density
+        == 77
+    )
+    assert set_all_physics(load_scene(root), Physics(presets=("soft",))).model == first == load_scene(root).model
 
 
 def test_set_physics_keeps_what_it_is_not_told(ball_scene):
     root = ball_scene().root
-    set_physics(root, overrides=["ball0.friction=0.1"])
-    item = set_physics(root, velocities=[(1.0, 0.0, 0.0)]).scene.objects[0]
+    set_physics(load_scene(root), Physics(overrides=("ball0.friction=0.1",)))
+    item = set_physics(load_scene(root), Physics(velocities=((1.0, 0.0, 0.0),))).model.objects[0]
     assert (item.friction, item.velocity, item.material.preset) == (0.1, (1.0, 0.0, 0.0), "soft")

@@ -11,13 +11,12 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.app.import_physgen3d import import_physgen3d
 from physgen.sim.errors import InputError
-from physgen.sim.importers.physgen3d import TRANSFORM_FILE, read_physgen3d
-from physgen.sim.importers.physgen3d_settings import read_settings
+from physgen.sim.importers.physgen3d import TRANSFORM_FILE, read_physgen3d, read_settings
+from physgen.sim.importers.physgen3d_scene import import_physgen3d
 from physgen.sim.scene.folder import load_scene
-from physgen.sim.scene.glb import read_textured_mesh
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.textured_mesh import read_textured_mesh
 from PIL import Image
 from scipy.spatial import ConvexHull
 
@@ -123,7 +122,7 @@ def rewrite(root, **changes):
 
 def test_the_picture_stays_and_the_world_is_ours(output, tmp_path):
     folder = import_physgen3d(output, tmp_path / "scene", size_m=0.3)
-    scene = folder.scene
+    scene = folder.model
     assert [o.name for o in scene.objects] == list(MESHES)
     for item in scene.objects:
         vertices = load_object_mesh(folder, item).vertices
@@ -147,7 +146,7 @@ def test_the_picture_stays_and_the_world_is_ours(output, tmp_path):
 
 def test_textures_masks_and_background_come_along(output, tmp_path):
     folder = import_physgen3d(output, tmp_path / "scene")
-    teddy, box = folder.scene.objects
+    teddy, box = folder.model.objects
     mesh = read_textured_mesh(folder.file(teddy.mesh))
     assert mesh.picture is not None and mesh.uv is not None
     # Every corner keeps its own texture coordinates.
@@ -175,10 +174,10 @@ def test_the_better_of_two_poses_is_taken(output, tmp_path):
         rewrite(output, **changes)
         events = []
         folder = import_physgen3d(output, tmp_path / "scene", on_event=events.append)
-        for item in folder.scene.objects:
+        for item in folder.model.objects:
             matrix = MATRICES[item.name]
             expected = seen(MESHES[item.name].vertices @ matrix[:3, :3].T + matrix[:3, 3])
-            pixels = folder.scene.camera.project(points_of(folder, item))[:, :2]
+            pixels = folder.model.camera.project(points_of(folder, item))[:, :2]
             assert np.linalg.norm(pixels[:, None] - expected[None], axis=2).min(axis=1).max() < 1e-3
         # The default fixture has a bad improved pose of the box, and only of that.
         assert ("box1: its pose in matrices" in messages(events)) == (matrices is None)
@@ -191,9 +190,9 @@ def test_an_improved_pose_without_a_mask_is_taken_if_it_is_near(output, tmp_path
     for improved, expected in ((near, near), (far, MATRICES["box1"]), (np.eye(4), MATRICES["box1"])):
         rewrite(output, matrices_optimized=[MATRICES["teddy1"].tolist(), improved.tolist()])
         folder = import_physgen3d(output, tmp_path / "scene")
-        box = folder.scene.objects[1]
+        box = folder.model.objects[1]
         truth = seen(MESHES["box1"].vertices @ expected[:3, :3].T + expected[:3, 3])
-        pixels = folder.scene.camera.project(points_of(folder, box))[:, :2]
+        pixels = folder.model.camera.project(points_of(folder, box))[:, :2]
         # It is put on the ground along the rays, so the picture tells which it was.
         assert np.linalg.norm(pixels[:, None] - truth[None], axis=2).min(axis=1).max() < 1e-3
         assert box.mask is None
@@ -203,12 +202,12 @@ def test_all_four_borders_of_the_view_count(output, tmp_path):
     # The photo is cut from a larger one: its middle is not on the camera's axis. Square pixels, f = 150.
     left, top, right, bottom = -0.5, -0.3, 0.3, -0.3 + 0.8 * HEIGHT / WIDTH
     rewrite(output, fov=[left, top, right, bottom])
-    camera = import_physgen3d(output, tmp_path / "scene").scene.camera
+    camera = import_physgen3d(output, tmp_path / "scene").model.camera
     assert (camera.fx, camera.fy) == (pytest.approx(150), pytest.approx(150))
     assert (camera.cx, camera.cy) == (pytest.approx(75), pytest.approx(45))
     # DUSt3R crops the height about the middle to what 16 divides: pixels stay square, and the middle stays.
     rewrite(output, fov=[left, top + 0.02, right, bottom - 0.02])
-    camera = import_physgen3d(output, tmp_path / "scene").scene.camera
+    camera = import_physgen3d(output, tmp_path / "scene").model.camera
     assert (camera.fx, camera.fy) == (pytest.approx(150), pytest.approx(150))
     assert (camera.cx, camera.cy) == (pytest.approx(75), pytest.approx(45))
 
@@ -242,7 +241,7 @@ def theirs(velocity):
 def test_the_settings_of_its_simulation(output, tmp_path):
     (output / "sim.yaml").write_text(SIMULATION)
     events = []
-    scene = import_physgen3d(output, tmp_path / "scene", on_event=events.append).scene
+    scene = import_physgen3d(output, tmp_path / "scene", on_event=events.append).model
     for item, told in zip(scene.objects, ([0.5, 0.25, 1.0], [0, 0, -2.0]), strict=True):
         # Its unit is the metre: gravity is 9.8 of them.
         assert item.velocity == pytest.approx(world_axes(scene).T @ theirs(told), abs=1e-9)
@@ -269,9 +268,9 @@ def points_of_mesh(name):
 
 def test_another_size_keeps_the_motion_in_the_picture(output, tmp_path):
     (output / "sim.yaml").write_text(SIMULATION)
-    small = import_physgen3d(output, tmp_path / "a").scene
+    small = import_physgen3d(output, tmp_path / "a").model
     events = []
-    large = import_physgen3d(output, tmp_path / "b", size_m=small.objects[0].size_m * 3, on_event=events.append).scene
+    large = import_physgen3d(output, tmp_path / "b", size_m=small.objects[0].size_m * 3, on_event=events.append).model
     for a, b in zip(small.objects, large.objects, strict=True):
         assert np.asarray(b.velocity) == pytest.approx(3 * np.asarray(a.velocity), abs=1e-9)
     assert "simulated with a gravity of 29.4 m/s²" in messages(events)
@@ -281,13 +280,13 @@ def test_settings_lie_where_the_program_has_them_or_are_named(output, tmp_path, 
     usual = tmp_path / "data" / "sim"
     usual.mkdir(parents=True)
     (usual / "teddy.yaml").write_text(SIMULATION)
-    assert import_physgen3d(output, tmp_path / "a").scene.ground.friction == 0.3
+    assert import_physgen3d(output, tmp_path / "a").model.ground.friction == 0.3
     (tmp_path / "mine.yaml").write_text("velocities: [0, 0, 1]\nfriction: 0.9\ninput_path: outputs/panda\n")
     arguments = ["import", str(output), "--out", str(tmp_path / "b"), "--settings", str(tmp_path / "mine.yaml")]
     assert main(arguments) == 0
     said = "".join(capsys.readouterr())
     assert "is for the folder panda, not for teddy" in said
-    scene = load_scene(tmp_path / "b").scene
+    scene = load_scene(tmp_path / "b").model
     assert scene.ground.friction == 0.9
     assert all(item.velocity == pytest.approx((0, 0, -1), abs=1e-9) for item in scene.objects), "one for all"
     (output / "a.yaml").write_text(SIMULATION)
@@ -302,7 +301,7 @@ def test_objects_that_its_simulation_leaves_in_the_air_stay_there(output, tmp_pa
     rewrite(output, matrices=[lifted.tolist(), MATRICES["box1"].tolist()], matrices_optimized=None)
     (output / "sim.yaml").write_text(SIMULATION.replace("pull_to_ground: true", "pull_to_ground: false"))
     folder = import_physgen3d(output, tmp_path / "scene")
-    assert points_of(folder, folder.scene.objects[0])[:, 2].min() == pytest.approx(0.03, rel=1e-6)
+    assert points_of(folder, folder.model.objects[0])[:, 2].min() == pytest.approx(0.03, rel=1e-6)
 
 
 def test_what_inverse_rendering_adds(output, tmp_path):
@@ -310,7 +309,7 @@ def test_what_inverse_rendering_adds(output, tmp_path):
     Image.new("L", (32, 32), 51).save(output / "meshes" / "teddy1_roughness.png")
     Image.new("L", (32, 32), 204).save(output / "meshes" / "teddy1_metallic.png")
     folder = import_physgen3d(output, tmp_path / "scene")
-    mesh = trimesh.load(folder.file(folder.scene.objects[0].mesh), force="mesh")
+    mesh = trimesh.load(folder.file(folder.model.objects[0].mesh), force="mesh")
     material = mesh.visual.material
     assert (material.roughnessFactor, material.metallicFactor) == (pytest.approx(0.2), pytest.approx(0.8))
     assert material.baseColorTexture.getpixel((5, 5))[:3] == (10, 200, 10)
@@ -353,17 +352,17 @@ def test_an_object_near_the_ground_is_put_on_it_without_moving_in_the_picture(ou
     rewrite(output, matrices=[lifted.tolist(), far.tolist()], matrices_optimized=None)
     events = []
     folder = import_physgen3d(output, tmp_path / "scene", on_event=events.append)
-    near, high = (load_object_mesh(folder, item).vertices for item in folder.scene.objects)
+    near, high = (load_object_mesh(folder, item).vertices for item in folder.model.objects)
     assert near[:, 2].min() == pytest.approx(0, abs=1e-6) and high[:, 2].min() > 0.05
     truth = MESHES["teddy1"].vertices @ lifted[:3, :3].T + lifted[:3, 3]
-    pixels = folder.scene.camera.project(near)[:, :2]
+    pixels = folder.model.camera.project(near)[:, :2]
     assert np.linalg.norm(pixels[:, None] - seen(truth)[None], axis=2).min(axis=1).max() < 1e-3
     assert any("box1 does not stand on the ground" in event["message"] for event in events)
 
 
 def test_matter_that_the_folder_names(output, tmp_path):
     rewrite(output, E=[5e4, 2e6], density=[300, 900])
-    materials = [item.material for item in import_physgen3d(output, tmp_path / "scene").scene.objects]
+    materials = [item.material for item in import_physgen3d(output, tmp_path / "scene").model.objects]
     assert [m.youngs_modulus for m in materials] == [5e4, 2e6] and [m.density for m in materials] == [300, 900]
 
 
@@ -371,12 +370,12 @@ def test_names_become_names_of_scenes(output, tmp_path):
     for suffix in ("obj", "png", "mtl"):
         (output / "meshes" / f"teddy1.{suffix}").rename(output / "meshes" / f"teddy.bär(1).{suffix}")
     rewrite(output, object_names=["teddy.bär(1)", "box1"])
-    assert import_physgen3d(output, tmp_path / "scene").scene.objects[0].name == "teddy_bär_1_"
+    assert import_physgen3d(output, tmp_path / "scene").model.objects[0].name == "teddy_bär_1_"
 
 
 def test_the_command(output, tmp_path, capsys):
     assert main(["import", str(output), "--out", str(tmp_path / "scene"), "--size", "0.2"]) == 0
-    assert load_scene(tmp_path / "scene").scene.objects[0].size_m == pytest.approx(0.2)
+    assert load_scene(tmp_path / "scene").model.objects[0].size_m == pytest.approx(0.2)
     assert main(["import", str(tmp_path), "--out", str(tmp_path / "other")]) != 0
     assert "transform.json" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
@@ -391,13 +390,13 @@ def skewed():
 MISTAKES = {
     "no objects": ({"object_names": []}, "object_names"),
     "a name that leads out": ({"object_names": ["../../x", "box1"]}, r"leads out|must be relative"),
-    "a name twice": ({"object_names": ["box1", "box1"]}, "twice"),
+    "a name twice": ({"object_names": ["box1", "box1"]}, "repeats a name"),
     "a matrix too few": ({"matrices": [np.eye(4).tolist()]}, "matrices: expected a list of 2"),
-    "a skewed matrix": ({"matrices": skewed()}, "one scale"),
-    "a mirroring matrix": ({"matrices": [np.diag([-1.0, 1, 1, 1]).tolist()] * 2}, "one scale"),
+    "a skewed matrix": ({"matrices": skewed()}, "uniform scale"),
+    "a mirroring matrix": ({"matrices": [np.diag([-1.0, 1, 1, 1]).tolist()] * 2}, "uniform scale"),
     "text in a matrix": ({"matrices": [[["a"] * 4] * 4] * 2}, r"matrices\[0\]"),
     "no plane": ({"plane_model": None}, "plane_model"),
-    "a wall": ({"plane_model": [0, 0, 1, -2]}, "no ground"),
+    "a wall": ({"plane_model": [0, 0, 1, -2]}, "not a ground"),
     "a ceiling": ({"plane_model": [0, 1, 0, 2]}, "below that ground"),
     "no angle of view": ({"fov": [0, 0, 0, 0]}, "fov is"),
     "stiffness of garbage": ({"E": [-5, 5]}, "teddy1: .*youngs_modulus"),
@@ -509,7 +508,7 @@ def test_a_known_scene_comes_back(tmp_path, unit):
     # With gravity as it is in its unit of length, the settings alone give the scale.
     (root / "sim.yaml").write_text(json.dumps({"velocities": velocities, "scale": 1 / unit, "friction": 0.25}))
     folder = import_physgen3d(root, tmp_path / "scene")
-    scene = folder.scene
+    scene = folder.model
     camera = np.asarray(scene.camera.world_from_camera)
     assert np.allclose(camera, pose, atol=1e-7)
     assert (scene.camera.fx, scene.camera.fy) == (pytest.approx(focal), pytest.approx(focal))

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The preview's worker as Blender meets it: a real process, requests on its input, events on its output."""
 
 import dataclasses
@@ -11,21 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.preview_proxy import Proxy, proxy
-from physgen.sim.app.preview_request import MAX_LINE, parse_request, read_line
-from physgen.sim.app.preview_world import STEPS_A_SECOND, prepare_preview, without_tiny
+from physgen.sim.app.preview_server import MAX_LINE, parse_request, read_line
+from physgen.sim.app.preview_simulation import STEPS_PER_SECOND, ProxyMesh, prepare_preview, proxy_mesh, without_tiny
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import InputError
-from physgen.sim.kept import Kept
-from physgen.sim.scene.folder import SceneFolder, save_scene
+from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.meshes import load_object_mesh
-from physgen.sim.scene.model import IDENTITY4, Box, Camera, Contact, Effect, Material, Scene, SceneObject
+from physgen.sim.scene.model import IDENTITY4, Box, Camera, Contact, Effect, Material, SceneModel, SceneObject
+from physgen.sim.weak_cache import WeakCache
 
 WAIT_S = 120.0
 """A worker that compiles on a busy machine takes its time; a test that waits this long has failed."""
 
 
-def scene_folder(root: Path, **fields) -> SceneFolder:
+def scene_folder(root: Path, **fields) -> Scene:
     """A ball of 10 cm in the air."""
     (root / "meshes").mkdir(parents=True)
     ball = trimesh.creation.icosphere(2, 0.05)
@@ -36,7 +36,7 @@ def scene_folder(root: Path, **fields) -> SceneFolder:
     material = fields.pop("material", Material(law="rigid"))
     item = SceneObject(name="ball", mesh="meshes/ball.ply", size_m=0.1, material=material, **fields)
     camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0, world_from_camera=IDENTITY4)
-    scene = Scene(camera=camera, objects=(item,), photo="photo.png", background="background.png")
+    scene = SceneModel(camera=camera, objects=(item,), photo="photo.png", background="background.png")
     return save_scene(root, scene)
 
 
@@ -59,7 +59,7 @@ class Worker:
         self.process.stdin.write(data)
         self.process.stdin.flush()
 
-    def ask(self, number: int, scene: SceneFolder, **request) -> None:
+    def ask(self, number: int, scene: Scene, **request) -> None:
         self.write(json.dumps({"id": number, "scene": str(scene.root), "frames": 6, **request}).encode() + b"\n")
 
     def until(self, kind: str, number: int | None = None) -> list[dict]:
@@ -124,7 +124,7 @@ def test_wrong_requests_are_answered_and_the_worker_lives_on(worker, tmp_path):
     assert "speed" in worker.until("error", 4)[-1]["message"]
     worker.ask(5, scene, overrides=["cube.velocity=1,0,0"])
     assert "'cube'" in worker.until("error", 5)[-1]["message"]
-    worker.ask(6, SceneFolder(root=tmp_path / "gone", scene=scene.scene))
+    worker.ask(6, Scene(root=tmp_path / "gone", model=scene.model))
     assert "gone" in worker.until("error", 6)[-1]["message"]
     worker.ask(7, scene)
     worker.until("done", 7)
@@ -160,10 +160,10 @@ def test_a_long_line_is_skipped_to_its_end(tmp_path):
 def test_stiff_matter_is_softened_to_the_steps_that_there_are(tmp_path, law):
     stiff = Material(law=law, youngs_modulus=1e9, bulk_modulus=1e9)
     folder = scene_folder(tmp_path / "scene", material=stiff)
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     prepared, notices = prepare_preview(folder, meshes, frames=24, fps=24.0, particles=2000)
     assert 500 <= prepared.particle_count <= 4000
-    assert 1 / prepared.stable_step < 2 * STEPS_A_SECOND
+    assert 1 / prepared.stable_step < 2 * STEPS_PER_SECOND
     assert any("ball" in text and "softer" in text for text in notices)
     soft = scene_folder(tmp_path / "soft", material=Material(youngs_modulus=1e4))
     assert prepare_preview(soft, meshes, frames=24, fps=24.0, particles=2000)[1] == []
@@ -172,7 +172,7 @@ def test_stiff_matter_is_softened_to_the_steps_that_there_are(tmp_path, law):
 def test_thin_walls_and_small_pins_do_not_stop_a_coarse_run(tmp_path):
     pin = Box(low=(0.0, 0.0, 0.145), high=(0.001, 0.001, 0.146))
     folder = scene_folder(tmp_path / "scene", material=Material(), fill=False, shell_thickness=1e-4, pins=(pin,))
-    meshes = [load_object_mesh(folder, item) for item in folder.scene.objects]
+    meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     prepared, _ = prepare_preview(folder, meshes, frames=24, fps=24.0, particles=2000)
     pinned = prepared.setup.bodies[0].pins
     assert 0 < pinned.sum() < 0.05 * prepared.particle_count
@@ -182,20 +182,20 @@ def test_thin_walls_and_small_pins_do_not_stop_a_coarse_run(tmp_path):
 def test_objects_of_several_sizes_take_a_bounded_number_of_particles(tmp_path, share, stays):
     folder = scene_folder(tmp_path / "scene", material=Material())
     rows = ((share, 0.0, 0.0, 0.3), (0.0, share, 0.0, 0.0), (0.0, 0.0, share, 0.1), (0.0, 0.0, 0.0, 1.0))
-    large = folder.scene.objects[0]
+    large = folder.model.objects[0]
     scene = dataclasses.replace(
-        folder.scene,
+        folder.model,
         objects=(large, dataclasses.replace(large, name="small", world_from_mesh=rows)),
         effects=(Effect(name="wind", objects=("small",)), Effect(name="wind", objects=("ball", "small"))),
         contacts=(Contact(between=("ball", "small"), friction=0.1), Contact(between=("ball", "ground"), friction=0.1)),
     )
-    folder = SceneFolder(root=folder.root, scene=scene)
+    folder = Scene(root=folder.root, model=scene)
     meshes = [load_object_mesh(folder, item) for item in scene.objects]
     scene, left, notices = without_tiny(scene, meshes, 2000)
     assert left == ([0, 1] if stays else [0]) and len(notices) == (0 if stays else 1)
     assert len(scene.effects) == len(scene.contacts) == (2 if stays else 1)
     prepared, _ = prepare_preview(
-        SceneFolder(root=folder.root, scene=dataclasses.replace(scene, effects=())),
+        Scene(root=folder.root, model=dataclasses.replace(scene, effects=())),
         [meshes[i] for i in left],
         frames=24,
         fps=24.0,
@@ -206,8 +206,8 @@ def test_objects_of_several_sizes_take_a_bounded_number_of_particles(tmp_path, s
 
 def test_a_fine_mesh_gets_a_proxy_of_its_shape():
     ball = trimesh.creation.icosphere(5, 0.5)
-    mesh = Proxy(vertices=np.asarray(ball.vertices), faces=np.asarray(ball.faces))
-    small = proxy(mesh, most=2000)
+    mesh = ProxyMesh(vertices=np.asarray(ball.vertices), faces=np.asarray(ball.faces))
+    small = proxy_mesh(mesh, most=2000)
     assert 500 < len(small.vertices) <= 2000
     radii = np.linalg.norm(small.vertices, axis=1)
     assert radii.min() > 0.47 and radii.max() < 0.501
@@ -216,8 +216,8 @@ def test_a_fine_mesh_gets_a_proxy_of_its_shape():
 
 def test_vertices_in_one_place_become_one_vertex():
     box = trimesh.creation.box((1, 1, 1))
-    torn = Proxy(vertices=box.vertices[box.faces].reshape(-1, 3), faces=np.arange(36).reshape(-1, 3))
-    small = proxy(torn)
+    torn = ProxyMesh(vertices=box.vertices[box.faces].reshape(-1, 3), faces=np.arange(36).reshape(-1, 3))
+    small = proxy_mesh(torn)
     assert len(small.vertices) == 8 and len(small.faces) == 12
 
 
@@ -225,7 +225,7 @@ def test_results_are_kept_as_long_as_their_owner():
     class Owner:
         pass
 
-    kept, made = Kept(most=2), []
+    kept, made = WeakCache(most=2), []
     owner = Owner()
     for value in (1, 1, 2, 3, 3, 1):
         assert kept.get(owner, value, lambda value=value: made.append(value) or value) == value

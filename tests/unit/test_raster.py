@@ -10,7 +10,7 @@ import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.gaussians.raster.rasteriser import Rasteriser
 from physgen.sim.gaussians.splats import Splats, joined
-from physgen.sim.mpm.options import SolverOptions
+from physgen.sim.mpm.solver_options import SolverOptions
 from physgen.sim.scene.model import Camera
 from scipy.spatial.transform import Rotation
 
@@ -264,7 +264,7 @@ def test_enormous_splats_cover_all(rasteriser):
 
 def test_more_than_memory_holds_is_said(rasteriser):
     splats = joined([one(scale=100.0)] * 5000)
-    with pytest.raises(InputError, match="5000 splats in a picture of 1024x1024 cover 20480000 tiles of 16 pixels"):
+    with pytest.raises(InputError, match="5000 splats in an image of 1024x1024 cover 20480000 tiles of 16 pixels"):
         rasteriser.render(splats, camera(1024, 1024))
     with pytest.raises(InputError, match="100000x100000"):
         rasteriser.render(splats, camera(100_000, 100_000))
@@ -280,5 +280,5 @@ def test_bad_input_is_said():
     d_colour, d_alpha = upstream()
     with pytest.raises(InputError, match="d_colour has shape"):
         fresh.gradients(d_colour[1:])
-    with pytest.raises(InputError, match="d_alpha has numbers"):
+    with pytest.raises(InputError, match="d_alpha has values"):
         fresh.gradients(d_colour, np.full_like(d_alpha, np.inf))

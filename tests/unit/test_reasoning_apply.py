@@ -10,16 +10,26 @@ import threading
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.options import ObjectRequest
-from physgen.sim.reconstruct.physics.answer import Answers, read_answer
-from physgen.sim.reconstruct.physics.apply import decide, ground_friction, in_words, stiffness_of_modulus, to_material
-from physgen.sim.reconstruct.physics.ask import ask
-from physgen.sim.reconstruct.physics.by_name import shipped_names
-from physgen.sim.reconstruct.physics.chat import ChatRequest
-from physgen.sim.reconstruct.physics.marks import LONGEST_SIDE, jpeg_bytes, marked_picture
-from physgen.sim.reconstruct.physics.prompt import prompt
-from physgen.sim.reconstruct.physics.record import physics_record
-from physgen.sim.scene.materials import load_preset
+from physgen.sim.reconstruct.reasoning.answer_parser import Answers, read_answer
+from physgen.sim.reconstruct.reasoning.chat_client import ChatRequest
+from physgen.sim.reconstruct.reasoning.material_decision import (
+    decide_materials,
+    describe_decision,
+    ground_friction,
+    physics_record,
+    stiffness_of_modulus,
+    to_material,
+)
+from physgen.sim.reconstruct.reasoning.material_names import shipped_names
+from physgen.sim.reconstruct.reasoning.material_query import (
+    LONGEST_SIDE,
+    jpeg_bytes,
+    marked_picture,
+    prompt,
+    query_materials,
+)
+from physgen.sim.reconstruct.reconstruct_options import ObjectRequest
+from physgen.sim.scene.material import load_preset
 from PIL import Image
 
 TABLE = shipped_names()
@@ -37,7 +47,7 @@ def disc(shape, x, y, radius):
 
 def decided(request=None, answer=None, name="object_1", count=1):
     answers = None if answer is None else read_answer(answer, count)
-    return decide([request or ObjectRequest(box=BOX)], [name], answers, TABLE)[0]
+    return decide_materials([request or ObjectRequest(box=BOX)], [name], answers, TABLE)[0]
 
 
 def test_marks_change_the_outline_and_little_else():
@@ -111,14 +121,14 @@ def test_photo_to_answers_over_a_real_connection(monkeypatch):
     masks = [disc((120, 160), 40, 60, 20), disc((120, 160), 110, 60, 30)]
     request = ChatRequest(url=f"http://127.0.0.1:{server.server_address[1]}", model="seer", consent=True, timeout_s=10)
     notices = []
-    answers = ask(photo(), masks, ["orange", "object_2"], request, notices.append)
+    answers = query_materials(photo(), masks, ["orange", "object_2"], request, notices.append)
     server.shutdown()
     server.server_close()
     assert "1: orange" in bodies[0]["messages"][0]["content"][0]["text"]
     assert [item.name for item in answers.objects] == ["orange", "book"] and answers.roughness == 0.3
     assert "160x120 pixels" in notices[0] and "seer" in notices[0] and "127.0.0.1" in notices[0]
     assert len(notices) == 2 and "object 2" in notices[1] and "'heavy'" in notices[1]
-    physics = decide([ObjectRequest(box=BOX)] * 2, ["orange", "object_2"], answers, TABLE)
+    physics = decide_materials([ObjectRequest(box=BOX)] * 2, ["orange", "object_2"], answers, TABLE)
     record = physics_record(["orange", "object_2"], physics, answers, request)
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert record["asked"]["model"] == "seer" and record["answers"]["raw"].startswith("1, orange")
@@ -130,7 +140,7 @@ def test_masks_and_names_must_pair():
     request = ChatRequest(url="http://127.0.0.1:9", model="m", consent=True)
     for masks, names in (([], []), ([np.zeros((120, 160), dtype=bool)], ["a", "b"])):
         with pytest.raises(InputError, match="masks"):
-            ask(photo(), masks, names, request, lambda _: None)
+            query_materials(photo(), masks, names, request, lambda _: None)
 
 
 def test_the_classes_are_the_papers():
@@ -183,7 +193,7 @@ def test_a_modulus_of_real_matter_becomes_a_class():
 
 def test_every_name_of_the_table_gives_a_material():
     names = sorted({item.name for item in (*TABLE.things.values(), *TABLE.matters.values())})
-    for physics in decide([ObjectRequest(box=BOX)] * len(names), names, None, TABLE):
+    for physics in decide_materials([ObjectRequest(box=BOX)] * len(names), names, None, TABLE):
         assert physics.source == "named" and to_material(physics).density == physics.density
         assert 0.05 <= physics.friction <= 0.95
 
@@ -195,7 +205,7 @@ def test_the_surface_gives_the_grounds_friction():
 
 
 def test_the_user_is_told_who_decided():
-    assert "by default" in in_words("object_1", decided())
-    assert "'mug'" in in_words("cup 1", decided(ObjectRequest(box=BOX, kind="mug")))
-    assert "as you chose" in in_words("x", decided(ObjectRequest(box=BOX, preset="sand")))
-    assert "model's answer" in in_words("x", decided(answer="1, thing, 700, hard, 0.3, yes"))
+    assert "by default" in describe_decision("object_1", decided())
+    assert "'mug'" in describe_decision("cup 1", decided(ObjectRequest(box=BOX, kind="mug")))
+    assert "as you chose" in describe_decision("x", decided(ObjectRequest(box=BOX, preset="sand")))
+    assert "model's answer" in describe_decision("x", decided(answer="1, thing, 700, hard, 0.3, yes"))

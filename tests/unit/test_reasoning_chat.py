@@ -16,8 +16,8 @@ from email.utils import formatdate
 
 import pytest
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.reconstruct.physics.chat import ChatRequest, complete
-from physgen.sim.reconstruct.physics.endpoint import MAX_ANSWER_BYTES
+from physgen.sim.reconstruct.reasoning.chat_client import ChatRequest, complete_chat
+from physgen.sim.reconstruct.reasoning.http_post import MAX_ANSWER_BYTES
 
 KEY = "sk-secret-0123456789abcdef"
 JPEG = b"\xff\xd8 not really a picture \xff\xd9"
@@ -88,14 +88,14 @@ def request(url, **values):
 
 def ask(url, cancelled=lambda: False, **values):
     notices = []
-    return complete(request(url, **values), "what is it?", JPEG, notices.append, cancelled), notices
+    return complete_chat(request(url, **values), "what is it?", JPEG, notices.append, cancelled), notices
 
 
 def refusal(url, **values):
     """The message of the error, after a look for the key in all that could be shown of it."""
     notices = []
     with pytest.raises(InputError) as caught:
-        complete(request(url, **values), "what is it?", JPEG, notices.append)
+        complete_chat(request(url, **values), "what is it?", JPEG, notices.append)
     shown = [str(caught.value), repr(caught.value), *notices, *traceback.format_exception(caught.value)]
     link = caught.value
     while link is not None:
@@ -157,8 +157,8 @@ def test_nothing_is_sent_without_consent(consent):
         ({"url": "file:///etc/passwd"}, "http and https"),
         ({"url": "host/v1"}, "http and https"),
         ({"url": "https://"}, "no host"),
-        ({"url": "https://[1:2"}, "no address"),
-        ({"url": "https://host:99999/"}, "no address"),
+        ({"url": "https://[1:2"}, "not a URL"),
+        ({"url": "https://host:99999/"}, "not a URL"),
         ({"url": f"https://me:{KEY}@host/v1"}, "user name or password"),
         ({"url": "https://host/a\r\nX: y"}, "odd characters"),
         ({"model": ""}, "model"),
@@ -182,7 +182,7 @@ def test_a_request_that_cannot_be_is_refused(values, what):
 def test_the_key_is_in_no_repr_and_a_bad_one_is_not_repeated(monkeypatch):
     assert KEY not in repr(request("http://host"))
     monkeypatch.setenv("PHYSGEN_API_KEY", f"{KEY}\r\nX-Other: 1")
-    assert "characters that no key has" in refusal("http://127.0.0.1:9")
+    assert "characters that a key cannot have" in refusal("http://127.0.0.1:9")
     assert "no such variable" in refusal("http://127.0.0.1:9", key_variable="PHYSGEN_NOT_SET")
 
 
@@ -235,7 +235,7 @@ def test_a_busy_endpoint_is_asked_again_when_it_says():
     assert len(notices) == 1 and "429" in notices[0] and "0.05 s" in notices[0]
 
 
-@pytest.mark.parametrize("after", ["3600", formatdate(time.time() + 7200, usegmt=True)])
+@pytest.mark.parametrize("after", ["3600", formatdate(time.time() + 7200, usegmt=True)], ids=["seconds", "date"])
 def test_an_endpoint_that_is_busy_for_long_is_not_waited_for(after):
     with Server(lambda h, n: send(h, b"{}", 429, Retry_After=after)) as server:
         assert "429" in refusal(server.url, retries=3)
@@ -441,7 +441,7 @@ def test_no_thread_or_socket_stays_behind():
 def test_an_unencrypted_way_over_the_network_is_said():
     notices = []
     with pytest.raises(Cancelled):
-        complete(request("http://host.invalid"), "?", JPEG, notices.append, lambda: True)
+        complete_chat(request("http://host.invalid"), "?", JPEG, notices.append, lambda: True)
     assert "unencrypted" in notices[0] and "photo and key" in notices[0]
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.physics.by_name import MAX_FILE_BYTES, NAMES_FILE, load_names, shipped_names
-from physgen.sim.scene.materials import load_preset
+from physgen.sim.reconstruct.reasoning.material_names import MAX_FILE_BYTES, NAMES_FILE, load_names, shipped_names
+from physgen.sim.scene.material import load_preset
 
 TABLE = shipped_names()
 EVERYDAY = [

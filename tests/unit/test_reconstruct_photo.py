@@ -12,8 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.photo import load_photo
-from physgen.sim.reconstruct.view.exif_focal import focal_from_exif
+from physgen.sim.reconstruct.photo import focal_from_exif, load_photo
 from PIL import Image, ImageCms
 
 

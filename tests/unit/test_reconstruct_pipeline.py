@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From a photo file to a scene folder: whole or not at all."""
 
+import dataclasses
 import json
 import math
 import os
@@ -9,7 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions, reconstruct
+from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from PIL import Image
@@ -18,7 +19,9 @@ from scipy import ndimage
 WIDTH, HEIGHT = 360, 270
 BALL = (95, 105, 175, 185)
 CRATE = (215, 91, 300, 203)
+SMALL_BALL, SMALL_CRATE = (tuple(v / 2 for v in box) for box in (BALL, CRATE))
 QUICK = ReconstructOptions(mesh_vertices=2000, pitch_deg=25.0, patch_radius=3)
+SMALL = dataclasses.replace(QUICK, mesh_vertices=500, sun=False)
 
 
 def draw_photo():
@@ -45,6 +48,14 @@ def photo(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def small_photo(photo, tmp_path_factory):
+    """Half as wide and high, where only the files matter that a reconstruction leaves behind."""
+    path = tmp_path_factory.mktemp("small") / "photo.png"
+    Image.open(photo).resize((WIDTH // 2, HEIGHT // 2), Image.Resampling.BOX).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
 def result(photo, tmp_path_factory):
     events = []
     out = tmp_path_factory.mktemp("scenes") / "deep" / "scene"
@@ -52,16 +63,16 @@ def result(photo, tmp_path_factory):
         ObjectRequest(box=BALL, name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),
         ObjectRequest(box=CRATE),
     ]
-    folder = reconstruct(photo, requests, out, QUICK, events.append)
+    folder = reconstruct_photo(photo, requests, out, QUICK, events.append)
     return folder, events, out
 
 
 def test_scene_is_complete_and_loads(result):
     folder, _, out = result
-    assert load_scene(out).scene == folder.scene
+    assert load_scene(out).model == folder.model
     assert sorted(path.name for path in out.parent.iterdir()) == ["scene"]
-    assert [item.name for item in folder.scene.objects] == ["ball", "object_2"]
-    ball, crate = folder.scene.objects
+    assert [item.name for item in folder.model.objects] == ["ball", "object_2"]
+    ball, crate = folder.model.objects
     assert ball.size_m == pytest.approx(0.2)
     assert ball.material.preset == "soft"
     assert ball.velocity == (1.0, 0.0, 0.5)
@@ -72,8 +83,8 @@ def test_scene_is_complete_and_loads(result):
 
 def test_masks_meshes_and_camera_agree(result):
     folder, _, _ = result
-    camera = folder.scene.camera
-    for item, truth in zip(folder.scene.objects, draw_photo()[1:3], strict=True):
+    camera = folder.model.camera
+    for item, truth in zip(folder.model.objects, draw_photo()[1:3], strict=True):
         mask = np.asarray(Image.open(folder.file(item.mask))) > 0
         assert (mask & truth).sum() / (mask | truth).sum() > 0.95
         mesh = load_object_mesh(folder, item)
@@ -84,7 +95,7 @@ def test_masks_meshes_and_camera_agree(result):
         assert pixels.min(axis=0) == pytest.approx([columns.min(), rows.min()], abs=1.5)
         assert pixels.max(axis=0) == pytest.approx([columns.max() + 1, rows.max() + 1], abs=1.5)
     # The world's origin is under the first object.
-    assert np.abs(load_object_mesh(folder, folder.scene.objects[0]).vertices[:, :2].mean(axis=0)).max() < 0.1
+    assert np.abs(load_object_mesh(folder, folder.model.objects[0]).vertices[:, :2].mean(axis=0)).max() < 0.1
 
 
 def test_photo_and_background_files(result):
@@ -93,17 +104,17 @@ def test_photo_and_background_files(result):
     background = np.asarray(Image.open(out / "background.png"))
     assert (photo == draw_photo()[0]).all()
     holes = np.zeros(photo.shape[:2], bool)
-    for item in folder.scene.objects:
+    for item in folder.model.objects:
         holes |= np.asarray(Image.open(out / "holes" / f"{item.name}.png")) > 0
     assert (photo[~holes] == background[~holes]).all()
-    shadow = np.asarray(Image.open(folder.file(folder.scene.objects[0].shadow))) > 0
+    shadow = np.asarray(Image.open(folder.file(folder.model.objects[0].shadow))) > 0
     truth = draw_photo()[3]
     assert (shadow & truth).sum() / (shadow | truth).sum() > 0.6
 
 
 def test_environment_has_mean_luminance_one(result):
     folder, _, _ = result
-    image = oiio.ImageBuf(str(folder.file(folder.scene.light.environment)))
+    image = oiio.ImageBuf(str(folder.file(folder.model.light.environment)))
     pixels = image.get_pixels(oiio.FLOAT)
     assert pixels.shape == (32, 64, 3)
     weight = np.cos((0.5 - (np.arange(32) + 0.5) / 32) * math.pi)
@@ -126,8 +137,8 @@ def test_again_gives_the_same_scene(result, photo, tmp_path):
         ObjectRequest(box=BALL, name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),
         ObjectRequest(box=CRATE),
     ]
-    again = reconstruct(photo, requests, tmp_path / "again", QUICK)
-    assert again.scene == folder.scene
+    again = reconstruct_photo(photo, requests, tmp_path / "again", QUICK)
+    assert again.model == folder.model
     for name in ("background.png", "meshes/ball.glb", "masks/ball.png", "shadows/ball.png"):
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
 
@@ -138,8 +149,8 @@ def test_large_photos_are_worked_on_smaller_and_boxes_follow(photo, tmp_path):
     events = []
     box = tuple(20.0 * v for v in BALL)
     options = ReconstructOptions(max_size=WIDTH, mesh_vertices=1500, pitch_deg=25.0)
-    folder = reconstruct(large, [ObjectRequest(box=box, name="ball")], tmp_path / "scene", options, events.append)
-    assert (folder.scene.camera.width, folder.scene.camera.height) == (WIDTH, HEIGHT)
+    folder = reconstruct_photo(large, [ObjectRequest(box=box, name="ball")], tmp_path / "scene", options, events.append)
+    assert (folder.model.camera.width, folder.model.camera.height) == (WIDTH, HEIGHT)
     assert any("7200x5400" in event.get("message", "") for event in events)
     mask = np.asarray(Image.open(folder.file("masks/ball.png"))) > 0
     truth = draw_photo()[1]
@@ -160,30 +171,30 @@ def test_large_photos_are_worked_on_smaller_and_boxes_follow(photo, tmp_path):
 )
 def test_impossible_requests_leave_nothing_behind(photo, tmp_path, requests, message):
     with pytest.raises(InputError, match=message):
-        reconstruct(photo, requests, tmp_path / "scene", QUICK)
+        reconstruct_photo(photo, requests, tmp_path / "scene", QUICK)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_horizon_below_the_objects_is_refused(photo, tmp_path):
     options = ReconstructOptions(horizon_y=0.9)
     with pytest.raises(InputError, match="horizon"):
-        reconstruct(photo, [ObjectRequest(box=BALL)], tmp_path / "scene", options)
+        reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path / "scene", options)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("stop_at", ["photo", "camera", "background", "write", None])
-def test_cancelling_leaves_nothing(photo, tmp_path, stop_at):
+def test_cancelling_leaves_nothing(small_photo, tmp_path, stop_at):
     reached = []
 
     def cancelled():
         return stop_at is None or stop_at in reached
 
     with pytest.raises(Cancelled):
-        reconstruct(
-            photo,
-            [ObjectRequest(box=BALL)],
+        reconstruct_photo(
+            small_photo,
+            [ObjectRequest(box=SMALL_BALL)],
             tmp_path / "scene",
-            QUICK,
+            SMALL,
             lambda event: reached.append(event.get("step")),
             cancelled,
         )
@@ -192,17 +203,17 @@ def test_cancelling_leaves_nothing(photo, tmp_path, stop_at):
 
 def test_a_folder_with_other_files_is_not_touched(photo, tmp_path):
     (tmp_path / "precious.txt").write_text("keep me")
-    with pytest.raises(InputError, match="no scene folder"):
-        reconstruct(photo, [ObjectRequest(box=BALL)], tmp_path, QUICK)
+    with pytest.raises(InputError, match="not part of a scene folder"):
+        reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path, QUICK)
     assert (tmp_path / "precious.txt").read_text() == "keep me"
 
 
 def test_out_below_a_file_is_refused(photo, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot be written|is a file"):
-        reconstruct(photo, [ObjectRequest(box=BALL)], tmp_path / "file" / "scene", QUICK)
+        reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path / "file" / "scene", QUICK)
     with pytest.raises(InputError, match="is a file"):
-        reconstruct(photo, [ObjectRequest(box=BALL)], tmp_path / "file", QUICK)
+        reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path / "file", QUICK)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
@@ -210,19 +221,19 @@ def test_unwritable_folder(photo, tmp_path):
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(InputError, match="cannot be written"):
-            reconstruct(photo, [ObjectRequest(box=BALL)], tmp_path / "scene", QUICK)
+            reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path / "scene", QUICK)
     finally:
         tmp_path.chmod(0o700)
 
 
-def test_an_old_scene_survives_a_failure_and_is_replaced_on_success(photo, tmp_path):
+def test_an_old_scene_survives_a_failure_and_is_replaced_on_success(small_photo, tmp_path):
     out = tmp_path / "scene"
-    reconstruct(photo, [ObjectRequest(box=BALL, name="first")], out, QUICK)
+    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_BALL, name="first")], out, SMALL)
     with pytest.raises(InputError):
-        reconstruct(photo, [ObjectRequest(box=(900, 900, 990, 990))], out, QUICK)
-    assert load_scene(out).scene.objects[0].name == "first"
-    reconstruct(photo, [ObjectRequest(box=CRATE, name="second")], out, QUICK)
-    assert [item.name for item in load_scene(out).scene.objects] == ["second"]
+        reconstruct_photo(small_photo, [ObjectRequest(box=(900, 900, 990, 990))], out, SMALL)
+    assert load_scene(out).model.objects[0].name == "first"
+    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_CRATE, name="second")], out, SMALL)
+    assert [item.name for item in load_scene(out).model.objects] == ["second"]
     assert not (out / "masks" / "first.png").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"]
 
@@ -253,17 +264,17 @@ def test_requests_are_checked(fields):
         ObjectRequest(**{"box": BALL, **fields})
 
 
-def test_a_scene_folder_with_something_of_the_users_in_it_is_not_replaced(photo, tmp_path):
+def test_a_scene_folder_with_something_of_the_users_in_it_is_not_replaced(small_photo, tmp_path):
     out = tmp_path / "scene"
-    reconstruct(photo, [ObjectRequest(box=BALL)], out, QUICK)
+    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_BALL)], out, SMALL)
     (out / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"notes\.txt"):
-        reconstruct(photo, [ObjectRequest(box=CRATE)], out, QUICK)
+        reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_CRATE)], out, SMALL)
     assert (out / "notes.txt").read_text() == "mine" and load_scene(out)
     stranger = tmp_path / "stranger"
     stranger.mkdir()
     for name in ("scene.json", "photo.png"):
         (stranger / name).write_text("mine")
-    with pytest.raises(InputError, match="no scene folder"):
-        reconstruct(photo, [ObjectRequest(box=BALL)], stranger, QUICK)
+    with pytest.raises(InputError, match="not part of a scene folder"):
+        reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_BALL)], stranger, SMALL)
     assert (stranger / "photo.png").read_text() == "mine"

@@ -8,7 +8,8 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.benchmarks.pictures import cases, judge, scoring, shapes
+from physgen.benchmarks.reconstruct_pictures import cases, scoring, shapes
+from physgen.benchmarks.reconstruct_pictures import scoring as judge
 from physgen.sim.scene.model import Camera
 
 LEVEL = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.mpm.contacts import GROUND_NAME, MODES
+from physgen.sim.mpm.surface_contact import GROUND_NAME, MODES
 from physgen.sim.scene.folder import (
     SCENE_FILE,
-    SceneFolder,
+    Scene,
     inside,
     load_scene,
     parse_scene,
@@ -24,8 +24,8 @@ from physgen.sim.scene.folder import (
     save_scene,
     scene_to_json,
 )
-from physgen.sim.scene.json_fields import read_json
-from physgen.sim.scene.materials import PRESET_FOLDER, load_preset, preset_names
+from physgen.sim.scene.material import PRESET_FOLDER, load_preset, preset_names
+from physgen.sim.scene.meshes import load_vertex_track
 from physgen.sim.scene.model import (
     CONTACT_MODES,
     GROUND,
@@ -40,11 +40,11 @@ from physgen.sim.scene.model import (
     Light,
     Material,
     Motion,
-    Scene,
+    SceneModel,
     SceneObject,
 )
 from physgen.sim.scene.overrides import apply_overrides, without_physics
-from physgen.sim.scene.vertex_tracks import load_vertex_track
+from physgen.sim.validation import read_json
 
 positive = st.floats(0.01, 1e4, allow_nan=False)
 # Libraries built with -ffast-math, which other tests load, switch the processor to flush subnormal numbers to zero.
@@ -55,7 +55,7 @@ vector = st.tuples(number, number, number)
 def a_scene(**changes):
     camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=30.0, cy=20.0, world_from_camera=IDENTITY4)
     item = SceneObject(name="cup", mesh="meshes/cup.glb", size_m=0.1, mask="masks/cup.png")
-    return Scene(**{"camera": camera, "objects": (item,), **changes})
+    return SceneModel(**{"camera": camera, "objects": (item,), **changes})
 
 
 times = st.lists(number, max_size=3, unique=True).map(sorted)
@@ -182,7 +182,7 @@ def write_files(root, scene):
 
 def test_a_saved_folder_loads(tmp_path):
     write_files(tmp_path, a_scene())
-    assert load_scene(tmp_path).scene == a_scene()
+    assert load_scene(tmp_path).model == a_scene()
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
@@ -381,7 +381,7 @@ def test_a_scene_needs_its_vertex_track_inside_the_folder(tmp_path):
         return a_scene(objects=(*a_scene().objects, wall))
 
     write_files(tmp_path, scene("meshes/wall.npz"))
-    with pytest.raises(InputError, match=r"meshes/wall\.npz.*not there"):
+    with pytest.raises(InputError, match=r"meshes/wall\.npz.*is missing"):
         load_scene(tmp_path)
     with pytest.raises(InputError, match="file name"):
         save_scene(tmp_path, scene("../wall.npz"))
@@ -412,12 +412,12 @@ def test_a_scene_may_have_neither_photo_nor_ground(tmp_path):
     scene = a_scene(objects=(item,), photo=None, background=None, ground=None)
     save_scene(tmp_path, scene)
     folder = load_scene(tmp_path)
-    assert folder.scene == scene and referenced_files(scene) == ["meshes/cup.glb"]
+    assert folder.model == scene and referenced_files(scene) == ["meshes/cup.glb"]
     with pytest.raises(InputError, match="no photo to render into; render it in Blender"):
         require_photo(folder)
     with pytest.raises(InputError, match="no ground"):
-        require_photo(SceneFolder(root=tmp_path, scene=a_scene(ground=None)))
-    assert require_photo(SceneFolder(root=tmp_path, scene=a_scene())) == ("photo.png", "background.png", Ground())
+        require_photo(Scene(root=tmp_path, model=a_scene(ground=None)))
+    assert require_photo(Scene(root=tmp_path, model=a_scene())) == ("photo.png", "background.png", Ground())
     with pytest.raises(InputError, match="null for both"):
         a_scene(photo=None)
 

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.app.bake_estimate import estimate_bake
-from physgen.sim.app.bake_inputs import BakeOptions, inputs_hash
-from physgen.sim.app.collider_motion import vertices_at
-from physgen.sim.app.quality import load_quality, quality_names
-from physgen.sim.app.setup_contacts import contact_table
-from physgen.sim.app.setup_resolution import BOX_BODIES, cell_size
+from physgen.sim.app.bake_options import BakeOptions, inputs_hash
+from physgen.sim.app.bake_quality import load_quality, quality_names
+from physgen.sim.app.world_setup import contact_table
+from physgen.sim.app.world_setup_checks import BOX_BODIES, cell_size, vertices_at
+from physgen.sim.constitutive import RigidMaterial
 from physgen.sim.errors import InputError
-from physgen.sim.mpm.materials import RigidMaterial
 from physgen.sim.scene.folder import save_scene
-from physgen.sim.scene.materials import load_preset
+from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Box, Contact, Effect, Ground, Key, Material, Motion, SceneObject
 
@@ -32,9 +31,9 @@ def world(ball_scene):
 
     def make(item=None, count=1, extra=(), **changes):
         folder = ball_scene(count=count, velocity=(0.0, 0.0, 0.0), **changes)
-        first = dataclasses.replace(folder.scene.objects[0], **(item or {}))
-        objects = (first, *folder.scene.objects[1:], *extra)
-        return save_scene(folder.root, dataclasses.replace(folder.scene, objects=objects))
+        first = dataclasses.replace(folder.model.objects[0], **(item or {}))
+        objects = (first, *folder.model.objects[1:], *extra)
+        return save_scene(folder.root, dataclasses.replace(folder.model, objects=objects))
 
     return make
 
@@ -117,7 +116,7 @@ def test_a_deforming_collider_reads_its_file_and_counts_in_the_hash(world):
     vertices = np.stack([rest, rest + RISE])
     np.savez(folder.root / "meshes/wall.npz", times=np.array([0.0, 1.0]), vertices=vertices)
     wall = a_wall(world_from_mesh=away(0.5), motion=Motion(vertices_file="meshes/wall.npz"))
-    folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=(*folder.scene.objects, wall)))
+    folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(*folder.model.objects, wall)))
     prepared = estimate_bake(folder, OPTIONS)
     assert not [w for w in prepared.warnings if "jumps" in w]
     np.testing.assert_allclose(vertices_at(prepared.setup.colliders[0], 0.5), rest + RISE / 2, atol=1e-7)
@@ -133,10 +132,10 @@ def test_surfaces_combine_by_the_documented_rules(world):
         count=3,
         ground=Ground(friction=0.4, static_friction=0.9, restitution=0.2),
     )
-    rough = dataclasses.replace(folder.scene.objects[1], roughness=1.0)
-    objects = (folder.scene.objects[0], rough, folder.scene.objects[2])
+    rough = dataclasses.replace(folder.model.objects[1], roughness=1.0)
+    objects = (folder.model.objects[0], rough, folder.model.objects[2])
     named = (Contact(between=("ball0", "ball2"), friction=0.7, adhesion=2.0), Contact(between=("ground", "ball1")))
-    table = contact_table(dataclasses.replace(folder.scene, objects=objects, contacts=named))
+    table = contact_table(dataclasses.replace(folder.model, objects=objects, contacts=named))
     icy = table.between("ball0", "ground")
     assert icy.friction == pytest.approx(math.sqrt(0.1 * 0.4)) and icy.static_friction == pytest.approx(0.3)
     assert (icy.restitution, icy.mode) == (0.5, "slip")
@@ -150,7 +149,7 @@ def test_surfaces_combine_by_the_documented_rules(world):
 
 def test_a_scene_without_surfaces_has_no_pairs(world):
     folder = world(count=2, ground=Ground(friction=0.3))
-    table = contact_table(folder.scene)
+    table = contact_table(folder.model)
     assert not table.pairs and table.default.friction == 0.3
 
 
@@ -175,7 +174,7 @@ def test_bodies_in_each_other_are_refused(world, distance, outcome):
         with pytest.raises(InputError, match=r"object ball0 and object other: they overlap.*start_time"):
             estimate_bake(folder, OPTIONS)
         later = dataclasses.replace(other, start_time=1.0)
-        folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=(folder.scene.objects[0], later)))
+        folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(folder.model.objects[0], later)))
     warnings = [w for w in estimate_bake(folder, OPTIONS).warnings if "overlap" in w]
     assert bool(warnings) == (outcome == "warned")
 
@@ -259,7 +258,7 @@ def test_qualities_get_the_particles_they_want(world, name):
 
 def test_the_papers_profile_has_256_cells_over_the_box(world):
     folder = world()
-    mesh = load_object_mesh(folder, folder.scene.objects[0])
+    mesh = load_object_mesh(folder, folder.model.objects[0])
     assert cell_size([mesh], load_quality("papers")) == pytest.approx(BOX_BODIES * 2 * RADIUS / 256)
 
 

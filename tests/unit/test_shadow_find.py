@@ -8,16 +8,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.composite.transfer import linear_to_bytes
-from physgen.sim.reconstruct.light.cast import even_sky, sun_disc
-from physgen.sim.reconstruct.shadow.find import cast_shadows, find_shadows
-from physgen.sim.reconstruct.view.camera import camera_above_ground
+from physgen.sim.composite.srgb import linear_to_bytes
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.lighting.ground_lighting import overcast_sky, sun_disc
+from physgen.sim.reconstruct.lighting.shadow_masks import cast_shadows, threshold_shadows
 from scipy import ndimage
 
 WIDTH, HEIGHT = 240, 180
 CAMERA = camera_above_ground(WIDTH, HEIGHT, 230.0, math.radians(30.0))
 SUN = np.array([0.55, 0.45, 0.7]) / np.linalg.norm([0.55, 0.45, 0.7])
 """Towards a sun behind and to the right: shadows fall to the left and to the front."""
+
+
+def find_shadows(pixels, masks, camera, *, fixed_threshold=None):
+    """The shadow masks as the reconstruction finds them, by default or by a grey value."""
+    if fixed_threshold is not None:
+        return threshold_shadows(pixels, masks, fixed_threshold)
+    return [cast.shadow for cast in cast_shadows(pixels, masks, camera)]
 
 
 def meets(centre, radius, origins, directions):
@@ -47,7 +54,7 @@ def draw(balls, ground, *, angle=0.05, share=0.7, seed=0):
     places = (eye + down[:, None] * rays)[on_ground]
     blocked = np.zeros((len(balls) + 1, len(places)))
     free = np.zeros(len(places))
-    for part, (directions, weights) in ((share, sun_disc(SUN, angle, 10)), (1.0 - share, even_sky(60))):
+    for part, (directions, weights) in ((share, sun_disc(SUN, angle, 10)), (1.0 - share, overcast_sky(60))):
         for direction, weight in zip(directions, weights / weights.sum(), strict=True):
             met = np.stack([np.isfinite(meets(c, c[2], places, direction[None])) for c in centres])
             free += part * weight * ~met.any(axis=0)

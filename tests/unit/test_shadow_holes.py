@@ -2,7 +2,7 @@
 """The holes that objects leave together with their shadows."""
 
 import numpy as np
-from physgen.sim.reconstruct.shadow.holes import PENUMBRA_DILATION, object_holes
+from physgen.sim.reconstruct.lighting.shadow_masks import PENUMBRA_DILATION, object_holes
 from scipy import ndimage
 
 WIDTH, HEIGHT = 320, 240

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from physgen.sim.reconstruct.shadow.rest import with_rest
+from physgen.sim.reconstruct.lighting.shadow_masks import extend_hard_shadow
 
 ROWS, COLUMNS = np.mgrid[:120, :160]
 NOTHING = np.zeros((120, 160), dtype=bool)
@@ -20,7 +20,7 @@ def photo(mask, share=0.4, noise=3.0, tint=(1.0, 1.0, 1.0)):
 
 
 def test_the_rest_of_a_hard_shadow_is_found():
-    found = with_rest(photo(WHOLE), FOUND, NOTHING)
+    found = extend_hard_shadow(photo(WHOLE), FOUND, NOTHING)
     assert (found & WHOLE).sum() > 0.95 * WHOLE.sum()
     assert (found & ~WHOLE).sum() < 0.05 * WHOLE.sum()
 
@@ -38,17 +38,17 @@ def test_other_dark_things_are_left_out(other):
         # These touch the shadow.
         bridge = WHOLE & (COLUMNS >= 85) & (COLUMNS < 109)
         pixels = np.where(bridge[..., None], np.roll(look, -24, axis=1), pixels)
-    assert (with_rest(pixels, FOUND, closed) & ~FOUND).sum() < 0.1 * FOUND.sum()
+    assert (extend_hard_shadow(pixels, FOUND, closed) & ~FOUND).sum() < 0.1 * FOUND.sum()
 
 
 def test_faint_shadows_uneven_ground_and_specks_stay_as_they_are():
-    assert (with_rest(photo(WHOLE, share=0.8), FOUND, NOTHING) == FOUND).all()
+    assert (extend_hard_shadow(photo(WHOLE, share=0.8), FOUND, NOTHING) == FOUND).all()
     striped = photo(WHOLE | (COLUMNS // 6 % 2 == 0), share=0.6)
-    assert (with_rest(striped, FOUND, NOTHING) == FOUND).all()
+    assert (extend_hard_shadow(striped, FOUND, NOTHING) == FOUND).all()
     speck = (ROWS == 60) & (np.abs(COLUMNS - 80) < 5)
-    assert (with_rest(photo(WHOLE), speck, NOTHING) == speck).all()
+    assert (extend_hard_shadow(photo(WHOLE), speck, NOTHING) == speck).all()
 
 
 def test_nothing_is_added_on_other_objects():
     closed = WHOLE & (COLUMNS > 95)
-    assert not (with_rest(photo(WHOLE), FOUND, closed) & closed).any()
+    assert not (extend_hard_shadow(photo(WHOLE), FOUND, closed) & closed).any()

@@ -10,16 +10,16 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.reconstruct.options import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.shape.build import build_body
-from physgen.sim.reconstruct.shape.lattice import cube_surface
-from physgen.sim.reconstruct.shape.primitives import Box, Revolved, Sphere, drawn
-from physgen.sim.reconstruct.shape.repair import keep_main_part
-from physgen.sim.reconstruct.view.camera import camera_above_ground
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+from physgen.sim.reconstruct.shape.inflated_mesh import keep_main_part
+from physgen.sim.reconstruct.shape.object_bodies import build_body
+from physgen.sim.reconstruct.shape.primitive_mesh import cube_surface
+from physgen.sim.reconstruct.shape.primitives import Box, Sphere, SurfaceOfRevolution, rasterize
 
 WIDTH, HEIGHT = 480, 360
 BOX = Box(0.1, 2.1, 0.5, 0.5, 0.4, 0.3)
-CAN = Revolved(-0.1, 2.0, (0.0, 0.5), (0.2, 0.2))
+CAN = SurfaceOfRevolution(-0.1, 2.0, (0.0, 0.5), (0.2, 0.2))
 BALL = Sphere(0.05, 2.2, 0.25)
 VOLUMES = {"box": 0.5 * 0.4 * 0.3, "cylinder": math.pi * 0.2**2 * 0.5, "sphere": 4 / 3 * math.pi * 0.25**3}
 
@@ -29,7 +29,7 @@ def view(pitch_deg=25.0):
 
 
 def outline(primitive, pitch_deg=25.0):
-    return drawn(primitive, view(pitch_deg), (HEIGHT, WIDTH), 0, 0)
+    return rasterize(primitive, view(pitch_deg), (HEIGHT, WIDTH), 0, 0)
 
 
 def cup():
@@ -172,7 +172,7 @@ def test_the_shape_that_the_user_wants_is_made_and_doubted():
 def test_a_thing_that_the_border_cuts_goes_on_outside():
     camera = view()
     left = float(camera.rays(np.array([25.0, 220.0]))[0] * 2.0)
-    can = Revolved(left, 2.0, (0.0, 0.4), (0.22, 0.22))
+    can = SurfaceOfRevolution(left, 2.0, (0.0, 0.4), (0.22, 0.22))
     mask = outline(can)
     assert mask[:, 0].any()
     body = made(mask, kind="can")
@@ -214,7 +214,7 @@ def test_the_far_side_of_a_can_shows_its_wall_and_not_its_top():
     vertices = body.mesh.vertices
     radius = np.hypot(vertices[:, 0] - CAN.x, vertices[:, 1] - CAN.y)
     far = (vertices[:, 1] > CAN.y + 0.1) & (radius > 0.19) & (vertices[:, 2] < 0.45) & (vertices[:, 2] > 0.02)
-    top = drawn(Revolved(CAN.x, CAN.y, (0.4999, 0.5), (0.19, 0.19)), view(40.0), mask.shape, 0, 0)
+    top = rasterize(SurfaceOfRevolution(CAN.x, CAN.y, (0.4999, 0.5), (0.19, 0.19)), view(40.0), mask.shape, 0, 0)
     at = np.floor(body.mesh.colours[far]).astype(int)
     assert far.sum() > 50
     assert top[at[:, 1], at[:, 0]].mean() < 0.02

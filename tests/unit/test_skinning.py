@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.skinning.binding import bind, deform, deform_locally
+from physgen.sim.skinning import bind, deform, deform_locally
 
 
 def a_body(seed=0, count=3000):

@@ -4,7 +4,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.physgen_addon.bridge.sky_lamps import sky_lamps
+from physgen.physgen_addon.render.sky_lamps import sky_lamps
 from physgen.sim.scene.equirectangular import irradiance
 
 

@@ -10,11 +10,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.soft.body_mesh import body_mesh
-from physgen.sim.diagnose.soft.flight import State
-from physgen.sim.diagnose.soft.laws import Laws
-from physgen.sim.diagnose.soft.worlds import Job, SoftWorlds, pellet
+from physgen.sim.diagnose.soft.free_flight import State
+from physgen.sim.diagnose.soft.soft_candidates import WorldParameters
+from physgen.sim.diagnose.soft.soft_simulator import SimulationJob, SoftWorlds, concentrated_masses
 
-LAWS = Laws(modulus=1e5, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
+LAWS = WorldParameters(modulus=1e5, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
 FREE = dataclasses.replace(LAWS, gravity=(0.0, 0.0, 0.0))
 
 
@@ -61,7 +61,7 @@ def test_a_homogeneous_stretch_leaves_no_force_inside():
 def test_flight_is_rigid_and_exact():
     mesh = box()
     start = at(velocity=(1.0, 0.5, 2.0))
-    (points,), _ = worlds(mesh).run([Job(start=start, laws=LAWS, times=np.array([0.05, 0.1]))])
+    (points,), _ = worlds(mesh).run([SimulationJob(start=start, world=LAWS, times=np.array([0.05, 0.1]))])
     centre = points.mean(axis=1)
     assert np.allclose(centre[1] - [0, 0, 1], [0.1, 0.05, 0.2 - 0.5 * 9.81 * 0.01], atol=2e-4)
     assert np.allclose(points[1] - centre[1], mesh.nodes, atol=1e-9)
@@ -75,19 +75,21 @@ def test_a_wave_runs_up_a_bar_at_the_bar_speed(stiffer):
     upright = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     times = np.arange(1, 250) * 1e-4
     start = at(place=(0, 0, long / 2), velocity=(0, 0, -fall), turn=upright)
-    laws = dataclasses.replace(FREE, factor=stiffer)
-    (points,), _ = worlds(mesh, np.array([[-long / 2, 0, 0]])).run([Job(start=start, laws=laws, times=times)])
+    world = dataclasses.replace(FREE, factor=stiffer)
+    (points,), _ = worlds(mesh, np.array([[-long / 2, 0, 0]])).run(
+        [SimulationJob(start=start, world=world, times=times)]
+    )
     speed = np.gradient(points[:, 0, 2], times)
     turned = times[np.argmax(speed > 0)]
     assert turned == pytest.approx(long / math.sqrt(stiffer * 1e5 / 400), rel=0.1)
     assert speed[times < 0.7 * turned] == pytest.approx(-fall, rel=0.1)
 
 
-def bounce(laws, velocity=-2.0):
+def bounce(world, velocity=-2.0):
     mesh = box((0.06, 0.06, 0.06), (4, 4, 4))
     times = np.arange(1, 60) * 1e-3
     start = at(place=(0, 0, 0.0301), velocity=(0, 0, velocity))
-    (points,), (history,) = worlds(mesh).run([Job(start=start, laws=laws, times=times)], keep=True)
+    (points,), (history,) = worlds(mesh).run([SimulationJob(start=start, world=world, times=times)], keep=True)
     return mesh, times, points, history
 
 
@@ -130,6 +132,6 @@ def test_a_pellet_keeps_the_mass_and_moves_its_centre(fraction, offset):
     mesh = box()
     masses = 400.0 * mesh.node_volumes()
     centre = masses @ mesh.nodes / masses.sum()
-    loaded = pellet(mesh.nodes, masses, fraction, centre + np.array(offset))
+    loaded = concentrated_masses(mesh.nodes, masses, fraction, centre + np.array(offset))
     assert loaded.sum() == pytest.approx(masses.sum())
     assert np.allclose(loaded @ mesh.nodes / masses.sum(), centre + fraction * np.array(offset), atol=1e-6)

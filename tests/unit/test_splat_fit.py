@@ -7,22 +7,25 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from physgen.sim.composite.metrics import psnr
+from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.errors import Cancelled, InputError, SimulationError
-from physgen.sim.gaussians.fit.adam import Descent
-from physgen.sim.gaussians.fit.fit import fit_splats
-from physgen.sim.gaussians.fit.options import FitOptions
-from physgen.sim.gaussians.fit.pair import PairOptions, fit_pair
-from physgen.sim.gaussians.fit.parameters import GROUPS, free_gradients, free_values, splats_of
-from physgen.sim.gaussians.fit.start import pixel_size, start_on_surface
-from physgen.sim.gaussians.fit.target import target_of
+from physgen.sim.gaussians.image_loss import view_target
+from physgen.sim.gaussians.pair_fit import PairFitOptions, fit_pair, initial_splats, pixel_size
 from physgen.sim.gaussians.raster.rasteriser import Rasteriser
+from physgen.sim.gaussians.splat_fit import (
+    GROUPS,
+    AdamState,
+    FitOptions,
+    fit_splats,
+    from_parameters,
+    parameter_gradients,
+    to_parameters,
+)
 from physgen.sim.gaussians.splats import Splats, joined
-from physgen.sim.gaussians.views.hull import HullOptions
-from physgen.sim.gaussians.views.orbit import orbit_camera
-from physgen.sim.gaussians.views.view import View
+from physgen.sim.gaussians.views.posed_images import View, orbit_camera
+from physgen.sim.gaussians.views.visual_hull import HullOptions
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.triangles import squared_distances
+from physgen.sim.mpm.geometry.triangles import squared_distances
 from trimesh import Trimesh
 from trimesh.creation import icosphere
 
@@ -76,7 +79,7 @@ def some_splats(count=6, seed=0):
 
 def test_free_values_and_back():
     splats = some_splats()
-    again = splats_of(free_values(splats))
+    again = from_parameters(to_parameters(splats))
     for name in GROUPS:
         np.testing.assert_allclose(getattr(again, name), getattr(splats, name), atol=1e-12)
 
@@ -85,15 +88,15 @@ def test_free_values_and_back():
 def test_chain_rule_against_finite_differences(name):
     """Of a loss that is linear in the splats, at quaternions that are not unit."""
     random = np.random.default_rng(5)
-    values = free_values(some_splats())
+    values = to_parameters(some_splats())
     values["rotations"] = values["rotations"] * random.uniform(0.5, 2, (6, 1))
     weights = {group: random.normal(size=values[group].shape) for group in GROUPS}
 
     def loss(changed):
-        splats = splats_of({**values, name: changed})
+        splats = from_parameters({**values, name: changed})
         return sum((weights[group] * getattr(splats, group)).sum() for group in GROUPS)
 
-    slope = free_gradients(values, SimpleNamespace(**weights))[name]
+    slope = parameter_gradients(values, SimpleNamespace(**weights))[name]
     direction = random.normal(size=values[name].shape)
     step = 1e-6
     along = (loss(values[name] + step * direction) - loss(values[name] - step * direction)) / (2 * step)
@@ -102,7 +105,7 @@ def test_chain_rule_against_finite_differences(name):
 
 def test_adam_goes_down_at_its_rate_whatever_the_slope():
     wanted = np.array([[1.0, -2.0, 0.5]])
-    descent = Descent({"centres": np.zeros((1, 3)), "colours": np.zeros((1, 3))})
+    descent = AdamState({"centres": np.zeros((1, 3)), "colours": np.zeros((1, 3))})
     first = descent.stepped({"centres": 1e-9 * (descent.values["centres"] - wanted)}, {"centres": 0.1})
     np.testing.assert_allclose(first.values["centres"], 0.1 * np.sign(wanted), rtol=1e-4)
     for _ in range(400):
@@ -118,32 +121,32 @@ def test_what_another_object_hides_does_not_count():
     mask[3, 3] = 0.4
     pixels = np.full((4, 4, 3), 0.2)
     view = View(camera=camera, pixels=pixels, mask=mask, labels=labels, name="front")
-    target = target_of(view, label=2)
+    target = view_target(view, label=2)
     np.testing.assert_array_equal(target.counted, (labels != 1) & (mask != 0.4))
     np.testing.assert_array_equal(target.alpha, labels == 2)
     np.testing.assert_array_equal(target.others.counted, labels == 1)
-    np.testing.assert_allclose(target.before((0.0, 0.5, 1.0))[2], [[0, 0.5, 1], [0, 0.5, 1], [0.2] * 3, [0.2] * 3])
+    np.testing.assert_allclose(target.over((0.0, 0.5, 1.0))[2], [[0, 0.5, 1], [0, 0.5, 1], [0.2] * 3, [0.2] * 3])
     bare = View(camera=camera, pixels=pixels, name="front")
     with pytest.raises(InputError, match="'front' has no labels"):
-        target_of(bare, label=2)
+        view_target(bare, label=2)
     with pytest.raises(InputError, match="'front' has no mask"):
-        target_of(bare)
+        view_target(bare)
 
 
 def test_a_start_has_the_colours_that_are_seen_there(ball, ball_views):
-    start = start_on_surface(ball, 2000, [target_of(view) for view in ball_views], inset=0.05)
+    start = initial_splats(ball, 2000, [view_target(view) for view in ball_views], inset=0.05)
     radii = np.linalg.norm(start.centres, axis=1)
     assert radii.min() > 0.93 and radii.max() <= 0.95 + 1e-9, "an icosphere's faces lie a little inside"
     seen = np.abs(start.centres[:, 2]) < 0.8
     assert np.abs(start.colours - painted(start.centres / radii[:, None]))[seen].mean() < 0.05
-    np.testing.assert_allclose(start_on_surface(ball, 10, []).colours, 0.5)
+    np.testing.assert_allclose(initial_splats(ball, 10, []).colours, 0.5)
 
 
 def test_a_ball_is_met_where_nobody_looked(ball, ball_views):
     """30.7 dB at the reference view is what the whole method has to reach, so its parts must at views never shown."""
-    targets = [target_of(view) for view in ball_views]
+    targets = [view_target(view) for view in ball_views]
     inset = pixel_size([view.camera for view in ball_views], ball)
-    start = start_on_surface(ball, 2500, targets, inset=inset)
+    start = initial_splats(ball, 2500, targets, inset=inset)
     events = []
     fitted = fit_splats(ball_views, start, FitOptions(steps=150), events.append)
     rasteriser = Rasteriser()
@@ -157,7 +160,7 @@ def test_a_ball_is_met_where_nobody_looked(ball, ball_views):
 
 
 def test_frozen_fields_stay(ball, ball_views):
-    start = start_on_surface(ball, 300, [])
+    start = initial_splats(ball, 300, [])
     fitted = fit_splats(ball_views, start, FitOptions(steps=3, frozen=frozenset({"centres", "opacities"})))
     np.testing.assert_array_equal(fitted.splats.centres, start.centres)
     np.testing.assert_allclose(fitted.splats.opacities, start.opacities, atol=1e-12)
@@ -173,27 +176,27 @@ def test_nothing_stays_before_the_company():
     mask[:2, :2] = 1
     view = View(camera=view.camera, pixels=view.pixels, mask=mask, labels=labels, name="front")
     shapes = [icosphere(subdivisions=2, radius=radius) for radius in (0.5, 0.6)]
-    inner, shell = (start_on_surface(Surface(vertices=m.vertices, faces=m.faces), 400, []) for m in shapes)
+    inner, shell = (initial_splats(Surface(vertices=m.vertices, faces=m.faces), 400, []) for m in shapes)
     company = inner.changed(colours=np.tile(RED, (400, 1)))
     frozen = frozenset({"centres", "colours"})
     options = FitOptions(steps=40, label=2, frozen=frozen, opacity_rate=0.2, alpha_weight=0.0)
     off = []
     for beside in (None, company):
-        fitted = fit_splats([view], shell, options, company=beside).splats
+        fitted = fit_splats([view], shell, options, fixed=beside).splats
         off.append(np.abs(Rasteriser().render(joined([company, fitted]), view.camera).colour[48, 48] - RED).max())
     assert off[0] > 0.3, "grey before red"
     assert off[1] < 0.05
 
 
 def test_a_fit_can_be_stopped_and_says_what_is_wrong(ball, ball_views):
-    start = start_on_surface(ball, 300, [])
+    start = initial_splats(ball, 300, [])
     asked = []
     with pytest.raises(Cancelled, match="at step 2 of 50"):
         fit_splats(ball_views, start, FitOptions(steps=50), cancelled=lambda: asked.append(0) or len(asked) > 2)
     with pytest.raises(InputError, match="no views"):
         fit_splats([], start)
     empty = View(camera=ball_views[0].camera, pixels=np.ones((96, 96, 3)), mask=np.zeros((96, 96)), name="empty")
-    with pytest.raises(InputError, match="no view shows any"):
+    with pytest.raises(InputError, match="no view shows the object"):
         fit_splats([empty], start)
     with pytest.raises(SimulationError, match=r"the loss is .* at step 0"):
         fit_splats(ball_views, start.changed(colours=np.full((300, 3), 1e30)))
@@ -212,7 +215,7 @@ def distances(points, triangles):
 def test_a_ball_and_the_ring_around_it_are_told_apart():
     ball, ring = Ball((0, 0, 0), 0.5), Ring(0.55, 0.12)
     few = FitOptions(steps=40)
-    options = PairOptions(
+    options = PairFitOptions(
         background_splats=800,
         foreground_splats=800,
         background_fit=few,

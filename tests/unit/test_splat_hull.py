@@ -6,12 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.views.depth import depth_buffer
-from physgen.sim.gaussians.views.hull import HullOptions, visual_hull
-from physgen.sim.gaussians.views.orbit import orbit_camera
-from physgen.sim.gaussians.views.view import View
-from physgen.sim.gaussians.views.votes import VoteOptions, split, vote
-from physgen.sim.mpm.triangles import check_closed, signed_volume
+from physgen.sim.gaussians.views.hull_segmentation import VoteOptions, vote_labels
+from physgen.sim.gaussians.views.posed_images import View, orbit_camera
+from physgen.sim.gaussians.views.visual_hull import HullOptions, depth_buffer, visual_hull
+from physgen.sim.mpm.geometry.triangles import check_closed, signed_volume
 
 from .splat_scenes import Ball, Box, Ring, views_of
 
@@ -141,7 +139,7 @@ def test_a_few_bad_masks_change_little_and_are_named(hat, which, mask, left_out)
 def test_masks_that_are_not_of_one_object_are_refused(hat):
     shifts = np.random.default_rng(0).integers(-25, 25, len(hat))
     scattered = [changed(v, mask=np.roll(v.mask, s, axis=1), labels=None) for v, s in zip(hat, shifts, strict=True)]
-    with pytest.raises(InputError, match=r"not of one object at one place; they fit worst in v\d+, v\d+"):
+    with pytest.raises(InputError, match=r"not of one object at rest; they fit worst in v\d+, v\d+"):
         visual_hull(scattered, QUICK)
     with pytest.raises(InputError, match="view 'v3' has no mask"):
         visual_hull(with_changes(hat, [3], mask=lambda view: None), QUICK)
@@ -165,20 +163,9 @@ def judged(hull, labels, solids, views):
 def test_votes_say_whose_each_vertex_is(solids, hat, ring):
     views = hat if solids[0] is BALL else ring
     hull = visual_hull(views, QUICK)
-    votes = vote(hull.vertices, hull.faces, views)
+    votes = vote_labels(hull.vertices, hull.faces, views)
     assert judged(hull, votes.labels, solids, views) >= 0.98
     assert votes.conflict < 0.05 and votes.left_out == () and votes.unseen < 0.1
-
-
-def test_parts_are_a_partition_of_the_vertices_and_of_the_faces(hat):
-    hull = visual_hull(hat, QUICK)
-    labels = vote(hull.vertices, hull.faces, hat).labels
-    first, second = split(hull.vertices, hull.faces, labels)
-    assert sorted([*first.indices, *second.indices]) == list(range(len(hull.vertices)))
-    assert len(first.faces) + len(second.faces) == len(hull.faces)
-    assert (labels[second.indices] == 2).all() and np.abs(HAT.distance(second.vertices)).mean() < pixel(hat[0])
-    with pytest.raises(InputError, match="no view shows object 2"):
-        split(hull.vertices, hull.faces, np.ones(len(hull.vertices), np.int8))
 
 
 def test_wrong_labels_are_outvoted_or_named(hat):
@@ -192,22 +179,22 @@ def test_wrong_labels_are_outvoted_or_named(hat):
         return labels
 
     hull = visual_hull(hat, QUICK)
-    votes = vote(hull.vertices, hull.faces, with_changes(hat, range(16), labels=spotted))
+    votes = vote_labels(hull.vertices, hull.faces, with_changes(hat, range(16), labels=spotted))
     assert judged(hull, votes.labels, (BALL, HAT), hat) >= 0.98 and 0.01 < votes.conflict < 0.15
-    votes = vote(hull.vertices, hull.faces, with_changes(hat, (3, 9), labels=swapped))
+    votes = vote_labels(hull.vertices, hull.faces, with_changes(hat, (3, 9), labels=swapped))
     assert judged(hull, votes.labels, (BALL, HAT), hat) >= 0.98
     assert votes.left_out == ("v3", "v9") and votes.conflicts["v3"] > 0.9 and "'v9'" in votes.notes[1]
     with pytest.raises(InputError, match=r"16 views contradict each other, most in v\d+"):
-        vote(hull.vertices, hull.faces, with_changes(hat, range(0, 16, 2), labels=swapped))
-    with pytest.raises(InputError, match="label no two objects"):
-        vote(hull.vertices, hull.faces, with_changes(hat, range(16), labels=lambda view: None))
+        vote_labels(hull.vertices, hull.faces, with_changes(hat, range(0, 16, 2), labels=swapped))
+    with pytest.raises(InputError, match="do not label two objects"):
+        vote_labels(hull.vertices, hull.faces, with_changes(hat, range(16), labels=lambda view: None))
     with pytest.raises(InputError, match="vote option smoothing"):
         VoteOptions(smoothing=-1)
 
 
 def test_a_few_labelled_views_label_the_unseen_side_by_what_is_nearest(hat):
     hull = visual_hull(hat, QUICK)
-    votes = vote(hull.vertices, hull.faces, with_changes(hat, range(1, 16), labels=lambda view: None))
+    votes = vote_labels(hull.vertices, hull.faces, with_changes(hat, range(1, 16), labels=lambda view: None))
     assert 0.3 < votes.unseen < 0.9 and votes.conflicts.keys() == {"v0"}
     behind = hull.vertices[:, 0] < -0.2
     assert (votes.labels[behind] == 1).all()

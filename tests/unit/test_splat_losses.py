@@ -7,10 +7,9 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.composite.metrics import psnr
-from physgen.sim.composite.ssim import WINDOW, ssim, ssim_and_slope
+from physgen.sim.composite.image_metrics import WINDOW, psnr, ssim, ssim_and_slope
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.fit.losses import fit_loss, image_loss, l1_loss
+from physgen.sim.gaussians.image_loss import fit_loss, image_loss, l1_loss
 from skimage.metrics import structural_similarity
 
 

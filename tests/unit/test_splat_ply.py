@@ -11,9 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.ply.dialects import SH_C0
-from physgen.sim.gaussians.ply.read import read_splat_file, read_splats
-from physgen.sim.gaussians.ply.write import PROPERTIES, write_splats
+from physgen.sim.gaussians.splat_ply import PROPERTIES, SH_C0, read_splat_file, read_splats, write_splats
 from physgen.sim.gaussians.splats import Splats
 
 INRIA = (
@@ -112,7 +110,7 @@ def test_solid_and_clear_splats_have_finite_logits(tmp_path):
     write_splats(tmp_path / "a.ply", splats)
     np.testing.assert_allclose(read_splats(tmp_path / "a.ply").opacities, [0, 1], atol=2e-6)
     with pytest.raises(InputError, match="no splats"):
-        write_splats(tmp_path / "a.ply", splats.chosen(np.zeros(2, bool)))
+        write_splats(tmp_path / "a.ply", splats.subset(np.zeros(2, bool)))
     with pytest.raises(InputError, match="float32"):
         write_splats(tmp_path / "b.ply", splats.changed(centres=np.full((2, 3), 1e39)))
     assert len(read_splats(tmp_path / "a.ply")) == 2 and sorted(p.name for p in tmp_path.iterdir()) == ["a.ply"]
@@ -147,7 +145,7 @@ def test_rows_of_text_may_end_as_on_windows(tmp_path):
 
 
 def test_long_files_are_read_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr("physgen.sim.gaussians.ply.table.BLOCK_BYTES", 1000)
+    monkeypatch.setattr("physgen.sim.gaussians.ply_format.BLOCK_BYTES", 1000)
     splats = some(500)
     for form in ("ascii", "binary_big_endian"):
         assert_same(read(tmp_path, ply(columns_of(splats), form=form)).splats, splats)
@@ -165,7 +163,7 @@ def test_colours_as_point_clouds_have_them(tmp_path, kind, most):
     assert "red, green, blue" in file.notes[0] and "alpha" in file.notes[1]
     if kind == "f4":
         columns["red"] = columns["red"] * 255
-        with pytest.raises(InputError, match=r"red goes from .* uchar from 0 to 255"):
+        with pytest.raises(InputError, match=r"red ranges from .* uchar from 0 to 255"):
             read(tmp_path, ply(columns))
 
 
@@ -229,7 +227,7 @@ def test_a_few_unusable_splats_are_left_out_and_told(tmp_path):
     assert len(file.splats) == 397
     assert file.notes == ("3 of 400 splats were left out, such as splat 17 with a centre that is not finite",)
     columns["opacity"] = np.where(np.arange(400) % 40 == 0, np.nan, columns["opacity"])
-    with pytest.raises(InputError, match=r"13 of 400 .* splat 0 with an opacity that is no number: export"):
+    with pytest.raises(InputError, match=r"13 of 400 .* splat 0 with an opacity that is not a number: export"):
         read(tmp_path, ply(columns))
 
 
@@ -268,9 +266,9 @@ ONLY_PLACES = {name: GOOD[name] for name in "xyz"}
         (ply(without("scale_2")), "lack scale_2"),
         (ply(without("f_dc_1")), "no colours"),
         (ply(without("y")), "lacks y"),
-        (ply(GOOD)[:-1], "168 bytes, and 167 follow"),
+        (ply(GOOD)[:-1], "168 bytes, but 167 follow"),
         (ply(GOOD, form="ascii")[:100], "its header"),
-        (ply(GOOD, before=FACES, head=b"\0"), "face with its lists stands before vertex"),
+        (ply(GOOD, before=FACES, head=b"\0"), "face with its lists comes before vertex"),
         (ply(GOOD, after="property list uchar int ids"), "rows of vertex hold lists"),
         (ply(GOOD, after="property float x"), "'x' twice"),
         (ply(GOOD, form="ascii").replace(b" ", b" a ", 100), "line"),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.sample import Texture, splats_on_mesh
-from physgen.sim.scene.glb import TexturedMesh
+from physgen.sim.gaussians.mesh_to_splats import Texture, splats_on_mesh
+from physgen.sim.scene.textured_mesh import TexturedMesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -105,7 +105,7 @@ def test_textures_of_mesh_files():
     texture = Texture.of(TexturedMesh(vertices, faces, vertices[:, :2], buffer.getvalue()))
     np.testing.assert_allclose(splats_on_mesh(vertices, faces, texture, 9).colours, 0.2)
     assert Texture.of(TexturedMesh(vertices, faces)) is None
-    with pytest.raises(InputError, match="not a readable picture"):
+    with pytest.raises(InputError, match="not a readable image"):
         Texture.of(TexturedMesh(vertices, faces, vertices[:, :2], b"\x89PNG garbage"))
 
 
@@ -119,8 +119,8 @@ def test_textures_of_mesh_files():
         (*plane(), Texture(np.zeros((3, 2)), np.zeros((1, 1, 3), np.uint8)), 5, "texture with uv"),
         (plane()[0] * 0, plane()[1], GREY, 5, "area is 0 m²"),
         (plane()[0] * np.nan, plane()[1], GREY, 5, "area is nan"),
-        (plane()[0], plane()[1] + 1, GREY, 5, "name vertex 4 of 4"),
-        (plane()[0], plane()[1][:0], GREY, 5, "give triangles"),
+        (plane()[0], plane()[1] + 1, GREY, 5, "refer to vertex 4 of 4"),
+        (plane()[0], plane()[1][:0], GREY, 5, r"give \(V, 3\) and \(T, 3\)"),
     ],
 )
 def test_what_no_splats_can_be_put_on_is_said(vertices, faces, colours, count, said):

@@ -11,12 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.views.backdrop import plain_backdrop_mask
-from physgen.sim.gaussians.views.multiview import LAYOUTS, read_multiview
-from physgen.sim.gaussians.views.orbit import orbit_camera
-from physgen.sim.gaussians.views.save import save_views
-from physgen.sim.gaussians.views.transforms import read_views
-from physgen.sim.gaussians.views.view import View
+from physgen.sim.gaussians.views.posed_images import View, orbit_camera, plain_background_mask
+from physgen.sim.gaussians.views.view_files import LAYOUTS, read_view_grid, read_views, save_views
 from physgen.sim.scene.model import Camera
 from PIL import Image
 from scipy.ndimage import binary_fill_holes
@@ -87,7 +83,7 @@ def test_views_come_back_from_the_folder_they_are_saved_to(tmp_path):
 def test_saving_never_touches_what_is_there(tmp_path):
     views = views_of(SOLIDS, count=2, side=16)
     (tmp_path / "kept.txt").write_text("x")
-    with pytest.raises(InputError, match="holds files already"):
+    with pytest.raises(InputError, match="is not empty"):
         save_views(tmp_path, views)
     for wrong in ([], [views[0], views[0]], [View(name="../a", camera=views[0].camera, pixels=views[0].pixels)]):
         with pytest.raises(InputError, match=r"no views|cannot be called"):
@@ -135,7 +131,7 @@ def test_masks_and_labels_beside_the_pictures(tmp_path):
     for view in views:
         assert view.labels[0].tolist() == [-1] * 9 + [1] * 3 + [2] * 4
     assert [view.mask[0].sum() for view in views] == [8, 11]
-    with pytest.raises(InputError, match="objects frog, sweater: say which is covered"):
+    with pytest.raises(InputError, match="objects frog, sweater: give their order"):
         read_views(tmp_path)
     with pytest.raises(InputError, match="has no folder 'cat'"):
         read_views(tmp_path, objects=("cat", "frog"))
@@ -143,7 +139,7 @@ def test_masks_and_labels_beside_the_pictures(tmp_path):
     write(tmp_path, {"camera_angle_x": 1, "frames": frames})
     assert read_views(tmp_path, objects=("frog", "sweater"))[1].mask[0].sum() == 7
     (tmp_path / "masks/sweater/r_1.png").unlink()
-    with pytest.raises(InputError, match=r"sweater/r_1.png: there is no such mask"):
+    with pytest.raises(InputError, match=r"sweater/r_1.png: no such mask"):
         read_views(tmp_path, objects=("frog", "sweater"))
     picture(tmp_path / "labels/r_1.png", label[:, ::-1])
     with pytest.raises(InputError, match=r"'r_1': 84 of 84 labelled pixels lie outside its mask"):
@@ -156,30 +152,30 @@ CLEAR = np.zeros((12, 16))
 @pytest.mark.parametrize(
     "change, said",
     [
-        (lambda f, d: (f / "transforms.json").unlink(), r"1 pictures and no transforms.json.*colmap2nerf"),
+        (lambda f, d: (f / "transforms.json").unlink(), r"1 images but no transforms.json.*colmap2nerf"),
         (lambda f, d: d["frames"][1].pop("transform_matrix"), r"frames\[1\]: has no camera"),
         (lambda f, d: d.pop("camera_angle_x"), r"no focal length: give fl_x"),
         (lambda f, d: d.update(camera_angle_x=4), "radians below pi"),
         (lambda f, d: d.update(fl_x=math.nan), "fl_x is 'nan'"),
         (lambda f, d: d.update(fl_x=-3), "above 0"),
-        (lambda f, d: d.update(k1=0.1), "k1 distorts the picture: undistort"),
+        (lambda f, d: d.update(k1=0.1), "k1 distorts the image: undistort"),
         (lambda f, d: d.update(camera_model="OPENCV_FISHEYE"), "pinhole"),
-        (lambda f, d: d.update(w=16, h=16), "the picture that the camera is of"),
+        (lambda f, d: d.update(w=16, h=16), "the image that belongs to this camera"),
         (lambda f, d: d.update(frames=[]), "no list of frames"),
-        (lambda f, d: d["frames"].append(3), r"frames\[2\]: is no object"),
-        (lambda f, d: d["frames"][0].update(transform_matrix=[[1, 2], [3]]), "no 4x4 matrix"),
+        (lambda f, d: d["frames"].append(3), r"frames\[2\]: is not an object"),
+        (lambda f, d: d["frames"][0].update(transform_matrix=[[1, 2], [3]]), "not a 4x4 matrix"),
         (lambda f, d: d["frames"][0].update(transform_matrix=(2 * np.eye(4)).tolist()), "scales or mirrors"),
         (lambda f, d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "scales or mirrors"),
         (lambda f, d: d["frames"][0].update(file_path=7), "file_path is '7'"),
         (lambda f, d: d["frames"][0].update(file_path="../secret.png"), r"frames\[0\]: file name.*without"),
         (lambda f, d: d["frames"][0].update(file_path="/etc/passwd"), "must be relative"),
         (lambda f, d: d["frames"][0].update(mask_path="../../x.png"), "without"),
-        (lambda f, d: d["frames"][0].update(file_path="train/r_9"), "there is no picture"),
+        (lambda f, d: d["frames"][0].update(file_path="train/r_9"), "no such image"),
         (lambda f, d: d["frames"][0].update(file_path="train/r_1.png"), "another frame has too"),
-        (lambda f, d: picture(f / "masks/r_0.png", np.ones((3, 3))), "has 3x3 pixels, its picture 16x12"),
-        (lambda f, d: picture(f / "labels/r_0.png", CLEAR + 1), "holds 255: give 0 outside"),
-        (lambda f, d: picture(f / "labels/r_0.png", np.ones((12, 16, 3))), "kept as colours"),
-        (lambda f, d: (f / "train/r_0.png").write_bytes(b"\x89PNG\r\n\x1a\n garbage"), "not a readable picture"),
+        (lambda f, d: picture(f / "masks/r_0.png", np.ones((3, 3))), "has 3x3 pixels, its image 16x12"),
+        (lambda f, d: picture(f / "labels/r_0.png", CLEAR + 1), "holds 255: use 0 outside"),
+        (lambda f, d: picture(f / "labels/r_0.png", np.ones((12, 16, 3))), "stored as colours"),
+        (lambda f, d: (f / "train/r_0.png").write_bytes(b"\x89PNG\r\n\x1a\n garbage"), "not a readable image"),
     ],
 )
 def test_what_is_wrong_with_a_folder_is_said(tmp_path, change, said):
@@ -219,8 +215,8 @@ def test_links_that_lead_out_are_refused(tmp_path):
 
 def test_pictures_beyond_bounds_are_refused_unread(tmp_path, monkeypatch):
     nerf_folder(tmp_path)
-    monkeypatch.setattr("physgen.sim.gaussians.views.pictures.MAX_PIXELS", 300)
-    with pytest.raises(InputError, match=r"r_1.png: with its 16x12 pixels the views have more"):
+    monkeypatch.setattr("physgen.sim.gaussians.views.posed_images.MAX_PIXELS", 300)
+    with pytest.raises(InputError, match=r"r_1.png: with its 16x12 pixels the views exceed"):
         read_views(tmp_path)
 
 
@@ -251,13 +247,13 @@ def test_the_backdrop_is_what_is_connected_to_the_border():
     grey = colours * mask[..., None] + 0.5 * (1 - mask[..., None]) + random.normal(0, 0.004, colours.shape)
     sure = (mask == 0) | (mask == 1)
     for pixels in (colours, np.clip(grey, 0, 1)):
-        found = plain_backdrop_mask(pixels.astype(np.float32))
+        found = plain_background_mask(pixels.astype(np.float32))
         np.testing.assert_array_equal(found[sure], mask[sure])
     inner = colours.copy()
     inner[30:34, 30:34] = 1
-    assert plain_backdrop_mask(inner.astype(np.float32))[32, 32] == 1
-    assert plain_backdrop_mask(random.uniform(size=(64, 64, 3)).astype(np.float32)) is None
-    assert plain_backdrop_mask(np.ones((64, 64, 3), np.float32)) is None
+    assert plain_background_mask(inner.astype(np.float32))[32, 32] == 1
+    assert plain_background_mask(random.uniform(size=(64, 64, 3)).astype(np.float32)) is None
+    assert plain_background_mask(np.ones((64, 64, 3), np.float32)) is None
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -286,7 +282,7 @@ def test_pictures_of_generators_have_their_published_cameras(tmp_path, layout):
         row, column = divmod(index, shape[1])
         sheet[row * side : (row + 1) * side, column * side : (column + 1) * side] = colours
     picture(tmp_path / "0.png", sheet)
-    views = read_multiview(tmp_path / "0.png", layout)
+    views = read_view_grid(tmp_path / "0.png", layout)
     for view, (camera, mask) in zip(views, truth, strict=True):
         np.testing.assert_allclose(view.camera.world_from_camera, camera.world_from_camera, atol=1e-9)
         assert (view.camera.fx, view.camera.cx, view.camera.cy) == pytest.approx((camera.fx, side / 2, side / 2))
@@ -294,17 +290,17 @@ def test_pictures_of_generators_have_their_published_cameras(tmp_path, layout):
         sure = (binary_fill_holes(mask > 0) == 0) | (mask == 1)
         np.testing.assert_array_equal(view.mask[sure], mask[sure])
     other = next(name for name in LAYOUTS if LAYOUTS[name].columns != LAYOUTS[layout].columns)
-    with pytest.raises(InputError, match="square views as"):
-        read_multiview(tmp_path / "0.png", other)
+    with pytest.raises(InputError, match="square views of"):
+        read_view_grid(tmp_path / "0.png", other)
 
 
 def test_layouts_and_views_are_checked(tmp_path):
     picture(tmp_path / "a.png", np.ones((16, 256)))
     with pytest.raises(InputError, match="layout is 'x': choose one of syncdreamer"):
-        read_multiview(tmp_path / "a.png", "x")
+        read_view_grid(tmp_path / "a.png", "x")
     with pytest.raises(InputError, match="distance is -1"):
-        read_multiview(tmp_path / "a.png", "syncdreamer", distance=-1)
-    views = read_multiview(tmp_path / "a.png", "syncdreamer", distance=3)
+        read_view_grid(tmp_path / "a.png", "syncdreamer", distance=-1)
+    views = read_view_grid(tmp_path / "a.png", "syncdreamer", distance=3)
     assert np.linalg.norm(views[3].camera.position) == pytest.approx(3) and views[3].mask is None
     camera, pixels = views[0].camera, views[0].pixels
     for wrong in ({"pixels": pixels[1:]}, {"pixels": pixels * np.nan}, {"mask": pixels[..., 0] * 2}):

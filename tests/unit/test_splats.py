@@ -50,7 +50,7 @@ def test_bad_numbers_are_named(changes, said):
 
 def test_parts_are_chosen_and_joined():
     splats = some(5)
-    halves = splats.chosen(np.arange(5) < 2), splats.chosen(np.arange(2, 5))
+    halves = splats.subset(np.arange(5) < 2), splats.subset(np.arange(2, 5))
     again = joined(halves)
     np.testing.assert_array_equal(again.centres, splats.centres)
     np.testing.assert_allclose(again.rotations, splats.rotations, atol=1e-15)

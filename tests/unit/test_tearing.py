@@ -5,7 +5,7 @@ import numpy as np
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.sim.skinning.tearing import TORN_STRETCH, first_torn
+from physgen.sim.skinning import TORN_STRETCH, first_torn
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 

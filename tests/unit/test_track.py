@@ -18,18 +18,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Camera as CaptureCamera
 from physgen.sim.diagnose.capture import load_capture
-from physgen.sim.diagnose.track.command import add_arguments, command, parse_takes, track_and_save
-from physgen.sim.diagnose.track.corners import contrast, image_noise
-from physgen.sim.diagnose.track.noise import jitter, pose_scatter
-from physgen.sim.diagnose.track.options import Take, TrackOptions
-from physgen.sim.diagnose.track.patches import align, cut, smoothed, warp
-from physgen.sim.diagnose.track.pose import Pose, locate, project
-from physgen.sim.diagnose.track.surface import Surface, cast, facing, silhouette
-from physgen.sim.diagnose.track.tracking import track_video, track_videos, withhold
+from physgen.sim.diagnose.track.feature_tracking import align, contrast, extract_patches, image_noise, smoothed, warp
+from physgen.sim.diagnose.track.pose_estimation import (
+    Pose,
+    Surface,
+    cast,
+    facing,
+    jitter,
+    locate,
+    pose_scatter,
+    project,
+    silhouette,
+)
+from physgen.sim.diagnose.track.track_command import add_arguments, parse_takes, run_command, track
+from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial
+from physgen.sim.diagnose.track.track_videos import track_video, track_videos, withhold
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.scene.folder import SceneFolder, save_scene
-from physgen.sim.scene.materials import load_preset
-from physgen.sim.scene.model import Camera, Scene, SceneObject
+from physgen.sim.scene.folder import Scene, save_scene
+from physgen.sim.scene.material import load_preset
+from physgen.sim.scene.model import Camera, SceneModel, SceneObject
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 480, 360
@@ -173,7 +180,7 @@ def write_video(path: Path, frames, *, fps=FPS, code="MJPG"):
     return path
 
 
-def make_scene(root: Path, stage: Stage, *, preset="wood", objects=("body",), **changes) -> SceneFolder:
+def make_scene(root: Path, stage: Stage, *, preset="wood", objects=("body",), **changes) -> Scene:
     """A perfect reconstruction: the mesh in millimetres, y up, in a frame of its own."""
     (root / "meshes").mkdir(parents=True)
     photo = np.clip(stage.draw(REST_TURN, REST_PLACE), 0, 255).astype(np.uint8)
@@ -196,7 +203,7 @@ def make_scene(root: Path, stage: Stage, *, preset="wood", objects=("body",), **
         )
         for name in objects
     )
-    return save_scene(root, Scene(**{"camera": stage.camera, "objects": items, **changes}))
+    return save_scene(root, SceneModel(**{"camera": stage.camera, "objects": items, **changes}))
 
 
 def truth(trial, motion, camera=CAMERA) -> np.ndarray:
@@ -226,7 +233,7 @@ def tossed(cube, tmp_path_factory):
     """The tossed cube, filmed and tracked once."""
     stage, folder = cube
     path = write_video(tmp_path_factory.mktemp("video") / "toss.avi", film(stage, toss, 30))
-    return path, track_video(Take(path=path), folder)
+    return path, track_video(VideoTrial(path=path), folder)
 
 
 def test_points_are_followed_to_a_tenth_of_a_pixel(tossed):
@@ -242,7 +249,7 @@ def test_points_are_followed_to_a_tenth_of_a_pixel(tossed):
 def test_what_is_tracked_is_a_capture_of_the_scene(cube, tossed, tmp_path):
     stage, folder = cube
     path, tracked = tossed
-    capture = track_and_save([Take(path=path)], folder, tmp_path / "capture")
+    capture = track(folder, [VideoTrial(path=path)], out=tmp_path / "capture")
     loaded = load_capture(tmp_path / "capture")
     assert loaded.warnings == ()
     assert [t.name for t in loaded.trials] == ["toss"]
@@ -286,7 +293,7 @@ def test_what_is_hidden_is_nan_and_nothing_is_wrong(cube, tmp_path):
         return 130 + 500 * t, 170 + 500 * t
 
     path = write_video(tmp_path / "bar.avi", film(stage, resting, 24, bar=bar))
-    trial = track_video(Take(path=path), folder).trial
+    trial = track_video(VideoTrial(path=path), folder).trial
     true = truth(trial, resting)
     off = np.linalg.norm(trial.pixels - true, axis=2)
     assert np.nanmax(off) < 1.0
@@ -304,7 +311,7 @@ def test_what_is_hidden_is_nan_and_nothing_is_wrong(cube, tmp_path):
 def test_an_occluder_never_carries_points_away(cube, tmp_path):
     stage, folder = cube
     path = write_video(tmp_path / "bar.mp4", film(stage, toss, 30, bar=lambda t: (900 * t - 80, 900 * t)), code="mp4v")
-    found = errors(track_video(Take(path=path), folder).trial, toss)
+    found = errors(track_video(VideoTrial(path=path), folder).trial, toss)
     assert len(found) > 300
     assert np.median(found) < 0.5
     assert np.percentile(found, 99) < 3.0
@@ -317,7 +324,7 @@ def test_motion_blur(cube, tmp_path, exposure, median, most):
     """Exposed for a share of the frame's time, over which the cube moves by up to 6 and 17 pixels."""
     stage, folder = cube
     path = write_video(tmp_path / "blur.avi", film(stage, toss, 26, exposure=exposure))
-    tracked = track_video(Take(path=path), folder)
+    tracked = track_video(VideoTrial(path=path), folder)
     found = errors(tracked.trial, toss)
     assert tracked.trial.seen.any(axis=1).all()
     assert np.median(found) < median
@@ -334,7 +341,7 @@ def test_a_bounce(cube, tmp_path):
         return spin * REST_TURN, REST_PLACE + np.array([0, 0, 4.905 * t * (0.25 - t)])
 
     path = write_video(tmp_path / "bounce.avi", film(stage, bounce, 25))
-    tracked = track_video(Take(path=path), folder)
+    tracked = track_video(VideoTrial(path=path), folder)
     assert tracked.trial.seen.any(axis=1).all()
     assert np.median(errors(tracked.trial, bounce)) < 0.15
     assert np.percentile(errors(tracked.trial, bounce), 99) < 1.0
@@ -344,7 +351,7 @@ def test_a_ball_that_deforms(tmp_path):
     stage = Stage(kind="ball")
     folder = make_scene(tmp_path / "scene", stage, preset="soft")
     path = write_video(tmp_path / "squash.avi", film(stage, squashed, 28))
-    trial = track_video(Take(path=path), folder).trial
+    trial = track_video(VideoTrial(path=path), folder).trial
     found = errors(trial, squashed)
     assert trial.seen.any(axis=1).all()
     assert len(found) > 28 * 10
@@ -357,7 +364,7 @@ def test_a_ball_that_spins(tmp_path):
     stage = Stage(kind="ball")
     folder = make_scene(tmp_path / "scene", stage)
     path = write_video(tmp_path / "spin.avi", film(stage, toss, 28))
-    trial = track_video(Take(path=path), folder).trial
+    trial = track_video(VideoTrial(path=path), folder).trial
     assert np.median(errors(trial, toss)) < 0.25
     late = np.linalg.norm(trial.pixels - truth(trial, toss), axis=2)[20:]
     assert np.nanmedian(late) < 0.4
@@ -367,7 +374,7 @@ def test_another_resolution(cube, tmp_path):
     _, folder = cube
     camera = dataclasses.replace(CAMERA, width=720, height=540, fx=780.0, fy=780.0, cx=360.0, cy=270.0)
     path = write_video(tmp_path / "large.avi", film(Stage(camera=camera), toss, 14))
-    tracked = track_video(Take(path=path), folder)
+    tracked = track_video(VideoTrial(path=path), folder)
     assert (tracked.camera.width, tracked.camera.fx, tracked.camera.cy) == (720, 780.0, 270.0)
     off = np.linalg.norm(tracked.trial.pixels - truth(tracked.trial, toss, camera), axis=2)
     assert np.nanmedian(off) < 0.3
@@ -381,16 +388,16 @@ def test_an_object_that_is_elsewhere_is_recognised(cube, tmp_path):
         return Rotation.from_rotvec(np.array([0.5, 0.3, 1.0]) * (t + 0.2)) * REST_TURN, place
 
     path = write_video(tmp_path / "thrown.avi", film(stage, thrown, 12))
-    tracked = track_video(Take(path=path), folder)
-    assert any("where the scene has" in w for w in tracked.warnings)
+    tracked = track_video(VideoTrial(path=path), folder)
+    assert any("at their scene poses" in w for w in tracked.warnings)
     assert np.median(errors(tracked.trial, thrown)) < 1.0
 
 
 def test_an_object_that_is_not_there(cube, tmp_path):
     stage, folder = cube
     path = write_video(tmp_path / "gone.avi", film(stage, lambda t: (REST_TURN, np.array([5.0, 0, 0.05])), 5))
-    with pytest.raises(InputError, match=r"body.*is not recognised elsewhere.*--start-frame"):
-        track_video(Take(path=path), folder)
+    with pytest.raises(InputError, match=r"body.*is not at its scene pose and not recognised elsewhere.*--start-frame"):
+        track_video(VideoTrial(path=path), folder)
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 6.0])
@@ -400,8 +407,8 @@ def test_an_object_without_texture(tmp_path, noise):
     photo = next(iter(film(plain, resting, 1, noise=noise)))
     cv2.imwrite(str(tmp_path / "scene/photo.png"), photo)
     path = write_video(tmp_path / "plain.avi", film(plain, toss, 8, noise=noise))
-    with pytest.raises(InputError, match=r"'body'.*too little texture; put on a pattern"):
-        track_video(Take(path=path), folder)
+    with pytest.raises(InputError, match=r"'body'.*too little texture; add a pattern"):
+        track_video(VideoTrial(path=path), folder)
 
 
 def test_several_takes_and_one_to_predict(cube, tossed, tmp_path):
@@ -410,7 +417,7 @@ def test_several_takes_and_one_to_predict(cube, tossed, tmp_path):
     second = tmp_path / "later.avi"
     second.write_bytes(path.read_bytes())
     takes = parse_takes([path, second], predict_from=["later=0.25"], end_frames=[24])
-    capture = track_and_save(takes, folder, tmp_path / "capture", withheld=tmp_path / "withheld")
+    capture = track(folder, takes, out=tmp_path / "capture", withheld=tmp_path / "withheld")
     loaded = load_capture(tmp_path / "capture")
     assert [(t.name, t.role) for t in loaded.trials] == [("toss", "fit"), ("later", "predict")]
     shown = loaded.predict_trials[0]
@@ -429,13 +436,13 @@ def test_the_command(cube, tossed, tmp_path):
     add_arguments(parser)
     line = f"{tossed[0]} --scene {cube[1].root} --out {tmp_path / 'c'} --end-frame 8 --density 20 --objects body"
     events = []
-    done = command(parser.parse_args(line.split()), events.append, lambda: False)
+    done = run_command(parser.parse_args(line.split()), events.append, lambda: False)
     assert done["event"] == "done" and done["capture"] == str(tmp_path / "c")
     assert "9 frames in 0.133 s" in done["summary"]
     trial = load_capture(tmp_path / "c").trials[0]
     assert trial.seen[0].sum() <= 20
-    with pytest.raises(InputError, match="is there already"):
-        command(parser.parse_args(line.split()), events.append, lambda: False)
+    with pytest.raises(InputError, match="already exists"):
+        run_command(parser.parse_args(line.split()), events.append, lambda: False)
 
 
 def test_two_objects_one_behind_the_other(tmp_path):
@@ -445,8 +452,8 @@ def test_two_objects_one_behind_the_other(tmp_path):
     wall = trimesh.creation.box((0.06, 0.01, 0.3))
     wall.apply_translation((0.12, -0.12, 0.1))
     wall.export(folder.root / "meshes/wall.ply")
-    items = (*folder.scene.objects, SceneObject(name="wall", mesh="meshes/wall.ply", size_m=0.3, role="collider"))
-    folder = save_scene(folder.root, dataclasses.replace(folder.scene, objects=items))
+    items = (*folder.model.objects, SceneObject(name="wall", mesh="meshes/wall.ply", size_m=0.3, role="collider"))
+    folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=items))
 
     def pushed(t):
         return REST_TURN, REST_PLACE + np.array([0.8 * max(0.0, t - 0.05), 0, 0])
@@ -459,7 +466,7 @@ def test_two_objects_one_behind_the_other(tmp_path):
             cv2.fillConvexPoly(frame, shape, 120)
             yield frame
 
-    tracked = track_video(Take(path=write_video(tmp_path / "pushed.avi", frames())), folder)
+    tracked = track_video(VideoTrial(path=write_video(tmp_path / "pushed.avi", frames())), folder)
     true = truth(tracked.trial, pushed)
     assert np.nanmax(np.linalg.norm(tracked.trial.pixels - true, axis=2)) < 1.5
     inside = np.array([[cv2.pointPolygonTest(shape, tuple(p), True) for p in row] for row in true - 0.5])
@@ -468,8 +475,8 @@ def test_two_objects_one_behind_the_other(tmp_path):
 
 
 def test_nothing_to_learn_from(cube, tossed):
-    with pytest.raises(InputError, match="leave at least one whole"):
-        track_videos([Take(path=tossed[0], predict_from=0.2)], cube[1])
+    with pytest.raises(InputError, match="leave at least one complete"):
+        track_videos([VideoTrial(path=tossed[0], predict_from=0.2)], cube[1])
 
 
 @given(st.floats(0.01, 1.0))
@@ -509,53 +516,53 @@ def test_times_are_the_containers(cube, tmp_path):
     stage, folder = cube
     path = write_video(tmp_path / "vfr.mp4", film(stage, resting, 12), fps=50.0, code="mp4v")
     stretch_times(path, 5, 3)
-    times = track_video(Take(path=path), folder).trial.times
+    times = track_video(VideoTrial(path=path), folder).trial.times
     np.testing.assert_allclose(np.diff(times), [0.02] * 5 + [0.06] * 6, atol=1e-4)
-    times = track_video(Take(path=path, start_frame=6, end_frame=10), folder).trial.times
+    times = track_video(VideoTrial(path=path, start_frame=6, end_frame=10), folder).trial.times
     np.testing.assert_allclose(times, np.arange(5) * 0.06, atol=1e-4)
 
 
 def test_slow_motion_files_are_told_their_rate(cube, tmp_path):
     stage, folder = cube
     path = write_video(tmp_path / "slow.avi", film(stage, resting, 6), fps=30.0)
-    times = track_video(Take(path=path, fps_override=240.0), folder).trial.times
+    times = track_video(VideoTrial(path=path, fps_override=240.0), folder).trial.times
     np.testing.assert_allclose(times, np.arange(6) / 240.0)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "no such video"), (b"", "is empty"), (b"not a video at all" * 100, "is not a video")],
+    [(None, "no such video"), (b"", "is empty"), (b"not a video at all" * 100, "not a readable video")],
 )
 def test_files_that_are_no_videos(cube, tmp_path, content, message):
     path = tmp_path / "broken.mp4"
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=message):
-        track_video(Take(path=path), cube[1])
+        track_video(VideoTrial(path=path), cube[1])
 
 
 def test_a_damaged_video(cube, tossed, tmp_path):
     whole = tossed[0].read_bytes()
     path = tmp_path / "half.avi"
     path.write_bytes(whole[: len(whole) // 2])
-    tracked = track_video(Take(path=path), cube[1])
+    tracked = track_video(VideoTrial(path=path), cube[1])
     assert 5 < len(tracked.trial.times) < 30
     path.write_bytes(whole[: whole.find(b"00dc", whole.find(b"00dc", whole.find(b"00dc") + 4) + 4)])
     with pytest.raises(InputError, match="a motion needs 3"):
-        track_video(Take(path=path), cube[1])
+        track_video(VideoTrial(path=path), cube[1])
 
 
 def test_ranges_beyond_the_video(cube, tossed):
     with pytest.raises(InputError, match="no frame could be read from frame 500 on"):
-        track_video(Take(path=tossed[0], start_frame=500), cube[1])
+        track_video(VideoTrial(path=tossed[0], start_frame=500), cube[1])
     with pytest.raises(InputError, match="end_frame is 3"):
-        Take(path=tossed[0], start_frame=3, end_frame=3)
+        VideoTrial(path=tossed[0], start_frame=3, end_frame=3)
 
 
 def test_another_shape_of_picture(cube, tmp_path):
     path = write_video(tmp_path / "wide.avi", (np.full((180, 320), 90, np.uint8) for _ in range(4)))
     with pytest.raises(InputError, match=r"320x180.*480x360.*reconstruct the scene from a frame"):
-        track_video(Take(path=path), cube[1])
+        track_video(VideoTrial(path=path), cube[1])
 
 
 def test_a_camera_that_moves_is_noticed(cube, tmp_path):
@@ -565,19 +572,19 @@ def test_a_camera_that_moves_is_noticed(cube, tmp_path):
         for i, frame in enumerate(film(stage, resting, 12)):
             yield np.roll(frame, i // 2, axis=1)
 
-    tracked = track_video(Take(path=write_video(tmp_path / "shaken.avi", shaken())), folder)
+    tracked = track_video(VideoTrial(path=write_video(tmp_path / "shaken.avi", shaken())), folder)
     assert any("camera was not fixed" in w for w in tracked.warnings)
 
 
 def test_cancelling_leaves_nothing(cube, tossed, tmp_path):
     with pytest.raises(Cancelled):
-        track_and_save([Take(path=tossed[0])], cube[1], tmp_path / "capture", cancelled=lambda: True)
+        track(cube[1], [VideoTrial(path=tossed[0])], out=tmp_path / "capture", cancelled=lambda: True)
     assert not (tmp_path / "capture").exists()
 
 
 def test_progress_and_warnings_are_events(cube, tossed, tmp_path):
     events = []
-    track_and_save([Take(path=tossed[0], end_frame=9)], cube[1], tmp_path / "capture", on_event=events.append)
+    track(cube[1], [VideoTrial(path=tossed[0], end_frame=9)], out=tmp_path / "capture", on_event=events.append)
     progress = [e for e in events if e["event"] == "progress"]
     assert [e["done"] for e in progress] == list(range(1, 11))
     assert {e["total"] for e in progress} == {10}
@@ -612,7 +619,7 @@ def test_wrong_arguments(changes, message):
 
 def test_wrong_objects(cube, tossed):
     with pytest.raises(InputError, match="no object 'cup'; choose from body"):
-        track_video(Take(path=tossed[0]), cube[1], objects=["cup"])
+        track_video(VideoTrial(path=tossed[0]), cube[1], objects=["cup"])
 
 
 def capture_camera() -> CaptureCamera:
@@ -681,7 +688,7 @@ def test_aligning_finds_shifts_whatever_the_light(dx, dy, gain, offset):
     moved = cv2.warpAffine(image, move, (200, 200), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     lit = np.clip(moved * gain + offset, 0, 255).astype(np.uint8)
     places = np.array([[80.5, 90.5], [120.5, 60.5], [100.5, 130.5]])
-    crops = cut(smoothed(image.astype(np.uint8)), places, 8)
+    crops = extract_patches(smoothed(image.astype(np.uint8)), places, 8)
     patches = warp(crops, np.broadcast_to(np.eye(2, 5), (3, 2, 5)), 8)
     found, score = align(smoothed(lit), patches, places, 8)
     np.testing.assert_allclose(found - places, np.broadcast_to([dx, dy], (3, 2)), atol=0.1)

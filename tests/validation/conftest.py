@@ -11,14 +11,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.mpm import runtime
+from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.mpm.bodies import BodyParticles
 from physgen.sim.mpm.colliders import Surface
-from physgen.sim.mpm.materials import ElasticMaterial, RigidMaterial
-from physgen.sim.mpm.options import SolverOptions
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.solids import Solids
+from physgen.sim.mpm.kernels import runtime
+from physgen.sim.mpm.rigid.rigid_bodies import RigidBodies
+from physgen.sim.mpm.solver_options import SolverOptions
 from physgen.sim.mpm.world import World
+from physgen.sim.mpm.world_setup import WorldSetup
 from physgen.sim.scene.units import Similarity
 
 GRID = 64
@@ -157,12 +157,12 @@ def ball_body() -> BoxFactory:
 
 
 @pytest.fixture
-def solids() -> Callable[..., Solids]:
+def solids() -> Callable[..., RigidBodies]:
     """A factory of solids: worlds of 32 cells a metre around the origin."""
 
-    def make(*setups: WorldSetup) -> Solids:
+    def make(*setups: WorldSetup) -> RigidBodies:
         runtime.ensure_started(SolverOptions(grid=GRID))
-        return Solids(setups, [1.0 / CELL] * len(setups), [(-1.0, -1.0, -1.0)] * len(setups))
+        return RigidBodies(setups, [1.0 / CELL] * len(setups), [(-1.0, -1.0, -1.0)] * len(setups))
 
     return make
 

@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.gaussians.physics.carry import CarriedMesh
-from physgen.sim.gaussians.physics.options import StepOptions
-from physgen.sim.gaussians.physics.penetration import penetration_of_meshes
-from physgen.sim.gaussians.physics.step import PhysicalBody
-from physgen.sim.gaussians.physics.together import stays_together
+from physgen.sim.gaussians.compose.deformable_part import BoundMesh
+from physgen.sim.gaussians.compose.pair_stability import check_stability
+from physgen.sim.gaussians.compose.penetration import penetration_of_meshes
+from physgen.sim.gaussians.compose.physical_body import PhysicalBody, StepOptions
 from physgen.sim.mpm.colliders import Collider, Surface
 
 
@@ -41,9 +40,7 @@ def finger(radius: float) -> trimesh.Trimesh:
 RING = trimesh.creation.torus(major_radius=0.01125, minor_radius=0.00125, major_sections=64, minor_sections=24)
 
 
-def resolved(
-    background: Surface, foreground: Surface, steps: int, **options: float
-) -> tuple[PhysicalBody, CarriedMesh]:
+def resolved(background: Surface, foreground: Surface, steps: int, **options: float) -> tuple[PhysicalBody, BoundMesh]:
     mesh = trimesh.Trimesh(background.vertices, background.faces)
     points = np.asarray(trimesh.sample.sample_surface(mesh, 4000, seed=5)[0])
     body = PhysicalBody(
@@ -52,7 +49,7 @@ def resolved(
         obstacles=[Collider(name="foreground", surface=foreground)],
         options=StepOptions(cells_across=20, **options),
     )
-    carried = CarriedMesh(background, body)
+    carried = BoundMesh(background, body)
     for _ in range(steps):
         body.step(np.zeros_like(points))
     return body, carried
@@ -67,7 +64,7 @@ def test_finger_is_squeezed_into_its_ring(too_thick, keep):
     radius = np.linalg.norm(body.points[:, :2], axis=1)
     assert (radius[np.abs(body.points[:, 2]) < 0.0008] < 0.0105).all()
     assert -body.lattices[0].at(body.particles)[0].min() < 0.005 * 0.06
-    assert penetration_of_meshes(carried.cleared(), foreground).volume < 0.01 * start.volume
+    assert penetration_of_meshes(carried.resolved(), foreground).volume < 0.01 * start.volume
 
 
 def test_ball_rises_in_a_bowl_that_is_too_small():
@@ -79,7 +76,7 @@ def test_ball_rises_in_a_bowl_that_is_too_small():
     below = body.points[body.points[:, 2] < -0.01]
     assert (np.linalg.norm(below, axis=1) < 0.0505).all()
     assert body.points[:, 2].mean() > 0.001
-    assert penetration_of_meshes(carried.cleared(), foreground).volume < 0.01 * start.volume
+    assert penetration_of_meshes(carried.resolved(), foreground).volume < 0.01 * start.volume
 
 
 def test_head_leaves_the_hat_that_was_pushed_into_it():
@@ -89,7 +86,7 @@ def test_head_leaves_the_hat_that_was_pushed_into_it():
     body, carried = resolved(background, foreground, 40)
     above = body.points[body.points[:, 2] > 0.03]
     assert (np.linalg.norm(above, axis=1) < 0.0905).all()
-    assert penetration_of_meshes(carried.cleared(), foreground).volume < 0.01 * start.volume
+    assert penetration_of_meshes(carried.resolved(), foreground).volume < 0.01 * start.volume
 
 
 POST = revolved((0, 0), (0.02, 0), (0.02, 0.004), (0.004, 0.005), (0.004, 0.06), (0, 0.06))
@@ -110,6 +107,6 @@ THIN_RING = trimesh.creation.torus(major_radius=0.0115, minor_radius=0.0015, maj
     ids=["ring on a tapered finger", "wide ring on a post", "ball in a bowl", "ball on a ball"],
 )  # fmt: skip
 def test_what_holds_stays_and_what_does_not_falls(background, foreground, stays):
-    result = stays_together(background, foreground)
+    result = check_stability(background, foreground)
     assert result.stays == stays
     assert result.stays or result.notes

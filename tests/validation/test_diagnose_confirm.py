@@ -6,9 +6,9 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.diagnose.analysis import CandidateFit, Estimate
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
-from physgen.sim.diagnose.confirm import confirm, starting_state, turned
+from physgen.sim.diagnose.diagnosis import CandidateFit, Estimate
+from physgen.sim.diagnose.verification_run import rotate_vectors, run_verification, starting_state
 from scipy.spatial.transform import Rotation
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -85,7 +85,7 @@ def test_the_engine_confirms_drag_in_flight(belief):
     capture = ball(trial, **belief)
     without = flight(0.0, frames=25, spin=(0.0, 0.0, 0.0)).points
     found = fit("air_drag", drag_per_mass=DRAG)
-    result = confirm(capture, trial, fit(), found, without, trial.points, lambda: False)
+    result = run_verification(capture, trial, fit(), found, without, trial.points, lambda: False)
     # A fifth of a second at 3.6 m/s under drag of 0.3/m: k v² t² / 2 = 8 cm at the end, 3.5 cm in the mean.
     assert result.before_rms_m > 0.02
     # Symplectic Euler with steps of 0.2 ms is off by about step / time, on a way of 2 m.
@@ -96,7 +96,7 @@ def test_the_engine_confirms_drag_in_flight(belief):
 def test_a_wrong_verdict_is_not_confirmed():
     trial = flight(0.0)
     found = fit("air_drag", drag_per_mass=DRAG)
-    result = confirm(ball(trial), trial, fit(), found, trial.points, flight(DRAG).points, lambda: False)
+    result = run_verification(ball(trial), trial, fit(), found, trial.points, flight(DRAG).points, lambda: False)
     assert result.word == "contradicted" and result.before_rms_m < 2e-3 < result.after_rms_m
 
 
@@ -105,12 +105,14 @@ def test_a_fast_clock_is_given_to_the_engine():
     recorded = dataclasses.replace(real, times=real.times / 1.1)
     found = fit("time_scale", rate=1.1)
     nominal = flight(0.0, rate=120.0 * 1.1).points
-    result = confirm(ball(recorded), recorded, fit(), found, nominal, recorded.points, lambda: False)
+    result = run_verification(ball(recorded), recorded, fit(), found, nominal, recorded.points, lambda: False)
     assert result.word == "confirmed" and result.after_rms_m < 2e-3
 
 
 def test_only_vectors_are_turned():
     quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
-    values = turned({"axis_x": 1.0, "axis_y": 0.0, "axis_z": 0.0, "fibre_modulus": 5.0, "offset_x": 2.0}, quarter)
+    values = rotate_vectors(
+        {"axis_x": 1.0, "axis_y": 0.0, "axis_z": 0.0, "fibre_modulus": 5.0, "offset_x": 2.0}, quarter
+    )
     assert values["fibre_modulus"] == 5.0 and values["offset_x"] == 2.0
     assert np.allclose([values[f"axis_{a}"] for a in "xyz"], [0, 1, 0])

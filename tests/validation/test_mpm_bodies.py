@@ -7,13 +7,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from physgen.sim.constitutive import ElasticMaterial
 from physgen.sim.errors import SimulationError
-from physgen.sim.mpm.contacts import ContactTable, SurfaceContact
-from physgen.sim.mpm.materials import ElasticMaterial
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.world import World
-from physgen.sim.mpm.worlds import Worlds
+from physgen.sim.mpm.solver_options import Ground
+from physgen.sim.mpm.surface_contact import ContactTable, SurfaceContact
+from physgen.sim.mpm.world import World, Worlds
+from physgen.sim.mpm.world_setup import WorldSetup
 
 G = 9.81
 

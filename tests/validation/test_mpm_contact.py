@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.options import Ground
+from physgen.sim.mpm.solver_options import Ground
 from physgen.sim.mpm.world import World
 
 G = 9.81

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.materials import ElasticMaterial, SandMaterial
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.constitutive import ElasticMaterial, SandMaterial
+from physgen.sim.mpm.colliders import Track
+from physgen.sim.mpm.solver_options import Ground
 from physgen.sim.mpm.world import World
 
 NO_GRAVITY = (0.0, 0.0, 0.0)

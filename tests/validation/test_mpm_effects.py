@@ -13,12 +13,12 @@ import math
 
 import numpy as np
 import pytest
+from physgen.sim.constitutive import DAMPED, FIBRED, ElasticMaterial, VonMisesMaterial
 from physgen.sim.effects.registry import apply_effects
-from physgen.sim.mpm.contacts import GROUND_NAME
-from physgen.sim.mpm.materials import DAMPED, FIBRED, VON_MISES, ElasticMaterial
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.worlds import Worlds
+from physgen.sim.mpm.solver_options import Ground
+from physgen.sim.mpm.surface_contact import GROUND_NAME
+from physgen.sim.mpm.world import Worlds
+from physgen.sim.mpm.world_setup import WorldSetup
 from physgen.sim.scene.model import Effect
 from scipy.integrate import quad, solve_ivp
 
@@ -277,7 +277,7 @@ def test_numbers_of_matter_reach_the_kernels(box, options, similarity):
     assert damped.laws == plain.laws | DAMPED
     assert damped._table.to_numpy()[1] == np.float32(3e-3)
     yielding = under(setup, [effect("plastic_yield", yield_stress=2e3)], similarity, options)[0].group._engine
-    assert yielding.laws == 1 << VON_MISES
+    assert yielding.laws == 1 << VonMisesMaterial.number
     assert yielding._table.to_numpy()[2] == pytest.approx(math.sqrt(2 / 3) * 2e3 / (2 * shear), rel=1e-6)
     fibred = under(
         setup, [effect("anisotropy", fibre_modulus=3e5, axis_x=0.0, axis_y=0.5, axis_z=0.0)], similarity, options

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.colliders import Collider, Surface
-from physgen.sim.mpm.distance import DistanceLattice
+from physgen.sim.mpm.geometry.signed_distance import DistanceLattice
 from physgen.sim.mpm.world import World
 
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.constitutive import ElasticMaterial
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.materials import ElasticMaterial
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.sampling import sample_interior
+from physgen.sim.mpm.geometry.interior_sampling import sample_interior
+from physgen.sim.mpm.solver_options import Ground
 from physgen.sim.mpm.world import World
 
 MODULUS, DENSITY, POISSON = 1e6, 1000.0, 0.3

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.materials import (
+from physgen.sim.constitutive import (
     ElasticMaterial,
     FluidMaterial,
     NeoHookeanMaterial,
@@ -15,7 +15,7 @@ from physgen.sim.mpm.materials import (
     SnowMaterial,
     VonMisesMaterial,
 )
-from physgen.sim.mpm.options import Ground, SolverOptions
+from physgen.sim.mpm.solver_options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
 from physgen.sim.scene.units import Similarity
 

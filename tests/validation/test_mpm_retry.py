@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from physgen.sim.errors import SimulationError
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.tracks import Track
-from physgen.sim.mpm.world import World
-from physgen.sim.mpm.worlds import Worlds
+from physgen.sim.mpm.colliders import Track
+from physgen.sim.mpm.world import World, Worlds
+from physgen.sim.mpm.world_setup import WorldSetup
 
 NO_GRAVITY = (0.0, 0.0, 0.0)
 BLOW = Track(times=[0.0, 1e-3, 1.1e-3], values=[[1e6, 0.0, 0.0], [1e6, 0.0, 0.0], [0.0, 0.0, 0.0]])

@@ -8,7 +8,7 @@ import io
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError, SimulationError
-from physgen.sim.mpm.options import Ground, SolverOptions
+from physgen.sim.mpm.solver_options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
 from physgen.sim.scene.units import Similarity
 

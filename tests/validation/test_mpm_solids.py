@@ -8,15 +8,13 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.constitutive import RigidMaterial
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.colliders import Collider, Surface
-from physgen.sim.mpm.contacts import ContactTable, SurfaceContact
-from physgen.sim.mpm.materials import RigidMaterial
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.tracks import Track
-from physgen.sim.mpm.world import World
-from physgen.sim.mpm.worlds import Worlds
+from physgen.sim.mpm.colliders import Collider, Surface, Track
+from physgen.sim.mpm.solver_options import Ground
+from physgen.sim.mpm.surface_contact import ContactTable, SurfaceContact
+from physgen.sim.mpm.world import World, Worlds
+from physgen.sim.mpm.world_setup import WorldSetup
 
 G = 9.81
 

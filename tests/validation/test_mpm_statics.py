@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.materials import ElasticMaterial
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.constitutive import ElasticMaterial
+from physgen.sim.mpm.colliders import Track
 from physgen.sim.mpm.world import World
 
 G, DENSITY = 9.81, 1000.0

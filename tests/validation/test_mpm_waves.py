@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.materials import ElasticMaterial, NeoHookeanMaterial
+from physgen.sim.constitutive import ElasticMaterial, NeoHookeanMaterial
 from physgen.sim.mpm.world import World
 
 DENSITY, MODULUS = 1000.0, 1e6

@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.mpm.colliders import Collider, Surface
-from physgen.sim.mpm.contacts import ContactTable, SurfaceContact
-from physgen.sim.mpm.options import Ground
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.mpm.colliders import Collider, Surface, Track
+from physgen.sim.mpm.solver_options import Ground
+from physgen.sim.mpm.surface_contact import ContactTable, SurfaceContact
+from physgen.sim.mpm.world_setup import WorldSetup
 
 G = 9.81
 CELL = 1 / 32

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from physgen.sim.mpm.forces import BodyForces
-from physgen.sim.mpm.setup import WorldSetup
-from physgen.sim.mpm.tracks import Track
+from physgen.sim.mpm.bodies import BodyForces
+from physgen.sim.mpm.colliders import Track
+from physgen.sim.mpm.world_setup import WorldSetup
 
 G = 9.81
 NO_GRAVITY = (0.0, 0.0, 0.0)

@@ -7,19 +7,17 @@ import itertools
 import numpy as np
 import pytest
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
-from physgen.sim.diagnose.soft.airborne import fit_airborne
 from physgen.sim.diagnose.soft.body_mesh import body_mesh
-from physgen.sim.diagnose.soft.candidates import candidates
-from physgen.sim.diagnose.soft.fits import fit_soft
-from physgen.sim.diagnose.soft.flight import State
-from physgen.sim.diagnose.soft.laws import Laws
-from physgen.sim.diagnose.soft.takes import Flights, GroundFrame, take_of
-from physgen.sim.diagnose.soft.worlds import Job, SoftWorlds
+from physgen.sim.diagnose.soft.flight_fits import Flights, GroundFrame, fit_in_flight, soft_trial
+from physgen.sim.diagnose.soft.free_flight import State
+from physgen.sim.diagnose.soft.soft_candidates import WorldParameters, candidates
+from physgen.sim.diagnose.soft.soft_fits import fit_soft
+from physgen.sim.diagnose.soft.soft_simulator import SimulationJob, SoftWorlds
 from physgen.sim.errors import Cancelled, InputError
 from scipy.spatial.transform import Rotation
 
 SIGMA = 5e-4
-NOMINAL = Laws(modulus=8e4, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
+NOMINAL = WorldParameters(modulus=8e4, poisson_ratio=0.3, friction=0.4, gravity=(0.0, 0.0, -9.81))
 
 
 def cube_surface(side=0.06, cells=4, away=False):
@@ -42,7 +40,7 @@ def cube_surface(side=0.06, cells=4, away=False):
     return lattice[used], again.reshape(-1, 3)
 
 
-def capture(laws, *, takes=3, after=0.15, seed=0):
+def capture(world, *, takes=3, after=0.15, seed=0):
     rng = np.random.default_rng(seed)
     vertices, faces = cube_surface()
     mesh = body_mesh(vertices, faces)
@@ -59,7 +57,7 @@ def capture(laws, *, takes=3, after=0.15, seed=0):
         )
         for i in range(takes)
     ]
-    points, _ = worlds.run([Job(start=s, laws=laws, times=times) for s in starts])
+    points, _ = worlds.run([SimulationJob(start=s, world=world, times=times) for s in starts])
     trials = []
     for i, truth in enumerate(points):
         seen = truth + SIGMA * rng.normal(size=truth.shape)
@@ -119,9 +117,9 @@ def test_no_bounce_gains_energy(turn):
         turn=Rotation.from_euler("xyz", turn).as_matrix(),
         spin=np.array([5.40490461, 3.94531129, 1.07214123]),
     )
-    laws = dataclasses.replace(NOMINAL, factor=0.55)
+    world = dataclasses.replace(NOMINAL, factor=0.55)
     times = np.arange(0, 0.38, 1 / 200)
-    (points,), _ = worlds.run([Job(start=start, laws=laws, times=times)])
+    (points,), _ = worlds.run([SimulationJob(start=start, world=world, times=times)])
     share = worlds.masses / worlds.masses.sum()
     place = np.einsum("n,tni->ti", share, points)
     speed = (place[-1] - place[-3]) * 100
@@ -136,7 +134,7 @@ def test_where_a_world_comes_to_nothing_the_body_goes_on_rigid(monkeypatch):
     made, _ = capture(NOMINAL, takes=1)
     mesh = body_mesh(made.objects[0].vertices, made.objects[0].faces)
     worlds = SoftWorlds(mesh, 400.0, made.trials[0].rest_points, threads=1)
-    flights = Flights([take_of(made.trials[0], GroundFrame(made), mesh.nodes)], worlds, SIGMA)
+    flights = Flights([soft_trial(made.trials[0], GroundFrame(made), mesh.nodes)], worlds, SIGMA)
     times = made.trials[0].predict_times
     monkeypatch.setattr(worlds, "run", lambda jobs, **_: ([np.full((len(j.times), 14, 3), np.nan) for j in jobs], []))
     assert np.isnan(flights.motion([0], [NOMINAL], [times])[0]).any()
@@ -146,21 +144,21 @@ def test_where_a_world_comes_to_nothing_the_body_goes_on_rigid(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "laws", "parameter", "truth"),
+    ("name", "world", "parameter", "truth"),
     [
         ("buoyancy", dataclasses.replace(NOMINAL, gravity=(0.0, 0.0, -8.0)), "fraction", 1 - 8.0 / 9.81),
         ("air_drag", dataclasses.replace(NOMINAL, drag=0.3), "drag_per_mass", 0.3),
         ("time_scale", NOMINAL, "rate", 1.0),
     ],
 )
-def test_flights_alone_find_what_acts_in_flight(name, laws, parameter, truth):
-    made, _ = capture(laws, takes=3, after=0.0)
+def test_flights_alone_find_what_acts_in_flight(name, world, parameter, truth):
+    made, _ = capture(world, takes=3, after=0.0)
     mesh = body_mesh(made.objects[0].vertices, made.objects[0].faces)
     frame = GroundFrame(made)
-    takes = [take_of(t, frame, mesh.nodes) for t in made.trials]
+    takes = [soft_trial(t, frame, mesh.nodes) for t in made.trials]
     flights = Flights(takes, SoftWorlds(mesh, 400.0, made.trials[0].rest_points, threads=1), SIGMA)
     (candidate,) = candidates(NOMINAL, 0.03, np.array([0, 0, 0.4]))[name]
-    found = fit_airborne(flights, [0, 1, 2], NOMINAL, candidate)
+    found = fit_in_flight(flights, [0, 1, 2], NOMINAL, candidate)
     spread = float(found.curvatures.sum(axis=0)[0, 0]) ** -0.5
     assert candidate.values(found.free)[parameter] == pytest.approx(truth, abs=max(4 * spread, 2e-3))
     count = sum(flights.fit(i, NOMINAL).count for i in range(3))

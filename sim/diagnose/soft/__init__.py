@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Candidate effects fitted to captures whose object deforms. ``fits.fit_soft`` is the way in."""
+"""Fits of candidate effects to captures of a deformable object; the entry point is ``soft_fits.fit_soft``."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A body of tetrahedra inside a closed surface: a lattice of cells, stretched along the rays from its middle.
+"""Tetrahedral mesh of a closed surface: a lattice of cells, stretched along the rays from its centre.
 
-A box becomes the lattice itself, a ball the lattice blown up to a ball, any star-shaped surface what lies between.
-Where the surface is such a lattice's own, its resolution is taken, so that nodes and vertices are the same points.
+A box becomes the lattice itself, a sphere the lattice inflated to a sphere, any star-shaped surface something between.
+Where the surface is itself that of a lattice, its resolution is used, so that nodes and vertices coincide.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Indices = NDArray[np.int64]
 Cells3 = tuple[int, int, int]
 
 CELLS_ACROSS = 7.0
-"""Cells along the mean extent, where the surface does not say."""
+"""Cells along the mean extent, unless the surface is that of a lattice."""
 
 MOST_CELLS = 1600
-"""Boxes of six tetrahedra; a finer surface is met by a coarser lattice."""
+"""Boxes of six tetrahedra; a finer surface gets a coarser lattice."""
 
 SLIVER = 0.05
-"""Volume of the smallest cell over the median's, below which the diagonals are turned."""
+"""Smallest over median cell volume below which the diagonals are flipped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,23 +46,23 @@ class BodyMesh:
 
     @property
     def centres(self) -> Array:
-        """(C, 3) middles of the cells."""
+        """Return the cell centres (C, 3)."""
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def node_volumes(self) -> Array:
-        """(N,) a quarter of each cell to each of its nodes."""
+        """Return the nodal volumes (N,) m³: a quarter of each adjacent cell."""
         found = np.zeros(len(self.nodes))
         np.add.at(found, self.cells, np.repeat(self.volumes[:, None] / 4, 4, axis=1))
         return found
 
     def faces(self) -> Indices:
-        """(F, 3) nodes of the faces that belong to one cell only: the surface."""
+        """Return the surface faces (F, 3): those that belong to one cell only."""
         every = np.sort(np.concatenate([self.cells[:, c] for c in itertools.combinations(range(4), 3)]), axis=1)
         found, count = np.unique(every, axis=0, return_counts=True)
         return np.asarray(found[count == 1])
 
     def node_areas(self) -> Array:
-        """(N,) m², a third of each face of the surface to each of its nodes."""
+        """Return the nodal surface areas (N,) m²: a third of each adjacent face."""
         faces, found = self.faces(), np.zeros(len(self.nodes))
         edges = self.nodes[faces[:, 1:]] - self.nodes[faces[:, :1]]
         areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
@@ -70,7 +70,7 @@ class BodyMesh:
         return found
 
     def locate(self, points: Array) -> tuple[Indices, Array]:
-        """Nodes (K, 4) and weights (K, 4) of ``points`` (K, 3); a point outside is extended from the nearest cell."""
+        """Return nodes (K, 4) and weights (K, 4) of ``points`` (K, 3), extrapolated from the nearest cell outside."""
         _, near = cKDTree(self.centres).query(points, k=min(40, len(self.cells)))
         near = np.asarray(near).reshape(len(points), -1)
         away = points[:, None] - self.nodes[self.cells[near, 0]]
@@ -82,24 +82,24 @@ class BodyMesh:
 
 
 def body_mesh(vertices: Array, faces: Indices, *, lattice: Cells3 | None = None) -> BodyMesh:
-    """Fill the closed surface ``vertices`` (V, 3), ``faces`` (F, 3); ``lattice`` sets the boxes along each axis.
+    """Return a mesh of the closed surface ``vertices`` (V, 3), ``faces`` (F, 3); ``lattice``: boxes along each axis.
 
-    A surface that is not closed, or not star-shaped seen from the middle of its bounds, is replaced by its convex hull.
-    Raises InputError when it has no inside.
+    A surface that is not closed, or not star-shaped about the centre of its bounds, is replaced by its convex hull.
+    Raises InputError when it has no volume.
     """
     surface = trimesh.Trimesh(vertices, faces, process=False)
     whole = trimesh.Trimesh(vertices, faces, process=True)
     if not whole.is_watertight or whole.volume <= 0 or not _star_shaped(surface):
         surface = trimesh.Trimesh(vertices, faces, process=True).convex_hull
     if surface.volume <= 1e-15:
-        raise InputError("the mesh has no inside: give a closed surface")
+        raise InputError("the mesh has no volume: give a closed surface")
     if lattice is None:
         lattice = _own_lattice(surface) or _default_lattice(np.ptp(surface.vertices, axis=0))
     return _tetrahedra(_nodes(surface, lattice), lattice, surface)
 
 
 def coarser(mesh: BodyMesh, surface_vertices: Array, faces: Indices, *, factor: float) -> BodyMesh:
-    """The same body with cells larger by ``factor``."""
+    """Return the same body with cells larger by ``factor``."""
     nx, ny, nz = (max(2, round(n / factor)) for n in mesh.lattice)
     return body_mesh(surface_vertices, faces, lattice=(nx, ny, nz))
 
@@ -116,7 +116,7 @@ def _star_shaped(surface: trimesh.Trimesh) -> bool:
 
 
 def _reach(surface: trimesh.Trimesh, centre: Array, directions: Array) -> Array:
-    """(D,) distance from ``centre`` to the surface along unit ``directions`` (D, 3)."""
+    """Return distances (D,) from ``centre`` to the surface along unit ``directions`` (D, 3)."""
     corners = surface.vertices[surface.faces] - centre
     turned = np.linalg.inv(np.transpose(corners, (0, 2, 1)))
     reach = np.zeros(len(directions))
@@ -139,14 +139,14 @@ def _nodes(surface: trimesh.Trimesh, lattice: Cells3) -> Array:
     out = np.tile(centre, (len(unit), 1))
     directions = rays[ok] / length[ok, None]
     radial = (level[ok] * _reach(surface, centre, directions))[:, None] * directions
-    # Towards the middle the plain lattice takes over: stretched all the way in, cells at its edges would be slivers.
+    # Towards the centre the plain lattice takes over: stretched all the way in, cells at its edges would be slivers.
     share = np.sqrt(level[ok, None])
     out[ok] += share * radial + (1 - share) * unit[ok] * half
     return np.asarray(out)
 
 
 def _own_lattice(surface: trimesh.Trimesh) -> Cells3 | None:
-    """The lattice whose surface has the surface's own vertices; None if there is none that is coarse enough."""
+    """Return the lattice whose surface vertices are those of the surface; None if none is coarse enough."""
     quads, extent = len(surface.faces) / 4, float(np.ptp(surface.vertices, axis=0).max())
     tree = cKDTree(surface.vertices)
     for nx, ny, nz in itertools.product(range(2, 25), repeat=3):
@@ -170,10 +170,10 @@ def _default_lattice(extents: Array) -> Cells3:
 
 
 def _tetrahedra(nodes: Array, lattice: Cells3, surface: trimesh.Trimesh) -> BodyMesh:
-    """Six tetrahedra to a box around its diagonal (Kuhn's subdivision).
+    """Return six tetrahedra per box around its diagonal (Kuhn's subdivision).
 
-    Diagonals all point the same way or away from the middle: as the surface's own do, where it is the lattice's. Else
-    away from the middle, so that no cell has all its nodes on two faces of a box that the surface has made one.
+    Diagonals all point the same way or away from the centre: as the surface's own where it is that of a lattice, else
+    away from the centre, so that no cell lies flat on two box faces that the surface has made coplanar.
     """
     boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)
     away = _around_diagonals(nodes, lattice, np.where(2 * boxes + 1 >= np.asarray(lattice), 1, -1))
@@ -184,7 +184,7 @@ def _tetrahedra(nodes: Array, lattice: Cells3, surface: trimesh.Trimesh) -> Body
 
 
 def _shared_faces(mesh: BodyMesh, surface: trimesh.Trimesh) -> int:
-    """How many triangles of ``surface`` are faces of cells."""
+    """Return how many triangles of ``surface`` are faces of cells."""
     extent = float(np.ptp(surface.vertices, axis=0).max())
     distance, nearest = cKDTree(mesh.nodes).query(surface.vertices)
     if float(distance.max()) > 1e-3 * extent:
@@ -194,7 +194,7 @@ def _shared_faces(mesh: BodyMesh, surface: trimesh.Trimesh) -> int:
 
 
 def _around_diagonals(nodes: Array, lattice: Cells3, towards: Indices) -> BodyMesh:
-    """``towards`` (boxes, 3), each 1 or -1: where the diagonal of a box goes."""
+    """Return the subdivision along the box diagonals ``towards`` (boxes, 3), components 1 or -1."""
     _, ny, nz = lattice
     strides = np.array([(ny + 1) * (nz + 1), nz + 1, 1])
     boxes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice), indexing="ij"), axis=-1).reshape(-1, 3)

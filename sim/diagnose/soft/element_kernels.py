@@ -4,7 +4,7 @@
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Explicit finite elements: linear tetrahedra, lumped masses, leapfrog; many worlds of one body in one launch.
 
-Each world is one thread's work from start to end, so that nothing is shared and no addition needs to be atomic.
+One thread runs a world from start to end, so nothing is shared and no addition needs to be atomic.
 
     elastic   psi = mu/2 (tr b - 3 - 2 ln J) + lambda/2 (ln J)²          (neo-Hookean, tau = mu (b - 1) + lambda ln J 1)
     fibres    psi += k/2 (s - 1)², s = |F a|                             (sim/effects/anisotropy)
@@ -16,7 +16,11 @@ Contact with the plane z = 0 of the world's own frame: springs, by area, at node
 Coulomb's friction as an impulse that at most stops the node.
 """
 
+from typing import NamedTuple
+
 import taichi as ti
+
+from ...mpm.kernels.kernel_bundles import func, kernel
 
 real = ti.f64
 mat3 = ti.types.matrix(3, 3, real)
@@ -39,21 +43,87 @@ WORLD_ROW = 32
 
 
 CONTACT_LIMIT = 1.0
-"""Largest stiffness of the ground's spring at a node over its mass and the squared step, for what a step misjudges."""
+"""Upper bound of a contact spring's stiffness over nodal mass and squared step, for stability."""
 
 CRUSHED = 0.15
-"""Volume ratio below which a cell is treated as if it had that one."""
+"""Lower bound of the volume ratio of a cell."""
+
+
+class MeshArrays(NamedTuple):
+    """Tetrahedral mesh of the body at rest: T cells, N nodes."""
+
+    cells: Integers2
+    """(T, 4) nodes of a cell."""
+
+    shapes: Matrices
+    """(T,) inverse of the matrix of a cell's edges, 1/m."""
+
+    volumes: Reals
+    """(T,) m³."""
+
+    centres: Vectors
+    """(T,) m."""
+
+    shares: Reals
+    """(T,) share of the stiffness that a cell has; below 1 in slivers."""
+
+    areas: Reals
+    """(N,) area of the surface at a node, m²."""
+
+
+class NodeState(NamedTuple):
+    """State of W worlds."""
+
+    masses: Reals2
+    """(W, N) kg."""
+
+    x: Vectors2
+    """(W, N) m."""
+
+    v: Vectors2
+    """(W, N) m/s."""
+
+    f: Vectors2
+    """(W, N) internal forces, N."""
+
+    plastic: Matrices2
+    """(W, T) inverse plastic strain C_p^-1; (1, 1) where nothing yields."""
+
+
+class TrackArrays(NamedTuple):
+    """Times at which the states are recorded, and the records; K tracked points, M times, padded."""
+
+    times: Reals2
+    """(W, M) s."""
+
+    counts: Integers2
+    """(W, 1) times of a world."""
+
+    holders: Integers2
+    """(K, 4) nodes of a point's cell."""
+
+    weights: Reals2
+    """(K, 4) weights of these nodes."""
+
+    tracked: Vectors3
+    """(W, M, K) written: places of the points, m."""
+
+    kept_x: Vectors3
+    """(W, M, N) written with ``keep``: places of all nodes, m."""
+
+    kept_f: Vectors3
+    """(W, M, N) written with ``keep``: internal accelerations of all nodes, m/s²; not of a world's last time."""
 
 
 @ti.func
 def column(a: mat3, i: ti.template()):
-    """Column i."""
+    """Return column i."""
     return vec3(a[0, i], a[1, i], a[2, i])
 
 
 @ti.func
 def plus(a: mat3, c: real):
-    """a + c 1."""
+    """Return a + c 1."""
     out = a
     for i in ti.static(range(3)):
         out[i, i] += c
@@ -62,21 +132,21 @@ def plus(a: mat3, c: real):
 
 @ti.func
 def half_log(b: mat3):
-    """ln(b) / 2 of a symmetric b by the Padé approximant (2, 2): 1e-3 of it between stretches of 0.6 and 1.6."""
+    """Return ln(b) / 2 of a symmetric b by the Padé approximant (2, 2); error 1e-3 for stretches of 0.6 to 1.6."""
     square = b @ b
     return 1.5 * plus(square, -1.0) @ ti.math.inverse(plus(square + 4.0 * b, 1.0))
 
 
 @ti.func
 def exponential(a: mat3):
-    """exp(a) of a symmetric a by the Padé approximant (2, 2)."""
+    """Return exp(a) of a symmetric a by the Padé approximant (2, 2)."""
     even = plus(a @ a, 12.0)
     return (even + 6.0 * a) @ ti.math.inverse(even - 6.0 * a)
 
 
 @ti.func
 def yielded(F: mat3, inverse: mat3, plastic: mat3, mu: real, lam: real, limit: real):
-    """Kirchhoff stress and the new inverse plastic strain C_p^-1 of trial F, given the old ``plastic``."""
+    """Return Kirchhoff stress and new inverse plastic strain C_p^-1 of trial F, given the old ``plastic``."""
     strain = half_log(F @ plastic @ F.transpose())
     volume = strain.trace()
     dev = plus(strain, -volume / 3.0)
@@ -89,39 +159,27 @@ def yielded(F: mat3, inverse: mat3, plastic: mat3, mu: real, lam: real, limit: r
     return plus(2.0 * mu * dev, (lam + 2.0 / 3.0 * mu) * volume), after
 
 
-@ti.func
+@func
 def inner_forces(
-    w: ti.i32,
-    worlds: Reals2,
-    cells: Integers2,
-    shapes: Matrices,
-    volumes: Reals,
-    centres: Vectors,
-    shares: Reals,
-    x: Vectors2,
-    v: Vectors2,
-    plastic: Matrices2,
-    f: Vectors2,
-    damped: ti.template(),
-    yields: ti.template(),
+    w: ti.i32, worlds: Reals2, damped: ti.template(), yields: ti.template(), mesh: MeshArrays, state: NodeState
 ):
-    """Add to f (worlds, nodes) what the matter of world w exerts; plastic strain goes on where it yields."""
+    """Add the internal forces of world w to f (worlds, nodes) and update plastic strain where it yields."""
     grade = vec3(worlds[w, GRADE], worlds[w, GRADE + 1], worlds[w, GRADE + 2])
     fibre = worlds[w, FIBRE]
     axis = vec3(worlds[w, FIBRE_AXIS], worlds[w, FIBRE_AXIS + 1], worlds[w, FIBRE_AXIS + 2])
-    for t in range(cells.shape[0]):
-        scale = shares[t] * ti.max(0.01, 1.0 + worlds[w, GRADE_AT] + grade.dot(centres[t]))
+    for t in range(mesh.cells.shape[0]):
+        scale = mesh.shares[t] * ti.max(0.01, 1.0 + worlds[w, GRADE_AT] + grade.dot(mesh.centres[t]))
         mu = worlds[w, MU] * scale
         lam = worlds[w, LAMBDA] * scale
-        n0 = cells[t, 0]
-        n1 = cells[t, 1]
-        n2 = cells[t, 2]
-        n3 = cells[t, 3]
-        x0 = x[w, n0]
-        shape = shapes[t]
-        F = ti.Matrix.cols([x[w, n1] - x0, x[w, n2] - x0, x[w, n3] - x0]) @ shape
+        n0 = mesh.cells[t, 0]
+        n1 = mesh.cells[t, 1]
+        n2 = mesh.cells[t, 2]
+        n3 = mesh.cells[t, 3]
+        x0 = state.x[w, n0]
+        shape = mesh.shapes[t]
+        F = ti.Matrix.cols([state.x[w, n1] - x0, state.x[w, n2] - x0, state.x[w, n3] - x0]) @ shape
         J = F.determinant()
-        # A cell that is all but crushed, or inside out, is still pushed open: the cofactors point there.
+        # A nearly crushed or inverted cell is still pushed open: the cofactors point there.
         cofactors = ti.Matrix.cols(
             [column(F, 1).cross(column(F, 2)), column(F, 2).cross(column(F, 0)), column(F, 0).cross(column(F, 1))]
         )
@@ -129,36 +187,36 @@ def inner_forces(
         inverse = back.transpose()
         stress = mat3(0.0)
         if ti.static(yields):
-            tau, after = yielded(F, inverse, plastic[w, t], mu, lam, worlds[w, YIELD])
-            plastic[w, t] = after
+            tau, after = yielded(F, inverse, state.plastic[w, t], mu, lam, worlds[w, YIELD])
+            state.plastic[w, t] = after
             stress = tau @ back
         else:
             stress = mu * (F - back) + (lam * ti.log(ti.max(J, CRUSHED))) * back
         if fibre > 0.0:
             along = F @ axis
             s = along.norm() + 1e-12
-            stress += (shares[t] * fibre * (s - 1.0) / s) * along.outer_product(axis)
+            stress += (mesh.shares[t] * fibre * (s - 1.0) / s) * along.outer_product(axis)
         if ti.static(damped):
-            v0 = v[w, n0]
-            rate = ti.Matrix.cols([v[w, n1] - v0, v[w, n2] - v0, v[w, n3] - v0]) @ shape @ inverse
+            v0 = state.v[w, n0]
+            rate = ti.Matrix.cols([state.v[w, n1] - v0, state.v[w, n2] - v0, state.v[w, n3] - v0]) @ shape @ inverse
             tau_v = mu * (rate + rate.transpose())
             for i in ti.static(range(3)):
                 tau_v[i, i] += lam * rate.trace()
             stress += worlds[w, DAMPING] * (tau_v @ back)
-        H = (-volumes[t]) * (stress @ shape.transpose())
+        H = (-mesh.volumes[t]) * (stress @ shape.transpose())
         h1 = vec3(H[0, 0], H[1, 0], H[2, 0])
         h2 = vec3(H[0, 1], H[1, 1], H[2, 1])
         h3 = vec3(H[0, 2], H[1, 2], H[2, 2])
         # Not +=, which Taichi makes atomic: only this thread writes the world's forces.
-        f[w, n1] = f[w, n1] + h1
-        f[w, n2] = f[w, n2] + h2
-        f[w, n3] = f[w, n3] + h3
-        f[w, n0] = f[w, n0] - h1 - h2 - h3
+        state.f[w, n1] = state.f[w, n1] + h1
+        state.f[w, n2] = state.f[w, n2] + h2
+        state.f[w, n3] = state.f[w, n3] + h3
+        state.f[w, n0] = state.f[w, n0] - h1 - h2 - h3
 
 
 @ti.func
 def whole_motion(w: ti.i32, masses: Reals2, x: Vectors2, v: Vectors2):
-    """Centre of mass, its velocity, and the spin that has the body's angular momentum."""
+    """Return centre of mass, its velocity, and the spin with the body's angular momentum."""
     total = 0.0
     centre = vec3(0.0)
     speed = vec3(0.0)
@@ -180,36 +238,19 @@ def whole_motion(w: ti.i32, masses: Reals2, x: Vectors2, v: Vectors2):
     return centre, speed, ti.math.inverse(inertia) @ momentum
 
 
-@ti.kernel
+@kernel
 def advance_worlds(
     worlds: Reals2,
-    cells: Integers2,
-    shapes: Matrices,
-    volumes: Reals,
-    centres: Vectors,
-    shares: Reals,
-    areas: Reals,
-    masses: Reals2,
-    times: Reals2,
-    counts: Integers2,
-    holders: Integers2,
-    weights: Reals2,
-    x: Vectors2,
-    v: Vectors2,
-    f: Vectors2,
-    plastic: Matrices2,
-    tracked: Vectors3,
-    kept_x: Vectors3,
-    kept_f: Vectors3,
     damped: ti.template(),
     yields: ti.template(),
     keep: ti.template(),
+    mesh: MeshArrays,
+    state: NodeState,
+    tracks: TrackArrays,
 ):
-    """Advance every world from its START through its ``times`` (worlds, frames) and write the tracked points.
+    """Advance every world from its START through its times and write the tracked points.
 
-    areas (nodes,): of the surface, m². counts (worlds, 1): frames of a world. holders (points, 4) and weights
-    (points, 4): nodes of a point's cell.
-    keep: also write places and inner accelerations of all nodes; those of a world's last frame are not written.
+    worlds (W, WORLD_ROW): parameters. keep: also write positions and internal accelerations of all nodes.
     """
     ti.loop_config(block_dim=1)
     for w in range(worlds.shape[0]):
@@ -218,13 +259,13 @@ def advance_worlds(
         wind = vec3(worlds[w, WIND], worlds[w, WIND + 1], worlds[w, WIND + 2])
         anchor = vec3(worlds[w, TETHER_ANCHOR], worlds[w, TETHER_ANCHOR + 1], worlds[w, TETHER_ANCHOR + 2])
         drag = worlds[w, DRAG]
-        for frame in range(counts[w, 0]):
-            steps = ti.max(1, ti.cast(ti.ceil((times[w, frame] - now) / worlds[w, STEP] - 1e-9), ti.i32))
-            dt = (times[w, frame] - now) / steps
+        for frame in range(tracks.counts[w, 0]):
+            steps = ti.max(1, ti.cast(ti.ceil((tracks.times[w, frame] - now) / worlds[w, STEP] - 1e-9), ti.i32))
+            dt = (tracks.times[w, frame] - now) / steps
             for step in range(steps):
                 common = gravity
                 if worlds[w, LIFT] != 0.0 or worlds[w, TETHER_STIFFNESS] > 0.0:
-                    centre, speed, spin = whole_motion(w, masses, x, v)
+                    centre, speed, spin = whole_motion(w, state.masses, state.x, state.v)
                     common += worlds[w, LIFT] * spin.cross(speed)
                     away = anchor - centre
                     length = away.norm() + 1e-12
@@ -234,42 +275,42 @@ def advance_worlds(
                     common += pull / length * away
                 if worlds[w, ADHESION] > 0.0:
                     lowest = 1e9
-                    for n in range(x.shape[1]):
-                        lowest = ti.min(lowest, x[w, n][2])
+                    for n in range(state.x.shape[1]):
+                        lowest = ti.min(lowest, state.x[w, n][2])
                     if lowest < worlds[w, REACH]:
                         common[2] -= worlds[w, ADHESION]
-                for n in range(x.shape[1]):
-                    f[w, n] = vec3(0.0)
-                inner_forces(w, worlds, cells, shapes, volumes, centres, shares, x, v, plastic, f, damped, yields)
+                for n in range(state.x.shape[1]):
+                    state.f[w, n] = vec3(0.0)
+                inner_forces(w, worlds, damped, yields, mesh, state)
                 if ti.static(keep):
                     begun = step == 0 and frame > 0
-                    for n in range(x.shape[1] if begun else 0):
-                        kept_f[w, frame - 1, n] = f[w, n] / masses[w, n]
-                for n in range(x.shape[1]):
-                    m = masses[w, n]
-                    speed_n = v[w, n]
+                    for n in range(state.x.shape[1] if begun else 0):
+                        tracks.kept_f[w, frame - 1, n] = state.f[w, n] / state.masses[w, n]
+                for n in range(state.x.shape[1]):
+                    m = state.masses[w, n]
+                    speed_n = state.v[w, n]
                     pushed = common
                     if drag > 0.0:
                         past = speed_n - wind
                         pushed -= drag * past.norm() * past
-                    speed_n += dt * (f[w, n] / m + pushed)
-                    depth = -x[w, n][2]
+                    speed_n += dt * (state.f[w, n] / m + pushed)
+                    depth = -state.x[w, n][2]
                     if depth > 0.0:
-                        spring = worlds[w, CONTACT_STIFFNESS] * areas[n] / m
+                        spring = worlds[w, CONTACT_STIFFNESS] * mesh.areas[n] / m
                         press = ti.min(spring, CONTACT_LIMIT / (dt * dt)) * depth * dt
                         slide = vec3(speed_n[0], speed_n[1], 0.0)
                         fast = slide.norm()
                         speed_n[2] += press
                         if fast > 1e-12:
                             speed_n -= ti.min(1.0, worlds[w, FRICTION] * press / fast) * slide
-                    v[w, n] = speed_n
-                    x[w, n] = x[w, n] + dt * speed_n
-            now = times[w, frame]
-            for k in range(holders.shape[0]):
+                    state.v[w, n] = speed_n
+                    state.x[w, n] = state.x[w, n] + dt * speed_n
+            now = tracks.times[w, frame]
+            for k in range(tracks.holders.shape[0]):
                 place = vec3(0.0)
                 for j in range(4):
-                    place = place + weights[k, j] * x[w, holders[k, j]]
-                tracked[w, frame, k] = place
+                    place = place + tracks.weights[k, j] * state.x[w, tracks.holders[k, j]]
+                tracks.tracked[w, frame, k] = place
             if ti.static(keep):
-                for n in range(x.shape[1]):
-                    kept_x[w, frame, n] = x[w, n]
+                for n in range(state.x.shape[1]):
+                    tracks.kept_x[w, frame, n] = state.x[w, n]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From videos of a scene to a capture: points on the objects' meshes and where each frame shows them.
+"""Point tracking in videos of a scene: points on the objects' meshes and their pixels in every frame, as a capture.
 
-``tracking`` is the way in; docs/tracking.md explains the method and its limits.
+The entry point is ``track_videos``; docs/diagnosis.md explains the method and its limits.
 """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Follows the points of one object from frame to frame.
+"""Tracks the points of one object from frame to frame.
 
-Each frame: Lucas–Kanade from the last one, both ways; the object's pose from what agrees; then every point that this
-pose turns towards the camera is looked for where it should be, comparing with its first sight warped to the present
-view. So points do not drift, come back after an occlusion, and are given up where something else is in their place.
+Each frame: Lucas–Kanade from the previous one with a forward-backward check; the object's pose from the consistent
+points; then every point facing the camera is searched at its predicted pixel, compared with its reference patch warped
+to the current view. So points do not drift, are recovered after an occlusion, and dropped when something covers them.
 """
 
 from __future__ import annotations
@@ -16,63 +16,82 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera
-from .beliefs import SceneBody
-from .corners import find_corners
-from .flow import follow
-from .options import TrackOptions
-from .patches import Image, align, cut, grid_offsets, smoothed, view_maps, warp
-from .pose import LEAST_POINTS, Array, Located, Mask, Pose, continued, locate, project
-from .surface import Surface, cast, facing, silhouette
+from .feature_tracking import (
+    Image,
+    align,
+    extract_patches,
+    find_corners,
+    grid_offsets,
+    smoothed,
+    track_points,
+    view_maps,
+    warp,
+)
+from .pose_estimation import (
+    LEAST_POINTS,
+    Array,
+    Located,
+    Mask,
+    Pose,
+    Surface,
+    cast,
+    continued,
+    facing,
+    locate,
+    project,
+    silhouette,
+)
+from .track_input import SceneBody, TrackOptions
 
 Grey = NDArray[np.uint8]
 
 LEAST_FACING = 0.3
-"""Cosine to the view below which a patch is too foreshortened (73 degrees)."""
+"""Cosine to the viewing direction below which a patch is too foreshortened (73 degrees)."""
 SOFT_TOLERANCE = 0.15
-"""How far points of a body that deforms may be off its best rigid pose, over the body's size in the picture."""
+"""Tolerance of points of a deformable body about its best rigid pose, over the body's size in the image."""
 LOOSEST_RIGID = 0.06
-"""The same of a rigid body, whose mesh may be a guess."""
+"""The same for a rigid body, whose mesh may be inexact."""
 REFILL_BELOW = 0.7
-"""Share of the wanted points below which new ones are sought."""
+"""Fraction of the target number of points below which new ones are added."""
 SHUTTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Shares of a frame's time for which a camera's shutter may be open."""
+"""Candidate shutter times, as fractions of the frame interval."""
 SHUTTER_VOTES = 9
-"""Fast frames that are asked which of them it is; their median then stands."""
+"""Fast frames that vote on the shutter time; then their median is fixed."""
 STREAK_PX = 3.0
-"""Way from frame to frame from which on blur tells the shutter."""
+"""Motion per frame from which blur reveals the shutter time."""
 LOOKS = 3
-"""A look from a better pose has better warps and brings more points in reach; after a few it is good enough."""
+"""Search iterations per frame: each starts from a better pose, with better warps and more points in reach."""
 LARGEST_BEND = 0.9
-"""Cosine between the surface's normals within a patch (26 degrees): across an edge no one warp fits a patch."""
+"""Least cosine between the normals within a patch (26 degrees): no single warp fits across an edge."""
 REFILL_EVERY = 3
-"""Frames between two searches for new points, which cost more than following them."""
+"""Frames between two searches for new points, which cost more than tracking."""
 PROBATION_FRAMES = 3
 PROBATION_PX = 8.0
-"""Frames through which, and way in the picture along which a new point must go with the object before it counts: it may
-sit on something that has come in front of it."""
+"""Frames, and motion in the image, through which a new point must move with the object before it counts: it may be on
+an occluder."""
 LIFT_PX, LIFT_SHARE = 1.5, 0.015
-"""Median distance from the fitted pose above which new points could not be placed on the mesh: pixels, or that share of
-the object's size in the picture if it is more."""
+"""Median residual of the fitted pose above which new points cannot be placed on the mesh: the larger of pixels and that
+fraction of the object's size in the image."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame as trackers need it: grey (H, W) and its smoothed copy."""
+    """A frame for trackers: grey (H, W) and its smoothed copy."""
 
     grey: Grey
     smooth: Image
 
     @classmethod
     def of(cls, grey: Grey) -> View:
-        """The view of a frame."""
+        """Return the view of a frame."""
         return cls(grey=np.asarray(cv2.GaussianBlur(grey, (3, 3), 0)), smooth=smoothed(grey))
 
 
 class BodyTracker:
     """The points of one object. ``rest`` (K, 3) m grows as points are added; ``places`` (K, 2) px, NaN where not seen.
 
-    residual: (K, 2) px, places minus the fitted pose's. trusted: (K,) whether a point has shown that it goes with the
-    object; others must be left out. pose: the last one; ``lost``: frames since it was seen.
+    residual: (K, 2) px, places minus their projection at the fitted pose. trusted: (K,) whether a point has moved with
+    the object for long enough to be used. pose: the last one; ``lost``: frames since it was seen.
     """
 
     def __init__(self, body: SceneBody, camera: Camera, options: TrackOptions, pose: Pose, view: View) -> None:
@@ -100,7 +119,7 @@ class BodyTracker:
 
     @property
     def size(self) -> float:
-        """Size in the picture, px: the side of a square of its area at the start."""
+        """Return its size in px: the side of a square with its initial image area."""
         return float(np.sqrt(max(self._area, 1.0)))
 
     @property
@@ -110,7 +129,7 @@ class BodyTracker:
 
     @property
     def _shutter(self) -> float:
-        """Share of a frame's time for which the shutter is open, as far as it is known."""
+        """Return the shutter time as a fraction of the frame interval, as far as it is known."""
         return float(np.median(self._shutters)) if self._shutters else 0.0
 
     @property
@@ -118,15 +137,15 @@ class BodyTracker:
         return self._options.rigid_tolerance_px if self.body.rigid else self._largest
 
     def add_points(self, view: View, frame: int, allowed: Mask | None, others: Sequence[tuple[Surface, Pose]]) -> int:
-        """Seek corners on what ``view`` shows of the object at ``pose`` and put them onto its mesh; how many.
+        """Add corners on the visible part of the object, mapped onto its mesh; return their number.
 
-        allowed: (H, W) further limit on where, or None. others: surfaces that may hide it.
+        allowed: (H, W) additional mask, or None. others: surfaces that may occlude it.
         """
         camera, half = self._camera, self._half
         shown = silhouette(self.body.surface, self.pose, camera)
         if allowed is not None:
             shown &= allowed
-        # A patch across the outline would show what is behind the object as well.
+        # A patch across the silhouette would include background.
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * half + 1, 2 * half + 1))
         bordered = cv2.copyMakeBorder(shown.astype(np.uint8), half, half, half, half, cv2.BORDER_CONSTANT, value=0)
         inner = cv2.erode(bordered, kernel)[half:-half, half:-half]
@@ -158,7 +177,7 @@ class BodyTracker:
         around = (corners[:, None] + grid_offsets(half)).reshape(-1, 2)
         grid = cast(self.body.surface, self.pose, camera, around).rest.reshape(-1, 25, 3)
         self._grids = np.concatenate([self._grids, grid])
-        self._crops = np.concatenate([self._crops, cut(view.smooth, corners, half)])
+        self._crops = np.concatenate([self._crops, extract_patches(view.smooth, corners, half)])
         self.places = np.concatenate([self.places, corners])
         self.residual = np.concatenate([self.residual, np.full((len(corners), 2), np.nan)])
         self.trusted = np.concatenate([self.trusted, np.full(len(corners), frame == 0)])
@@ -167,7 +186,7 @@ class BodyTracker:
         return len(corners)
 
     def _smooth(self, corners: Array, normals: Array) -> Mask:
-        """(N,): whether the surface bends little within the patches around ``corners``."""
+        """Return (N,): whether the surface is nearly flat within the patches around ``corners``."""
         good = np.ones(len(corners), dtype=np.bool_)
         for offset in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
             hits = cast(self.body.surface, self.pose, self._camera, corners + 0.8 * self._half * np.array(offset))
@@ -176,7 +195,7 @@ class BodyTracker:
         return good
 
     def step(self, view: View, frame: int, others: Sequence[tuple[Surface, Pose]]) -> None:
-        """Go on to ``view``. others: surfaces of the scene's other objects, that may hide this one."""
+        """Track into ``view``. others: surfaces of other objects that may occlude this one."""
         predicted = self.pose if self._before is None else continued(self._before, self.pose)
         rough = self._from_last_frame(view, predicted)
         if rough is None:
@@ -186,7 +205,7 @@ class BodyTracker:
             self.places = np.full_like(self.places, np.nan)
             self.residual = np.full_like(self.residual, np.nan)
             self.lost += 1
-            # What is out of sight goes on as before for a while; where it is after longer, nobody knows.
+            # Out of sight the motion is extrapolated for a while; after that the pose is unknown.
             if self.lost <= 15:
                 self._before, self.pose = self.pose, predicted
         else:
@@ -197,18 +216,18 @@ class BodyTracker:
         self._view = view
 
     def _from_last_frame(self, view: View, predicted: Pose) -> Pose | None:
-        """A pose by Lucas–Kanade from the points seen in the last frame."""
+        """Return a pose by Lucas–Kanade from the points seen in the last frame."""
         seen = np.flatnonzero(np.isfinite(self.places).all(axis=1) & self.trusted)
         if len(seen) < LEAST_POINTS:
             return None
         camera, rest, start = self._camera, self.rest[seen], self.places[seen]
         ahead = project(camera, predicted.apply(rest)) - project(camera, self.pose.apply(rest))
         best: Located | None = None
-        # A body that hits something does not go on as before: then from where it was. A body that starts or stops fast
-        # is sharp in one frame and blurred in the other: then by what both show.
+        # After an impact extrapolation fails: start from the last pose. A body that starts or stops abruptly is sharp
+        # in one frame and blurred in the other: use what both show.
         tries = ((start + np.nan_to_num(ahead), predicted, 0.0), (start, self.pose, 0.0), (start, self.pose, 0.6))
         for guess, initial, blur in tries:
-            ends, miss = follow(
+            ends, miss = track_points(
                 _blurred(self._view.grey, blur * self._half),
                 _blurred(view.grey, blur * self._half),
                 start,
@@ -226,7 +245,7 @@ class BodyTracker:
         return None if best is None else best.pose
 
     def _search(self, view: View, predicted: Pose) -> Pose | None:
-        """A pose by looking for the points' first sights around where they would be at ``predicted``."""
+        """Return a pose by searching reference patches around their pixels at ``predicted``."""
         expected = project(self._camera, predicted.apply(self.rest))
         good = self.trusted & (facing(self.rest, self._normals, predicted) > 2 * LEAST_FACING)
         good &= np.isfinite(expected).all(axis=1)
@@ -266,14 +285,14 @@ class BodyTracker:
         return None if fitted is None or fitted.inliers.sum() < LEAST_POINTS + 2 else fitted.pose
 
     def _maps(self, chosen: NDArray[np.int64], pose: Pose) -> Array:
-        """(N, 2, 5): from pixels of the present view to pixels of the first sight."""
+        """Return maps (N, 2, 5) from pixels of the current view to pixels of the reference view."""
         camera = self._camera
         middle = project(camera, pose.apply(self.rest[chosen]))
         around = project(camera, pose.apply(self._grids[chosen].reshape(-1, 3))).reshape(-1, 25, 2)
         return view_maps(around - middle[:, None], self._half)
 
     def _look(self, view: View, rough: Pose, others: Sequence[tuple[Surface, Pose]]) -> Pose | None:
-        """Look for all points at the pose ``rough``, keep what is there; the refined pose, or None if too few are."""
+        """Search all points at the pose ``rough`` and keep those found; return the refined pose, None with too few."""
         camera, half = self._camera, self._half
         found: tuple[NDArray[np.int64], Array, Mask, Located] | None = None
         for _ in range(LOOKS):
@@ -309,9 +328,9 @@ class BodyTracker:
         return best.pose
 
     def _aligned(self, view: View, chosen: NDArray[np.int64], guesses: Array, pose: Pose) -> tuple[Array, Array]:
-        """Where the points ``chosen`` are, and how well that looks like their first sight, blurred by their motion.
+        """Return the pixels of the points ``chosen`` and their correlation with motion-blurred reference patches.
 
-        For which share of a frame's time the camera's shutter is open is not known; fast motion tells.
+        The shutter time is unknown at first and estimated from fast motion.
         """
         camera, crops, maps = self._camera, self._crops[chosen], self._maps(chosen, pose)
         rest = self.rest[chosen]
@@ -328,7 +347,7 @@ class BodyTracker:
         return align(view.smooth, warp(crops, maps, self._half, self._shutter * way), guesses, self._half)
 
     def _judge(self, missing: NDArray[np.int64], there: NDArray[np.int64], last: Array) -> None:
-        """New points that went along for long enough count from now on; one that was not where it had to be never."""
+        """Promote new points that moved with the object for long enough; reject those that were not where predicted."""
         self._dropped[missing] |= ~self.trusted[missing]
         way = np.linalg.norm(self.places[there] - last[there], axis=1)
         self._agreed[there] += np.stack([np.ones(len(there)), np.nan_to_num(way)], axis=1)
@@ -337,7 +356,7 @@ class BodyTracker:
     def _expected(
         self, view: View, pose: Pose, others: Sequence[tuple[Surface, Pose]]
     ) -> tuple[NDArray[np.int64], Array]:
-        """Points that a camera would see at ``pose``, and where."""
+        """Return the points visible at ``pose`` and their pixels."""
         camera, half = self._camera, self._half
         height, width = view.grey.shape
         local = pose.apply(self.rest)
@@ -355,7 +374,7 @@ class BodyTracker:
         return chosen[~hidden], pixels[chosen[~hidden]]
 
     def _deformation(self) -> Array:
-        """(K, 2) px: how far points were off the rigid pose in the last frame, of unseen ones by their neighbours."""
+        """Return (K, 2) px: offsets from the rigid pose in the last frame, interpolated for unseen points."""
         known = np.flatnonzero(np.isfinite(self.residual).all(axis=1) & self.trusted)
         if len(known) == 0:
             return np.zeros((len(self.rest), 2))
@@ -388,7 +407,7 @@ def _blurred(grey: Grey, sigma: float) -> Grey:
 
 
 def _hidden(pixels: Array, depth: Array, others: Sequence[tuple[Surface, Pose]], camera: Camera) -> Mask:
-    """(N,): whether another object is in front."""
+    """Return (N,): whether another object is in front."""
     hidden = np.zeros(len(pixels), dtype=np.bool_)
     for surface, pose in others:
         hidden |= cast(surface, pose, camera, pixels).depth < depth

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of splats, and gradients back to them (Taichi).
+"""Differentiable rasterisation of splats (Taichi).
 
-rasteriser.py    the way in: render, gradients
-projection.py    splats ↔ ellipses in the picture
-tiles.py         which splats each tile blends, in which order
-blending.py      ellipses ↔ pixels
-"""
+rasteriser.py        render and gradients, the interface
+splat_projection.py  splats ↔ ellipses in the image
+tiles.py             which splats each tile blends, in which order
+blending.py          ellipses ↔ pixels"""
 
 # Importing it keeps Taichi from greeting on standard output, which belongs to the caller's own results.
 from ... import mpm  # noqa: F401

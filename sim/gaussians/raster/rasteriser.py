@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of Gaussian splats and exact gradients of a loss on them (Kerbl et al. 2023)."""
+"""Renders of Gaussian splats, and exact gradients of a loss on them (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -11,139 +11,138 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...mpm.options import SolverOptions
-from ...mpm.runtime import ensure_started
+from ...mpm.kernels.runtime import ensure_started
+from ...mpm.solver_options import SolverOptions
 from ...scene.model import Camera
 from ..splats import Splats
-from .blending import LIGHT, MEAN_DEPTH, STATE, blend, blend_back
-from .projection import ELLIPSE, FURTHEST, LOW_PASS, NEAREST, SUMS, numbers_of, project, project_back
-from .tiles import Pairs, pairs_of
+from .blending import LIGHT, MEAN_DEPTH, STATE, BackwardArrays, PairArrays, PictureArrays, blend, blend_back
+from .splat_projection import (
+    ELLIPSE,
+    FURTHEST,
+    LOW_PASS,
+    NEAREST,
+    SUMS,
+    PairSums,
+    ProjectionLimits,
+    SplatArrays,
+    numbers_of,
+    project,
+    project_back,
+)
+from .tiles import TilePairs, pairs_of
 
-MOST_PIXELS = 2**26
-"""Bound of memory: a pixel takes some 60 bytes."""
+MAX_PIXELS = 2**26
+"""Bounds memory: a pixel takes about 60 bytes."""
 
 CPU_TILE, DEVICE_TILE = 16, 8
-"""Side of a tile in pixels. A thread does a whole tile: a GPU needs many short ones."""
+"""Side of a tile in pixels. A thread processes a whole tile: a GPU needs many small ones."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Rendering:
-    """What a camera sees of splats."""
+class SplatRender:
+    """Splats rendered from a camera."""
 
     colour: NDArray[np.float32]
-    """(H, W, 3) over the background's colour, in the colours' own terms (sRGB as files keep it)."""
+    """(H, W, 3) over the background colour, in the colour space of the splats (sRGB)."""
 
     alpha: NDArray[np.float32]
-    """(H, W) share of the background's light that is held back."""
+    """(H, W) opacity."""
 
     depth: NDArray[np.float32]
-    """(H, W) metres along the optical axis, mean of the splats' centres by their shares; 0 where alpha is 0."""
+    """(H, W) metres along the optical axis, weighted mean of the splats' centres; 0 where alpha is 0."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SplatGradients:
-    """Gradient of a scalar loss by each array of the splats, of the same shape, float64."""
+    """Gradients of a scalar loss by each array of the splats, of the same shape, float64."""
 
     centres: NDArray[np.float64]
     scales: NDArray[np.float64]
 
     rotations: NDArray[np.float64]
-    """By the four numbers of the unit quaternion q, through q/|q|: at a right angle to q."""
+    """By the four entries of the unit quaternion q, through q/|q|: orthogonal to q."""
 
     opacities: NDArray[np.float64]
     colours: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Drawn:
-    """What the gradients of a rendering need."""
+class _RenderState:
+    """State of a render that its gradients need."""
 
     splats: Splats
     camera: NDArray[np.float64]
     background: NDArray[np.float64]
-    tile: int
     ellipses: NDArray[np.float64]
-    pairs: Pairs
-    tile_ends: NDArray[np.int64]
+    pairs: TilePairs
+    lists: PairArrays
     last: NDArray[np.int32]
     light: NDArray[np.float32]
 
 
 class Rasteriser:
-    """Renders splats, and takes gradients of the picture back to them.
+    """Renders splats, and propagates gradients of the image to them.
 
-    The gradients are those of the picture as it is drawn: a splat's share of light falls to none continuously, so what
-    is left out at its rim has no gradient to miss. Treated as constant although it jumps: which splat is in front of
-    which; a splat that comes nearer than NEAREST; a pixel that is finished, with at most LEAST_LIGHT of its colour
-    still to come. Where MOST_ALPHA holds a splat back, and where J stands still beside the picture, the gradient is
-    that of the constant.
+    The gradients are exact for the image as drawn: a splat's alpha falls to 0 continuously at its rim, so cutting it
+    off loses no gradient. Treated as constant although discontinuous: the depth order; splats crossing the near plane
+    NEAREST; termination of a pixel, with at most MIN_TRANSMITTANCE of its colour missing. Where MAX_ALPHA clamps a
+    splat, and where J is clamped outside the image, the gradient is that of the constant.
 
-    Equal input gives equal bytes, whatever the number of threads.
+    Deterministic: equal input gives equal bytes, for any number of threads.
     """
 
     def __init__(self, *, solver: SolverOptions | None = None) -> None:
-        """``solver`` says where to compute; None takes Taichi as it runs in this process, or starts it on the CPU. Of
-        its fields only arch, threads and cache_folder count; they should be those of the engine's worlds in the same
-        process, whose state a restart loses."""
+        """solver: where to compute; None uses Taichi as it runs in this process, or starts it on the CPU. Only its
+        arch, threads and cache_folder matter; they should equal those of the engine's worlds in the same process, whose
+        state is lost in a restart."""
         self._solver = solver
-        self._drawn: _Drawn | None = None
+        self._drawn: _RenderState | None = None
         self._sums = np.empty((0, SUMS), dtype=np.float32)
 
     def render(
         self, splats: Splats, camera: Camera, *, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    ) -> Rendering:
-        """``splats`` as ``camera`` sees them before ``background`` (sRGB). Raises InputError on a picture or a number
-        of splats that memory has no room for."""
+    ) -> SplatRender:
+        """Return ``splats`` seen by ``camera`` over ``background`` (sRGB). Raises InputError on an image or a number of
+        splats above the memory bounds, and on a background that is not three finite numbers."""
         behind = _colour(background)
         height, width = camera.height, camera.width
-        if height * width > MOST_PIXELS:
-            raise InputError(f"camera size is {width}x{height}: rendering splats takes up to {MOST_PIXELS} pixels")
+        if height * width > MAX_PIXELS:
+            raise InputError(f"camera size is {width}x{height}: rendering splats takes up to {MAX_PIXELS} pixels")
         tile = self._start()
         self._drawn = None
         numbers = numbers_of(camera)
         ellipses = np.zeros((len(splats), ELLIPSE))
         if len(splats):
-            project(
-                splats.centres,
-                splats.scales,
-                splats.rotations,
-                splats.opacities,
-                splats.colours,
-                numbers,
-                LOW_PASS,
-                NEAREST,
-                FURTHEST,
-                ellipses,
-            )
+            project(numbers, ellipses, _arrays(splats), ProjectionLimits(LOW_PASS, NEAREST, FURTHEST))
         pairs = pairs_of(ellipses, width, height, tile)
         pixels = np.zeros((height, width, STATE), dtype=np.float32)
         pixels[..., LIGHT] = 1.0
         last = np.full((height, width), np.iinfo(np.int32).max, dtype=np.int32)
         tile_ends = np.zeros(len(pairs.tile_starts) - 1, dtype=np.int64)
+        lists = PairArrays(tile, pairs.splats, pairs.order, pairs.tile_starts, tile_ends)
         if len(pairs.splats):
-            blend(ellipses, pairs.splats, pairs.order, pairs.tile_starts, tile, tile_ends, pixels, last)
+            blend(ellipses, lists, PictureArrays(pixels, last))
         light = pixels[..., LIGHT].copy()
         alpha = 1.0 - light
-        self._drawn = _Drawn(
+        self._drawn = _RenderState(
             splats=splats,
             camera=numbers,
             background=behind,
-            tile=tile,
             ellipses=ellipses,
             pairs=pairs,
-            tile_ends=tile_ends,
+            lists=lists,
             last=last,
             light=light,
         )
-        return Rendering(
+        return SplatRender(
             colour=pixels[..., :LIGHT] + light[..., None] * behind.astype(np.float32),
             alpha=alpha,
             depth=np.divide(pixels[..., MEAN_DEPTH], alpha, out=np.zeros_like(alpha), where=alpha > 0),
         )
 
     def gradients(self, d_colour: NDArray[np.floating], d_alpha: NDArray[np.floating] | None = None) -> SplatGradients:
-        """Gradients of a loss with ∂L/∂colour = ``d_colour`` (H, W, 3) and ∂L/∂alpha = ``d_alpha`` (H, W; None: 0) of
-        the last rendering. Raises InputError if there is none, and on other shapes or numbers that are not finite."""
+        """Return gradients by the splats of the last render, given ∂L/∂colour = ``d_colour`` (H, W, 3) and ∂L/∂alpha =
+        ``d_alpha`` (H, W; None: 0). Raises InputError before any render, and on wrong shapes or non-finite values."""
         drawn = self._drawn
         if drawn is None:
             raise InputError("gradients of splats: nothing has been rendered yet: call render first")
@@ -166,44 +165,24 @@ class Rasteriser:
         behind = np.stack([drawn.light, upstream[..., :3] @ drawn.background.astype(np.float32)], axis=-1)
         if len(self._sums) < len(pairs.splats):
             self._sums = np.empty((len(pairs.splats) * 5 // 4, SUMS), dtype=np.float32)
-        blend_back(
-            drawn.ellipses,
-            pairs.splats,
-            pairs.order,
-            pairs.tile_starts,
-            drawn.tile,
-            drawn.tile_ends,
-            drawn.last,
-            upstream,
-            behind,
-            self._sums,
-        )
-        project_back(
-            drawn.splats.centres,
-            drawn.splats.scales,
-            drawn.splats.rotations,
-            drawn.camera,
-            drawn.ellipses,
-            pairs.ranked,
-            pairs.splat_starts,
-            self._sums,
-            found.centres,
-            found.scales,
-            found.rotations,
-            found.opacities,
-            found.colours,
-        )
+        blend_back(drawn.ellipses, drawn.last, drawn.lists, BackwardArrays(upstream, behind, self._sums))
+        sums = PairSums(pairs.ranked, pairs.splat_starts, self._sums)
+        project_back(drawn.camera, drawn.ellipses, _arrays(drawn.splats), sums, _arrays(found))
         return found
 
     def _start(self) -> int:
-        """Make sure that Taichi runs; the side of a tile on what it runs on.
+        """Start Taichi if needed; return the side of a tile for its backend.
 
-        All that lasts between calls is numpy's, which a restart leaves alone and a CPU reads in place.
+        All state between calls is in NumPy arrays, which survive a restart and are read in place by a CPU.
         """
         if self._solver is not None or ti.lang.impl.get_runtime().prog is None:
             ensure_started(self._solver or SolverOptions())
         on_cpu = ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64)
         return CPU_TILE if on_cpu else DEVICE_TILE
+
+
+def _arrays(of: Splats | SplatGradients) -> SplatArrays:
+    return SplatArrays(of.centres, of.scales, of.rotations, of.opacities, of.colours)
 
 
 def _colour(background: Sequence[float]) -> NDArray[np.float64]:
@@ -216,7 +195,7 @@ def _colour(background: Sequence[float]) -> NDArray[np.float64]:
 def _checked(name: str, value: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.floating]:
     value = np.asarray(value)
     if value.shape != shape:
-        raise InputError(f"gradients of splats: {name} has shape {value.shape}: give {shape}, the picture's")
+        raise InputError(f"gradients of splats: {name} has shape {value.shape}: give {shape}, the image's")
     if not np.isfinite(value).all():
-        raise InputError(f"gradients of splats: {name} has numbers that are not finite: look at the loss before this")
+        raise InputError(f"gradients of splats: {name} has values that are not finite: check the loss")
     return value

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of an object from all around: cameras, masks, the hull that they leave, whose each point is. No Taichi.
+"""Views of an object from all around: posed images, the visual hull and its segmentation. No Taichi.
 
-view.py         what a view is
-transforms.py   a folder with transforms.json → views; save.py the way back
-frames.py       what transforms.json says of a picture
-multiview.py    pictures of SyncDreamer and Zero123++ → views; orbit.py cameras around an object
-pictures.py     picture files within bounds; outside.py masks and labels beside them; backdrop.py masks without any
-hull.py         masks and cameras → a closed mesh; carving.py its field, depth.py what a camera sees of a mesh
-votes.py        whose each vertex is, by the views that see it
-"""
+posed_images.py       a view: image, camera, mask, labels; image files and orbit cameras
+view_files.py         folders with transforms.json, and image grids of SyncDreamer and Zero123++
+visual_hull.py        masks and cameras → a closed mesh
+hull_segmentation.py  vertex labels by voting over views, and the foreground's closed body"""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A user's own models in place of stages: Python functions, programs, ONNX files (docs/adapters.md)."""
+"""A user's own models in place of stages: Python functions, programs, ONNX files (docs/extending.md)."""
 
-from .crop import object_crop
+from .command_adapter import object_crop
 from .protocols import Depth, DepthEstimator, Inpainter, Mesher, Segmenter
 from .resolve import resolve
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""From what an option says to what takes the stage's place.
+"""Resolve an adapter specification to a callable that replaces a stage.
 
-python:MODULE:FUNCTION, python:FILE.py:FUNCTION   a function as ``protocols`` says
-command:FILE.toml                                 a program (``command_file``)
-lama:FILE.onnx                                    inpainting by LaMa through onnxruntime (``lama``)
-picture:FILE                                      inpainting from a picture without the objects (``picture``)
-NAME                                              one of these under a name (``names``)
+python:MODULE:FUNCTION, python:FILE.py:FUNCTION a function as in ``protocols``
+command:FILE.toml a program (``command_adapter``)
+lama:FILE.onnx inpainting by LaMa through onnxruntime (``lama_adapter``)
+picture:FILE inpainting from a picture without the objects (``picture_adapter``)
+NAME one of these by name (``adapter_registry``)
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from typing import Any, Literal, overload
 
 from ...errors import InputError
 from ...events import IsCancelled, never
-from .command import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
-from .command_file import read_command_file
-from .lama import load_lama
-from .names import KINDS, named_adapters, split_spec
-from .picture import load_picture
+from .adapter_registry import ADAPTER_TYPES, named_adapters, read_command_file, split_spec
+from .command_adapter import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
+from .lama_adapter import load_lama
+from .picture_adapter import load_picture
 from .protocols import STAGES, DepthEstimator, Inpainter, Mesher, Segmenter
-from .python_function import (
+from .python_adapter import (
     DepthFunction,
     InpainterFunction,
     MesherFunction,
@@ -60,15 +59,16 @@ def resolve(
 @overload
 def resolve(stage: Literal["mesher"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...) -> Mesher: ...
 def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path | None = None) -> Any:
-    """What ``spec`` names, as ``protocols`` has ``stage``: files are opened and modules imported, nothing is run yet.
+    """Return the adapter ``spec`` for ``stage``, as in ``protocols``; nothing is run yet.
 
-    cancelled: asked while a program runs; a Python function is not interrupted. names: the user's file of names, in
+    cancelled: polled while a program runs; a Python function is not interrupted. names: the user's file of names, in
     place of the environment's.
-    Calls raise InputError that names the adapter: for what the user's code raises, for an answer that its stage cannot
-    use. Raises InputError for what cannot be found or cannot be that stage.
+
+    Calls of the result raise InputError that names the adapter, for exceptions of the user's code and for invalid
+    results. Raises InputError for a specification that cannot be found or does not fit ``stage``.
     """
     if stage not in STAGES:
-        raise InputError(f"stage {stage!r}: there is none of that name; choose one of {', '.join(STAGES)}")
+        raise InputError(f"stage {stage!r}: is unknown; choose one of {', '.join(STAGES)}")
     parts = split_spec(spec)
     if parts is not None:
         return _of_kind(stage, *parts, cancelled)
@@ -83,26 +83,26 @@ def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path |
         where = f"adapter {spec} of {adapter.source}"
         try:
             function = adapter.entry_point.load()
-        # A user's package may fail in any way.
+        # A user's package may raise anything.
         except Exception as error:
             raise InputError(f"{where}: cannot be imported ({type(error).__name__}: {error})") from error
         return _FUNCTIONS[stage](checked_function(function, stage, where), where)
     shown = ", ".join(a.name for a in known if a.stage == stage) or "none"
     raise InputError(
         f"{stage} {spec!r}: there is no adapter of that name (known: {shown}); give a name, or one of "
-        f"{', '.join(f'{kind}:…' for kind in KINDS)} (docs/adapters.md)"
+        f"{', '.join(f'{kind}:…' for kind in ADAPTER_TYPES)} (docs/extending.md)"
     )
 
 
 def _of_kind(stage: str, kind: str, target: str, cancelled: IsCancelled) -> Any:
     where = f"adapter {kind}:{target}"
     if not target:
-        raise InputError(f"{where}: names nothing; give {kind}:… with a path or name (docs/adapters.md)")
+        raise InputError(f"{where}: has no target; give {kind}:… with a path or name (docs/extending.md)")
     if kind == "python":
         return _FUNCTIONS[stage](load_function(target, stage, where), where)
     path = Path(target).expanduser().absolute()
     if kind == "command":
         return _COMMANDS[stage](read_command_file(path, stage), cancelled)
     if stage != "inpainter":
-        raise InputError(f"{where}: fills holes, it is no {stage}")
+        raise InputError(f"{where}: is an inpainter, not a {stage}")
     return load_lama(path, where) if kind == "lama" else load_picture(path, where)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What the surface of an object is like without the photo's light: albedo, roughness, metallic."""
+"""Appearance of objects without the photo's light: albedo, roughness, metallic."""

@@ -1,27 +1,231 @@
 # SPDX-License-Identifier: MIT
-"""The texture without the photo's light: its picture divided by the shading of what each of its pixels shows."""
+"""Albedo: the texture of a body divided by the shading at the surface point of each texel.
+
+After division by the right shading, texels of one colour are equally bright. Where they differ more than in the photo,
+the light, shape or material is wrong, and only a power of the shading is divided out.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.spatial import cKDTree
 
-from ...composite.transfer import linear_to_bytes
-from .creased import CreasedSurface
-from .doubt import division_exponent
-from .visible import rasterised
+from ...composite.srgb import linear_to_bytes
+from ...scene.model import Camera
+
+Points = NDArray[np.float64]
+
+CREASE_COSINE = 0.77
+"""Cosine of 40°: faces at a sharper edge do not share a normal."""
+
+
+@dataclass(frozen=True, eq=False)
+class CreasedSurface:
+    """A surface with one vertex per normal.
+
+    vertices, normals: (N, 3), normals of unit length; faces: (T, 3) into them, in the order of the surface's own;
+    source: (N,) index of the surface's own vertex.
+    """
+
+    vertices: Points
+    normals: Points
+    faces: NDArray[np.int64]
+    source: NDArray[np.int64]
+
+
+def split_creases(vertices: Points, faces: NDArray[np.integer]) -> CreasedSurface:
+    """Return the surface of ``vertices`` (V, 3), ``faces`` (T, 3), smooth except at creases; coincident vertices share
+    normals."""
+    faces = np.asarray(faces, dtype=np.int64)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    weighted = np.cross(b - a, c - a)
+    unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-30)
+    size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
+    _, place = np.unique(np.round((vertices - vertices.min(axis=0)) / size * 1e6), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    corner_place, corner_face = place[faces].ravel(), np.repeat(np.arange(len(faces)), 3)
+    ones = np.ones(len(corner_place))
+    touching = sparse.csr_matrix((ones, (corner_place, corner_face)), shape=(int(place.max()) + 1, len(faces)))
+    pairs = touching[corner_place].tocoo()
+    smooth = (unit[corner_face[pairs.row]] * unit[pairs.col]).sum(axis=1) > CREASE_COSINE
+    rows, columns = pairs.row[smooth], pairs.col[smooth]
+    averaging = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(corner_place), len(faces)))
+    summed = averaging @ weighted
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    normals = np.where(length > 1e-30, summed / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
+    keys = np.column_stack([faces.ravel(), np.round(normals * 1000)]).astype(np.int64)
+    _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    source = np.asarray(faces.ravel()[first], dtype=np.int64)
+    return CreasedSurface(vertices[source], normals[first], which.reshape(-1, 3), source)
+
+
+CHUNK = 2_000_000
+"""Candidate pixels per batch."""
+DEPTH_CELLS = 256
+"""Cells along the longer side of the depth map for visibility."""
+BEHIND = 0.015
+"""Depth tolerance of visible faces over the extent."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePixels:
+    """P pixels of a grid. rows, columns: (P,); faces: (P,); corners: (P, 3) barycentric, in space."""
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    faces: NDArray[np.int64]
+    corners: NDArray[np.float64]
+
+    def interpolated(self, faces: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``values`` (N, C) at the vertices of ``faces`` (T, 3), interpolated at the pixels (P, C)."""
+        return np.asarray(np.einsum("pk,pkc->pc", self.corners, values[faces[self.faces]]))
+
+
+def visible_pixels(
+    camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64], scale: float = 1.0
+) -> VisiblePixels:
+    """Return the nearest surface at the pixel centres of the photo scaled by ``scale``.
+
+    Back faces, and faces behind the camera or reaching there, are left out.
+    """
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    at = camera.project(vertices)
+    at[:, :2] *= (size[0] / camera.width, size[1] / camera.height)
+    # Pixel rows run downward: a front face is oriented the other way round in the image.
+    return rasterised(at, faces, size, _area(at[faces]) < 0)
+
+
+def seen_faces(camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the faces (T,) towards the camera whose centres are in front of all others."""
+    corner = camera.project(vertices)[faces]
+    towards = (_area(corner) < 0) & (corner[..., 2] > 1e-9).all(axis=1)
+    extent = float(np.ptp(corner[..., :2].reshape(-1, 2), axis=0).max())
+    scale = min(1.0, DEPTH_CELLS / max(extent, 1.0))
+    shown = visible_pixels(camera, vertices, faces, scale)
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    depth = np.full(size[::-1], np.inf)
+    depth[shown.rows, shown.columns] = shown.interpolated(faces, camera.project(vertices)[:, 2:])[:, 0]
+    middle = corner.mean(axis=1)
+    x, y = ((middle[:, i] * scale).clip(0, size[i] - 1).astype(np.int64) for i in (0, 1))
+    slack = BEHIND * float(np.ptp(vertices, axis=0).max())
+    return np.asarray(towards & (middle[:, 2] <= depth[y, x] + slack))
+
+
+def rasterised(
+    at: NDArray[np.float64], faces: NDArray[np.int64], size: tuple[int, int], use: NDArray[np.bool_]
+) -> VisiblePixels:
+    """Return the visible triangles ``faces`` (T, 3) among ``use`` (T,) at the pixels of a grid of ``size`` (width,
+    height).
+
+    at: (N, 3) x, y in pixels and depth of the vertices; the least depth wins.
+    """
+    width, height = size
+    corner = at[faces]
+    a, b, c = corner[:, 0, :2], corner[:, 1, :2], corner[:, 2, :2]
+    area = _area(corner)
+    low = np.maximum(np.ceil(corner[..., :2].min(axis=1) - 0.5), 0)
+    high = np.minimum(np.floor(corner[..., :2].max(axis=1) - 0.5), (width - 1, height - 1))
+    span = (high - low + 1).clip(0)
+    kept = np.flatnonzero(use & (corner[..., 2] > 1e-9).all(axis=1) & (np.abs(area) > 1e-12) & (span > 0).all(axis=1))
+    counts = (span[kept, 0] * span[kept, 1]).astype(np.int64)
+    ends = np.cumsum(counts)
+    best_depth = np.full(width * height, np.inf)
+    best_face = np.full(width * height, -1, dtype=np.int64)
+    best_corners = np.zeros((width * height, 3))
+    start = 0
+    while start < len(kept):
+        done = ends[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
+        part, number = kept[start:stop], counts[start:stop]
+        face = np.repeat(part, number)
+        offset = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+        columns = (low[face, 0] + offset % span[face, 0]).astype(np.int64)
+        rows = (low[face, 1] + offset // span[face, 0]).astype(np.int64)
+        x, y = columns + 0.5, rows + 0.5
+        flat = np.empty((len(face), 3))
+        for k, (first, second) in enumerate(((b, c), (c, a), (a, b))):
+            p, q = first[face], second[face]
+            flat[:, k] = ((q[:, 0] - p[:, 0]) * (y - p[:, 1]) - (q[:, 1] - p[:, 1]) * (x - p[:, 0])) / area[face]
+        inside = (flat >= -1e-9).all(axis=1)
+        face, flat, cell = face[inside], flat[inside], (rows * width + columns)[inside]
+        weight = flat / corner[face, :, 2]
+        depth = 1.0 / weight.sum(axis=1)
+        order = np.lexsort((depth, cell))
+        cell, depth, face, weight = cell[order], depth[order], face[order], weight[order]
+        first_there = np.flatnonzero(np.diff(cell, prepend=-1))
+        nearer = first_there[depth[first_there] < best_depth[cell[first_there]]]
+        best_depth[cell[nearer]] = depth[nearer]
+        best_face[cell[nearer]] = face[nearer]
+        best_corners[cell[nearer]] = weight[nearer] * depth[nearer, None]
+        start = stop
+    found = np.flatnonzero(best_face >= 0)
+    return VisiblePixels(found // width, found % width, best_face[found], best_corners[found])
+
+
+def _area(corner: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Twice the signed area (T,) of triangles (T, 3, 2 or more)."""
+    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    return np.asarray((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+
+
+RADIUS = 0.2
+"""Radius in log chromaticity of one colour, of any brightness."""
+LEAST_PIXELS, LEAST_SHARE = 350, 0.4
+"""Least pixels of one colour, and least share of the visible ones: with fewer, paint may cause the differences."""
+SAMPLE = 2500
+BORDER = 2
+"""Texels along the outline, which are mixed with the background."""
+CLIPPED = 0.95
+DARKEST = 4e-3
+"""Linear brightness below which 8 bits do not resolve a colour."""
+
+
+def division_exponent(brightness: NDArray[np.float64], divisor: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
+    """Return the exponent, 0 to 1, of ``divisor`` (h, w, 3) in the division of linear ``brightness`` (h, w, 3).
+
+    1 unless that makes the texels of the most common colour among ``where`` (h, w) differ more, as the deviation of
+    logarithms, than they do undivided. Then the exponent of least difference, by linear regression.
+    """
+    inside = ndimage.binary_erosion(where, iterations=BORDER)
+    light, shading = brightness[inside], divisor[inside]
+    valid = (light.min(axis=1) > DARKEST) & (light.max(axis=1) < CLIPPED)
+    light, shading = light[valid], shading[valid]
+    if len(light) < LEAST_PIXELS:
+        return 1.0
+    chosen = _most_common(light)
+    if chosen.sum() < max(LEAST_PIXELS, LEAST_SHARE * inside.sum()):
+        return 1.0
+    seen, expected = (np.log(v[chosen].mean(axis=1)) for v in (light, shading))
+    seen, expected = seen - seen.mean(), expected - expected.mean()
+    if (seen - expected).std() <= seen.std():
+        return 1.0
+    # Least squares of seen = exponent · expected. The variance of expected is not 0, or nothing would differ more.
+    return float(np.clip((seen @ expected) / (expected @ expected), 0.0, 1.0))
+
+
+def _most_common(light: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels (bool) of ``light`` (P, 3) with the most common chromaticity."""
+    logs = np.log(light)
+    features = np.column_stack([logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1]])
+    some = features[np.random.default_rng(0).permutation(len(features))[:SAMPLE]]
+    near = cKDTree(some).query_ball_point(some, RADIUS, return_length=True)
+    return np.asarray(np.linalg.norm(features - some[int(np.argmax(near))], axis=1) < RADIUS)
+
 
 LEAST_SHADING = 0.2
-"""Of the median: deep shade is not divided by less, where errors of the light would glare."""
+"""Least shading over the median, as errors of the light would glare in deep shade."""
 BRIGHTEST = 0.95
 NEAR = 24
-"""Pixels of the texture beyond what the camera sees over which its shading goes on."""
+"""Texels over which the shading is extended beyond the visible surface."""
 LEAST_LEFT = 0.3
-"""Of a pixel's brightness, that no reflection takes away: black matter does not exist."""
+"""Least share of a pixel's brightness that is not a reflection: black materials do not exist."""
 HIGHLIGHT_SHARE = 0.5
-"""Of a pixel's brightness, above which the colour below a highlight is taken from around it."""
+"""Share of a highlight in a pixel's brightness above which the colour below is inpainted from around it."""
 
 
 def texel_values(
@@ -31,11 +235,11 @@ def texel_values(
     values: NDArray[np.float64],
     size: tuple[int, int],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """``values`` (N, C) of the vertices of ``creased`` over a texture (h, w, C) of ``size`` (width, height).
+    """Return ``values`` (N, C) at the vertices of ``creased`` over a texture (h, w, C) of ``size`` (width, height).
 
-    uv: (V, 2) of the surface's own vertices. seen: (T,) faces that the camera sees; their values go on over what is
-    near by, for all that is seen of a photo is painted there. Elsewhere the median of the seen. Also which texels
-    (h, w) the seen faces cover.
+    uv: (V, 2) of the surface's own vertices. seen: (T,) visible faces; their values are extended over nearby texels,
+    which hold the photo's colours, too. Elsewhere the median of the visible values. Also the texels (h, w) that visible
+    faces cover.
     """
     width, height = size
     place = uv[creased.source] * (width, -height) + (0.0, height)
@@ -56,28 +260,29 @@ def texel_values(
     return result, covered
 
 
-def albedo_of(
+def compute_albedo(
     brightness: NDArray[np.float64],
     shading: NDArray[np.float64],
     highlight: NDArray[np.float64] | None,
     seen: NDArray[np.bool_],
 ) -> tuple[NDArray[np.uint8], float]:
-    """Albedo (h, w, 3) in 8-bit sRGB of a texture of linear ``brightness`` (h, w, 3) under ``shading`` (h, w, 3).
+    """Return albedo (h, w, 3) in 8-bit sRGB of a texture of linear ``brightness`` (h, w, 3) under ``shading`` (h, w,
+    3).
 
-    Both in the unit of ``surroundings``. highlight: (h, w, 3) brightness that no albedo causes. Where the result would
-    be whiter than white matter, all of it is made darker alike: the photo was exposed brighter than was assumed.
-    seen: (h, w) what of it the photo shows. Also the exponent of the shading, 1 unless ``division_exponent`` doubts it;
-    the median of the shading is divided by in full.
+    Both in the unit of ``LocalLighting``. highlight: (h, w, 3) reflected brightness. If the result is brighter than
+    white, all of it is darkened: the photo was exposed brighter than assumed. seen: (h, w) visible texels. Also the
+    exponent of the shading, 1 unless ``division_exponent`` rejects it; the median of the shading is always divided out
+    in full.
     """
     least = LEAST_SHADING * np.median(shading, axis=(0, 1))
-    # A soft maximum: a hard one would draw its border.
+    # A soft maximum, as a hard one would leave a visible border.
     divisor = (np.maximum(shading, 0.0) ** 4 + least**4) ** 0.25
     light = brightness
     if highlight is not None:
         light = np.maximum(brightness - highlight, LEAST_LEFT * brightness)
     exponent = division_exponent(light, divisor, seen)
     if exponent < 1.0 and highlight is not None:
-        # Of a light that is not so, neither are the reflections.
+        # If the light is wrong, so are the reflections.
         light, highlight = brightness, None
         exponent = division_exponent(light, divisor, seen)
     if exponent < 1.0:
@@ -95,7 +300,7 @@ def albedo_of(
 def _refilled(
     albedo: NDArray[np.float64], brightness: NDArray[np.float64], highlight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``albedo`` with what lies below strong highlights, where the photo shows hardly any of it, from around them."""
+    """``albedo`` with texels below strong highlights, where hardly any of it is visible, inpainted from around them."""
     weak = highlight.mean(axis=2) < HIGHLIGHT_SHARE * np.maximum(brightness.mean(axis=2), 1e-6)
     if weak.all() or not weak.any():
         return albedo

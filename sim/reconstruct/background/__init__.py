@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The photo without its objects."""
+"""Inpainting of the background behind objects and shadows."""

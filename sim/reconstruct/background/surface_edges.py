@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Where one surface ends and another begins behind a hole: a wall on the floor, a table's edge.
+"""Edges between two surfaces behind a hole: a wall on the floor, a table's edge.
 
-Such an edge is straight, is seen on both sides of the hole, and what lies above it differs from what lies below it. A
-line is taken for one only if two surfaces, each with its own slow light, explain the colours much better than one.
+Such an edge is straight, visible on both sides of the hole, and separates different surfaces. A line is accepted only
+if two surfaces, each with its own smooth light, explain the colours much better than one.
 """
 
 from __future__ import annotations
@@ -19,23 +19,22 @@ Picture = NDArray[np.float32]
 COARSE = 40
 """Longer side in pixels of the copy in which lines are tried."""
 AROUND = 0.6
-"""How much of the photo around a hole is looked at, over the hole's size."""
+"""Margin of the photo around a hole, over the size of the hole."""
 STEEPEST = 0.15
-"""Most that a line falls, over its way across: steeper ones are corners of walls, where both sides are alike."""
+"""Steepest slope of a line: steeper ones are corners of walls, where both sides are alike."""
 LEAST = 0.08
-"""Share of what is seen that must lie on each side."""
+"""Least visible share on each side of the line."""
 GAIN, CLEARLY = 0.2, 0.28
-"""Logarithm of the likelihood, each pixel, that two surfaces gain over one; the same with the step over the line. Below
-either, there is but one surface."""
+"""Least gain in log likelihood per pixel of two surfaces over one; and the same including the step across the line."""
 STEP, STEPS, UNUSUAL = 0.06, 0.8, 2.5
-"""Difference of colours over a line, in logarithms; share of a line's places that must show it, on either side of the
-hole: where nothing changes no surface ends."""
+"""Colour difference across a line, in logarithms; share of its points that must show it on either side of the hole; and
+the factor over the usual difference."""
 MOST_STEP = 0.35
-"""Above this a step is no more of an edge."""
+"""Step above which an edge is not more likely."""
 LEAST_ERROR = 0.02
-"""Standard deviation in logarithms below which a surface is told no better from another."""
+"""Residual in logarithms below which surfaces are not distinguished better."""
 RIDGE = 1e-3
-"""Pull of polynomials to zero, over the weight of the data."""
+"""Regularisation of polynomials, relative to the data."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +46,19 @@ class Edge:
     c: float
 
     def height(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Signed distance (H, W) of the pixels' centres in pixels, positive below."""
+        """Return the signed distance (H, W) of the pixels' centres in pixels, positive below."""
         y, x = np.ogrid[: shape[0], : shape[1]]
         return np.asarray(self.a * (x + 0.5) + self.b * (y + 0.5) - self.c, dtype=np.float32)
 
     def below(self, shape: tuple[int, int]) -> Mask:
-        """The pixels (H, W) below."""
+        """Return the pixels (H, W) below."""
         return np.asarray(self.height(shape) > 0.0)
 
 
-def edges_through(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
-    """Edges that pass behind ``part`` (H, W), none or one.
+def edges_behind(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
+    """Return edges that pass behind ``part`` (H, W), none or one.
 
-    logs: (H, W, 3) logarithms of the photo's values, true where not ``closed``.
+    logs: (H, W, 3) logarithms of the photo's values, valid where not ``closed``.
     """
     rows, columns = _window(part)
     known, inner = ~closed[rows, columns], part[rows, columns]
@@ -92,7 +91,7 @@ def _window(part: Mask) -> tuple[slice, slice]:
 
 
 def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, NDArray[np.float64]] | None:
-    """Rows at which the best line enters at the left and leaves at the right, and the colour's step down over it."""
+    """Rows at which the best line enters at the left and leaves at the right, and the colour step down across it."""
     height, width = known.shape
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=-1)[known]
@@ -101,7 +100,7 @@ def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, ND
         return None
     at_y, at_x = (axis + 0.5 for axis in np.nonzero(known))
     cut_y, cut_x = (axis + 0.5 for axis in np.nonzero(cut))
-    # A little of a flat prior, so that a side of few pixels is not explained by the swing of its polynomial.
+    # Weak regularisation, so that a side of few pixels is not explained by an oscillating polynomial.
     ridge = RIDGE * len(basis) * np.diag([0.0, 1, 1, 1, 1, 1])
     powers = np.square(target).sum(axis=1)
     squares, products, power = basis.T @ basis, basis.T @ target, float(powers.sum())
@@ -111,7 +110,7 @@ def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, ND
         return -float((products * solved).sum())
 
     def cost(error: float, count: int) -> float:
-        """Negative logarithm of the likelihood of pixels that are spread evenly by ``error`` in all."""
+        """Negative log likelihood of ``count`` pixels with squared ``error`` in total."""
         return 0.5 * count * float(np.log(max(error, 0.0) / count + 3 * LEAST_ERROR**2))
 
     changes = _changes(small, known, cut)
@@ -132,10 +131,10 @@ def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, ND
             part = basis[below]
             mine, my = part.T @ part, part.T @ target[below]
             my_power = powers[below].sum()
-            # Each surface has a spread of its own: a table is plain, the room behind it is not.
+            # Each surface has its own variance: a table is plain, the room behind it is not.
             error = cost(my_power + left_over(mine, my), count)
             error += cost(power - my_power + left_over(squares - mine, products - my), len(below) - count)
-            # Edges far away are seen nearly level.
+            # Distant edges appear nearly level.
             if whole - error < GAIN * len(basis):
                 continue
             score = error + (abs(right - left) / width - float(changes[left, right])) * len(basis)
@@ -151,8 +150,8 @@ def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, ND
 
 
 def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
-    """For lines by the rows (h, h) where they enter and leave: how much colours change over them on that side of the
-    hole where they change less; negative where that is not enough for an edge."""
+    """Colour change (h, h) across lines, by the rows where they enter and leave, on the side of the hole where it is
+    smaller; negative if insufficient for an edge."""
     height, width = known.shape
     middle = float(np.nonzero(cut)[1].mean()) + 0.5
     x = np.arange(width) + 0.5
@@ -163,7 +162,7 @@ def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
     inside = (above >= 0) & (below < height)
     above, below = np.clip(above, 0, height - 1), np.clip(below, 0, height - 1)
     seen = inside & known[above, across] & known[below, across]
-    # What changes everywhere, as grain of wood does, parts nothing.
+    # Changes that occur everywhere, such as wood grain, separate nothing.
     both = known[2:] & known[:-2]
     usual = np.median(np.linalg.norm(small[2:] - small[:-2], axis=-1)[both]) if both.any() else 0.0
     change = np.where(seen[..., None], small[below, across] - small[above, across], 0.0)
@@ -173,7 +172,7 @@ def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
     for side in (x < middle, x >= middle):
         count = seen[..., side].sum(axis=-1)
         share = step[..., side].sum(axis=-1) / np.maximum(count, 1)
-        # Steps up and down along a line, as over spots, are no edge either.
+        # Steps of both signs along a line, as over spots, are not an edge either.
         mean = np.linalg.norm(change[:, :, side].sum(axis=2), axis=-1) / np.maximum(count, 1)
         # A hole that reaches the border of the picture is open there.
         open_side = int((side & ~cut.any(axis=0)).sum()) < 2
@@ -187,12 +186,12 @@ def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
 def _settled(
     logs: Picture, known: Mask, ends: tuple[float, float], step: NDArray[np.float64], ratio: float
 ) -> tuple[float, float]:
-    """``ends`` moved to where the colours change by ``step`` most suddenly."""
+    """``ends`` refined to where the colours change by ``step`` most suddenly."""
     size = max(float(np.linalg.norm(step)), 1e-6)
     plane = np.asarray(logs @ (step / size).astype(np.float32), dtype=np.float32)
     seen = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
     x = np.linspace(0.5, known.shape[1] - 0.5, min(known.shape[1], 400))
-    # Over a wider reach a sharp step is the same wherever it lies within: the last look is a near one.
+    # A wide comparison cannot locate a sharp step within it: the last pass is narrow.
     for spacing, reach in ((max(ratio / 3.0, 0.5), 1.5), (max(ratio / 12.0, 0.25), 1.5), (0.25, 0.5)):
         moves = spacing * np.arange(-5, 6)
         shift = np.stack(np.meshgrid(moves, moves, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -207,7 +206,7 @@ def _settled(
         change = np.clip(at(plane, y + reach) - at(plane, y - reach), -size, size)
         total = weight.sum(axis=1)
         score = np.where(total > 0.1 * len(x), (weight * change).sum(axis=1) / np.maximum(total, 1e-6), -np.inf)
-        # Of equals the one that was moved least.
+        # Break ties by the smallest move.
         score = score - 1e-6 * np.abs(shift).sum(axis=1)
         index = int(np.argmax(score))
         if np.isfinite(score[index]):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The ground as seen from above: where it lies in the photo, and pictures carried there and back.
+"""Rectified top views of the ground: homographies to the photo, and resampling both ways.
 
-Seen from above, tiles are equal tiles and boards run parallel, so that what is seen of the ground can stand in for
-what is hidden of it. One view has one resolution, the photo shows the near ground finer than the far: a deep hole is
-looked at in several views, each over a span of depth in which the resolution differs little.
+In a top view tiles are equal tiles and boards run parallel, so that visible ground can replace hidden ground. A view
+has one resolution, while the photo shows near ground finer than far: a deep hole is split into several views, each over
+a range of depth in which the resolution differs little.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ...scene.model import Camera
 Mask = NDArray[np.bool_]
 
 SPAN = 2.2
-"""Depth of a view's hole, far over near. The resolution along the ground goes with the square of the depth."""
+"""Ratio of far to near depth in a view's hole. The resolution along the ground goes with the square of the depth."""
 FARTHEST = 14.0
-"""Depth, over that of the nearest ground in the hole, beyond which ground is a picture like a wall: it is seen at a
-grazing angle, in rows that hold metres each."""
+"""Depth over that of the hole's nearest ground beyond which ground is treated like a wall: at a grazing angle a pixel
+row spans metres."""
 ANISOTROPY = 3.0
-"""Most that one axis of a view may be finer than the other."""
+"""Largest ratio of the two axes' resolutions."""
 MORE = 2.5
-"""Pixels of the rectangle around a view's hole, over those that the photo has of the hole."""
+"""Largest ratio of a view's pixels to the hole's pixels in the photo."""
 MARGIN = 0.7
-"""How much ground around the hole a view shows, over the extent of the hole."""
+"""Margin of ground around the hole, over the extent of the hole."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,13 @@ class TopView:
     size: tuple[int, int]
 
     def positions(self) -> NDArray[np.float64]:
-        """Where the view's pixels lie in the photo, (h, w, 2); not finite where behind the camera."""
+        """Return positions (h, w, 2) in the photo of the view's pixels; not finite behind the camera."""
         x, y = np.meshgrid(np.arange(self.size[0]) + 0.5, np.arange(self.size[1]) + 0.5)
         return _carried(self.image_from_view, x, y)
 
     def inverse_positions(self, rows: slice, columns: slice, times: int) -> NDArray[np.float64]:
-        """Where the photo's pixels, ``times`` by ``times`` samples in each, lie in the view, (h·times, w·times, 2)."""
+        """Return positions (h·times, w·times, 2) in the view of the photo's pixels, with ``times`` by ``times`` samples
+        in each."""
         x, y = np.meshgrid(
             columns.start + (np.arange((columns.stop - columns.start) * times) + 0.5) / times,
             rows.start + (np.arange((rows.stop - rows.start) * times) + 0.5) / times,
@@ -71,9 +72,10 @@ def _carried(matrix: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.
 
 
 def ground_frame(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3, 3) homography from the ground to the photo, and the unit vector away from the camera in the world, (2,).
+    """Return the (3, 3) homography from the ground to the photo, and the unit vector (2,) away from the camera in the
+    world.
 
-    Ground coordinates: across to the right of that direction, along it, from below the camera, over the camera's
+    Ground coordinates: across to the right of that direction, and along it, from below the camera, over the camera's
     height.
     """
     pose = np.asarray(camera.world_from_camera, dtype=np.float64)
@@ -96,19 +98,19 @@ def ground_frame(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def ground_positions(camera: Camera, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Ground coordinates (H, W, 2) of the photo's pixels; NaN where no ground can be seen."""
+    """Return ground coordinates (H, W, 2) of the photo's pixels; NaN where there is no ground."""
     matrix, _ = ground_frame(camera)
     x, y = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
     inverse = np.linalg.inv(matrix)
-    # The sign of the depth tells ground ahead from the sky, which meets the plane behind the camera.
+    # The sign of the depth separates ground ahead from sky, which meets the plane behind the camera.
     depth = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
     at = _carried(inverse, x, y)
     at[depth <= 1e-9] = np.nan
     return at
 
 
-def views_of(camera: Camera, hole: Mask, most_pixels: int) -> list[tuple[TopView, Mask]]:
-    """Views that together show the ground in ``hole`` (H, W), from the nearest on, each with its part of the hole.
+def top_views(camera: Camera, hole: Mask, most_pixels: int) -> list[tuple[TopView, Mask]]:
+    """Return views that together cover the ground in ``hole`` (H, W), nearest first, each with its part of the hole.
 
     Ground beyond ``FARTHEST`` belongs to no part. most_pixels: of one view.
     """
@@ -117,7 +119,7 @@ def views_of(camera: Camera, hole: Mask, most_pixels: int) -> list[tuple[TopView
     seen = hole & np.isfinite(along)
     if not seen.any():
         return []
-    # Distance from the camera, not from below it: this is what the resolution goes with.
+    # Distance from the camera, not from below it: it determines the resolution.
     away = np.sqrt(1.0 + np.square(np.where(seen[..., None], at, 0.0)).sum(axis=-1))
     near = float(np.quantile(away[seen], 0.002))
     far = min(float(away[seen].max()), FARTHEST * near)
@@ -137,10 +139,10 @@ def _view(camera: Camera, part: Mask, at: NDArray[np.float64], most_pixels: int)
     inside = at[part]
     low, high = inside.min(axis=0), inside.max(axis=0)
     extent = high - low
-    # As fine as the photo itself where it shows the hole finest: nothing is lost on the way there and back.
+    # As fine as the photo where it shows the hole finest, so that resampling loses nothing.
     fine = np.quantile(_resolution(matrix, inside[:: max(1, len(inside) // 4000)]), 0.9, axis=0)
     fine = np.maximum(fine, fine.max() / ANISOTROPY)
-    # Far ground needs less: not many more pixels than the photo has of the hole.
+    # Far ground needs less: not many more pixels than the hole has in the photo.
     fine *= min(1.0, math.sqrt(MORE * part.sum() / max(float((extent * fine).prod()), 1.0)))
     distance = float(np.sqrt(1.0 + np.square((low + high) / 2.0).sum()))
     margin = MARGIN * np.maximum(extent, 0.5 * extent.max()) + 24.0 / fine
@@ -157,7 +159,7 @@ def _view(camera: Camera, part: Mask, at: NDArray[np.float64], most_pixels: int)
 
 
 def _resolution(matrix: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of the photo per unit of ground, across and along, (n, 2), at ground coordinates (n, 2)."""
+    """Pixels of the photo per unit of ground, across and along (n, 2), at ground coordinates (n, 2)."""
     steps = []
     for axis in (0, 1):
         shift = np.zeros(2)
@@ -167,10 +169,10 @@ def _resolution(matrix: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray
     return np.stack(steps, axis=-1)
 
 
-def seen_from_above(image: NDArray[np.float32], view: TopView) -> NDArray[np.float32]:
-    """``image`` (H, W) or (H, W, C) as ``view`` shows it, (h, w, …); what the photo does not show repeats its edge."""
+def to_top_view(image: NDArray[np.float32], view: TopView) -> NDArray[np.float32]:
+    """Return ``image`` (H, W) or (H, W, C) resampled to ``view``, (h, w, …); the photo's border is repeated outside."""
     at = np.nan_to_num(view.positions(), nan=-1e6, posinf=-1e6, neginf=-1e6)
-    # Where the view is coarser than the photo, its pixels are means of the photo's.
+    # Where the view is coarser than the photo, average the photo's pixels.
     across, down = np.diff(at[:-1, :, 0], axis=1), np.diff(at[:, :-1, 1], axis=0)
     coarse = max(1, min(4, round(float(np.median(np.hypot(across, down))) / 1.2)))
     source = image if coarse == 1 else cv2.blur(image, (coarse, coarse))
@@ -178,18 +180,18 @@ def seen_from_above(image: NDArray[np.float32], view: TopView) -> NDArray[np.flo
     return np.asarray(cv2.remap(source, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
 
-def inside_photo(view: TopView, closed: Mask) -> Mask:
-    """Which pixels (h, w) of ``view`` show what the photo shows outside of ``closed`` (H, W)."""
+def visible_in_photo(view: TopView, closed: Mask) -> Mask:
+    """Return the pixels (h, w) of ``view`` that show photo pixels outside of ``closed`` (H, W)."""
     at = np.nan_to_num(view.positions(), nan=-1e6, posinf=-1e6, neginf=-1e6)
     x, y = (np.clip(at[..., i] - 0.5, -1e4, 3e4).astype(np.float32) for i in (0, 1))
     barred = cv2.remap(closed.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
     return np.asarray(barred < 1e-3)
 
 
-def seen_in_photo(
+def to_photo(
     picture: NDArray[np.float32], view: TopView, rows: slice, columns: slice, times: int = 2
 ) -> NDArray[np.float32]:
-    """``picture`` (h, w, C) of ``view`` as the photo would show it in ``rows`` and ``columns``."""
+    """Return ``picture`` (h, w, C) of ``view`` resampled to ``rows`` and ``columns`` of the photo."""
     at = np.nan_to_num(view.inverse_positions(rows, columns, times), nan=-1e6, posinf=-1e6, neginf=-1e6)
     x, y = (np.clip(at[..., i] - 0.5, -1e4, 3e4).astype(np.float32) for i in (0, 1))
     fine = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

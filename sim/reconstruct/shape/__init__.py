@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""From an outline to a closed body that stands on the ground, with the photo on it."""
+"""From a mask to a closed body that stands on the ground, textured by the photo."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Inflate a silhouette: how thick is the body behind each pixel?
+"""Inflate a silhouette: the thickness of the body behind each pixel.
 
-The height of a soap film under even pressure, ∇²u = −4 with u = 0 on the outline, gives h = √u. A disc of radius R
-has u = R² − r², so it becomes a ball. Rectangular outlines become slabs with rounded edges instead.
+The height of a soap film under even pressure, ∇²u = −4 with u = 0 on the outline, gives h = √u. A disc of radius R has
+u = R² − r², so it becomes a sphere. Rectangular outlines become slabs with rounded edges instead.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ Field = NDArray[np.float64]
 POISSON_UNKNOWNS = 40_000
 """Larger silhouettes are solved on a coarser grid; the outline stays at full resolution."""
 RECTANGULAR = 0.88
-"""Area over that of the smallest rotated rectangle, above which an outline is a box; an ellipse has 0.785."""
+"""Area over that of the smallest rotated rectangle above which a mask is a box; an ellipse has 0.785."""
 LONGEST_SLAB = 3.0
-"""Length over width of a box; longer ones are taken for bottles, pens and sticks, which are round."""
+"""Length over width up to which a mask is a box; longer ones are bottles, pens and sticks, which are round."""
 SLAB_THICKNESS = 0.2
 """Default thickness over width of a box: between a book and a carton."""
 OUTSET = 2e-4
-"""How far bodies reach beyond their mask, over the photo's longer side (0.4 pixels at 1920). Triangles cut the corners
-of an outline, and there the background would show inside the mask: as bright specks around a dark thing."""
+"""Distance by which bodies extend beyond their mask, over the photo's longer side (0.4 pixels at 1920). Triangles cut
+the corners of an outline, where the background would show inside the mask as bright specks."""
 MIN_HALF_THICKNESS = 1.0
-"""Pixels; a thinner sheet has no inside that particles could be put into."""
+"""Pixels; a thinner sheet has no interior for particles."""
 SLAB_BEVEL = 0.5
 """Rounding of a slab's edges over its half thickness."""
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """The outline of one object and its inflation, on a crop of the photo.
+    """The silhouette of one object and its inflation, on a crop of the photo.
 
     mask: (h, w); distance: (h, w) signed distance to the outline in pixels, positive inside, smooth to sub-pixels;
-    square_height: (h, w) h² in pixels², negative outside with the slope it has inside.
-    left, top: position of the crop's first pixel in the photo; its centre is at (left + 0.5, top + 0.5).
-    slab: whether the outline is a box'. roundness: 1 for an ellipse, 0 for anything far from one.
+    square_height: (h, w) h² in pixels², negative outside with the slope it has inside. left, top: position of the
+    crop's first pixel in the photo; its centre is at (left + 0.5, top + 0.5). slab: whether the mask is a box'.
+    roundness: 1 for an ellipse, 0 for anything far from one.
     """
 
     mask: Mask
@@ -62,11 +62,11 @@ class Silhouette:
 def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
     """Inflate ``mask`` (H, W), which must not be empty.
 
-    thickness: depth over width of the body; None takes 1 for round outlines and 0.2 for boxes.
+    thickness: depth over width of the body; None uses 1 for round masks and 0.2 for boxes.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     pad = 8 + round(0.05 * max(np.ptp(rows), np.ptp(columns)))
-    # Beyond the photo's border the object ends, as far as anyone can see: pad with background.
+    # Assume that the object ends at the photo's border: pad with background.
     padded = np.pad(mask, pad)
     crop = padded[rows[0] : rows[-1] + 1 + 2 * pad, columns[0] : columns[-1] + 1 + 2 * pad]
     distance = signed_distance(crop) + OUTSET * max(mask.shape)
@@ -86,17 +86,18 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
 
 
 def signed_distance(mask: Mask) -> Field:
-    """Distance in pixels of each pixel's centre to the outline of ``mask``, positive inside, without stair-steps."""
+    """Return the signed distance in pixels of each pixel's centre to the outline of ``mask``, positive inside, without
+    stair-steps."""
     inside, outside = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
     exact = np.where(mask, inside - 0.5, 0.5 - outside)
     smooth = ndimage.gaussian_filter(exact, 1.0)
-    # Smoothing flattens the ridge of a strap, so only the neighbourhood of the outline is taken from it.
+    # Smoothing flattens the ridge of a strap, so use it only near the outline.
     weight = np.clip(np.abs(exact) - 1.5, 0.0, 1.0)
     return np.asarray(weight * exact + (1.0 - weight) * smooth)
 
 
 def is_box(mask: Mask) -> bool:
-    """Whether ``mask`` fills the smallest rectangle, at any angle, that holds it, and is not drawn out like a stick."""
+    """Return whether ``mask`` fills its smallest rotated rectangle, and is not elongated like a stick."""
     points = cv2.findNonZero(mask.astype(np.uint8))
     if points is None:
         return False
@@ -106,7 +107,8 @@ def is_box(mask: Mask) -> bool:
 
 
 def roundness(mask: Mask) -> float:
-    """1 where ``mask`` is an ellipse (overlap of 0.96 with the ellipse of the same moments), falling to 0 at 0.9."""
+    """Return 1 if ``mask`` is an ellipse (overlap of 0.96 with the ellipse of the same moments), falling to 0 at
+    0.9."""
     rows, columns = np.nonzero(mask)
     points = np.column_stack([columns, rows]).astype(np.float64)
     centre = points.mean(axis=0)
@@ -119,7 +121,7 @@ def roundness(mask: Mask) -> float:
 
 
 def soap_film(mask: Mask) -> Field:
-    """u (h, w) in pixels² with ∇²u = −4 inside ``mask`` and u = 0 outside, by the five-point Laplacian."""
+    """Return u (h, w) in pixels² with ∇²u = −4 inside ``mask`` and u = 0 outside, by the five-point Laplacian."""
     index = np.full(mask.shape, -1, dtype=np.int64)
     count = int(mask.sum())
     index[mask] = np.arange(count)
@@ -144,7 +146,8 @@ def soap_film(mask: Mask) -> Field:
 
 
 def film_profile(mask: Mask, distance: Field, thickness: float) -> Field:
-    """h² (h, w) in pixels² of ``mask`` inflated, with its signed ``distance``; ``thickness`` as for ``inflate``."""
+    """Return h² (h, w) in pixels² of ``mask`` inflated, with its signed ``distance``; ``thickness`` as for
+    ``inflate``."""
     scale = min(1.0, float(np.sqrt(POISSON_UNKNOWNS / max(1, int(mask.sum())))))
     height, width = mask.shape
     if scale < 1.0:
@@ -175,5 +178,40 @@ def _slab_profile(distance: Field, thickness: float) -> Field:
     half = max(MIN_HALF_THICKNESS, thickness * float(distance.max()))
     bevel = max(2.0, min(SLAB_BEVEL * half, 0.5 * float(distance.max())))
     rise = np.minimum(distance / bevel, 1.0)
-    # A quarter circle from the outline up to the flat; outside it goes on with the slope at the outline.
+    # A quarter circle from the outline up to the flat; outside it continues with the slope at the outline.
     return np.asarray(half**2 * np.where(rise > 0, 1.0 - (1.0 - rise) ** 2, 2.0 * rise))
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The mask of one object on a crop.
+
+    mask: (h, w); photo: (h, w) pixels inside the photo; distance: (h, w) pixels to the outline, positive inside, with
+    ``outset`` added. left, top: photo pixels of the first pixel's corner; may be negative. outset: distance by which
+    the body extends beyond the mask.
+    """
+
+    mask: Mask
+    photo: Mask
+    distance: Field
+    left: int
+    top: int
+    outset: float
+
+    def pixels(self) -> Field:
+        """Return photo pixels (h w, 2) of all pixel centres, row by row."""
+        height, width = self.mask.shape
+        rows, columns = np.mgrid[:height, :width]
+        return np.stack([self.left + columns + 0.5, self.top + rows + 0.5], axis=-1).reshape(-1, 2)
+
+
+def crop_mask(mask: Mask) -> Crop:
+    """Return the part of ``mask`` (H, W), not empty, that holds the object, with a border of background."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    pad = 8 + round(0.08 * max(np.ptp(rows), np.ptp(columns)))
+    padded = np.pad(mask, pad)
+    window = (slice(rows[0], rows[-1] + 1 + 2 * pad), slice(columns[0], columns[-1] + 1 + 2 * pad))
+    part = padded[window]
+    outset = OUTSET * max(mask.shape)
+    photo = np.pad(np.ones(mask.shape, dtype=bool), pad)[window]
+    return Crop(part, photo, signed_distance(part) + outset, int(columns[0]) - pad, int(rows[0]) - pad, outset)

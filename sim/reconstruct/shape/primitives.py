@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Boxes, balls and bodies of revolution that rest on the ground z = 0: their outlines, and what is inside them.
+"""Boxes, spheres and surfaces of revolution on the ground z = 0, and outlines to fit them to.
 
 World axes: Z up. ``inside`` is open below, so that the ground itself cuts the base.
 """
@@ -14,22 +14,100 @@ from typing import Protocol
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ...scene.model import Camera
-from .outline import hull_polygon
 
-Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Points = NDArray[np.float64]
+
+GUESSED = 0.1
+"""Weight of guessed outline behind an occluder."""
+BORDER = 1.5
+"""Outline nearer than this to the photo's border, in pixels, is the photo's end and not the object's."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Points evenly along the outline of a mask.
+
+    points: (n, 2) photo pixels; weights: (n,) 0 (unknown) to 1; size: square root of the area in pixels.
+    """
+
+    points: Points
+    weights: NDArray[np.float64]
+    size: float
+
+    def thinned(self, count: int) -> Outline:
+        """Return about ``count`` of the points."""
+        step = max(1, len(self.points) // count)
+        return Outline(self.points[::step], self.weights[::step], self.size)
+
+
+def outline_of(full: Mask, seen: Mask | None = None, count: int = 400) -> Outline:
+    """Return the outer outline of ``full`` (H, W), which must not be empty, as about ``count`` points.
+
+    Outline next to pixels in ``full`` but not in ``seen`` has a lower weight, and at the photo's border none.
+    """
+    contours, _ = cv2.findContours(full.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    longest = max(contours, key=cv2.contourArea)[:, 0, :].astype(np.float64)
+    # Centres of border pixels are half a pixel inside the outline; smooth and move out by that.
+    loop = longest + 0.5
+    smooth = ndimage.gaussian_filter1d(loop, 1.0, axis=0, mode="wrap") if len(loop) > 8 else loop
+    tangent = np.roll(smooth, -1, axis=0) - np.roll(smooth, 1, axis=0)
+    length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    normal = np.column_stack([tangent[:, 1], -tangent[:, 0]]) / length
+    area = float(cv2.contourArea(longest.astype(np.float32), oriented=True))
+    smooth = smooth + 0.5 * normal * (1.0 if area > 0 else -1.0)
+    smooth = smooth[_even(smooth, count)]
+    height, width = full.shape
+    x, y = smooth[:, 0], smooth[:, 1]
+    inner = (x > BORDER) & (y > BORDER) & (x < width - BORDER) & (y < height - BORDER)
+    weights = inner.astype(np.float64)
+    hidden = full & ~seen if seen is not None else np.zeros_like(full)
+    if hidden.any():
+        reach = ndimage.binary_dilation(hidden, iterations=2)
+        rows, columns = np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)
+        weights *= np.where(reach[rows, columns], GUESSED, 1.0)
+    return Outline(points=smooth, weights=weights, size=float(np.sqrt(full.sum())))
+
+
+def _even(loop: Points, count: int) -> NDArray[np.int64]:
+    """Indices of about ``count`` points of the closed ``loop`` (n, 2), evenly by length."""
+    steps = np.linalg.norm(np.diff(loop, axis=0, append=loop[:1]), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
+    wanted = np.linspace(0.0, along[-1], min(count, len(loop)))
+    return np.unique(np.searchsorted(along, wanted).clip(0, len(loop) - 1))
+
+
+def hull_polygon(pixels: Points) -> Points:
+    """Return the convex hull (m, 2) of ``pixels`` (n, 2)."""
+    index = cv2.convexHull(pixels.astype(np.float32), returnPoints=False)[:, 0]
+    return pixels[index]
+
+
+def distance_to_convex(points: Points, polygon: Points) -> NDArray[np.float64]:
+    """Return the signed distance (n,) of ``points`` (n, 2) to a convex ``polygon`` (m, 2), positive inside."""
+    start = polygon
+    edge = np.roll(polygon, -1, axis=0) - start
+    squared = np.maximum((edge**2).sum(axis=1), 1e-12)
+    offset = points[:, None, :] - start[None]
+    along = np.clip((offset * edge).sum(axis=-1) / squared, 0.0, 1.0)
+    distance = np.linalg.norm(offset - along[..., None] * edge, axis=-1).min(axis=1)
+    cross = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
+    inside = (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
+    return np.where(inside, distance, -distance)
+
 
 CIRCLE = 48
-"""Points on a circle whose hull stands for it; the area misses 0.3 %."""
+"""Points on a circle whose hull approximates it; the area is 0.3 % too small."""
 FINER = 4
 SUNK = 0.01
-"""How far a ball is sunk into the ground, over its radius: it rests on a small disc instead of on a point."""
+"""Depth by which a sphere is sunk into the ground, over its radius: it rests on a small disc instead of a point."""
 
 
 class Primitive(Protocol):
-    """A body with few numbers. ``name`` is its shape's name."""
+    """A parametric body. ``name`` is its shape's name."""
 
     @property
     def name(self) -> str:
@@ -37,7 +115,7 @@ class Primitive(Protocol):
 
     @property
     def height(self) -> float:
-        """Of its top above the ground."""
+        """Height of its top above the ground."""
 
     @property
     def centre(self) -> Points:
@@ -48,21 +126,23 @@ class Primitive(Protocol):
         """Its smallest extent."""
 
     def pieces(self, camera: Camera) -> list[Points]:
-        """Points (n, 3) of convex pieces: the union of the pieces' hulls, projected, is the outline."""
+        """Return points (n, 3) of convex pieces: the union of the pieces' projected hulls is the outline."""
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Distance (n,) from the surface at ``points`` (n, 3), positive inside; edges rounded by ``rounding``."""
+        """Return the distance (n,) from the surface at ``points`` (n, 3), positive inside; edges rounded by
+        ``rounding``."""
 
 
 def soft_min(first: Points, second: Points, width: float) -> Points:
-    """A smooth minimum that never exceeds either and is the smaller one where they differ by ``width`` or more."""
+    """Return a smooth minimum that never exceeds either and is the smaller one where they differ by ``width`` or
+    more."""
     blend = np.clip(1.0 - np.abs(first - second) / max(width, 1e-12), 0.0, 1.0)
     return np.minimum(first, second) - blend**2 * width / 4.0
 
 
 @dataclass(frozen=True)
 class Box:
-    """Upright; x, y: middle of its base; yaw: radians about Z of its width's direction; width, depth, height."""
+    """An upright box. x, y: centre of its base; yaw: radians about Z of its width's direction; width, depth, height."""
 
     x: float
     y: float
@@ -89,7 +169,7 @@ class Box:
         return np.array([cosine, sine]), np.array([-sine, cosine])
 
     def corners(self) -> Points:
-        """(8, 3): index bits 1, 2, 4 are the far end of width, depth and height."""
+        """Return the corners (8, 3): index bits 1, 2, 4 are the far end of width, depth and height."""
         across, along = self.axes
         bits = np.arange(8)
         u = ((bits & 1) - 0.5) * self.width
@@ -113,7 +193,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball; x, y: where it touches the ground; squash: height over width, 0.8 of a mandarin."""
+    """A sphere. x, y: contact point; squash: height over width, 0.8 for a mandarin."""
 
     x: float
     y: float
@@ -142,8 +222,8 @@ class Sphere:
         return self.radius * np.array([1.0, 1.0, self.squash])
 
     def pieces(self, camera: Camera) -> list[Points]:
-        """The ellipse in which the cone of sight touches it."""
-        # In units of its semi-axes it is a ball of radius 1, and lines stay lines.
+        """Return the ellipse in which the cone of sight touches it."""
+        # In units of its semi-axes it is a unit sphere, and lines stay lines.
         towards = (self.centre - camera.position) / self.axes
         distance = float(np.linalg.norm(towards))
         axis = towards / distance
@@ -164,8 +244,8 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Revolved:
-    """A body of revolution about the vertical through x, y: a cylinder has two equal radii.
+class SurfaceOfRevolution:
+    """A surface of revolution about the vertical through x, y: a cylinder has two equal radii.
 
     heights: rising from 0; radii: at these, linear between; at least two, all above zero but the last.
     """
@@ -194,7 +274,7 @@ class Revolved:
     def circle(self, height: float, radius: float) -> Points:
         """Points (CIRCLE, 3) around the axis."""
         turn = 2.0 * np.pi * np.arange(CIRCLE) / CIRCLE
-        # A polygon with the circle's area stands for it better than the inscribed one.
+        # A polygon with the circle's area approximates it better than the inscribed one.
         wide = radius * np.sqrt(2.0 * np.pi / CIRCLE / np.sin(2.0 * np.pi / CIRCLE))
         return np.column_stack([self.x + wide * np.cos(turn), self.y + wide * np.sin(turn), np.full(CIRCLE, height)])
 
@@ -216,9 +296,10 @@ class Revolved:
         return soft_min((radius - rho) / np.sqrt(1.0 + slope**2), self.height - z, rounding)
 
 
-def drawn(primitive: Primitive, camera: Camera, shape: tuple[int, int], left: float, top: float) -> Mask:
-    """The primitive's outline as a mask of ``shape`` (h, w) whose first pixel is at ``left``, ``top`` in the photo."""
-    # OpenCV also fills the pixels that the border touches: drawn finer, that is an eighth of a pixel.
+def rasterize(primitive: Primitive, camera: Camera, shape: tuple[int, int], left: float, top: float) -> Mask:
+    """Return the primitive's silhouette as a mask of ``shape`` (h, w) whose first pixel is at ``left``, ``top`` in the
+    photo."""
+    # OpenCV also fills border pixels: at a finer scale that is an eighth of a pixel.
     image = np.zeros((shape[0] * FINER, shape[1] * FINER), np.uint8)
     for polygon in polygons(primitive, camera):
         corners = np.round(((polygon - [left, top]) * FINER - 0.5) * 16).clip(-(2**30), 2**30).astype(np.int32)
@@ -227,7 +308,8 @@ def drawn(primitive: Primitive, camera: Camera, shape: tuple[int, int], left: fl
 
 
 def polygons(primitive: Primitive, camera: Camera) -> Sequence[Points]:
-    """Convex polygons (m, 2) in photo pixels whose union is the primitive's outline; () when it reaches behind us."""
+    """Return convex polygons (m, 2) in photo pixels whose union is the primitive's outline; () if it reaches behind the
+    camera."""
     result = []
     for piece in primitive.pieces(camera):
         projected = camera.project(piece)

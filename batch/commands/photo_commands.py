@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``correct``, ``import``, ``light``, ``render``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ...physgen_addon.render.render_options import require_video_name
+from ...sim.app.import_folder import import_folder
+from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
+from ...sim.app.set_light import set_light
+from ...sim.cache.bake_folder import load_bake
+from ...sim.events import IsCancelled
+from ...sim.importers.splat_scene import DEFAULT_UP_AXIS, SPLAT_UP_AXES
+from ...sim.reconstruct.reconstruct_pipeline import object_names
+from ...sim.scene.folder import load_scene
+from ...sim.scene.overrides import check_overrides
+from ...sim.validation import to_json
+from .. import stages
+from ..terminal import Terminal
+from .flags import (
+    add_bake_flags,
+    add_environment_flags,
+    add_object_flags,
+    add_physics_flags,
+    add_reasoning_flags,
+    add_reconstruction_flags,
+    add_sun_flags,
+    bake_options,
+    chat_request,
+    corrected_requests,
+    light_request,
+    object_requests,
+    physics_options,
+    reconstruct_options,
+)
+from .render_commands import add_render_flags, render_options
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen run``."""
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_object_flags(parser)
+    add_reconstruction_flags(parser)
+    add_reasoning_flags(parser)
+    add_physics_flags(parser)
+    add_bake_flags(parser)
+    add_render_flags(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="VIDEO.mp4", help="the video")
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="folder for scene, bake and frames (default: beside the video)"
+    )
+
+
+def add_reconstruct(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen reconstruct``."""
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_object_flags(parser)
+    add_reconstruction_flags(parser)
+    add_reasoning_flags(parser)
+    add_physics_flags(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+
+
+def add_correct(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen correct``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder reconstructed from a photo")
+    add_object_flags(parser, boxes=False)
+    add_reconstruction_flags(parser)
+
+
+def add_import(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen import``."""
+    what = "PhysGen3D or PhysGen folder (docs/reconstruction.md), or PLY file of splats (docs/splats.md)"
+    parser.add_argument("folder", type=Path, metavar="SOURCE", help=what)
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+    scale = "largest extent of the first object; sets the scene's scale (default: that of its simulation, else 0.15)"
+    parser.add_argument("--size", type=float, metavar="METRES", help=scale)
+    up = f"up axis of a splat file, or its down axis (default: {DEFAULT_UP_AXIS})"
+    parser.add_argument("--up", choices=SPLAT_UP_AXES, help=up)
+    settings = "PhysGen3D's simulation settings, with velocities and friction (default: searched for)"
+    parser.add_argument("--settings", type=Path, metavar="FILE.yaml", help=settings)
+
+
+def add_light(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen light``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    add_environment_flags(parser)
+    add_sun_flags(parser)
+
+
+def add_render(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen render``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("--bake", type=Path, required=True, metavar="BAKE", help="bake folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the frames")
+    parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all baked frames)")
+    parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode a video: .mp4 or .webm")
+    add_render_flags(parser)
+
+
+def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen run``; the exit code."""
+    require_video_name(options.out)
+    work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
+    request = stages.RunRequest(
+        photo=options.photo,
+        objects=object_requests(options, work / "scene"),
+        video=options.out,
+        work=work,
+        physics=physics_options(options),
+        reconstruct=reconstruct_options(options),
+        ask=chat_request(options),
+        bake=bake_options(options),
+        render=render_options(options),
+    )
+    stages.photo_to_video(request, terminal, cancelled)
+    terminal(
+        {"event": "done", "video": str(request.video), "scene": str(request.work / "scene"), "work": str(request.work)}
+    )
+    terminal.line(f"video: {request.video}\nscene: {request.work / 'scene'}")
+    return 0
+
+
+def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen reconstruct``; the exit code."""
+    settings, ask = reconstruct_options(options), chat_request(options)
+    requests = object_requests(options, options.out)
+    physics = physics_options(options)
+    require_physics(len(requests), physics)
+    check_overrides(object_names(requests), physics.overrides)
+    reconstruct(
+        options.photo,
+        requests,
+        out=options.out,
+        options=settings,
+        physics=physics,
+        ask=ask,
+        on_event=terminal,
+        cancelled=cancelled,
+    )
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen correct``; the exit code."""
+    stamp = require_stamp(options.scene)
+    requests, settings = corrected_requests(options, stamp.objects), reconstruct_options(options, stamp.options)
+    correct(load_scene(options.scene), objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
+    terminal({"event": "done", "scene": str(options.scene)})
+    terminal.line(f"scene: {options.scene}")
+    return 0
+
+
+def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen import``; the exit code."""
+    import_folder(
+        options.folder,
+        options.out,
+        size_m=options.size,
+        settings=options.settings,
+        up=options.up,
+        on_event=terminal,
+        cancelled=cancelled,
+    )
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0
+
+
+def run_light(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen light``; the exit code."""
+    light = set_light(load_scene(options.scene), request=light_request(options), on_event=terminal).model.light
+    terminal({"event": "done", "scene": str(options.scene), "light": to_json(light)})
+    terminal.line(f"scene: {options.scene}")
+    return 0
+
+
+def run_render(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen render``; the exit code."""
+    done = stages.run_render(
+        load_scene(options.scene),
+        load_bake(options.bake),
+        options.out,
+        render_options(options),
+        frames=options.frames,
+        video=options.video,
+        on_event=terminal,
+        cancelled=cancelled,
+    )
+    terminal(done)
+    terminal.line(f"frames: {options.out}" + (f"\nvideo: {options.video}" if options.video else ""))
+    return 0

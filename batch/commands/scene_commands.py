@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The verbs of a scene folder: ``variant``, ``bake``, ``estimate``, ``free`` and ``preview``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ...sim.app import preview_server
+from ...sim.app.bake_estimate import bake_cost
+from ...sim.app.reconstruct import set_physics, with_physics
+from ...sim.app.scene_variant import make_variant
+from ...sim.app.world_setup import cost_text
+from ...sim.cache.bake_folder import free_bake
+from ...sim.events import IsCancelled
+from ...sim.scene.folder import Scene, load_scene
+from .. import stages
+from ..terminal import Terminal
+from .flags import add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options
+
+
+def add_bake(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen bake``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("--out", type=Path, metavar="BAKE", help="bake folder to write; an unfinished one is resumed")
+    parser.add_argument("--estimate", action="store_true", help="only estimate the cost, as physgen estimate does")
+    parser.set_defaults(wrong_usage=parser.error)
+    add_physics_flags(parser)
+    add_bake_flags(parser)
+    add_sample_flags(parser)
+
+
+def add_estimate(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen estimate``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    add_physics_flags(parser)
+    add_bake_flags(parser)
+    add_sample_flags(parser)
+
+
+def add_free(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen free``."""
+    parser.add_argument("bake", type=Path, metavar="BAKE", help="bake folder to delete")
+
+
+def add_preview(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen preview``."""
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the runs; each gets a subfolder"
+    )
+
+
+def run_bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen bake``; the exit code."""
+    if options.estimate:
+        return run_estimate(options, terminal, cancelled)
+    if options.out is None:
+        options.wrong_usage("the following arguments are required: --out (or --estimate)")
+    folder = set_physics(load_scene(options.scene), physics_options(options))
+    done = stages.run_bake(folder, options.out, bake_options(options), terminal, cancelled)
+    terminal(done)
+    terminal.line(f"bake: {options.out}")
+    return 0
+
+
+def run_estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen estimate``; the exit code."""
+    folder = load_scene(options.scene)
+    scene = with_physics(folder.model, physics_options(options))
+    cost = bake_cost(Scene(root=folder.root, model=scene), bake_options(options))
+    for warning in cost.prepared.warnings:
+        terminal({"event": "notice", "stage": "estimate", "message": warning})
+    terminal({"event": "done", "stage": "estimate", **cost.to_json()})
+    terminal.line(f"{cost_text(cost.prepared)}; {cost.disk_bytes / 2**20:.0f} MiB on disk")
+    cost.prepared.require_affordable()
+    return 0
+
+
+def run_free(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen free``; the exit code."""
+    freed = free_bake(options.bake)
+    terminal({"event": "done", "stage": "free", "bytes": freed})
+    terminal.line(f"{freed / 2**20:.1f} MiB freed: {options.bake}")
+    return 0
+
+
+def run_preview(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen preview``; the exit code."""
+    return preview_server.serve(options.out, cancelled)
+
+
+def add_variant(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen variant``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE2", help="the new scene folder")
+    add_physics_flags(parser)
+    effects = "all effects of the new scene, as JSON in the form of scene.json (default: those of the scene)"
+    parser.add_argument("--effects-json", metavar="JSON", help=effects)
+
+
+def run_variant(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen variant``; the exit code."""
+    make_variant(
+        load_scene(options.scene), out=options.out, physics=physics_options(options), effects=options.effects_json
+    )
+    terminal({"event": "done", "scene": str(options.out)})
+    terminal.line(f"scene: {options.out}")
+    return 0

@@ -1,0 +1,488 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run one task on this machine: its log, its record by content hashes, its process.
+
+The same on a laptop, on a Dask worker and in a SLURM array.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import shlex
+import signal
+import socket
+import stat
+import subprocess
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from queue import Empty, Queue
+from types import TracebackType
+
+from ...sim.app.bake_options import file_hash
+from ...sim.app.stage_process import (
+    CANCEL_GRACE_S,
+    MOST_LINE_BYTES,
+    ask_to_stop,
+    own_command,
+    parse_event,
+    start_process,
+)
+from ...sim.atomic import write_json
+from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
+from ...sim.cache.folder_lock import LOCK_FILE, is_locked
+from ...sim.errors import Cancelled, InputError, PhysGenError
+from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ...sim.scene.folder import inside
+from ...sim.validation import parse, read_json, to_json
+from ...sim.version import VERSION
+from .planning.plan import Outcome, Task
+
+HEAD_BYTES = 256 * 1024
+TAIL_BYTES = 256 * 1024
+EARLIER_BYTES = 64 * 1024
+"""Of earlier attempts, kept at the beginning."""
+
+
+class TaskLog:
+    """The log of one attempt: its beginning is written at once, its end on close.
+
+    Raises InputError when it cannot be created; later write errors are ignored, so that a full disk does not stop a
+    task that needs no more space.
+    """
+
+    def __init__(self, path: Path, title: str) -> None:
+        self.path = path
+        self._left = HEAD_BYTES
+        self._tail: deque[bytes] = deque()
+        self._tail_bytes = self._dropped = 0
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            earlier = path.read_bytes()[-EARLIER_BYTES:] if path.is_file() else b""
+            self._file = path.open("wb", buffering=0)
+            self._file.write(earlier + f"==== {title}\n".encode())
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror or error}); free space or choose another folder"
+            ) from error
+
+    def write(self, line: bytes) -> None:
+        """Add one line."""
+        line = line.rstrip(b"\r\n") + b"\n"
+        if len(line) <= self._left:
+            self._left -= len(line)
+            self._put(line)
+            return
+        self._left = 0
+        self._tail.append(line)
+        self._tail_bytes += len(line)
+        while self._tail_bytes > TAIL_BYTES:
+            self._tail_bytes -= len(self._tail.popleft())
+            self._dropped += 1
+
+    def close(self) -> None:
+        """Write the end and close the file."""
+        if self._dropped:
+            self._put(f"… {self._dropped} lines omitted …\n".encode())
+        self._put(b"".join(self._tail))
+        self._file.close()
+
+    def _put(self, content: bytes) -> None:
+        try:
+            self._file.write(content)
+        except OSError:
+            self._left = 0
+
+    def __enter__(self) -> TaskLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def log_end(path: Path, most: int = 4096) -> str:
+    """Return the last ``most`` bytes of a log, from the start of a line; empty if there is none."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(max(0, size - most))
+            content = file.read()
+    except OSError:
+        return ""
+    if size > most:
+        content = content.partition(b"\n")[2]
+    return content.decode("utf-8", "replace")
+
+
+RECORD_FORMAT = "physgen-task/1"
+SETTLED_S = 2.0
+"""A more recently changed file may change again within the file system's clock tick: it is always hashed."""
+
+_Hashes = dict[Path, tuple[tuple[int, int, int], str]]
+_known: _Hashes = {}
+"""Cached hashes with size, modification time and inode: chunks share scene and bake."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """Record of a finished task.
+
+    argv: as run. version: of the program. inputs, produced: (name relative to the root, SHA-256) of files.
+    seconds, cpu_seconds, worker: as in ``Outcome``.
+    """
+
+    task: str
+    version: str
+    argv: tuple[str, ...]
+    inputs: tuple[tuple[str, str], ...]
+    produced: tuple[tuple[str, str], ...]
+    seconds: float
+    cpu_seconds: float
+    worker: str
+
+
+def record_path(task: Task, root: Path) -> Path:
+    """Return the path of the record of ``task``. Raises InputError for an id that leads out of its folder."""
+    return inside(root, f"{task.farm_folder}/records/{task.id}.json")
+
+
+def log_path(task: Task, root: Path) -> Path:
+    """Return the path of the log of ``task``. Raises InputError for an id that leads out of its folder."""
+    return inside(root, f"{task.farm_folder}/logs/{task.id}.log")
+
+
+def load_record(task: Task, root: Path) -> Record | None:
+    """Return the record of ``task``; None if there is no readable one."""
+    try:
+        data = read_json(record_path(task, root))
+        if not isinstance(data, dict) or data.pop("format", None) != RECORD_FORMAT:
+            return None
+        return parse(Record, data, "record")
+    except InputError:
+        return None
+
+
+def save_record(task: Task, root: Path, record: Record) -> None:
+    """Write the record of ``task``, atomically. Raises InputError when it cannot be written."""
+    write_json(record_path(task, root), {"format": RECORD_FORMAT, **to_json(record)})
+
+
+def input_hashes(task: Task, root: Path) -> tuple[tuple[str, str], ...]:
+    """Return (name, SHA-256) of all input files of ``task``, including those in folders, sorted.
+
+    Names that begin with a dot (locks, records, partial files) are skipped. Raises InputError for missing files.
+    """
+    found: dict[str, str] = {}
+    for name in task.inputs:
+        path = inside(root, name)
+        if path.is_dir():
+            for folder, folders, files in os.walk(path):
+                folders[:] = [f for f in folders if not f.startswith(".")]
+                for file in (Path(folder, f) for f in files if not f.startswith(".")):
+                    found[file.relative_to(root).as_posix()] = content_hash(file)
+        else:
+            found[name] = content_hash(path)
+    return tuple(sorted(found.items()))
+
+
+def produced_hashes(task: Task, root: Path) -> tuple[tuple[str, str], ...]:
+    """Return (name, SHA-256) of the output files of ``task``, sorted. Raises InputError for missing files.
+
+    For a bake these include all caches in its manifest: which objects have particles is known only afterwards.
+    """
+    names = set(task.produces)
+    for manifest in (PurePosixPath(name) for name in task.produces if task.stage == "bake"):
+        if manifest.name == MANIFEST_FILE:
+            caches = load_manifest(inside(root, str(manifest)).parent).files
+            names |= {str(manifest.parent / cache) for cache in caches}
+    return tuple((name, content_hash(inside(root, name))) for name in sorted(names))
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, cached by this process while the file is unchanged."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    if not stat.S_ISREG(state.st_mode):
+        raise InputError(f"{path}: is not a regular file; move it away")
+    seen = (state.st_size, state.st_mtime_ns, state.st_ino)
+    known = _known.get(path)
+    if known is not None and known[0] == seen:
+        return known[1]
+    result = file_hash(path)
+    if time.time() - state.st_mtime > SETTLED_S:
+        _known[path] = (seen, result)
+    return result
+
+
+def up_to_date_record(task: Task, root: Path, version: str) -> Record | None:
+    """Return the record of ``task`` if arguments, inputs and outputs are unchanged since; else None."""
+    record = load_record(task, root)
+    if record is None or (record.task, record.version, record.argv) != (task.id, version, task.argv):
+        return None
+    try:
+        same = record.produced == produced_hashes(task, root) and record.inputs == input_hashes(task, root)
+    except InputError:
+        return None
+    return record if same else None
+
+
+STOP_GRACE_S = CANCEL_GRACE_S + 5.0
+"""Longer than the command itself waits for its child processes."""
+
+FOLDER_WAIT_S = 300.0
+"""Time to wait for a folder still held by a process of a killed attempt, which ends after its frame."""
+
+DRAIN_S = 2.0
+"""Time to wait for the remaining output of an ended command."""
+
+LOOK_S = 0.1
+
+
+@dataclass(kw_only=True)
+class _Ended:
+    """How a command ended. code: negative for a signal. final: its ``done`` or ``error`` event. words: last line.
+
+    cancelled: whether it was asked to stop.
+    """
+
+    code: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    final: Event | None = None
+    words: str = ""
+    cancelled: bool = False
+
+
+def execute_task(
+    task: Task,
+    root: Path,
+    *,
+    version: str,
+    worker: str,
+    cancelled: IsCancelled = never,
+    on_event: OnEvent = ignore,
+    threads: int = 0,
+) -> Outcome:
+    """Run ``task`` in the folder ``root``, unless its record shows that its files are up to date; return the outcome.
+
+    version: of the program that planned it; any other refuses. worker: readable name of this machine. on_event:
+    receives the command's progress and notices with the task's id as ``task``. threads: CPU threads of a render, 0 for
+    all; not part of ``argv``, because the result does not depend on it.
+
+    Failures are in the outcome, with ``attempts`` 1, or 0 if nothing was started; nothing is raised.
+    """
+    outcome = Outcome(task=task.id, state="failed", exit_code=InputError.exit_code, worker=worker)
+    if version != VERSION:
+        message = (
+            f"{worker} has PhysGen {VERSION}, the job was planned by {version}; install the same version on all "
+            "machines"
+        )
+        return dataclasses.replace(outcome, message=message)
+    try:
+        record = up_to_date_record(task, root, version)
+        if record is not None:
+            return Outcome(
+                task=task.id, state="kept", seconds=record.seconds, cpu_seconds=record.cpu_seconds, worker=record.worker
+            )
+        inputs = input_hashes(task, root)
+        _await_folders(task, root, cancelled, on_event)
+        ended = _run_command(task, root, cancelled, on_event, threads)
+        outcome = dataclasses.replace(
+            outcome,
+            exit_code=ended.code,
+            attempts=1,
+            seconds=ended.seconds,
+            cpu_seconds=ended.cpu_seconds,
+        )
+        if ended.cancelled and ended.code != 0:
+            return dataclasses.replace(outcome, state="cancelled", exit_code=Cancelled.exit_code, message="cancelled")
+        if ended.code != 0:
+            return dataclasses.replace(outcome, message=_message(ended))
+        return _finish(task, root, inputs, outcome)
+    except PhysGenError as error:
+        state = "cancelled" if isinstance(error, Cancelled) else "failed"
+        return dataclasses.replace(outcome, state=state, exit_code=error.exit_code, message=str(error))
+
+
+def _finish(task: Task, root: Path, inputs: tuple[tuple[str, str], ...], outcome: Outcome) -> Outcome:
+    """Check the files of a finished command and write its record."""
+    missing = [name for name in task.produces if not inside(root, name).is_file()]
+    if missing:
+        message = f"the command succeeded but did not write {missing[0]}; see its log"
+        return dataclasses.replace(outcome, exit_code=1, message=message)
+    record = Record(
+        task=task.id,
+        version=VERSION,
+        argv=task.argv,
+        inputs=inputs,
+        produced=produced_hashes(task, root),
+        seconds=outcome.seconds,
+        cpu_seconds=outcome.cpu_seconds,
+        worker=outcome.worker,
+    )
+    save_record(task, root, record)
+    return dataclasses.replace(outcome, state="done")
+
+
+def _message(ended: _Ended) -> str:
+    if ended.final is not None and ended.final["event"] == "error":
+        return str(ended.final.get("message"))
+    if ended.code < 0:
+        try:
+            name = signal.Signals(-ended.code).name
+        except ValueError:
+            name = f"signal {-ended.code}"
+        return f"the command was ended by {name}" + (f": {ended.words}" if ended.words else "")
+    return f"the command ended with code {ended.code}: {ended.words or 'no output'}"
+
+
+def _await_folders(task: Task, root: Path, cancelled: IsCancelled, on_event: OnEvent) -> None:
+    """Wait while a process of an earlier attempt, whose parent was killed, still writes into the same folders.
+
+    After ``FOLDER_WAIT_S`` the command is started anyway, and itself reports who holds the folder.
+    """
+    folders = {inside(root, name).parent for name in task.produces}
+    deadline = time.monotonic() + FOLDER_WAIT_S
+    said = False
+    while any(_is_held(folder) for folder in folders) and time.monotonic() < deadline:
+        if not said:
+            on_event({"event": "notice", "task": task.id, "stage": task.stage, "message": "waiting for another run"})
+            said = True
+        if cancelled():
+            raise Cancelled("cancelled while waiting for another run's folder")
+        time.sleep(LOOK_S)
+
+
+def _is_held(folder: Path) -> bool:
+    """Return whether a living process of this machine, or any of another machine, holds ``folder``."""
+    try:
+        owner = json.loads((folder / LOCK_FILE).read_bytes())
+        return is_locked(folder) or str(owner["host"]) != socket.gethostname()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError):
+        return False
+
+
+def _run_command(task: Task, root: Path, cancelled: IsCancelled, on_event: OnEvent, threads: int) -> _Ended:
+    """Run the command of ``task`` to its end; return how it ended."""
+    argv = [*task.argv]
+    if threads > 0 and task.stage == "render":
+        argv += ["--threads", str(threads)]
+    with TaskLog(log_path(task, root), f"physgen {shlex.join(argv)}") as log:
+        started = time.monotonic()
+        process = start_process(own_command("batch.cli", *argv, "--json", folder=root, ends_with_us=True))
+        # Bounded, so that a command with endless output blocks.
+        lines: Queue[bytes | None] = Queue(maxsize=256)
+        readers = [threading.Thread(target=_read, args=(process, error, lines), daemon=True) for error in (False, True)]
+        for reader in readers:
+            reader.start()
+        ended = _Ended()
+        try:
+            _attend(process, lines, ended, log, cancelled, lambda event: on_event({**event, "task": task.id}))
+        finally:
+            _reap(process, ended, kill=True)
+            ended.seconds = time.monotonic() - started
+            _release(lines, readers)
+        log.write(f"==== ended with code {ended.code}, {ended.cpu_seconds:.1f} CPU seconds".encode())
+    return ended
+
+
+def _attend(
+    process: subprocess.Popen[bytes],
+    lines: Queue[bytes | None],
+    ended: _Ended,
+    log: TaskLog,
+    cancelled: IsCancelled,
+    on_event: OnEvent,
+) -> None:
+    """Relay the output of ``process`` until it has ended, or must be killed."""
+    asked_at: float | None = None
+    gone_at: float | None = None
+    open_pipes = 2
+    while True:
+        now = time.monotonic()
+        if asked_at is None and cancelled():
+            asked_at, ended.cancelled = now, True
+            ask_to_stop(process)
+        if asked_at is not None and now - asked_at > STOP_GRACE_S:
+            return
+        try:
+            line = lines.get(timeout=LOOK_S)
+        except Empty:
+            # A process that outlives the command may keep its pipes open.
+            _reap(process, ended, kill=False)
+            if process.returncode is not None:
+                gone_at = gone_at or now
+                if open_pipes == 0 or now - gone_at > DRAIN_S:
+                    return
+            continue
+        if line is not None:
+            _hear(line, ended, log, on_event)
+            continue
+        open_pipes -= 1
+        if open_pipes == 0 and _reaped_soon(process, ended):
+            return
+
+
+def _reaped_soon(process: subprocess.Popen[bytes], ended: _Ended) -> bool:
+    """Return whether ``process``, whose pipes are closed, ends now, as it does unless it closed them itself."""
+    deadline = time.monotonic() + LOOK_S
+    while process.returncode is None and time.monotonic() < deadline:
+        _reap(process, ended, kill=False)
+        time.sleep(0.001)
+    return process.returncode is not None
+
+
+def _hear(line: bytes, ended: _Ended, log: TaskLog, on_event: OnEvent) -> None:
+    event = parse_event(line)
+    if event is None:
+        log.write(line)
+        ended.words = line.decode("utf-8", "replace").strip() or ended.words
+    elif event["event"] in ("done", "error"):
+        ended.final = event
+        log.write(line)
+    else:
+        if event["event"] != "progress":
+            log.write(line)
+        on_event(event)
+
+
+def _read(process: subprocess.Popen[bytes], error: bool, lines: Queue[bytes | None]) -> None:
+    stream = process.stderr if error else process.stdout
+    assert stream is not None
+    while line := stream.readline(MOST_LINE_BYTES):
+        lines.put(line)
+    lines.put(None)
+
+
+def _release(lines: Queue[bytes | None], readers: list[threading.Thread]) -> None:
+    """Drain the queue of an ended process, so that its reader threads end as well."""
+    deadline = time.monotonic() + DRAIN_S
+    while any(reader.is_alive() for reader in readers) and time.monotonic() < deadline:
+        with contextlib.suppress(Empty):
+            lines.get(timeout=0.01)
+
+
+def _reap(process: subprocess.Popen[bytes], ended: _Ended, *, kill: bool) -> None:
+    """Collect the exit code of ``process``, and the CPU time of it and of its waited-for children."""
+    if process.returncode is not None:
+        return
+    if kill:
+        process.kill()
+    if not hasattr(os, "wait4"):  # no CPU time on Windows
+        code = process.wait() if kill else process.poll()
+        ended.code = 0 if code is None else code
+        return
+    pid, status, usage = os.wait4(process.pid, 0 if kill else os.WNOHANG)
+    if pid == 0:
+        return
+    # Popen would wait for it itself.
+    process.returncode = ended.code = os.waitstatus_to_exitcode(status)
+    ended.cpu_seconds = usage.ru_utime + usage.ru_stime

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bake and render as processes of their own, and all stages from photo to video: ``physgen run`` and ``make demo``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..physgen_addon.frames.frame_index import frame_name, parse_frame_range
+from ..physgen_addon.render.render_options import RenderOptions, render_arguments, require_video_name
+from ..sim.app import bake_worker
+from ..sim.app.bake_options import BakeOptions, inputs_hash
+from ..sim.app.bake_quality import load_quality
+from ..sim.app.reconstruct import Physics, reconstruct, require_physics
+from ..sim.app.stage_process import own_command, run_stage
+from ..sim.cache.bake_folder import Bake, load_bake
+from ..sim.errors import RenderError, SimulationError
+from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ..sim.reconstruct import ObjectRequest, ReconstructOptions
+from ..sim.reconstruct.reasoning.chat_client import ChatRequest
+from ..sim.reconstruct.reconstruct_pipeline import object_names
+from ..sim.scene.folder import Scene, require_photo
+from ..sim.scene.overrides import check_overrides
+
+
+def run_bake(folder: Scene, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+    """Bake the scene, as loaded, in a worker process of ``physgen.bake``; return its ``done`` event.
+
+    Raises as ``sim.app.bake.bake``, and InputError when the scene on disk has changed since.
+    """
+    load_quality(options.quality)
+    job = bake_worker.BakeJob(
+        scene=str(folder.root.resolve()),
+        out=str(out.resolve()),
+        options=options,
+        expected_inputs=inputs_hash(folder, options),
+    )
+    with tempfile.TemporaryDirectory(prefix="physgen-") as temporary:
+        path = Path(temporary) / "job.json"
+        path.write_text(json.dumps(bake_worker.job_to_json(job)), encoding="utf-8")
+        return run_stage(own_command("sim.app.bake_worker", str(path)), on_event, cancelled, failure=SimulationError)
+
+
+def render(
+    scene: Scene,
+    bake: Bake,
+    *,
+    out: str | Path,
+    options: RenderOptions | None = None,
+    frames: str | None = None,
+    video: str | Path | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> tuple[Path, ...]:
+    """Return the frames of ``bake`` rendered into the scene's photo, as image files in the folder ``out``, in order.
+
+    Blender runs in a process of its own. Frames that exist and whose inputs have not changed are not rendered again.
+    frames: a range such as ``1-48``, ``1,5,9`` or ``1-48x2``; None for all baked. video: also encode .mp4 or .webm.
+
+    >>> import physgen
+    >>> scene, baked = physgen.load_scene("scene"), physgen.load_bake("bake")  # doctest: +SKIP
+    >>> options = physgen.RenderOptions(samples=32)
+    >>> frames = physgen.render(scene, baked, out="frames", options=options, video="video.mp4")  # doctest: +SKIP
+
+    Raises InputError for a scene without a photo and for unusable options, before Blender starts; RenderError when
+    Blender fails; Cancelled when cancelled: complete frames are kept then.
+    """
+    options, out = options or RenderOptions(), Path(out)
+    run_render(scene, bake, out, options, frames=frames, video=video, on_event=on_event, cancelled=cancelled)
+    numbers = parse_frame_range(frames, bake.first_frame, bake.last_frame)
+    return tuple(out / frame_name(number, options.frame_format.suffix) for number in numbers)
+
+
+def run_render(
+    scene: Scene,
+    bake: Bake,
+    out: Path,
+    options: RenderOptions,
+    *,
+    frames: str | None = None,
+    video: str | Path | None = None,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> Event:
+    """Return the ``done`` event of ``render``'s process, as ``physgen render --json`` prints it."""
+    if video is not None:
+        require_video_name(Path(video))
+    require_photo(scene)
+    command = own_command("batch.render", str(scene.root.resolve()), "--bake", str(bake.root.resolve()))
+    command += ["--out", str(out.resolve()), "--json", "--parent", str(os.getpid()), *render_arguments(options)]
+    if frames is not None:
+        command += ["--frames", frames]
+    if video is not None:
+        command += ["--video", str(Path(video).resolve())]
+    # Blender occasionally crashes when a video or a process ends; complete frames are kept, so try once more.
+    return run_stage(command, on_event, cancelled, failure=RenderError, restarts=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """A job from photo to ``video``; ``work`` holds ``scene``, ``bake`` and ``frames``.
+
+    physics: per object, in the order of ``objects``; by default ``medium`` and at rest, so that the same request
+    always gives the same video.
+    """
+
+    photo: Path
+    objects: tuple[ObjectRequest, ...]
+    video: Path
+    work: Path
+    physics: Physics = dataclasses.field(default_factory=Physics)
+    reconstruct: ReconstructOptions = dataclasses.field(default_factory=ReconstructOptions)
+    ask: ChatRequest | None = None
+    bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
+    render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
+
+
+def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
+    """Return initial guesses per stage, from the coffee demo on two cores, until measured speeds replace them."""
+    guesses = {"reconstruct": 15.0, "bake": 8.0 + 0.6 * frames, "render": 8.0 + 5.0 * frames}
+    return {stage: guesses[stage] for stage in stages}
+
+
+def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
+    """Run all stages from photo to video; return its path. A stage whose inputs have not changed does nothing.
+
+    Everything is validated before the first stage starts, as far as possible.
+    """
+    require_physics(len(request.objects), request.physics)
+    check_overrides(object_names(request.objects), request.physics.overrides)
+    load_quality(request.bake.quality)
+    require_video_name(request.video)
+    scene = reconstruct(
+        request.photo,
+        request.objects,
+        out=request.work / "scene",
+        options=request.reconstruct,
+        physics=request.physics,
+        ask=request.ask,
+        on_event=on_event,
+        cancelled=cancelled,
+    )
+    run_bake(scene, request.work / "bake", request.bake, on_event, cancelled)
+    render(
+        scene,
+        load_bake(request.work / "bake"),
+        out=request.work / "frames",
+        options=request.render,
+        video=request.video,
+        on_event=on_event,
+        cancelled=cancelled,
+    )
+    return request.video

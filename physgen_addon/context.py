@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blender's context, also without a window: active and selected objects, and editors on screen."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from typing import Any
+
+import bpy
+from mathutils import Vector
+
+
+def active(context: bpy.types.Context) -> Any:
+    """Return the active object, or None."""
+    return context.active_object if hasattr(context, "active_object") else context.view_layer.objects.active
+
+
+def selected(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the selected objects."""
+    found = context.selected_objects if hasattr(context, "selected_objects") else context.view_layer.objects.selected
+    return list(found)
+
+
+def scene_with(uid: int) -> bpy.types.Scene | None:
+    """Return the scene with the given ``session_uid``, which survives undo and renaming; None if it is gone."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+
+
+TAB = "PhysGen"
+"""Category of the sidebar tab."""
+WIDE_PX = 800
+"""Minimum width of an image editor that has room for its sidebar."""
+
+
+def viewports(context: bpy.types.Context) -> list[bpy.types.SpaceView3D]:
+    """Return the 3D viewports of the window."""
+    areas = context.window.screen.areas if context.window is not None else ()
+    return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
+
+
+def redraw(area_type: str, *region_types: str) -> None:
+    """Redraw all editors of the given type in all windows, or only the given ``region_types``."""
+    for manager in bpy.data.window_managers:
+        for window in manager.windows:
+            for area in window.screen.areas:
+                if area.type != area_type:
+                    continue
+                if not region_types:
+                    area.tag_redraw()
+                for region in area.regions:
+                    if region.type in region_types:
+                        region.tag_redraw()
+
+
+def turn_to(context: bpy.types.Context, low: Vector, high: Vector) -> None:
+    """Frame the box between ``low`` and ``high`` in the viewports, with colours that show discrepancies."""
+    reach = (high - low).length
+    for space in viewports(context):
+        space.shading.color_type = "VERTEX"
+        space.shading.show_object_outline = False  # Cavity shading would paint thin trails black.
+        space.clip_start = min(space.clip_start, max(reach, 1e-3) / 1000)
+        if space.region_3d is not None and reach > 0:
+            space.lock_object = None
+            space.region_3d.view_location = (low + high) / 2
+            space.region_3d.view_distance = reach
+
+
+def look_through_camera(context: bpy.types.Context) -> None:
+    """Make the window's viewports look through the scene's camera."""
+    for space in viewports(context):
+        if space.region_3d is not None:
+            space.region_3d.view_perspective = "CAMERA"
+
+
+def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
+    """Make the viewports show ``scene`` through its camera, with plain textures and the whole image in view."""
+    if context.window is None or context.window.scene != scene:
+        return
+    look_through_camera(context)
+    for area in context.window.screen.areas:
+        space = area.spaces.active
+        if area.type != "VIEW_3D" or space.region_3d is None:
+            continue
+        space.use_local_camera = False
+        space.shading.color_type, space.shading.light = "TEXTURE", "FLAT"
+        region = next((region for region in area.regions if region.type == "WINDOW"), None)
+        with context.temp_override(window=context.window, area=area, region=region):
+            if bpy.ops.view3d.view_center_camera.poll():
+                bpy.ops.view3d.view_center_camera()
+
+
+def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
+    """Show ``image`` and the sidebar's ``tab`` in an image editor, or beside the 3D viewport if there is none."""
+    if context.window is None:
+        return
+    areas = context.window.screen.areas
+    area = next((area for area in areas if area.type == "IMAGE_EDITOR"), None) or _beside_viewport(context)
+    if area is None:
+        return
+    area.spaces.active.image = image
+    # In a narrow editor a sidebar would cover the image; the viewport's sidebar has the same panel.
+    if area.width < WIDE_PX * context.preferences.system.ui_scale:
+        area = next((area for area in areas if area.type == "VIEW_3D"), area)
+    area.spaces.active.show_region_ui = True
+    # After the editor has its size and the sidebar its tabs.
+    bpy.app.timers.register(functools.partial(_settle, image.name, tab), first_interval=0.5)
+
+
+def show_result(context: bpy.types.Context, image: bpy.types.Image) -> None:
+    """Show ``image`` in an image editor, or in a new window if none is open.
+
+    No window is opened if the preferences keep renders in the interface (Render In: Keep User Interface).
+    """
+    if bpy.app.background or context.window is None:
+        return
+    screens = [window.screen for window in context.window_manager.windows]
+    areas = [area for screen in screens for area in screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        if context.preferences.view.render_display_type == "NONE":
+            return
+        before = set(context.window_manager.windows)
+        bpy.ops.wm.window_new()
+        areas = [window.screen.areas[0] for window in context.window_manager.windows if window not in before]
+    for area in areas[:1]:
+        area.type = "IMAGE_EDITOR"
+        area.spaces.active.image = image
+
+
+def _settle(name: str, tab: str) -> None:
+    """Fit the image ``name`` in the image editors that show it, and switch open sidebars to ``tab``."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions:
+                if region.type == "UI" and getattr(area.spaces.active, "show_region_ui", False):
+                    # A sidebar without this tab rejects the name.
+                    with contextlib.suppress(TypeError, AttributeError):
+                        region.active_panel_category = tab
+                        area.tag_redraw()
+            shown = area.spaces.active.image if area.type == "IMAGE_EDITOR" else None
+            if shown is not None and shown.name == name:
+                region = next(region for region in area.regions if region.type == "WINDOW")
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    bpy.ops.image.view_all(fit_view=True)
+
+
+def _beside_viewport(context: bpy.types.Context) -> bpy.types.Area | None:
+    """Split an image editor off the left half of the largest 3D viewport; return None without a viewport."""
+    views = [area for area in context.window.screen.areas if area.type == "VIEW_3D"]
+    if not views:
+        return None
+    before = set(context.window.screen.areas)
+    view = max(views, key=lambda area: area.width * area.height)
+    region = next(region for region in view.regions if region.type == "WINDOW")
+    with context.temp_override(window=context.window, area=view, region=region):
+        bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
+    new = next((area for area in context.window.screen.areas if area not in before), None)
+    if new is not None:
+        new.type = "IMAGE_EDITOR"
+    return new

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: bake, pause, estimate, free and relink bakes."""
+
+import contextlib
+from pathlib import Path
+
+import bpy
+
+from ...sim.app.bake_options import BakeOptions, inputs_hash
+from ...sim.app.stage_process import run_stage
+from ...sim.cache.bake_folder import free_bake
+from ...sim.errors import Cancelled, InputError, PhysGenError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.folder import load_scene
+from .. import background_jobs, bake_state, paths
+from .. import bake_state as unsaved
+from ..background_jobs import Job, JobOperator, Work
+from ..compat import OperatorMixin
+from ..interpreter import cli_command, find_python
+from ..playback import bake_record, show_bake
+from ..playback.bake_record import BakeRecord, read_record, write_record
+from ..props.body_props import bodies
+from ..props.preferences import python
+from ..scene_io.export_animation import clock, export_names
+from ..scene_io.export_scene import export_scene
+from ..scene_io.motion_fingerprint import fingerprint
+from ..text import count, duration, report_errors, storage
+
+
+def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
+    """Write the scene as a scene folder to its cache; return it with the simulation options.
+
+    Raises InputError if nothing is simulated, frames or objects are invalid, or the cache is not writable.
+    """
+    settings = scene.physgen.simulation
+    if not bodies(scene):
+        raise InputError("no object takes part in the simulation; select one and turn on In Simulation")
+    if settings.frame_end <= settings.frame_start:
+        raise InputError(
+            f"End is frame {settings.frame_end} and Start {settings.frame_start}; let End come after Start"
+        )
+    if paths.is_unsaved_cache(scene):
+        paths.make_unsaved_root()
+        settings.unsaved = settings.unsaved or paths.unsaved_key()
+    root = paths.scene_cache(scene) / "scene"
+    paths.require_writable(root)
+    export_scene(scene, root)
+    times = clock(scene)
+    options = BakeOptions(
+        frames=len(times.frames),
+        fps=times.fps,
+        quality=settings.quality,
+        arch=settings.device,
+        seed=settings.seed,
+        space="mesh",
+        points=True,
+    )
+    return root, options
+
+
+def option_arguments(options: BakeOptions) -> list[str]:
+    """Return ``options`` as arguments of ``physgen``."""
+    arguments = ["--frames", str(options.frames), "--fps", repr(options.fps), "--quality", options.quality]
+    arguments += ["--arch", options.arch, "--seed", str(options.seed), "--space", options.space]
+    return [*arguments, "--points" if options.points else "--no-points"]
+
+
+class Bake(JobOperator):
+    """A bake of the context's scene: ``begin``, then ``tick`` until it returns a result."""
+
+    bl_idname = bake_state.BAKE_OPERATOR
+    job_title = "Bake"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Export the scene and return the bake job; later edits cannot affect it."""
+        scene = context.scene
+        bake_state.set_trouble(scene, "")
+        root, options = exported(scene)
+        names = export_names(scene)
+        start = scene.physgen.simulation.frame_start
+        for item in bodies(scene):
+            item.physgen.cache = names[item.name]
+        looks = tuple(show_bake.look_of(item, names[item.name], start) for item in bodies(scene))
+        record = BakeRecord(fingerprints=(fingerprint(scene),), frame_start=start, looks=looks)
+        self._shown = 0
+        preferred, before = python(context), background_jobs.stopping()
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            on_event({"event": "detail", "fingerprint": record.fingerprints[0]})
+            background_jobs.wait_for(before, on_event, cancelled)
+            interpreter = find_python(preferred)
+            folder = root.parent / bake_record.BAKES / inputs_hash(load_scene(root), options)[:12]
+            mine = BakeRecord(
+                folder=str(folder),
+                fingerprints=record.fingerprints,
+                frame_start=record.frame_start,
+                looks=record.looks,
+            )
+            write_record(mine)
+            on_event({"event": "detail", "folder": str(folder)})
+            command = cli_command(interpreter, "bake", str(root), "--out", str(folder), *option_arguments(options))
+            measured = False
+
+            def relay(event: Event) -> None:
+                nonlocal measured
+                if not measured and int(event.get("done") or 0) > 0 and event.get("event") == "progress":
+                    measured = True
+                    write_record(bake_record.with_spacings(mine))
+                on_event(event)
+
+            return {**run_stage(command, relay, cancelled), "folder": str(folder)}
+
+        return work
+
+    def begin(self, context: bpy.types.Context) -> Job:
+        """Start as any job; errors are also shown in the panel, because reports vanish."""
+        try:
+            return super().begin(context)
+        except PhysGenError as error:
+            bake_state.set_trouble(context.scene, str(error))
+            raise
+
+    def progressed(self, scene: bpy.types.Scene, job: Job) -> None:
+        """Attach the caches at the first frame; Blender reads appended frames by itself."""
+        bake_state.mark_progress(scene)
+        folder, done = job.details.get("folder"), job.done or 0
+        if folder is None or done < 1 or done == self._shown:
+            return
+        path = Path(folder)
+        # Undo may have detached the caches.
+        if not self._shown or not bake_state.shows(scene, path):
+            record = read_record(path)
+            if record is None or not bake_record.playable(path):
+                return
+            show_bake.show(scene, record)
+        self._refresh_held_frame(scene, done)
+        self._shown = done
+
+    def _refresh_held_frame(self, scene: bpy.types.Scene, done: int) -> None:
+        """Re-evaluate if the current frame lies beyond the last baked one, which has just been appended."""
+        start = scene.physgen.simulation.frame_start
+        if scene.frame_current >= start + self._shown:
+            for item in bodies(scene):
+                item.update_tag(refresh={"DATA"})
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show the whole bake."""
+        folder = Path(str(final["folder"]))
+        record = read_record(folder)
+        if record is None:
+            raise InputError(f"{folder}: the record of the bake is gone; bake again")
+        troubles = show_bake.show(scene, record)
+        last = scene.physgen.simulation.frame_end
+        scene.frame_end = max(scene.frame_end, last)
+        waits = paths.is_unsaved_cache(scene)
+        unsaved.settle(scene)
+        bake_state.observe(scene)
+        sentence = f"frames {record.frame_start} to {last} are baked"
+        if waits:
+            sentence += "; they wait in a temporary folder until you save the file"
+        return ". ".join([sentence, *troubles])
+
+    def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
+        """Keep the available frames playable."""
+        bake_state.set_trouble(scene, "" if isinstance(error, Cancelled) else str(error))
+        unsaved.settle(scene)
+        bake_state.refresh(scene)
+
+
+class PHYSGEN_OT_bake(Bake, bpy.types.Operator):
+    """Simulate the scene. Frames can be played as they arrive; a stopped bake is resumed"""
+
+    bl_idname = bake_state.BAKE_OPERATOR
+    bl_label = "Bake"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+
+class PHYSGEN_OT_pause_bake(bpy.types.Operator):
+    """Pause the bake. Its frames stay playable, and Bake resumes it, even after Blender was closed"""
+
+    bl_idname = "physgen.pause_bake"
+    bl_label = "Pause"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled while this scene is being baked."""
+        return bake_state.bake_job(context.scene) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Request the stop; the worker saves its state."""
+        job = bake_state.bake_job(context.scene)
+        if job is not None:
+            job.cancel()
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_estimate_bake(JobOperator, bpy.types.Operator):
+    """Estimate the number of particles, memory and time of the bake"""
+
+    bl_idname = "physgen.estimate_bake"
+    bl_label = "Estimate"
+    job_title = "Estimate"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Export the scene and return the estimate as a child process."""
+        scene = context.scene
+        root, options = exported(scene)
+        current, preferred, before = fingerprint(scene), python(context), background_jobs.stopping()
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            background_jobs.wait_for(before, on_event, cancelled)
+            command = cli_command(find_python(preferred), "estimate", str(root), *option_arguments(options))
+            return {**run_stage(command, on_event, cancelled), "fingerprint": current}
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Store the estimate until the scene changes."""
+        settings = scene.physgen.simulation
+        settings.estimate, settings.estimate_of = estimate_text(final), str(final["fingerprint"])
+        bake_state.observe(scene)
+        return settings.estimate
+
+
+def estimate_text(cost: Event) -> str:
+    """Return the result of ``physgen estimate`` as a sentence."""
+    return (
+        f"About {duration(float(cost['seconds']))} and {storage(int(cost['memory_bytes']))} of memory, "
+        f"{storage(int(cost['disk_bytes']))} on the disk: {cost['particles']} particles, "
+        f"{cost['substeps']} time steps"
+    )
+
+
+def used_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
+    """Return whether another scene or file plays the bake ``folder``, or it lies outside this scene's cache."""
+    record = bake_record.read_record(folder)
+    blend = Path(bpy.data.filepath) if bpy.data.filepath else None
+    if record is not None and bake_record.other_files(record, blend):
+        return True
+    if any(bake_state.shows(other, folder) for other in bpy.data.scenes if other != scene):
+        return True
+    return not folder.is_relative_to(paths.scene_cache(scene))
+
+
+def delete(folder: Path) -> int:
+    """Delete the bake ``folder`` and its record; return freed bytes. Raises InputError if that fails."""
+    freed = free_bake(folder)
+    record = bake_record.record_file(folder)
+    try:
+        record.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{record}: cannot be deleted ({error.strerror or error}); delete it by hand") from error
+    return freed
+
+
+class _CacheOperator(OperatorMixin):
+    """Disabled while the scene is being baked."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled unless the scene is being baked."""
+        if bake_state.bake_job(context.scene) is not None:
+            cls.poll_message_set("The scene is being baked; pause it first")
+            return False
+        return True
+
+
+class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
+    """Remove the bake from the scene and delete its files; objects are restored"""
+
+    bl_idname = "physgen.free_bake"
+    bl_label = "Free Bake"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if a bake is shown."""
+        if not context.scene.physgen.simulation.bake:
+            cls.poll_message_set("No bake is shown")
+            return False
+        return super().poll(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Restore objects, then delete files."""
+        scene = context.scene
+        folder = paths.absolute(scene.physgen.simulation.bake)
+        try:
+            kept = used_elsewhere(scene, folder)
+            show_bake.hide(scene)
+            freed = 0 if kept or bake_record.manifest_of(folder) is None else delete(folder)
+        except PhysGenError as error:
+            with contextlib.suppress(PhysGenError):
+                show_bake.show(scene, bake_state.record_of(scene, folder))
+            bake_state.observe(scene)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        bake_state.set_trouble(scene, "")
+        bake_state.observe(scene)
+        words = f"its files stay, because they are not this scene's alone: {folder}" if kept else storage(freed)
+        self.report({"INFO"}, f"The bake is out of the scene; {words}")
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_free_old_bakes(_CacheOperator, bpy.types.Operator):
+    """Delete all bakes of this scene except the one it shows. Undo cannot restore them"""
+
+    bl_idname = "physgen.free_old_bakes"
+    bl_label = "Free Old Bakes"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Delete each; name those that cannot be deleted."""
+        scene, freed, deleted, troubles = context.scene, 0, 0, []
+        for cache in bake_state.caches_of(scene):
+            for record in bake_record.records(cache):
+                if bake_state.shows(scene, record.path) or used_elsewhere(scene, record.path):
+                    continue
+                try:
+                    freed += delete(record.path)
+                    deleted += 1
+                except InputError as error:
+                    troubles.append(str(error))
+        bake_state.observe(scene)
+        for trouble in troubles:
+            self.report({"WARNING"}, trouble)
+        self.report({"INFO"}, f"{count(deleted, 'bake')} deleted; {storage(freed)}")
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_relink_caches(_CacheOperator, bpy.types.Operator):
+    """Choose the folder of the moved bakes: the cache folder, one of its scenes, or the bake itself"""
+
+    bl_idname = "physgen.relink_caches"
+    bl_label = "Relink Caches"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    directory: bpy.props.StringProperty(name="Folder", description="Where the bakes are now", subtype="DIR_PATH")
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Search the folder for the bake that was shown."""
+        scene = context.scene
+        relink(scene, paths.require_folder(self.directory, "Folder"))
+        bake_state.set_trouble(scene, "")
+        bake_state.observe(scene)
+        self.report({"INFO"}, f"The bake is {scene.physgen.simulation.bake}")
+        return {"FINISHED"}
+
+
+def relink(scene: bpy.types.Scene, chosen: Path) -> None:
+    """Make ``scene`` play, from below ``chosen``, the bake that it showed; else the one that matches the scene now.
+
+    Raises InputError if there is neither.
+    """
+    shown = paths.shown_bake(scene)
+    name = shown.name if shown is not None else ""
+    depths = ("", bake_record.BAKES, f"*/{bake_record.BAKES}", f"*/*/{bake_record.BAKES}")
+    candidates = [chosen] if chosen.name == name else []
+    if name:
+        candidates += [path / name for depth in depths for path in (sorted(chosen.glob(depth)) if depth else [chosen])]
+    for folder in candidates:
+        if bake_record.manifest_of(folder) is not None:
+            show_bake.show(scene, bake_state.record_of(scene, folder))
+            return
+    current = fingerprint(scene)
+    for cache in (chosen, chosen.parent, *sorted(chosen.glob("*")), *sorted(chosen.glob("*/*"))):
+        found = bake_record.matching(cache, current) if cache.is_dir() else None
+        if found is not None:
+            show_bake.show(scene, found)
+            return
+    what = f"the bake {name!r}" if name else "a bake of this scene"
+    raise InputError(f"{chosen}: {what} is not in there; choose the folder with the caches, or bake again")

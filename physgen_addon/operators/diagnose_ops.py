@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: load a capture, diagnose it, add the effect that was found, compare two bakes."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+
+import bpy
+
+from ...sim.app.add_effect import AddRequest, add_and_bake, found_effects, with_effects
+from ...sim.app.stage_process import run_stage
+from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
+from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
+from ...sim.errors import InputError, PhysGenError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.folder import load_scene
+from ...sim.validation import read_json
+from ..background_jobs import JobOperator, Work
+from ..context import look_through_camera, turn_to, viewports
+from ..interpreter import cli_command, find_python
+from ..paths import bake_folder, folder_beside, require_folder
+from ..playback import capture_scene, capture_view
+from ..playback import capture_view as overlay
+from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
+from ..props import diagnose_props as report_props
+from ..props.diagnose_props import apply_view
+from ..props.preferences import python
+from ..text import count, report_errors
+
+
+def capture_folder(path: str) -> Path:
+    """Return the folder of a capture, from the folder or its ``capture.json``. Raises InputError without one."""
+    folder = require_folder(path, "Capture")
+    folder = folder.parent if folder.name == CAPTURE_FILE else folder
+    if not (folder / CAPTURE_FILE).is_file():
+        raise InputError(f"{folder}: there is no {CAPTURE_FILE} in it; choose the folder of a capture")
+    return folder
+
+
+def report_folder(state: bpy.types.PropertyGroup) -> Path:
+    """Return the folder of the diagnosis of the scene's capture, existing or not."""
+    if state.report.strip():
+        return require_folder(state.report, "Diagnosis")
+    return folder_beside(capture_folder(state.capture), "diagnosis")
+
+
+def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
+    """(Re)build the capture of ``scene`` with the diagnosis in the folder ``diagnosis``; keep the visible trial
+    and layers.
+
+    Raises InputError; then nothing has changed.
+    """
+    state = scene.physgen_diagnose
+    capture = load_capture(capture_folder(state.capture))
+    report, arrays = None, capture_scene.Diagnosed()
+    if diagnosis is not None:
+        report, where, prediction = read_diagnosis(diagnosis)
+        arrays = capture_scene.Diagnosed(where=where, prediction=prediction)
+    takes = capture_scene.prepare(capture, arrays)
+    fresh, trial, had_motion = state.root is None, state.trial if state.trials else "", state.has_motion
+    if state.root is not None:
+        capture_scene.remove(state.root)
+    root = state.root = capture_scene.build(scene, capture, takes)
+    _fill_trials(state, capture)
+    state.has_scores = any(arrays.score(t) is not None for t in capture.trials)
+    state.has_motion = any(arrays.layer(t, NOMINAL) is not None for t in capture.trials)
+    if state.has_scores:
+        state.most = max(arrays.most(capture), 1e-6)
+    if report is not None:
+        report_props.fill_diagnosis(state, report)
+    else:
+        report_props.clear_diagnosis(state)
+    if fresh or had_motion != state.has_motion:
+        _choose_layers(state, flat=capture.camera is not None and not state.has_motion)
+        state.radius = 0.03 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
+    names = [t.name for t in capture.trials]
+    state.trial = trial if trial in names else names[0]
+    apply_view(state)
+    capture_view.play_range(scene, root, state.trial)
+    return capture
+
+
+def _fill_trials(state: bpy.types.PropertyGroup, capture: Capture) -> None:
+    state.trials.clear()
+    for trial in capture.trials:
+        line = state.trials.add()
+        line.name = trial.name
+        rate = (len(trial.times) - 1) / (trial.times[-1] - trial.times[0])
+        what = "" if trial.role == "fit" else "; its end is withheld"
+        line.label = f"{len(trial.times)} frames at {rate:.4g} Hz, {trial.observed.shape[1]} points{what}"
+    state.capture_warnings.clear()
+    for text in capture.warnings:
+        state.capture_warnings.add().text = text
+
+
+def _choose_layers(state: bpy.types.PropertyGroup, *, flat: bool) -> None:
+    """Choose visible layers: the recording; with a diagnosis, the recording as coloured mesh and the nominal
+    model as points.
+
+    flat: the points are pixels of unknown depth, to which a mesh cannot be fitted.
+    """
+    chosen = {
+        OBSERVED: {"points": True, "trail": True, "body": not flat},
+        NOMINAL: {"points": state.has_motion, "trail": state.has_motion, "body": False},
+        FOUND: {"points": False, "trail": False, "body": False},
+    }
+    for name in LAYERS:
+        for key, value in chosen[name].items():
+            setattr(getattr(state, name), key, value)
+
+
+class PHYSGEN_OT_load_capture(bpy.types.Operator):
+    """Load the capture: its ground, camera, objects and tracked points, and a diagnosis beside it"""
+
+    bl_idname = "physgen.load_capture"
+    bl_label = "Load Capture"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load and show."""
+        scene = context.scene
+        state = scene.physgen_diagnose
+        folder = report_folder(state) if state.report.strip() or _found_beside(state) else None
+        if folder is not None and not (folder / REPORT_FILE).is_file():
+            folder = None
+        capture = show_capture(scene, folder)
+        if folder is not None:
+            state.report = str(folder)
+        turn_to(context, *capture_view.capture_bounds(state.root, state.trial))
+        if capture.camera is not None:
+            look_through_camera(context)
+        self.report({"INFO"}, f"{count(len(capture.trials), 'trial')} of {capture_folder(state.capture).name} loaded")
+        return {"FINISHED"}
+
+
+def _found_beside(state: bpy.types.PropertyGroup) -> bool:
+    folder = capture_folder(state.capture)
+    return (folder.with_name(f"{folder.name}_diagnosis") / REPORT_FILE).is_file()
+
+
+class PHYSGEN_OT_load_diagnosis(bpy.types.Operator):
+    """Reload the diagnosis and show it with the capture"""
+
+    bl_idname = "physgen.load_diagnosis"
+    bl_label = "Load Diagnosis"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load and show."""
+        show_capture(context.scene, report_folder(context.scene.physgen_diagnose))
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_clear_capture(bpy.types.Operator):
+    """Remove the capture from the scene; its files are kept"""
+
+    bl_idname = "physgen.clear_capture"
+    bl_label = "Clear Capture"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if there is one."""
+        return context.scene.physgen_diagnose.root is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove its objects and results."""
+        state = context.scene.physgen_diagnose
+        capture_scene.remove(state.root)
+        state.trials.clear()
+        state.capture_warnings.clear()
+        state.has_motion = state.has_scores = False
+        report_props.clear_diagnosis(state)
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_open_report(bpy.types.Operator):
+    """Open the report of the diagnosis in the browser"""
+
+    bl_idname = "physgen.open_report"
+    bl_label = "Open Report"
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Open report.html."""
+        page = report_folder(context.scene.physgen_diagnose) / PAGE_FILE
+        if not page.is_file():
+            raise InputError(f"{page}: there is no such page; run the diagnosis again")
+        webbrowser.open(page.as_uri())
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_follow(bpy.types.Operator):
+    """Make the viewport follow the object closely; press again to release"""
+
+    bl_idname = "physgen.follow_object"
+    bl_label = "Follow the Object"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with a viewport and a visible object."""
+        return context.scene.physgen_diagnose.root is not None and bool(viewports(context))
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Lock the viewports to the visible body, or release them."""
+        state = context.scene.physgen_diagnose
+        spaces = viewports(context)
+        if any(space.lock_object is not None for space in spaces):
+            turn_to(context, *capture_view.capture_bounds(state.root, state.trial))
+            return {"FINISHED"}
+        body = capture_view.shown_body(state.root, state.trial)
+        if body is None:
+            self.report({"WARNING"}, "no object is in sight: show the mesh of a layer")
+            return {"CANCELLED"}
+        for space in spaces:
+            space.lock_object = body
+            if space.region_3d is not None:
+                space.region_3d.view_distance = 5 * max(body.dimensions)
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
+    """Find where simulation and recording differ, which effect is missing, and how much of the gap it closes"""
+
+    bl_idname = "physgen.diagnose"
+    bl_label = "Diagnose"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Diagnosis"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the diagnosis as a child process."""
+        state = context.scene.physgen_diagnose
+        capture = capture_folder(state.capture)
+        out = report_folder(state)
+        preferred = python(context)
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "diagnose", str(capture), "--out", str(out))
+            return {"out": str(out), **run_stage(command, on_event, cancelled), "capture": str(capture)}
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show the result, also if undo has meanwhile removed the capture from the scene."""
+        state, out = scene.physgen_diagnose, Path(str(final["out"]))
+        state.capture = str(final["capture"])
+        show_capture(scene, out)
+        state.report = str(out)
+        return str(state.summary)
+
+
+class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
+    """Add the found effect to the scene folder and bake it; without a reference bake, bake that first"""
+
+    bl_idname = "physgen.add_found_effect"
+    bl_label = "Add Effect and Bake"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Bake"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if an effect was found that can be added."""
+        state = context.scene.physgen_diagnose
+        if not state.has_report or state.verdict in ("none", "unknown"):
+            cls.poll_message_set("The diagnosis names no effect that could be added")
+            return False
+        return super().poll(context)
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Add the effect to the scene; return one or two bakes as child processes."""
+        state = context.scene.physgen_diagnose
+        scene_root = require_folder(state.scene_folder, "Scene")
+        found = found_effects(read_json(report_folder(state) / REPORT_FILE))
+        with_effects(load_scene(scene_root).model, found)
+        bake_before = not state.before.strip()
+        # A bake from an earlier run is reused while the scene is unchanged.
+        beside = folder_beside(scene_root, "bake_before")
+        before = beside if bake_before else require_folder(state.before, "Bake Before")
+        request = AddRequest(
+            scene=scene_root,
+            found=found,
+            before=before,
+            after=bake_folder(folder_beside(scene_root, "bake_after")),
+            bake_before=bake_before,
+        )
+        settings = ("--frames", str(state.frames), "--fps", repr(state.fps), "--quality", state.quality)
+        preferred = python(context)
+
+        def run_bake(scene: Path, out: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "bake", str(scene), "--out", str(out), *settings)
+            return run_stage(command, on_event, cancelled)
+
+        return lambda on_event, cancelled: add_and_bake(request, run_bake, on_event, cancelled)
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show both bakes."""
+        state = scene.physgen_diagnose
+        # Undo may have cleared the property.
+        state.scene_folder = str(final["scene"])
+        state.before, state.after = str(final["before"]), str(final["after"])
+        show_overlay(scene)
+        return "the effect is in the scene; before and after lie over each other"
+
+
+class PHYSGEN_OT_show_overlay(bpy.types.Operator):
+    """Show the bakes before and after in this scene"""
+
+    bl_idname = "physgen.show_overlay"
+    bl_label = "Show Before and After"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load both."""
+        show_overlay(context.scene)
+        return {"FINISHED"}
+
+
+def show_overlay(scene: bpy.types.Scene) -> None:
+    """Show both bakes of the scene folder in ``scene`` and hide the capture. Raises InputError."""
+    state = scene.physgen_diagnose
+    folder = require_folder(state.scene_folder, "Scene")
+    bakes = {
+        overlay.BEFORE: require_folder(state.before, "Bake Before"),
+        overlay.AFTER: require_folder(state.after, "Bake After"),
+    }
+    first, last, rate = overlay.overlay_frame_range(folder, bakes[overlay.AFTER])
+    built: list[bpy.types.Collection] = []
+    try:
+        for which, bake in bakes.items():
+            built.append(overlay.build_overlay(scene, folder, bake, which))
+    except PhysGenError:
+        for collection in built:
+            overlay.remove_overlay(collection)
+        raise
+    for old in (state.before_root, state.after_root):
+        if old is not None:
+            overlay.remove_overlay(old)
+    state.before_root, state.after_root = built
+    if state.root is not None:
+        state.root.hide_viewport = state.root.hide_render = True
+    overlay.show_overlay(*built, choice=state.overlay)
+    low, high = overlay.overlay_bounds(built[1])
+    turn_to(bpy.context, 2 * low - high, 2 * high - low)
+    scene.frame_start, scene.frame_end = first, last
+    capture_view.set_rate(scene, rate)
+
+
+class PHYSGEN_OT_clear_overlay(bpy.types.Operator):
+    """Remove both bakes from the scene and show the capture again; files are kept"""
+
+    bl_idname = "physgen.clear_overlay"
+    bl_label = "Clear Overlay"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove the two collections."""
+        state = context.scene.physgen_diagnose
+        for collection in (state.before_root, state.after_root):
+            if collection is not None:
+                overlay.remove_overlay(collection)
+        if state.root is not None:
+            state.root.hide_viewport = state.root.hide_render = False
+            capture_view.play_range(context.scene, state.root, state.trial)
+        return {"FINISHED"}

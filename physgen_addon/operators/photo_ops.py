@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: open a photo, draw boxes around its objects, reconstruct."""
+
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from ...sim.app.stage_process import run_stage
+from ...sim.errors import InputError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.folder import load_scene
+from ..background_jobs import JobOperator, Work
+from ..context import TAB, show_beside
+from ..interpreter import cli_command, find_python
+from ..photo.photo_image import (
+    SUFFIXES,
+    drop_mask,
+    load_photo_image,
+    on_screen,
+    place_under,
+    region_under,
+    shows_photo,
+    why_not_seen,
+    write_masks,
+)
+from ..photo.photo_request import LEAST_PX, arguments, mask_files, photo_file, report_page, scene_folder, take_camera
+from ..props.preferences import python
+from ..scene_io.import_physics import find_edits, remember_imported, restore_edits
+from ..text import report_errors
+from .import_ops import show_scene
+
+
+def set_photo(scene: bpy.types.Scene, path: Path) -> None:
+    """Set the photo of ``scene`` to ``path``; boxes of another photo are removed. Raises InputError if it is none."""
+    image, size = load_photo_image(path)
+    state = scene.physgen_photo
+    old = state.image
+    state.image, (state.width, state.height) = image, size
+    if Path(bpy.path.abspath(state.path)) != path:
+        for box in state.boxes:
+            drop_mask(box)
+        state.boxes.clear()
+        state.has_found = False
+    state.path = str(path)
+    if old is not None and old.users == 0:
+        bpy.data.images.remove(old)
+
+
+class PHYSGEN_OT_open_photo(bpy.types.Operator):
+    """Choose a photo to reconstruct: draw a box around each object, then press Reconstruct"""
+
+    bl_idname = "physgen.open_photo"
+    bl_label = "Start from a Photo"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    filepath: StringProperty(name="Photo", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Load and show it."""
+        if not self.filepath.strip():
+            raise InputError("no photo is chosen; choose a JPEG, PNG, TIFF or WebP file")
+        set_photo(context.scene, Path(bpy.path.abspath(self.filepath)).resolve())
+        show_beside(context, context.scene.physgen_photo.image, TAB)
+        return {"FINISHED"}
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Load a dropped file directly; otherwise ask for one."""
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+
+class PHYSGEN_OT_use_image(bpy.types.Operator):
+    """Start from the photo that this image editor shows"""
+
+    bl_idname = "physgen.use_image"
+    bl_label = "Use This Image"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if the image is a file."""
+        image = getattr(context.space_data, "image", None)
+        if image is None or image.source != "FILE" or not image.filepath:
+            cls.poll_message_set("The image shown is not a file")
+            return False
+        return True
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Set it."""
+        path = bpy.path.abspath(context.space_data.image.filepath)
+        set_photo(context.scene, Path(path).resolve())
+        context.space_data.image = context.scene.physgen_photo.image
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_remove_box(bpy.types.Operator):
+    """Remove the active box"""
+
+    bl_idname = "physgen.remove_box"
+    bl_label = "Remove Box"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with an active box."""
+        state = context.scene.physgen_photo
+        return 0 <= state.box_index < len(state.boxes)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove it; the next one becomes active."""
+        state = context.scene.physgen_photo
+        drop_mask(state.boxes[state.box_index])
+        state.boxes.remove(state.box_index)
+        state.box_index = max(0, min(state.box_index, len(state.boxes) - 1))
+        return {"FINISHED"}
+
+
+class PHYSGEN_FH_photo(bpy.types.FileHandler):
+    """Drop of a photo on PhysGen's tab. Elsewhere Blender's own handling of images comes first."""
+
+    bl_idname = "PHYSGEN_FH_photo"
+    bl_label = "PhysGen: Start from This Photo"
+    bl_import_operator = "physgen.open_photo"
+    bl_file_extensions = ";".join(SUFFIXES)
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        """Accept drops on a sidebar that shows the tab."""
+        area, region = context.area, context.region
+        if area is None or region is None or area.type not in ("VIEW_3D", "IMAGE_EDITOR") or region.type != "UI":
+            return False
+        return region.active_panel_category == TAB
+
+
+def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    self.layout.operator(PHYSGEN_OT_open_photo.bl_idname, text="PhysGen Photo (.jpg, .png)")
+
+
+def register_photo_menu() -> None:
+    """Add to File > Import."""
+    bpy.types.TOPBAR_MT_file_import.append(_draw_menu)
+
+
+def unregister_photo_menu() -> None:
+    """Remove from File > Import."""
+    bpy.types.TOPBAR_MT_file_import.remove(_draw_menu)
+
+
+CHOSEN, OTHER, DRAGGED = (1.0, 0.55, 0.1, 1.0), (1.0, 1.0, 1.0, 0.8), (1.0, 0.8, 0.2, 1.0)
+_dragged: list[tuple[int, int, int, int]] = []
+"""The rectangle being dragged, at most one; not stored in any file."""
+_handlers: list[Any] = []
+
+
+def add_box(scene: bpy.types.Scene, corners: tuple[int, int, int, int], name: str = "") -> bpy.types.PropertyGroup:
+    """Add a box x0, y0, x1, y1 in pixels of the upright photo, clipped to it, and make it active."""
+    state = scene.physgen_photo
+    box = state.boxes.add()
+    box.x0, box.x1 = (max(0, min(x, state.width)) for x in sorted(corners[0::2]))
+    box.y0, box.y1 = (max(0, min(y, state.height)) for y in sorted(corners[1::2]))
+    taken = {other.name for other in state.boxes}
+    box.name = name or next(f"object {n}" for n in range(1, len(state.boxes) + 1) if f"object {n}" not in taken)
+    state.box_index = len(state.boxes) - 1
+    return box
+
+
+class PHYSGEN_OT_draw_box(bpy.types.Operator):
+    """Drag a box around an object of the photo in the image editor; it need not be tight"""
+
+    bl_idname = "physgen.draw_box"
+    bl_label = "Draw Box"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with a visible photo."""
+        why = why_not_seen(context)
+        if why:
+            cls.poll_message_set(why)
+        return not why
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Wait for the drag."""
+        self._start: tuple[int, int] | None = None
+        self._region: bpy.types.Region | None = None
+        context.window.cursor_modal_set("CROSSHAIR")
+        context.workspace.status_text_set("Drag a box around an object    Esc, right click: stop")
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Handle events from press to release."""
+        image = context.scene.physgen_photo.image
+        if image is None or event.type in ("ESC", "RIGHTMOUSE"):
+            return self._end(context, "CANCELLED")
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            region = region_under(context, image, event)
+            if region is None:
+                self.report({"INFO"}, "drag inside the image in the image editor")
+                return self._end(context, "CANCELLED")
+            self._region, self._start = region, _pixel(context.scene, region, event)
+        elif self._start is None or self._region is None:
+            # Zooming and panning stay available.
+            return {"PASS_THROUGH"}
+        elif event.type == "MOUSEMOVE":
+            _dragged[:] = [(*self._start, *_pixel(context.scene, self._region, event))]
+            self._region.tag_redraw()
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            corners = (*self._start, *_pixel(context.scene, self._region, event))
+            if min(abs(corners[2] - corners[0]), abs(corners[3] - corners[1])) < LEAST_PX:
+                return self._end(context, "CANCELLED")
+            add_box(context.scene, corners)
+            return self._end(context, "FINISHED")
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Called by Blender when another file is loaded or Blender quits."""
+        self._end(context, "CANCELLED")
+
+    def _end(self, context: bpy.types.Context, how: str) -> set[str]:
+        _dragged.clear()
+        context.window.cursor_modal_restore()
+        context.workspace.status_text_set(None)
+        for area in context.window.screen.areas:
+            area.tag_redraw()
+        return {how}
+
+
+def _pixel(scene: bpy.types.Scene, region: bpy.types.Region, event: bpy.types.Event) -> tuple[int, int]:
+    """Return the upright photo's pixel under the mouse, from its top left corner; may lie outside."""
+    u, v = place_under(region, event)
+    return round(u * scene.physgen_photo.width), round(v * scene.physgen_photo.height)
+
+
+def _label(box: bpy.types.PropertyGroup) -> str:
+    return box.name if box.mask is None else f"{box.name} (mask)"
+
+
+def _draw_boxes() -> None:
+    """Draw callback of image editors; in pixels of the region."""
+    import blf
+    import gpu
+    from gpu_extras.batch import batch_for_shader
+
+    context = bpy.context
+    state = context.scene.physgen_photo
+    if not shows_photo(context):
+        return
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    scale = context.preferences.system.ui_scale
+    lines = [
+        ((box.x0, box.y0, box.x1, box.y1), CHOSEN if index == state.box_index else OTHER, _label(box))
+        for index, box in enumerate(state.boxes)
+    ]
+    lines += [(corners, DRAGGED, "") for corners in _dragged]
+    gpu.state.blend_set("ALPHA")
+    gpu.state.line_width_set(2.0 * scale)
+    for (x0, y0, x1, y1), colour, name in lines:
+        places = [
+            on_screen(context.region, x / state.width, y / state.height)
+            for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        ]
+        shader.uniform_float("color", colour)
+        batch_for_shader(shader, "LINE_LOOP", {"pos": [(*place, 0.0) for place in places]}).draw(shader)
+        if name:
+            top = max(place.y for place in places)
+            blf.size(0, 12.0 * scale)
+            blf.color(0, *colour)
+            blf.position(0, min(place.x for place in places), top + 4 * scale, 0)
+            blf.draw(0, name)
+    gpu.state.line_width_set(1.0)
+    gpu.state.blend_set("NONE")
+
+
+def register_box_drawing() -> None:
+    """Add the draw callback of the boxes."""
+    _handlers.append(bpy.types.SpaceImageEditor.draw_handler_add(_draw_boxes, (), "WINDOW", "POST_PIXEL"))
+
+
+def unregister_box_drawing() -> None:
+    """Remove the draw callback of the boxes."""
+    for handler in _handlers:
+        bpy.types.SpaceImageEditor.draw_handler_remove(handler, "WINDOW")
+    _handlers.clear()
+    _dragged.clear()
+
+
+class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
+    """Reconstruct a scene from the photo: segment the objects, inpaint the background, estimate camera, ground
+    and light
+    """
+
+    bl_idname = "physgen.reconstruct"
+    bl_label = "Reconstruct"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Reconstruction"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with a photo and a box."""
+        state = context.scene.physgen_photo
+        if state.image is None or not state.boxes:
+            cls.poll_message_set("Open a photo and draw a box around each object")
+            return False
+        return super().poll(context)
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the reconstruction as a child process, which reads the masks from files."""
+        state = context.scene.physgen_photo
+        given, out, preferred = arguments(state), scene_folder(state), python(context)
+        write_masks(dict(mask_files(state, out).values()))
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "reconstruct", *given, "--out", str(out))
+            return run_stage(command, on_event, cancelled)
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Open the scene folder and reapply the user's edits of an earlier one; show the estimated horizon."""
+        root, photo = Path(str(final["scene"])), photo_file(scene.physgen_photo)
+        changed = find_edits(scene, photo)
+        sentence = show_scene(scene, root)
+        remember_imported(scene, photo)
+        restore_edits(scene, changed)
+        take_camera(scene.physgen_photo, load_scene(root).model.camera)
+        return sentence
+
+
+class PHYSGEN_OT_open_photo_report(bpy.types.Operator):
+    """Open the report with images of every stage in the browser"""
+
+    bl_idname = "physgen.open_photo_report"
+    bl_label = "Open Report"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if the last reconstruction wrote one."""
+        if report_page(context.scene.physgen_photo) is None:
+            cls.poll_message_set("Switch Write Report on and reconstruct")
+            return False
+        return True
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Open report.html."""
+        page = report_page(context.scene.physgen_photo)
+        if page is None:
+            raise InputError("there is no report of this photo; switch Write Report on and reconstruct")
+        webbrowser.open(page.as_uri())
+        return {"FINISHED"}

@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: render into the photo, export as Alembic, USD, or a .blend that needs no extension."""
+
+import contextlib
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import bpy
+
+from ...sim.app.bake_transfer import transfer_bake
+from ...sim.app.stage_process import run_stage
+from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
+from ...sim.errors import InputError, PhysGenError, RenderError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.scene.camera_path import CameraPath, save_camera_path
+from ...sim.scene.folder import SCENE_FILE, load_scene
+from .. import bake_state, paths
+from ..background_jobs import JobOperator, Work
+from ..compat import OperatorMixin
+from ..context import show_result
+from ..frames.frame_index import frame_name
+from ..paths import require_folder
+from ..playback import bake_record, particles, show_bake
+from ..props.body_props import bodies
+from ..props.render_props import render_options
+from ..render.render_options import render_arguments
+from ..scene_io import export_animation
+
+SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
+NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
+"""Modules that rendering into a photo imports, and their package names."""
+
+
+def missing_modules() -> list[str]:
+    """Return the packages that this Blender's Python lacks for rendering into a photo."""
+    return [title for module, title in NEEDED.items() if importlib.util.find_spec(module) is None]
+
+
+def render_command() -> list[str]:
+    """Return the command that runs ``batch/render.py``, to be followed by its arguments.
+
+    It is this Python if that has bpy as a module, else this Blender.
+    """
+    if not bpy.app.binary_path:
+        return [sys.executable, str(SCRIPT)]
+    # A factory start-up does not load extensions, hence not their wheels.
+    paths = f"import sys; sys.path += [p for p in {[p for p in sys.path if p]!r} if p not in sys.path]"
+    blender = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
+    return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--"]
+
+
+def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
+    """Return by name in the photo's scene folder the name under which the object was baked."""
+    names: dict[str, str] = {}
+    for item in bodies(scene):
+        body = item.physgen
+        if body.source:
+            # A duplicate is not in the photo; the first by name was imported.
+            names.setdefault(body.source, body.cache or item.name)
+    return names
+
+
+def _output_folder(scene: bpy.types.Scene) -> Path:
+    path = scene.physgen.rendering.output
+    if path.startswith("//") and not bpy.data.filepath:
+        raise InputError(f"Output is {path!r}, beside a file that is not saved yet: save it, or choose a folder")
+    return require_folder(path, "Output")
+
+
+def _camera_path(scene: bpy.types.Scene, photo: Path, bake: Path) -> CameraPath | None:
+    """Write the path of the scene's camera over the frames of ``bake``, relative to the scene folder ``photo``."""
+    manifest = load_manifest(bake)
+    first = scene.physgen.simulation.frame_start
+    frames = range(first, first + max(manifest.frames_done, 1))
+    camera = load_scene(photo).model.camera
+    return export_animation.camera_path(scene, camera, frames, first_frame=manifest.frame_start)
+
+
+class _Render(JobOperator):
+    job_title = "Render"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with a photo and a bake, and without a running job."""
+        state = context.scene.physgen
+        if not state.folder:
+            cls.poll_message_set("This scene has no photo: render it as any scene of Blender")
+            return False
+        if not state.simulation.bake:
+            cls.poll_message_set("Bake first (see Simulate)")
+            return False
+        return super().poll(context)
+
+    def _work(self, scene: bpy.types.Scene, *choices: str) -> Work:
+        lacking = missing_modules()
+        if lacking:
+            raise RenderError(
+                f"this Blender's Python lacks {', '.join(lacking)}, needed to render into a photo: install PhysGen "
+                "from the zip for your system, which brings them, or render with `physgen render`"
+            )
+        bake = require_folder(scene.physgen.simulation.bake, "Bake")
+        if not (bake / MANIFEST_FILE).is_file():
+            raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost (see Simulate, Cache)")
+        photo, baked_scene = require_folder(scene.physgen.folder, "Scene Folder"), bake.parent.parent / "scene"
+        names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
+        out = _output_folder(scene)
+        arguments = ["--out", str(out), "--parent", str(os.getpid()), "--json", *choices]
+        arguments += render_arguments(render_options(scene.physgen.rendering))
+        start = render_command()
+        path = _camera_path(scene, photo, bake)
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            if strangers:
+                message = f"not in the photo, so not rendered into it: {', '.join(strangers)}"
+                on_event({"event": "notice", "message": message})
+            with tempfile.TemporaryDirectory(prefix="physgen-render-") as scratch:
+                rendered = bake
+                if (baked_scene / SCENE_FILE).is_file():
+                    rendered = Path(scratch) / "bake"
+                    transfer_bake(photo, baked_scene, bake, rendered, names, on_event)
+                command = [*start, str(photo), "--bake", str(rendered), *arguments]
+                if path is not None:
+                    save_camera_path(Path(scratch) / "camera.json", path)
+                    command += ["--camera", str(Path(scratch) / "camera.json")]
+                # The result does not contain the requested range.
+                return {**run_stage(command, on_event, cancelled, failure=RenderError, restarts=1), "out": str(out)}
+
+        return work
+
+
+class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
+    """Render the current frame into the photo"""
+
+    bl_idname = "physgen.render_still"
+    bl_label = "Render Still"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the job for the current frame."""
+        scene = context.scene
+        simulation = scene.physgen.simulation
+        manifest = load_manifest(require_folder(simulation.bake, "Bake"))
+        first = simulation.frame_start
+        sample = scene.frame_current - first
+        if not 0 <= sample < manifest.frames_done:
+            last = first + manifest.frames_done - 1
+            raise InputError(f"frame {scene.frame_current} is not baked: go to one from {first} to {last}")
+        number = manifest.frame_start + sample
+        work = self._work(scene, "--frames", str(number))
+        name = frame_name(number, render_options(scene.physgen.rendering).frame_format.suffix)
+        return lambda on_event, cancelled: {**work(on_event, cancelled), "still": name}
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show it."""
+        path = Path(str(final["out"])) / str(final["still"])
+        if not path.is_file():
+            raise RenderError(f"{path}: is not there, although rendering has ended; render again")
+        scene.physgen.rendering.result = str(path)
+        image = bpy.data.images.load(str(path), check_existing=True)
+        image.reload()
+        show_result(bpy.context, image)
+        return f"rendered {path}"
+
+
+class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
+    """Render all baked frames into the photo, and a video of them. Up-to-date frames are not rendered again"""
+
+    bl_idname = "physgen.render_video"
+    bl_label = "Render Video"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the job for all frames."""
+        scene = context.scene
+        name = f"video.{scene.physgen.rendering.video}"
+        work = self._work(scene, "--video", str(_output_folder(scene) / name))
+        return lambda on_event, cancelled: {**work(on_event, cancelled), "video": name}
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Report its path."""
+        path = Path(str(final["out"])) / str(final["video"])
+        scene.physgen.rendering.result = str(path)
+        return f"rendered {path}"
+
+
+class _ExportOperator(OperatorMixin):
+    """Asks for a file, selects the baked objects, and runs Blender's exporter, which blocks Blender.
+
+    Subclasses define ``filename_ext``, ``format_name``, ``other_format`` (offered if this one is missing) and
+    ``write``.
+    """
+
+    filename_ext: ClassVar[str]
+    format_name: ClassVar[str]
+    other_format: ClassVar[str]
+    if TYPE_CHECKING:
+        filepath: str
+
+    def write(self, path: str, first: int, last: int) -> None:
+        """Write the frames ``first`` to ``last`` to ``path``."""
+        raise NotImplementedError
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if a bake is shown."""
+        if not context.scene.physgen.simulation.bake:
+            cls.poll_message_set("Nothing is baked yet")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        if not self.filepath:
+            blend = Path(bpy.data.filepath or "untitled.blend")
+            self.filepath = str(blend.with_suffix(self.filename_ext))
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Export the baked frames."""
+        scene = context.scene
+        try:
+            self._require_exporter()
+            first, last = baked_range(scene)
+            path = self._target()
+            with _only_baked(context, scene, first, last):
+                self.write(str(path), first, last)
+        except (PhysGenError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error).strip())
+            return {"CANCELLED"}
+        if not path.is_file():
+            self.report({"ERROR"}, f"{path}: Blender's exporter has written nothing; see its messages")
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Frames {first} to {last} are in {path}")
+        return {"FINISHED"}
+
+    def _require_exporter(self) -> None:
+        """Raise InputError if this Blender lacks the exporter."""
+        if not getattr(bpy.app.build_options, self.format_name.lower()):
+            raise InputError(
+                f"this Blender was built without {self.format_name}; use an official build, or export "
+                f"{self.other_format}"
+            )
+
+    def _target(self) -> Path:
+        if not self.filepath.strip():
+            raise InputError("File is empty: choose where to write")
+        path = Path(bpy.path.abspath(self.filepath))
+        path = path if path.suffix else path.with_suffix(self.filename_ext)
+        paths.require_writable(path.parent)
+        return path
+
+
+class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
+    """Export the baked animation as Alembic: bodies, surfaces, and grains as vertices. Blocks Blender meanwhile"""
+
+    bl_idname = "physgen.export_alembic"
+    bl_label = "Export Alembic"
+    filename_ext = ".abc"
+    format_name, other_format = "Alembic", "USD"
+
+    filepath: bpy.props.StringProperty(name="File", description="File to write", subtype="FILE_PATH")
+    filter_glob: bpy.props.StringProperty(default="*.abc", options={"HIDDEN"})
+
+    def write(self, path: str, first: int, last: int) -> None:
+        """Run Blender's exporter."""
+        bpy.ops.wm.alembic_export(filepath=path, start=first, end=last, selected=True, as_background_job=False)
+
+
+class PHYSGEN_OT_export_usd(_ExportOperator, bpy.types.Operator):
+    """Export the baked animation as USD: bodies, surfaces, and grains as vertices. Blocks Blender meanwhile"""
+
+    bl_idname = "physgen.export_usd"
+    bl_label = "Export USD"
+    filename_ext = ".usdc"
+    format_name, other_format = "USD", "Alembic"
+
+    filepath: bpy.props.StringProperty(name="File", description="File to write", subtype="FILE_PATH")
+    filter_glob: bpy.props.StringProperty(default="*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
+
+    def write(self, path: str, first: int, last: int) -> None:
+        """Run Blender's exporter; the frames are the scene's range."""
+        bpy.ops.wm.usd_export(filepath=path, selected_objects_only=True, export_animation=True)
+
+
+def baked_range(scene: bpy.types.Scene) -> tuple[int, int]:
+    """Return first and last playable frame. Raises InputError if there is none."""
+    record = bake_state.shown_record(scene)
+    done = bake_record.playable(record.path) if record is not None else 0
+    if record is None or done < 1:
+        raise InputError("no frame of the bake can be played; bake again, or relink its files")
+    return record.frame_start, record.frame_start + done - 1
+
+
+@contextlib.contextmanager
+def _only_baked(context: bpy.types.Context, scene: bpy.types.Scene, first: int, last: int) -> Iterator[None]:
+    """Select bodies and particles and set the frame range within the context."""
+    layer = context.view_layer
+    chosen = [item for item in layer.objects if item.select_get()]
+    frames, current = (scene.frame_start, scene.frame_end), scene.frame_current
+    baked = {*bodies(scene), *(item for item in scene.objects if particles.POINTS_OF in item)}
+    locked = [item for item in baked if item.hide_select]
+    try:
+        for item in locked:
+            item.hide_select = False
+        for item in baked:
+            particles.set_bare(item, True)
+        for item in layer.objects:
+            item.select_set(item in baked)
+        scene.frame_start, scene.frame_end = first, last
+        yield
+    finally:
+        for item in locked:
+            item.hide_select = True
+        for item in baked:
+            particles.set_bare(item, False)
+        for item in layer.objects:
+            item.select_set(item in chosen)
+        scene.frame_start, scene.frame_end = frames
+        scene.frame_set(current)
+
+
+class PHYSGEN_OT_make_independent(bpy.types.Operator):
+    """Make the file independent of PhysGen: the animation uses native data only. The point caches stay files
+    beside it; images are packed. PhysGen can no longer find or free its bakes
+    """
+
+    bl_idname = "physgen.make_independent"
+    bl_label = "Make Independent"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    filepath: bpy.props.StringProperty(
+        name="Copy",
+        description="Save a copy there and keep this file unchanged; empty: convert this file",
+        subtype="FILE_PATH",
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Convert this file, or a copy of it."""
+        try:
+            if self.filepath.strip():
+                needed = show_bake.save_independent_copy(Path(bpy.path.abspath(self.filepath)))
+            else:
+                needed = show_bake.strip_extension_data()
+        except (PhysGenError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error).strip())
+            return {"CANCELLED"}
+        words = f"These must travel with it: {', '.join(needed)}" if needed else "It needs no other file"
+        self.report({"INFO"}, f"The file no longer depends on PhysGen. {words}")
+        return {"FINISHED"}

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Objects panel: roles, materials, composition, initial motion and pins."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import bpy
+from mathutils import Vector
+
+from ...sim.constitutive import COHERENT, SHAPED, cohesion_of
+from .. import text
+from ..background_jobs import running
+from ..operators.body_ops import (
+    PHYSGEN_OT_add_bodies,
+    PHYSGEN_OT_add_pin,
+    PHYSGEN_OT_clear_motion,
+    PHYSGEN_OT_copy_material,
+    PHYSGEN_OT_delete_preset,
+    PHYSGEN_OT_remove_body,
+    PHYSGEN_OT_remove_pin,
+    PHYSGEN_OT_reset_preset,
+    PHYSGEN_OT_save_preset,
+    PHYSGEN_OT_select_bodies,
+)
+from ..operators.compose_ops import PHYSGEN_OT_compose_objects, chosen_meshes
+from ..playback import splats
+from ..props import material_props
+from ..props.body_props import bodies, is_body
+from ..props.material_props import LAW_FIELDS, is_modified
+from .sidebar import (
+    MOTION,
+    OBJECTS,
+    TOGETHER,
+    Sidebar,
+    active_body,
+    draw_arrows,
+    draw_job,
+    draw_static_friction_note,
+    is_in,
+    settings,
+)
+
+ROLE_ICONS = {"dynamic": "PHYSICS", "collider": "MOD_PHYSICS"}
+UNITS = {
+    "youngs_modulus": text.pressure,
+    "yield_stress": text.pressure,
+    "bulk_modulus": text.pressure,
+    "fibre_modulus": text.pressure,
+}
+"""Text of a value that spans many orders of magnitude, beside its field."""
+SURFACE = ("friction", "static_friction", "restitution", "contact_mode")
+
+
+class PHYSGEN_UL_bodies(bpy.types.UIList):
+    """List of the simulated objects of the scene."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Draw role, name, material and visibility."""
+        body = item.physgen
+        row = layout.row(align=True)
+        row.prop(item, "name", text="", emboss=False, icon=ROLE_ICONS[body.role])
+        row = row.row()
+        row.alignment = "RIGHT"
+        words = "Collider" if body.role == "collider" else material_props.preset_title(body.material.preset_name)
+        row.label(text=words + ("*" if body.role == "dynamic" and is_modified(body.material) else ""))
+        row.prop(item, "hide_viewport", text="", emboss=False)
+
+    def filter_items(self, context: bpy.types.Context, data: Any, prop: str) -> tuple[list[int], list[int]]:
+        """Return bodies whose name matches the filter, by name."""
+        items = getattr(data, prop)
+        names = bpy.types.UI_UL_list
+        if self.filter_name:
+            flags = names.filter_items_by_name(self.filter_name, self.bitflag_filter_item, items, "name")
+        else:
+            flags = [self.bitflag_filter_item] * len(items)
+        flags = [flag if is_body(item) else 0 for flag, item in zip(flags, items, strict=True)]
+        return flags, names.sort_items_by_name(items, "name")
+
+
+class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
+    """Objects of the simulation"""
+
+    bl_idname = "PHYSGEN_PT_objects"
+    bl_label = "Objects"
+    bl_order = OBJECTS
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown if there are any; before that the Scene panel offers starting points."""
+        return bool(bodies(context.scene))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the list and the role of the active object."""
+        layout, scene = self.layout, context.scene
+        editing = context.mode != "OBJECT"
+        row = layout.row()
+        names = row.column()
+        names.enabled = not editing
+        names.template_list("PHYSGEN_UL_bodies", "", scene, "objects", scene.physgen, "body_index", rows=3)
+        side = settings(row, context)
+        side.use_property_split = False
+        side = side.column(align=True)
+        side.operator(PHYSGEN_OT_add_bodies.bl_idname, text="", icon="ADD")
+        side.operator(PHYSGEN_OT_remove_body.bl_idname, text="", icon="REMOVE")
+        side.separator()
+        side.operator(PHYSGEN_OT_select_bodies.bl_idname, text="", icon="RESTRICT_SELECT_OFF")
+        if editing:
+            text.sentences(layout, context, "Leave Edit Mode to choose another object.", icon="INFO")
+        item = active_body(context)
+        if item is None:
+            active = context.active_object
+            words = f"{active.name} is not in the simulation." if active is not None else "No object is active."
+            text.sentences(layout, context, f"{words} Choose one in the list.", icon="INFO")
+            return
+        column = settings(layout, context, why=True)
+        column.row().prop(item.physgen, "role", expand=True)
+        if splats.find(item) is not None:
+            column.row().prop(item.physgen, "splats_as", expand=True)
+        if item.physgen.role == "dynamic":
+            _draw_preset(column, context, item.physgen.material)
+        if item.physgen.role == "collider":
+            text.sentences(layout, context, "Other objects collide with it. It is static, or follows its keyframes.")
+
+
+class _Part(Sidebar):
+    bl_parent_id = "PHYSGEN_PT_objects"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown if the active object is dynamic."""
+        item = active_body(context)
+        return item is not None and item.physgen.role == "dynamic"
+
+
+class PHYSGEN_PT_material(_Part, bpy.types.Panel):
+    """Material of the object"""
+
+    bl_label = "Material"
+    bl_order = 0
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw behaviour, and the values it uses."""
+        material = active_body(context).physgen.material
+        column = settings(self.layout, context)
+        column.prop(material, "law")
+        _number(column, material, "density", "kg/m³")
+        for name in LAW_FIELDS[material.law]:
+            if name == "fibre_axis":
+                if material.fibre_modulus > 0:
+                    column.prop(material, name)
+                continue
+            _number(column, material, name, UNITS[name](getattr(material, name)) if name in UNITS else "")
+        if any(is_body(o) and o != context.active_object for o in context.selected_objects):
+            column.operator(PHYSGEN_OT_copy_material.bl_idname, icon="COPYDOWN")
+
+
+def _draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material: Any) -> None:
+    own = material_props.own_presets()
+    name = material.preset_name
+    row = layout.row(align=True)
+    row.use_property_split = False
+    row.prop(material, "preset", text="")
+    modified = is_modified(material)
+    if modified:
+        row.operator(PHYSGEN_OT_reset_preset.bl_idname, text="", icon="LOOP_BACK")
+    row.operator(PHYSGEN_OT_save_preset.bl_idname, text="", icon="FILE_TICK")
+    if name in own.good:
+        row.operator(PHYSGEN_OT_delete_preset.bl_idname, text="", icon="TRASH").name = name
+    if modified:
+        text.sentences(
+            layout, context, f"{material_props.preset_title(name)}, with modified values.", icon="GREASEPENCIL"
+        )
+    elif name != material_props.CUSTOM and material_props.find_preset(name) is None:
+        words = f"There is no preset {name} on this computer. The object keeps its values."
+        text.sentences(layout, context, words, icon="INFO")
+    for broken in own.broken:
+        row = layout.row(align=True)
+        row.alert = True
+        row.label(text=f"Unreadable preset: {broken}", icon="ERROR")
+        row.operator(PHYSGEN_OT_delete_preset.bl_idname, text="", icon="TRASH").name = broken
+
+
+def _number(layout: bpy.types.UILayout, data: Any, name: str, words: str) -> None:
+    """Draw a field with its unit or its value in words beside it, aligned with the other fields."""
+    split = layout.split(factor=0.4, align=True)
+    split.use_property_split = False
+    title = split.row()
+    title.alignment = "RIGHT"
+    title.label(text=data.bl_rna.properties[name].name)
+    field = split.split(factor=0.58, align=True)
+    field.prop(data, name, text="")
+    unit = field.row()
+    unit.active = False
+    unit.label(text=words)
+
+
+class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
+    """Solid or hollow; turning to sand"""
+
+    bl_label = "Filling"
+    bl_order = 1
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw fill, wall and sand."""
+        body = active_body(context).physgen
+        column = settings(self.layout, context)
+        column.prop(body, "fill")
+        if not body.fill:
+            column.prop(body, "shell_thickness")
+            if body.shell_thickness == 0:
+                text.sentences(column, context, "0: the thinnest wall that the quality resolves.")
+        law = body.material.law
+        # Only deformable objects can turn to sand.
+        if cohesion_of(law) in (SHAPED, COHERENT):
+            column.prop(body, "sandy")
+            if body.sandy:
+                column.prop(body, "sandy_frame")
+
+
+class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
+    """Friction and bounce"""
+
+    bl_parent_id = "PHYSGEN_PT_objects"
+    bl_label = "Surface"
+    bl_order = 2
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown for all bodies; colliders have a surface too."""
+        return active_body(context) is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw its own values, or the ground's."""
+        body = active_body(context).physgen
+        column = settings(self.layout, context)
+        column.prop(body, "own_surface")
+        if not body.own_surface:
+            text.sentences(column, context, "Uses the ground's friction and bounce (see World).")
+            return
+        for name in SURFACE:
+            column.prop(body, name)
+        draw_static_friction_note(column, context, body)
+
+
+class PHYSGEN_PT_compose(Sidebar, bpy.types.Panel):
+    """Resolve intersections of objects"""
+
+    bl_idname = "PHYSGEN_PT_together"
+    bl_label = "Compose Objects"
+    bl_order = TOGETHER
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the fixed and the yielding objects, method, button and last result."""
+        layout, state = self.layout, context.scene.physgen_together
+        items = chosen_meshes(context)
+        if len(items) < 2:
+            text.sentences(layout, context, "Select two or more meshes that intersect.", icon="INFO")
+        else:
+            text.sentences(layout, context, f"Stays: {items[0].name}", icon="PINNED")
+            text.sentences(layout, context, f"Yields: {', '.join(item.name for item in items[1:])}", icon="MOD_CLOTH")
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.prop(state, "method")
+        column.prop(state, "steps")
+        column.prop(state, "keep_strain")
+        column.prop(state, "keep_original")
+        if running() is not None:
+            draw_job(layout)
+        else:
+            row = layout.row()
+            row.scale_y = 1.4
+            row.operator(PHYSGEN_OT_compose_objects.bl_idname, icon="CON_SHRINKWRAP")
+        if state.pairs:
+            _draw_result(layout, state)
+
+
+def _draw_result(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> None:
+    box = layout.box()
+    box.label(text="Penetration, before → after")
+    for pair in state.pairs:
+        column = box.column(align=True)
+        column.scale_y = 0.8
+        column.label(text=pair.name)
+        column.label(
+            text=f"{text.volume(pair.volume_before)} ({100 * pair.share_before:.3g} %) → "
+            f"{text.volume(pair.volume_after)} ({100 * pair.share_after:.3g} %)",
+            icon="BLANK1",
+        )
+        deepest = f"{text.length(pair.deepest_before)} → {text.length(pair.deepest_after)}"
+        column.label(text=f"deepest {deepest}", icon="BLANK1")
+
+
+class PHYSGEN_UL_pins(bpy.types.UIList):
+    """List of pins."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Draw the box and its problem, if any."""
+        box = item.box
+        row = layout.row(align=True)
+        row.alert = box is None or not is_in(box, context.scene)
+        row.prop(item, "box", text="", icon="CUBE")
+        if row.alert:
+            row.label(text="", icon="ERROR")
+
+
+class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
+    """Initial motion of the active object"""
+
+    bl_idname = "PHYSGEN_PT_motion"
+    bl_label = "Motion"
+    bl_order = MOTION
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown if an object may be dynamic."""
+        return bool(bodies(context.scene))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw velocity, spin and start."""
+        layout, item = self.layout, active_body(context)
+        if item is None:
+            text.sentences(layout, context, "Select an object of the simulation to set its initial motion.")
+            return
+        if item.physgen.role == "collider":
+            text.sentences(layout, context, "A collider follows its keyframes. Animate it as any object.")
+            return
+        body = item.physgen
+        text.sentences(layout, context, f"{item.name} at the start:")
+        column = settings(layout, context)
+        column.prop(body, "velocity")
+        column.prop(body, "speed")
+        column.prop(body, "spin")
+        turns = Vector(body.spin).length / (2 * math.pi)
+        if turns > 0:
+            split = column.split(factor=0.4)
+            split.label(text="")
+            split.active = False
+            split.label(text=f"{turns:.2g} turns/s")
+        column.prop(body, "start_frame")
+        row = layout.row(align=True)
+        draw_arrows(row, context)
+        cleared = row.row(align=True)
+        cleared.enabled = column.enabled
+        cleared.operator(PHYSGEN_OT_clear_motion.bl_idname, text="", icon="LOOP_BACK")
+
+
+class PHYSGEN_PT_pins(Sidebar, bpy.types.Panel):
+    """Pins of the active object"""
+
+    bl_parent_id = "PHYSGEN_PT_motion"
+    bl_label = "Hold"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown if the active object is dynamic."""
+        item = active_body(context)
+        return item is not None and item.physgen.role == "dynamic"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw pins and shape stiffness."""
+        layout, body = self.layout, active_body(context).physgen
+        locked = settings(layout, context)
+        if body.pins:
+            row = locked.row()
+            row.template_list("PHYSGEN_UL_pins", "", body, "pins", body, "pin_index", rows=2)
+            side = row.column(align=True)
+            side.operator(PHYSGEN_OT_add_pin.bl_idname, text="", icon="ADD")
+            side.operator(PHYSGEN_OT_remove_pin.bl_idname, text="", icon="REMOVE")
+            if any(pin.box is None or not is_in(pin.box, context.scene) for pin in body.pins):
+                text.sentences(
+                    locked, context, "A pin has lost its box: choose another empty or remove it.", icon="ERROR"
+                )
+            text.sentences(locked, context, "Move, scale or animate the box in the viewport.")
+        else:
+            text.sentences(locked, context, "A pin is a box: the part of the object inside it is held.")
+            locked.operator(PHYSGEN_OT_add_pin.bl_idname, icon="PINNED")
+        column = locked.column()
+        column.prop(body, "goal_stiffness")
+        damping = column.column()
+        damping.active = body.goal_stiffness > 0
+        damping.prop(body, "goal_damping")

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Photo panel: the photo, its boxes and corrections, Reconstruct. In image editor and 3D viewport."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import bpy
+
+from ...sim.errors import PhysGenError
+from .. import text
+from ..context import TAB
+from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
+from ..operators.photo_ops import (
+    PHYSGEN_OT_draw_box,
+    PHYSGEN_OT_open_photo,
+    PHYSGEN_OT_open_photo_report,
+    PHYSGEN_OT_reconstruct,
+    PHYSGEN_OT_remove_box,
+    PHYSGEN_OT_use_image,
+)
+from ..photo.photo_consent import OFFLINE, is_allowed
+from ..photo.photo_request import made_folder, scene_folder
+from .sidebar import draw_job
+
+KEY_VARIABLE = "PHYSGEN_API_KEY"
+
+
+def _part(layout: bpy.types.UILayout, name: str, title: str) -> bpy.types.UILayout | None:
+    """Return the layout of a part that is closed by default; None while it is closed."""
+    header, body = layout.panel(f"PHYSGEN_{name}", default_closed=True)
+    header.label(text=title)
+    if body is None:
+        return None
+    column = body.column()
+    column.use_property_split, column.use_property_decorate = True, False
+    return column
+
+
+def draw_details(layout: bpy.types.UILayout, context: bpy.types.Context, box: Any) -> None:
+    """Draw the user-supplied properties of the active object."""
+    column = _part(layout, "photo_details", f"Details of {box.name}")
+    if column is None:
+        return
+    column.prop(box, "kind")
+    draw_mask(column, context, box)
+    shape = column.column()
+    shape.active = not box.mesh.strip()
+    shape.prop(box, "shape")
+    inflated = shape.column()
+    inflated.active = box.shape in ("auto", "inflated")
+    inflated.prop(box, "back")
+    inflated.prop(box, "thickness")
+    column.prop(box, "mesh")
+    if box.mesh.strip():
+        column.prop(box, "mesh_up")
+    grid = column.grid_flow(columns=2, row_major=True, even_columns=True, align=True)
+    grid.use_property_split = False
+    for name in ("x0", "x1", "y0", "y1"):
+        grid.prop(box, name)
+
+
+def draw_mask(layout: bpy.types.UILayout, context: bpy.types.Context, box: Any) -> None:
+    """Draw buttons to paint, choose and remove a mask."""
+    column = layout.column(align=True)
+    column.use_property_split = False
+    row = column.row(align=True)
+    row.operator(PHYSGEN_OT_paint_mask.bl_idname, icon="BRUSH_DATA")
+    if box.mask is not None:
+        row.operator(PHYSGEN_OT_clear_mask.bl_idname, text="", icon="X")
+    column.template_ID(box, "mask", open="image.open")
+
+
+def draw_camera(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    """Draw camera settings."""
+    column = _part(layout, "photo_camera", "Camera")
+    if column is None:
+        return
+    column.prop(state, "camera", text="Tilt")
+    if state.camera == "PITCH":
+        column.prop(state, "pitch")
+    if state.camera == "HORIZON":
+        column.prop(state, "horizon")
+        column.prop(state, "roll")
+    column.operator(PHYSGEN_OT_set_horizon.bl_idname, icon="DRIVER_ROTATIONAL_DIFFERENCE")
+    row = column.row(heading="Field of View")
+    row.prop(state, "use_fov", text="")
+    value = row.row()
+    value.active = state.use_fov
+    value.prop(state, "fov", text="")
+    if state.has_found:
+        pitch, fov = math.degrees(state.found_pitch), math.degrees(state.found_fov)
+        words = f"Last time: pitch {pitch:.0f}°, horizon {state.found_horizon:.2f}, field of view {fov:.0f}°."
+        text.sentences(column, context, words)
+
+
+def draw_files(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    """Draw depth map and report."""
+    column = _part(layout, "photo_files", "Depth Map and Report")
+    if column is None:
+        return
+    column.prop(state, "depth")
+    column.prop(state, "report")
+    column.operator(PHYSGEN_OT_open_photo_report.bl_idname, icon="URL")
+
+
+def draw_asking(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    """Draw the reasoning endpoint for materials."""
+    column = _part(layout, "photo_asking", "Ask a Model")
+    if column is None:
+        return
+    text.sentences(column, context, "Estimate materials with a vision-capable chat endpoint.")
+    column.prop(state, "ask_url")
+    column.prop(state, "ask_model")
+    url = state.ask_url.strip()
+    allowed = is_allowed(url, online=bpy.app.online_access)
+    consent = column.row()
+    consent.use_property_split = False
+    consent.enabled = bool(url) and allowed
+    consent.prop(state, "send_photo")
+    if url and not allowed:
+        text.sentences(column, context, f"{OFFLINE}.", icon="ERROR")
+        return
+    text.sentences(
+        column,
+        context,
+        f"Nobody is asked without it. The key, where one is needed, is read from the environment variable "
+        f"{KEY_VARIABLE} that Blender was started with.",
+    )
+
+
+class PHYSGEN_UL_boxes(bpy.types.UIList):
+    """List of boxes: name of the object, and its size."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Draw the name (double click to rename) and size."""
+        row = layout.row(align=True)
+        row.prop(item, "name", text="", emboss=False, icon="SELECT_SET")
+        right = row.row()
+        right.alignment = "RIGHT"
+        right.label(text=text.length(item.size_m) if item.size_m > 0 else "")
+
+
+def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw everything from photo to scene."""
+    state = context.scene.physgen_photo
+    column = layout.column(align=True)
+    column.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo" if state.image is None else state.image.name)
+    editor = context.space_data.type == "IMAGE_EDITOR"
+    if editor and context.space_data.image not in (None, state.image):
+        column.operator(PHYSGEN_OT_use_image.bl_idname, icon="IMAGE_DATA")
+    if state.image is None:
+        text.sentences(layout, context, "A photo of objects on a table or floor. It can be dropped here.")
+        return
+    _draw_boxes(layout, context, state)
+    if 0 <= state.box_index < len(state.boxes):
+        draw_details(layout, context, state.boxes[state.box_index])
+    draw_camera(layout, context, state)
+    draw_files(layout, context, state)
+    draw_asking(layout, context, state)
+    layout.prop(state, "output", text="Save To")
+    if not state.output.strip():
+        try:
+            text.sentences(layout, context, f"Makes {scene_folder(state).name} beside the {_beside()}.")
+        except PhysGenError as error:
+            text.sentences(layout, context, str(error), icon="ERROR")
+    row = layout.row()
+    row.scale_y = 1.4
+    again = made_folder(state) is not None
+    row.operator(
+        PHYSGEN_OT_reconstruct.bl_idname, text="Reconstruct Again" if again else "Reconstruct", icon="MESH_MONKEY"
+    )
+    if again:
+        text.sentences(layout, context, "Only affected stages run again; your physics edits are kept.")
+    draw_job(layout)
+
+
+def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
+    row = layout.row()
+    row.template_list("PHYSGEN_UL_boxes", "", state, "boxes", state, "box_index", rows=3)
+    buttons = row.column(align=True)
+    buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
+    buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
+    layout.operator(PHYSGEN_OT_draw_box.bl_idname, icon="SELECT_SET")
+    if not state.boxes:
+        text.sentences(layout, context, "Draw a box around each object that is to move.")
+        return
+    if not 0 <= state.box_index < len(state.boxes):
+        return
+    box = state.boxes[state.box_index]
+    column = layout.column(align=True)
+    column.use_property_split, column.use_property_decorate = True, False
+    column.prop(box, "size_m")
+    if not any(other.size_m > 0 for other in state.boxes):
+        text.sentences(layout, context, "Set the size of one object; otherwise the scale is estimated.")
+
+
+def _beside() -> str:
+    return ".blend file" if bpy.data.filepath else "photo"
+
+
+class PHYSGEN_PT_photo(bpy.types.Panel):
+    """Reconstructs a scene from a photo"""
+
+    bl_idname = "PHYSGEN_PT_photo"
+    bl_label = "Start from a Photo"
+    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", TAB
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the same as in the 3D viewport."""
+        draw_photo(self.layout, context)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render panel: into the photo or as any Blender scene, and export to other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .. import text
+from ..background_jobs import running
+from ..operators.render_ops import (
+    PHYSGEN_OT_export_alembic,
+    PHYSGEN_OT_export_usd,
+    PHYSGEN_OT_make_independent,
+    PHYSGEN_OT_render_still,
+    PHYSGEN_OT_render_video,
+    missing_modules,
+)
+from ..render.render_options import VIDEO_CODECS
+from .sidebar import RENDER, Sidebar, draw_job
+
+RESULTS = (".png", ".exr", *VIDEO_CODECS)
+"""Suffixes of rendered files."""
+
+
+class PHYSGEN_PT_render(Sidebar, bpy.types.Panel):
+    """Render images and video"""
+
+    bl_idname = "PHYSGEN_PT_render"
+    bl_label = "Render"
+    bl_order = RENDER
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw settings and buttons, of the photo's renderer or Blender's own."""
+        column = self.layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        if context.scene.physgen.folder:
+            _draw_photo_render(column, context)
+        else:
+            _draw_own_render(column, context)
+
+
+def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    state = context.scene.physgen
+    rendering = state.rendering
+    under_way = running()
+    choices = layout.column()
+    choices.enabled = under_way is None
+    choices.prop(rendering, "engine")
+    if rendering.engine == "cycles":
+        choices.prop(rendering, "device")
+    choices.prop(rendering, "samples")
+    if not rendering.samples:
+        text.sentences(choices, context, "Samples 0: the engine's default.")
+    choices.prop(rendering, "scale")
+    choices.prop(rendering, "format")
+    choices.prop(rendering, "video")
+    choices.prop(rendering, "output")
+    if rendering.output.startswith("//") and not bpy.data.filepath:
+        words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
+        text.sentences(layout, context, words, icon="INFO")
+    lacking = missing_modules()
+    if lacking:
+        words = f"Blender's Python lacks {', '.join(lacking)}: install PhysGen from the zip for your system."
+        text.sentences(layout, context, words, icon="ERROR")
+    if under_way is not None and under_way.title == "Render":
+        draw_job(layout)
+    elif under_way is not None:
+        text.sentences(layout, context, f"{under_way.title} is running; render when it is done.", icon="INFO")
+    elif not state.simulation.bake:
+        text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = not lacking
+    row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
+    row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
+    _draw_result(layout, rendering)
+
+
+def _draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup) -> None:
+    if not rendering.result:
+        return
+    path = Path(bpy.path.abspath(rendering.result))
+    # A .blend from elsewhere may set any path here, and Open passes it to the operating system.
+    if path.suffix not in RESULTS or not path.is_file():
+        return
+    row = layout.row(align=True)
+    row.label(text=path.name, icon="CHECKMARK")
+    row.operator("wm.path_open", text="Open").filepath = str(path)
+    row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
+
+
+def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    scene = context.scene
+    text.sentences(layout, context, "No photo: rendered as an ordinary Blender scene.")
+    layout.prop(scene.render, "engine")
+    layout.prop(scene.render, "resolution_percentage", text="Size")
+    layout.prop(scene.render, "filepath", text="Output")
+    layout.prop(scene.render, "use_motion_blur")
+    if scene.camera is None:
+        text.sentences(layout, context, "The scene has no camera: add one (Shift A).", icon="ERROR")
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = scene.camera is not None
+    row.operator("render.render", text="Render Still", icon="RENDER_STILL").use_viewport = True
+    video = row.operator("render.render", text="Render Video", icon="RENDER_ANIMATION")
+    video.animation, video.use_viewport = True, True
+
+
+class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
+    """Match the photo's camera"""
+
+    bl_parent_id = "PHYSGEN_PT_render"
+    bl_label = "Look"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown with a photo."""
+        return bool(context.scene.physgen.folder)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw a line for each effect."""
+        rendering = context.scene.physgen.rendering
+        column = self.layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.enabled = running() is None
+        column.prop(rendering, "motion_blur", slider=True)
+        matched = column.column(heading="From the Photo", align=True)
+        matched.prop(rendering, "grain")
+        matched.prop(rendering, "match_sharpness")
+        column.column(heading="Floor").prop(rendering, "reflections")
+        column.prop(rendering, "f_number")
+        if rendering.f_number:
+            column.prop(rendering, "focus_distance")
+            if not rendering.focus_distance:
+                text.sentences(column, context, "Focus 0: each object is in focus at rest.")
+        text.sentences(column, context, "Frame 1 always equals the photo.")
+
+
+class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
+    """Export the motion for other programs, and for Blender without PhysGen"""
+
+    bl_parent_id = "PHYSGEN_PT_render"
+    bl_label = "Export"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw one button each."""
+        layout = self.layout
+        if not context.scene.physgen.simulation.bake:
+            text.sentences(layout, context, "Bake first (see Simulate) to export the motion.", icon="INFO")
+        row = layout.row(align=True)
+        row.operator(PHYSGEN_OT_export_alembic.bl_idname, text="Alembic", icon="EXPORT")
+        row.operator(PHYSGEN_OT_export_usd.bl_idname, text="USD", icon="EXPORT")
+        layout.operator(PHYSGEN_OT_make_independent.bl_idname, text="Make Independent", icon="UNLINKED")
+        text.sentences(layout, context, "Independent: the file plays and renders without PhysGen.")

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scene panel: starting points, the source of this scene, and corrections of its reconstruction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .. import text
+from ..operators.body_ops import PHYSGEN_OT_add_bodies
+from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
+from ..operators.photo_ops import PHYSGEN_OT_open_photo
+from ..props.body_props import bodies
+from . import photo_panel
+from .photo_panel import draw_photo
+from .sidebar import SCENE, Sidebar
+
+
+class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
+    """Source of the scene"""
+
+    bl_idname = "PHYSGEN_PT_scene"
+    bl_label = "Scene"
+    bl_order = SCENE
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw starting points; later the scene's folder."""
+        layout, state = self.layout, context.scene.physgen
+        if state.folder:
+            _draw_folder(layout, context, state)
+            return
+        if context.scene.physgen_photo.image is not None:
+            photo_panel.draw_photo(layout, context)
+            return
+        found = bodies(context.scene)
+        if not found:
+            _draw_beginning(layout, context)
+            return
+        what = text.count(len(found), "object")
+        text.sentences(layout, context, f"{what} in the simulation, without a photo.", icon="CHECKMARK")
+        row = layout.row(align=True)
+        row.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo", icon="IMAGE_DATA")
+        row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import", icon="IMPORT")
+
+
+def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    text.sentences(layout, context, "Objects that fall, bounce, deform and flow. Start with one of these:")
+    for title, operator, label, icon in (
+        ("Meshes: select some in the viewport", PHYSGEN_OT_add_bodies, "Simulate Selected", "PHYSICS"),
+        ("A photo: draw a box around each object", PHYSGEN_OT_open_photo, "Open Photo", "IMAGE_DATA"),
+        ("An existing scene folder", PHYSGEN_OT_import_scene, "Import Scene Folder", "IMPORT"),
+        ("Gaussian splats of an object (PLY)", PHYSGEN_OT_choose_splats, "Import Splats", "POINTCLOUD_DATA"),
+    ):
+        box = layout.box()
+        text.sentences(box, context, title)
+        row = box.row()
+        row.scale_y = 1.3
+        row.operator(operator.bl_idname, text=label, icon=icon)
+    text.sentences(layout, context, "Then choose materials and velocities here, and press Bake (see Simulate).")
+
+
+def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
+    folder = Path(bpy.path.abspath(state.folder))
+    row = layout.row(align=True)
+    row.prop(state, "folder", text="")
+    there = folder.is_dir()
+    if there:
+        row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
+    else:
+        row.alert = True
+        text.sentences(
+            layout, context, "This folder is not there: choose where it is now, or import it again.", icon="ERROR"
+        )
+    text.sentences(layout, context, f"{text.count(len(bodies(context.scene)), 'object')} in the simulation.")
+    row = layout.row(align=True)
+    row.operator("view3d.view_camera", text="Look Through Camera", icon="VIEW_CAMERA")
+    if state.photo_root is not None:
+        row.prop(state.photo_root, "hide_viewport", text="")
+    layout.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import Another", icon="IMPORT")
+
+
+class PHYSGEN_PT_correct(Sidebar, bpy.types.Panel):
+    """The photo of a reconstructed scene, to correct its estimates"""
+
+    bl_idname = "PHYSGEN_PT_correct"
+    bl_label = "Correct"
+    bl_parent_id = "PHYSGEN_PT_scene"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown once a scene with a photo was imported; before that the Scene panel shows all of it."""
+        return bool(context.scene.physgen.folder) and context.scene.physgen_photo.image is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the same as in the image editor."""
+        draw_photo(self.layout, context)

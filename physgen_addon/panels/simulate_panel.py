@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Simulate panel: quality, frames, folder; the bake and its state."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import text
+from ..background_jobs import PHYSGEN_OT_cancel_job, running
+from ..bake_state import BakeState, state
+from ..operators.bake_ops import (
+    PHYSGEN_OT_bake,
+    PHYSGEN_OT_estimate_bake,
+    PHYSGEN_OT_free_bake,
+    PHYSGEN_OT_free_old_bakes,
+    PHYSGEN_OT_pause_bake,
+    PHYSGEN_OT_relink_caches,
+)
+from ..operators.world_ops import PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only
+from ..props.body_props import bodies
+from .sidebar import SIMULATE, Sidebar, draw_preview, draw_progress, draw_trouble, is_baking, settings
+
+
+class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
+    """Simulate the scene"""
+
+    bl_idname = "PHYSGEN_PT_simulate"
+    bl_label = "Simulate"
+    bl_order = SIMULATE
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw settings, estimate, buttons and the bake's state."""
+        layout, scene = self.layout, context.scene
+        simulation = scene.physgen.simulation
+        column = settings(layout, context)
+        column.prop(simulation, "quality")
+        frames = column.column(align=True)
+        row = frames.row(align=True)
+        row.prop(simulation, "frame_start", text="Frames")
+        row.operator(PHYSGEN_OT_frames_from_scene.bl_idname, text="", icon="TIME")
+        frames.prop(simulation, "frame_end", text="To")
+        column.prop(simulation, "device")
+        _draw_length(layout, context, simulation)
+        lacking = _lacking(scene)
+        if not lacking:
+            draw_preview(layout, context)
+        elif not is_baking(scene):
+            text.sentences(layout, context, lacking, icon="INFO")
+        _draw_bake(layout, context, state(scene), ready=not lacking)
+
+
+def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulation: bpy.types.PropertyGroup) -> None:
+    frames = simulation.frame_end - simulation.frame_start + 1
+    rate = context.scene.render.fps / context.scene.render.fps_base
+    if frames < 2:
+        text.sentences(layout, context, "The last frame must come after the first.", icon="ERROR")
+        return
+    text.sentences(layout, context, f"{frames} frames: {frames / rate:.2g} s at {rate:.4g} fps")
+
+
+def _lacking(scene: bpy.types.Scene) -> str:
+    """Return why nothing can be baked yet; empty if it can."""
+    found = bodies(scene)
+    if found and all(item.physgen.role == "collider" for item in found):
+        return "Nothing moves yet: give an object the role Moves (see Objects)."
+    if not found and scene.physgen_photo.image is not None:
+        return "Nothing moves yet: draw boxes and reconstruct the photo (see Scene)."
+    if not found:
+        return "Nothing moves yet: select a mesh, then Simulate Selected (see Scene)."
+    return ""
+
+
+def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState, *, ready: bool) -> None:
+    if found.status == "baking":
+        job = running()
+        if job is None:
+            # A bake by another Blender, or one that was killed, is running.
+            text.sentences(layout, context, found.message, icon="INFO")
+            return
+        draw_progress(layout, job)
+        row = layout.row(align=True)
+        row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="Pause", icon="PAUSE")
+        row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="Cancel", icon="CANCEL")
+        return
+    other = running()
+    if other is not None:
+        text.sentences(layout, context, f"{other.title} is running; bake when it is done.", icon="INFO")
+    labels = {"paused": "Resume", "baked": "Bake Again", "stale": "Bake Again", "missing": "Bake Again"}
+    icons = {"paused": "PLAY", "none": "PHYSICS"}
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = ready
+    label, icon = labels.get(found.status, "Bake"), icons.get(found.status, "FILE_REFRESH")
+    row.operator(PHYSGEN_OT_bake.bl_idname, text=label, icon=icon)
+    if not ready and found.status == "none":
+        return
+    _draw_status(layout, context, found)
+    estimate = layout.row(align=True)
+    estimate.enabled = ready
+    estimate.operator(PHYSGEN_OT_estimate_bake.bl_idname, text="Estimate Time and Memory", icon="SORTTIME")
+    if found.estimate_text:
+        text.sentences(layout, context, found.estimate_text)
+
+
+def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: BakeState) -> None:
+    """Draw the bake's state in a box, with possible actions."""
+    advice = text.brief(found.advice)
+    if found.status == "none":
+        if found.trouble:
+            draw_trouble(layout, context, found.trouble, icon="ERROR")
+        text.sentences(layout, context, advice)
+        return
+    box = layout.box()
+    if found.trouble:
+        draw_trouble(box, context, found.trouble, icon="ERROR")
+    if found.status == "missing":
+        text.sentences(box, context, advice, icon="ERROR")
+        row = box.row(align=True)
+        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find It", icon="FILE_FOLDER")
+        row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
+        return
+    words, icon = {
+        "baked": (f"Baked: {found.frames_done} frames", "CHECKMARK"),
+        "paused": (f"{found.frames_done} of {found.frames} frames are baked and play", "PAUSE"),
+        "stale": (f"{found.frames_done} frames are baked and still play", "ERROR"),
+    }[found.status]
+    text.sentences(box, context, words, icon=icon)
+    if advice:
+        text.sentences(box, context, advice)
+    last = context.scene.physgen.simulation.frame_end
+    if found.status == "baked" and context.scene.frame_end > last:
+        column = box.column(align=True)
+        text.sentences(column, context, f"Playback goes on to frame {context.scene.frame_end}, at rest.")
+        column.operator(PHYSGEN_OT_play_bake_only.bl_idname, text=f"End Playback at {last}", icon="PREVIEW_RANGE")
+    row = box.row(align=True)
+    row.label(text=f"{text.storage(found.disk_bytes)} on disk")
+    row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
+
+
+class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
+    """Location of the bakes"""
+
+    bl_parent_id = "PHYSGEN_PT_simulate"
+    bl_label = "Cache"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw folder, seed, and relinking of lost bakes."""
+        layout, simulation = self.layout, context.scene.physgen.simulation
+        column = settings(layout, context)
+        column.prop(simulation, "cache", text="Folder")
+        if simulation.cache.startswith("//") and not bpy.data.filepath:
+            words = "Until this file is saved, bakes wait in a temporary folder."
+            text.sentences(column, context, words, icon="INFO")
+        column.prop(simulation, "seed")
+        row = layout.row(align=True)
+        row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find Lost", icon="FILE_FOLDER")
+        row.operator(PHYSGEN_OT_free_old_bakes.bl_idname, text="Free Old", icon="TRASH")

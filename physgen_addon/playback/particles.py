@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked particles: a vertex-only mesh that follows its point cache, and geometry nodes that make grains or a surface.
+
+All of it is native Blender data: it plays and renders without this extension.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...sim.cache.pc2 import Pc2Reader
+from .. import compat
+from . import point_caches
+from .geometry_nodes import Tree, set_input
+
+POINTS_OF = "physgen_particles_of"
+"""Custom property of objects created here: name of the object in the bake."""
+MODIFIER, UNTIL = "PhysGen particles", "PhysGen mesh until"
+GRAINS_GROUP, SURFACE_GROUP, UNTIL_GROUP = "PhysGen grains", "PhysGen surface", "PhysGen mesh until"
+RADIUS, FROM, MATERIAL, BARE = "Radius", "From Frame", "Material", "Bare Vertices"
+GRAIN = 0.55
+"""Radius of a grain over the particle spacing: neighbours just touch."""
+STRAY, SMALLEST, LARGEST = 0.6, 0.75, 1.15
+"""Variation of grains, over their radius: offset along each axis, and smallest and largest size. Without it the initial
+lattice would be visible in a heap.
+"""
+SURFACE, VOXEL, SHRINK, BLUR = 1.1, 0.6, 0.7, 2
+"""Surface parameters, over the particle spacing: radius of the merged balls, which closes gaps between neighbours;
+voxel size; inward offset afterwards, so that it ends at the material's boundary. And the number of smoothing steps.
+"""
+
+
+def find(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
+    """Return the particles object of the object ``name`` in the bake, or None."""
+    return next((item for item in scene.objects if item.get(POINTS_OF) == name), None)
+
+
+def show(
+    scene: bpy.types.Scene,
+    body: bpy.types.Object,
+    name: str,
+    cache: Pc2Reader,
+    path: str,
+    first_frame: int,
+    *,
+    surface: bool,
+    from_frame: int,
+    distance: float,
+) -> bpy.types.Object:
+    """Show the particles of ``cache`` from ``from_frame`` on, and the mesh of ``body`` before.
+
+    name: of the object in the bake. path: of the cache as stored in the file. surface: a surface around the particles
+    instead of grains. distance: of neighbouring particles, m. Samples are in the space of ``body``, which is therefore
+    the parent.
+    """
+    item = find(scene, name)
+    if item is not None and len(item.data.vertices) != cache.vertex_count:
+        remove(item)
+        item = None
+    if item is None:
+        item = _add(body, name, cache.sample(0))
+        _add_look(item, distance, surface=surface)
+    point_caches.attach_as_first(item, cache, path, first_frame)
+    set_input(item.modifiers[MODIFIER], FROM, from_frame)
+    until = body.modifiers.get(UNTIL)
+    if until is None:
+        until = body.modifiers.new(UNTIL, "NODES")
+        until.node_group = _until_group()
+    set_input(until, FROM, from_frame)
+    return item
+
+
+def remove(item: bpy.types.Object) -> None:
+    """Delete what ``show`` added for one body, except the modifier on it (``uncover``)."""
+    mesh = item.data
+    bpy.data.objects.remove(item)
+    if mesh.users == 0:
+        bpy.data.meshes.remove(mesh)
+
+
+def set_bare(item: bpy.types.Object, bare: bool) -> None:
+    """Make grains vertices of a mesh without faces: exporters skip point clouds made by modifiers."""
+    modifier = item.modifiers.get(MODIFIER)
+    if modifier is not None and modifier.node_group is not None and modifier.node_group.name.startswith(GRAINS_GROUP):
+        set_input(modifier, BARE, bare)
+        item.update_tag()
+
+
+def uncover(body: bpy.types.Object) -> None:
+    """Show the mesh of ``body`` at all frames again."""
+    until = body.modifiers.get(UNTIL)
+    if until is not None:
+        body.modifiers.remove(until)
+
+
+def _add(body: bpy.types.Object, name: str, rest: np.ndarray) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new(f"{body.name} particles")
+    mesh.vertices.add(len(rest))
+    # A hundred times as fast as by the vertices' ``co``.
+    mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(rest, dtype=np.float32).ravel())
+    material = body.active_material
+    if material is not None:
+        mesh.materials.append(material)
+    item = bpy.data.objects.new(f"{body.name} particles", mesh)
+    item[POINTS_OF] = name
+    item.color = body.color
+    for collection in body.users_collection:
+        collection.objects.link(item)
+    item.parent = body
+    item.matrix_parent_inverse = Matrix.Identity(4)
+    item.hide_select = True
+    return item
+
+
+def _add_look(item: bpy.types.Object, distance: float, *, surface: bool) -> None:
+    modifier = item.modifiers.new(MODIFIER, "NODES")
+    modifier.node_group = _surface_group() if surface else _grains_group()
+    set_input(modifier, RADIUS, distance * (SURFACE if surface else GRAIN))
+    if item.data.materials:
+        set_input(modifier, MATERIAL, item.data.materials[0])
+
+
+def begun(tree: Tree) -> Any:
+    """Return a condition, true from frame FROM on; half a frame early, because subframes of motion blur belong to their
+    frame.
+    """
+    frame = tree.node("GeometryNodeInputSceneTime").outputs["Frame"]
+    return tree.compare("GREATER_EQUAL", frame, tree.math("SUBTRACT", tree.inputs[FROM], 0.5))
+
+
+def switch(tree: Tree, when: Any, no: Any, yes: Any) -> Any:
+    """Return a switch between the geometries ``yes`` and ``no``."""
+    return tree.out("GeometryNodeSwitch", when, no, yes, input_type="GEOMETRY")
+
+
+def _grains_group() -> bpy.types.NodeTree:
+    """Return a group: points → a point cloud of round grains, which engines draw as spheres, far lighter than
+    instances.
+    """
+    found = bpy.data.node_groups.get(GRAINS_GROUP)
+    if found is not None:
+        return found
+    inputs = {RADIUS: ("Float", 0.01), FROM: ("Int", 1), MATERIAL: ("Material", None), BARE: ("Bool", False)}
+    tree = Tree(GRAINS_GROUP, inputs)
+    grains = grain_cloud(tree, tree.inputs["Geometry"], tree.inputs[RADIUS])
+    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[MATERIAL])
+    shown = switch(tree, tree.inputs[BARE], coloured, tree.inputs["Geometry"])
+    return tree.finish(switch(tree, begun(tree), None, shown))
+
+
+def grain_cloud(tree: Tree, geometry: Any, radius: Any) -> Any:
+    """Return a grain of about ``radius`` near each vertex of ``geometry``."""
+    reach = tree.math("MULTIPLY", radius, STRAY)
+    stray = tree.out("FunctionNodeRandomValue", tree.math("MULTIPLY", reach, -1.0), reach, data_type="FLOAT_VECTOR")
+    size = tree.out("FunctionNodeRandomValue", SMALLEST, LARGEST, data_type="FLOAT")
+    size = tree.math("MULTIPLY", radius, size)
+    place = tree.out("ShaderNodeVectorMath", tree.out("GeometryNodeInputPosition"), stray, operation="ADD")
+    return tree.out("GeometryNodeMeshToPoints", geometry, None, place, size)
+
+
+def _surface_group() -> bpy.types.NodeTree:
+    """Return a group: points → the surface of merged balls around them."""
+    found = bpy.data.node_groups.get(SURFACE_GROUP)
+    if found is not None:
+        return found
+    tree = Tree(SURFACE_GROUP, {RADIUS: ("Float", 0.02), FROM: ("Int", 1), MATERIAL: ("Material", None)})
+    radius = tree.inputs[RADIUS]
+    # Switch before the expensive part: frames without particles cost nothing.
+    shown = switch(tree, begun(tree), None, tree.inputs["Geometry"])
+    surface = enclosing_surface(tree, shown, radius)
+    return tree.finish(tree.out("GeometryNodeSetMaterial", surface, None, tree.inputs[MATERIAL]))
+
+
+def enclosing_surface(tree: Tree, points: Any, radius: Any) -> Any:
+    """Return the smoothed surface of balls of ``radius`` around the vertices ``points``, offset inward to the
+    material's boundary.
+    """
+    points = tree.out("GeometryNodeMeshToPoints", points, None, None, radius)
+    volume = tree.node("GeometryNodePointsToVolume")
+    compat.set_resolution(volume, "Size")
+    tree.group.links.new(points, volume.inputs["Points"])
+    tree.group.links.new(radius, volume.inputs["Radius"])
+    tree.group.links.new(tree.math("MULTIPLY", radius, VOXEL / SURFACE), volume.inputs["Voxel Size"])
+    mesh = tree.node("GeometryNodeVolumeToMesh", volume.outputs[0])
+    compat.set_resolution(mesh, "Grid")
+    mesh.inputs["Threshold"].default_value = 0.1
+    place, normal = tree.out("GeometryNodeInputPosition"), tree.out("GeometryNodeInputNormal")
+    even = tree.out("GeometryNodeBlurAttribute", place, BLUR, data_type="FLOAT_VECTOR")
+    inwards = tree.node("ShaderNodeVectorMath", normal, operation="SCALE")
+    tree.group.links.new(tree.math("MULTIPLY", radius, -SHRINK / SURFACE), inwards.inputs["Scale"])
+    drawn_in = tree.out("GeometryNodeSetPosition", mesh.outputs[0], None, even, inwards.outputs[0])
+    return tree.out("GeometryNodeSetShadeSmooth", drawn_in)
+
+
+def _until_group() -> bpy.types.NodeTree:
+    """Return a group: the mesh before frame FROM, nothing afterwards."""
+    found = bpy.data.node_groups.get(UNTIL_GROUP)
+    if found is not None:
+        return found
+    tree = Tree(UNTIL_GROUP, {FROM: ("Int", 1)})
+    return tree.finish(switch(tree, begun(tree), tree.inputs["Geometry"], None))

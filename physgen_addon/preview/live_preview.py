@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The live preview of this Blender: a single session, stepped by a timer and drawn in the viewports."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..context import redraw
+from ..interpreter import cli_command, find_python
+from ..props import preferences
+from ..props.body_props import bodies
+from .preview_session import Session
+
+STEP_S = 0.04
+JOIN_S = 0.5
+
+_sessions: list[Session] = []
+"""The running session, at most one."""
+_drawings: list[object] = []
+longest_step_s = [0.0]
+"""Longest time in s that a step has blocked Blender since the preview was switched on."""
+
+
+def session() -> Session | None:
+    """Return the running preview, or None."""
+    return _sessions[0] if _sessions else None
+
+
+def start(scene: bpy.types.Scene, command: Callable[[Path], Sequence[str]]) -> Session:
+    """Start the preview of ``scene``; stop any other."""
+    stop()
+    new = Session(scene.session_uid, command)
+    _sessions.append(new)
+    longest_step_s[0] = 0.0
+    new.start()
+    if not bpy.app.background:
+        # Shaders need a window.
+        from .preview_drawing import Drawing
+
+        _drawings.append(Drawing(new))
+        bpy.app.timers.register(_tick, first_interval=STEP_S, persistent=False)
+    return new
+
+
+def stop() -> None:
+    """Stop the preview, if running."""
+    while _drawings:
+        _drawings.pop().remove()  # type: ignore[attr-defined]
+    while _sessions:
+        old = _sessions.pop()
+        old.stop()
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    redraw("VIEW_3D", "WINDOW", "UI")
+
+
+def _tick() -> float | None:
+    current = session()
+    if current is None:
+        return None
+    before = time.perf_counter()
+    said = (current.state, current.message)
+    if current.step():
+        redraw("VIEW_3D", *(("WINDOW", "UI") if (current.state, current.message) != said else ("WINDOW",)))
+    longest_step_s[0] = max(longest_step_s[0], time.perf_counter() - before)
+    return STEP_S
+
+
+@persistent
+def _on_other_file(*_: object) -> None:
+    stop()
+
+
+def register_live_preview() -> None:
+    """Stop the preview when another file is loaded."""
+    bpy.app.handlers.load_pre.append(_on_other_file)
+
+
+def unregister_live_preview() -> None:
+    """Stop the preview and wait for the worker."""
+    bpy.app.handlers.load_pre.remove(_on_other_file)
+    old = session()
+    stop()
+    if old is not None:
+        old.join(JOIN_S)
+
+
+def worker_command(preferred: str) -> Callable[[Path], Sequence[str]]:
+    """Return the worker's command line; finding the interpreter can take seconds, so this runs in the client's
+    thread.
+    """
+
+    def command(runs: Path) -> Sequence[str]:
+        return cli_command(find_python(preferred), "preview", "--out", str(runs))
+
+    return command
+
+
+class PHYSGEN_OT_toggle_preview(bpy.types.Operator):
+    """Simulate the scene coarsely after every change, and play that in the viewport. The bake is not affected"""
+
+    bl_idname = "physgen.toggle_preview"
+    bl_label = "Live Preview"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if it is running, or there is a dynamic object."""
+        if session() is not None or any(item.physgen.role == "dynamic" for item in bodies(context.scene)):
+            return True
+        cls.poll_message_set("Add an object to the simulation first")
+        return False
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Toggle; returns at once."""
+        if session() is not None:
+            stop()
+        else:
+            start(context.scene, worker_command(preferences.python(context)))
+        return {"FINISHED"}

@@ -1,0 +1,429 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A live preview: watch the scene, send changes to the warm worker, play the frames it returns. Never blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.app.stage_process import parse_event, read_errors, start_process
+from ...sim.cache.pc2 import Pc2Reader
+from ...sim.errors import InputError, PhysGenError
+from ...sim.events import Event
+from ...sim.validation import to_json
+from ..context import scene_with
+from ..props.body_props import bodies
+from ..scene_io.export_animation import channels, clock, export_names, metres_per_unit
+from ..scene_io.export_meshes import read_points
+from ..scene_io.export_objects import physics
+from ..scene_io.export_scene import export_scene
+from ..scene_io.export_world import effects, gravity
+from ..text import decimal
+
+LAST_FRAME_S = 0.4
+"""Duration of the last frame before the loop restarts, s."""
+
+
+@dataclass(eq=False)
+class Proxy:
+    """Proxy of an object: faces (T, 3) int32; samples, one (V, 3) float32 in world metres for each frame so far."""
+
+    name: str
+    faces: NDArray[np.int32]
+    samples: list[NDArray[np.float32]] = field(default_factory=list)
+
+
+class Clip:
+    """A growing run. frames: of the whole run; done: available so far."""
+
+    def __init__(self, folder: Path, started: dict[str, Any], *, frames: int, fps: float) -> None:
+        self.folder, self.frames, self.fps, self.done = folder, frames, fps, 0
+        self.proxies = [Proxy(str(item["name"]), _faces(folder, item)) for item in started["objects"]]
+        self._time = 0.0
+        self._last: float | None = None
+
+    def read(self, done: int) -> None:
+        """Read the frames up to ``done``, which the worker has written. Raises InputError for a missing one."""
+        for proxy in self.proxies:
+            cache = Pc2Reader(self.folder / f"{proxy.name}.pc2")
+            for index in range(len(proxy.samples), done):
+                proxy.samples.append(cache.sample(index))
+        self.done = max(self.done, done)
+
+    def frame_at(self, now: float) -> int:
+        """Return the frame to show at ``now``, in s of any monotonic clock: looping, never ahead of the worker."""
+        elapsed = 0.0 if self._last is None else min(now - self._last, 0.25)
+        self._last = now
+        self._time += elapsed
+        if self.done < self.frames:
+            self._time = min(self._time, max(self.done - 1, 0) / self.fps)
+        elif self._time > (self.frames - 1) / self.fps + LAST_FRAME_S:
+            self._time = 0.0
+        # Slightly more, so that a time of exactly a frame is that frame.
+        return min(int(self._time * self.fps + 1e-6), max(self.done - 1, 0))
+
+
+def _faces(folder: Path, item: dict[str, Any]) -> NDArray[np.int32]:
+    try:
+        faces = np.load(folder / f"{item['name']}.faces.npy", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: {error}; switch the preview off and on") from None
+    if (
+        faces.ndim != 2
+        or faces.shape[1] != 3
+        or (len(faces) and not 0 <= faces.min() <= faces.max() < item["vertices"])
+    ):
+        raise InputError(f"{folder}: faces of {item['name']} are damaged; switch the preview off and on")
+    return np.ascontiguousarray(faces, dtype=np.int32)
+
+
+TINT = (0.22, 0.62, 1.0)
+OPACITY = 0.72
+AMBIENT = 0.35
+LIGHT = np.array((0.35, -0.45, 0.82), dtype=np.float32)
+"""Unit vector towards the light, in world axes."""
+
+
+def shade_vertices(points: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Return RGBA (V, 4) of vertices (V, 3) of triangles (T, 3) in plain sRGB."""
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    corners = faces.T.ravel()
+    sums = np.stack(
+        [np.bincount(corners, weights=np.tile(normals[:, i], 3), minlength=len(points)) for i in range(3)], axis=1
+    )
+    lengths = np.maximum(np.linalg.norm(sums, axis=1), 1e-30)
+    light = AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * (sums @ LIGHT) / lengths)
+    result = np.empty((len(points), 4), dtype=np.float32)
+    result[:, :3] = light[:, None] * np.asarray(TINT)
+    result[:, 3] = OPACITY
+    return result
+
+
+STOP_GRACE_S = 5.0
+"""Time that the worker may take to end after its input is closed."""
+
+
+class Client:
+    """Starts and stops the worker, sends requests, receives events.
+
+    command: called in a thread, returns the worker's command line; may take seconds, may raise PhysGenError. at_end:
+    called in that thread when the worker has ended.
+    """
+
+    def __init__(self, command: Callable[[], Sequence[str]], at_end: Callable[[], None]) -> None:
+        self._command, self._at_end = command, at_end
+        self._events: SimpleQueue[Event] = SimpleQueue()
+        self._requests: SimpleQueue[bytes | None] = SimpleQueue()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="physgen preview", daemon=True)
+
+    def start(self) -> None:
+        """Start; returns at once."""
+        self._thread.start()
+
+    def send(self, request: Event) -> None:
+        """Request a run; requests are queued until the worker is ready."""
+        self._requests.put(json.dumps(request).encode() + b"\n")
+
+    def events(self) -> list[Event]:
+        """Return events since the last call; ``{"event": "ended", "message"}`` when the worker has ended."""
+        found = []
+        while True:
+            try:
+                found.append(self._events.get_nowait())
+            except Empty:
+                return found
+
+    def stop(self) -> None:
+        """End the worker, by force if necessary; returns at once."""
+        self._stopped.set()
+        self._requests.put(None)
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the worker's end, for at most ``timeout`` s; return whether it has ended."""
+        if self._thread.ident is None:
+            return True
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            command = list(self._command())
+            if self._stopped.is_set():
+                return
+            self._serve(command)
+        except (PhysGenError, OSError) as error:
+            self._events.put({"event": "ended", "message": str(error)})
+        finally:
+            self._at_end()
+
+    def _serve(self, command: list[str]) -> None:
+        process = start_process(command, stdin=subprocess.PIPE)
+        tail: deque[str] = deque(maxlen=10)
+        threads = [
+            threading.Thread(target=self._write, args=(process,), daemon=True),
+            threading.Thread(target=read_errors, args=(process, tail), daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        assert process.stdout is not None
+        for line in process.stdout:
+            event = parse_event(line)
+            if event is not None:
+                self._events.put(event)
+        code = process.wait()
+        self._requests.put(None)
+        for thread in threads:
+            thread.join(1.0)
+        words = "" if self._stopped.is_set() else "\n".join(tail).strip() or f"the worker ended with code {code}"
+        self._events.put({"event": "ended", "message": words})
+
+    def _write(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):
+            while (line := self._requests.get()) is not None:
+                process.stdin.write(line)
+                process.stdin.flush()
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        try:
+            process.wait(STOP_GRACE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+UNSET = ("friction", "static_friction", "restitution", "contact_mode", "shell_thickness")
+"""Properties of an object that are omitted unless set."""
+
+
+def watched_numbers(scene: bpy.types.Scene) -> tuple[str, ...]:
+    """Return all values that can be passed to the worker without a new export, as overrides of the exported scene.
+
+    Raises InputError for an invalid one.
+    """
+    unit, times, names = metres_per_unit(scene), clock(scene), export_names(scene)
+    found = []
+    for item in bodies(scene):
+        fields: dict[str, Any] = {**dict.fromkeys(UNSET), **physics(item, unit, times)}
+        fields.pop("role")
+        material = fields.pop("material", None)
+        if material is not None:
+            fields |= {name: value for name, value in to_json(material).items() if name != "preset"}
+        found += [f"{names[item.name]}.{name}={json.dumps(to_json(value))}" for name, value in fields.items()]
+    world = scene.physgen.world
+    if world.use_ground:
+        friction = decimal(world.friction)
+        static = max(friction, decimal(world.static_friction))
+        found += [f"ground.friction={friction}", f"ground.static_friction={static}"]
+        found.append(f"ground.restitution={decimal(world.restitution)}")
+    if not {path for path, _ in channels(scene)} & {"gravity", "use_gravity"}:
+        found.append(f"scene.gravity={json.dumps(gravity(scene, unit))}")
+    return tuple(found)
+
+
+def watched_shapes(scene: bpy.types.Scene) -> str:
+    """Return a hash of the other inputs that users edit during a preview: meshes, poses, roles, pins, effects.
+
+    Animated changes do not count; restarting the preview exports everything anew.
+    """
+    digest = hashlib.sha256()
+    world = scene.physgen.world
+    known: list[Any] = [metres_per_unit(scene), world.use_ground, tuple(world.ground_point), tuple(world.ground_normal)]
+    known += _place(world.ground_object)
+    try:
+        known.append(to_json(effects(scene, export_names(scene))))
+    except InputError as error:
+        known.append(str(error))
+    for item in bodies(scene):
+        body = item.physgen
+        known += [item.name, body.role, body.sandy, body.sandy_frame, *_place(item)]
+        for pin in body.pins:
+            known += _place(pin.box)
+        if not item.data.is_editmode:
+            known += [len(item.data.vertices), len(item.data.loops)]
+            digest.update(read_points(item.data))
+        known += [(modifier.name, modifier.show_viewport) for modifier in item.modifiers]
+    digest.update(repr(known).encode())
+    return digest.hexdigest()
+
+
+def _place(item: bpy.types.Object | None) -> list[Any]:
+    if item is None:
+        return [None]
+    moving = {path for path, _ in channels(item)}
+    own = [name for name in ("location", "rotation_euler", "rotation_quaternion", "scale") if name not in moving]
+    return [item.name, item.parent.name if item.parent else "", *(tuple(getattr(item, name)) for name in own)]
+
+
+PARTICLES = 2000
+MOST_FRAMES = 48
+SHAPES_S = 0.3
+"""Interval of comparing shapes: that reads every vertex."""
+
+ENOUGH = 3
+"""Frames of a new run that must be available before it replaces the playing one."""
+
+
+class Session:
+    """The live preview of one scene.
+
+    command: returns the command line of a worker whose runs go into a folder; called in a thread.
+    scene_uid: its ``session_uid``, looked up at every step, because undo and another file replace the scene.
+    state: ``starting``, ``compiling``, ``running``, ``playing`` or ``error``; message: for the user; clip: what is
+    shown.
+    """
+
+    def __init__(self, scene_uid: int, command: Callable[[Path], Sequence[str]]) -> None:
+        self.scene_uid = scene_uid
+        self.state, self.message = "starting", ""
+        self.notices: list[str] = []
+        self.clip: Clip | None = None
+        self.frame = 0
+        self.unit = 1.0
+        self.answer_s: float | None = None
+        self._coming: Clip | None = None
+        self._root = Path(tempfile.mkdtemp(prefix="physgen-preview-"))
+        self._client = Client(lambda: command(self._root / "runs"), self._remove_files)
+        self._ended = False
+        self._ready = self._ran = False
+        self._number, self._asked_at = 0, 0.0
+        self._numbers: tuple[str, ...] | None = None
+        self._shapes, self._shapes_at, self._exports = "", -SHAPES_S, 0
+        self._length = (0, 0.0)
+
+    def start(self) -> None:
+        """Start the worker; returns at once."""
+        self._client.start()
+
+    def stop(self) -> None:
+        """End the worker and delete its files. Returns at once."""
+        self._client.stop()
+        self.clip = self._coming = None
+        if self._client.join(0.0):
+            # It was deleted before the last export.
+            self._remove_files()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the worker's end after ``stop``; return whether it has ended within ``timeout`` s."""
+        return self._client.join(timeout)
+
+    def _remove_files(self) -> None:
+        shutil.rmtree(self._root, ignore_errors=True)
+
+    def step(self, now: float | None = None) -> bool:
+        """Process changes of the scene and events of the worker; return whether to redraw the viewport.
+
+        now: seconds of a monotonic clock; None reads it.
+        """
+        now = time.monotonic() if now is None else now
+        before = (self.clip, self.frame, self.state, self.message)
+        scene = self.scene()
+        if scene is None:
+            self._fail("the scene is gone; switch the preview off")
+        elif not self._ended:
+            self._follow(scene, now)
+        for event in self._client.events():
+            try:
+                self._take(event, now)
+            except InputError as error:
+                self._fail(str(error))
+        if self.clip is not None:
+            self.frame = self.clip.frame_at(now)
+        return (self.clip, self.frame, self.state, self.message) != before
+
+    def scene(self) -> bpy.types.Scene | None:
+        """The scene, even if renamed; None if it is gone."""
+        return scene_with(self.scene_uid)
+
+    def _follow(self, scene: bpy.types.Scene, now: float) -> None:
+        """Request a run if a value or a shape differs from the last request."""
+        try:
+            changed = False
+            if now - self._shapes_at >= SHAPES_S:
+                self._shapes_at = now
+                shapes = watched_shapes(scene)
+                if shapes != self._shapes:
+                    # Stored first, so that a scene that cannot be exported is not retried until it changes.
+                    self._shapes, changed = shapes, True
+                    self._numbers = None
+                    self._exports += 1
+                    export_scene(scene, self._root / f"scene-{self._exports}")
+                    shutil.rmtree(self._root / f"scene-{self._exports - 2}", ignore_errors=True)
+                    self._numbers = ()
+            if self._numbers is None:
+                return
+            times = clock(scene)
+            length = (max(2, min(len(times.frames), MOST_FRAMES)), times.fps)
+            numbers = watched_numbers(scene)
+            if changed or (numbers, length) != (self._numbers, self._length):
+                self._numbers, self._length = numbers, length
+                self._request(scene, now)
+        except PhysGenError as error:
+            self._fail(str(error))
+
+    def _request(self, scene: bpy.types.Scene, now: float) -> None:
+        self._number += 1
+        self._asked_at = now
+        self.unit = metres_per_unit(scene)
+        frames, fps = self._length
+        self._client.send(
+            {
+                "id": self._number,
+                "scene": str(self._root / f"scene-{self._exports}"),
+                "overrides": list(self._numbers or ()),
+                "frames": frames,
+                "fps": fps,
+                "particles": PARTICLES,
+            }
+        )
+        if self._ready:
+            self.state, self.message = "compiling" if not self._ran else "running", ""
+
+    def _take(self, event: Event, now: float) -> None:
+        kind = event["event"]
+        if kind == "ready":
+            self._ready = True
+            if self._number:
+                self.state = "compiling"
+        elif kind == "ended":
+            self._ended = True
+            if event["message"]:
+                self._fail(event["message"])
+        elif event.get("id") != self._number:
+            return
+        elif kind == "started":
+            self.notices = [str(text) for text in event["notices"]]
+            frames, fps = self._length
+            self._coming = Clip(Path(event["folder"]), event, frames=frames, fps=fps)
+        elif kind == "frame" and self._coming is not None:
+            self._coming.read(int(event["done"]))
+            if self._coming.done >= min(ENOUGH, self._coming.frames) and self.clip is not self._coming:
+                self.clip, self._ran = self._coming, True
+                self.answer_s = now - self._asked_at
+            if self.clip is self._coming:
+                self.state, self.message = "running", f"{self._coming.done} of {self._coming.frames} frames"
+        elif kind == "done":
+            self.state, self.message = "playing", ""
+        elif kind == "error":
+            self._fail(str(event.get("message")))
+
+    def _fail(self, message: str) -> None:
+        self.state, self.message = "error", message
+        self.clip = self._coming = None

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Simulation properties of an object: role, surface, material, initial motion, pins."""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+from mathutils import Vector
+
+from ...sim.scene.model import Ground, SceneObject
+from ..playback import splats
+from .generated_properties import from_field
+from .material_props import PHYSGEN_PG_material
+
+
+def _on_friction(self: "Surface", context: bpy.types.Context) -> None:
+    # Only upwards and only from here, so that the two can be set in any order.
+    if self.static_friction < self.friction:
+        self.static_friction = self.friction
+
+
+class Surface:
+    """Mixin of property groups: fields of ``sim.scene.scene_object.SceneObject`` and ``sim.scene.model.Ground``."""
+
+    friction: from_field(
+        Ground,
+        "friction",
+        "Friction",
+        "Coefficient of sliding friction: ice 0.03, wood on wood 0.4, rubber 1",
+        soft_max=1.5,
+        update=_on_friction,
+    )
+    static_friction: from_field(
+        Ground,
+        "static_friction",
+        "Static Friction",
+        "Coefficient of static friction; never below the sliding one",
+        default=Ground.friction,
+        soft_max=1.5,
+    )
+    restitution: from_field(
+        Ground,
+        "restitution",
+        "Bounce",
+        "Coefficient of restitution: speed after over speed before an impact of rigid objects",
+        subtype="FACTOR",
+    )
+
+
+def _is_empty(self: "PHYSGEN_PG_pin", item: bpy.types.Object) -> bool:
+    return item.type == "EMPTY"
+
+
+class PHYSGEN_PG_pin(bpy.types.PropertyGroup):
+    """A box that pins the part of the object inside it."""
+
+    box: PointerProperty(
+        name="Box",
+        description=(
+            "Empty of type Cube: the part of the object inside it at the start is held. "
+            "Animate the empty to move that part"
+        ),
+        type=bpy.types.Object,
+        poll=_is_empty,
+    )
+
+
+def _get_speed(self: "PHYSGEN_PG_body") -> float:
+    return Vector(self.velocity).length
+
+
+def _set_speed(self: "PHYSGEN_PG_body", speed: float) -> None:
+    velocity = Vector(self.velocity)
+    direction = velocity.normalized() if velocity.length > 0 else Vector((1.0, 0.0, 0.0))
+    self.velocity = direction * speed
+
+
+def _show_splats(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
+    splats.show_as(self.id_data, self.splats_as)
+
+
+class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
+    """Simulation properties of an object; ``Object.physgen``."""
+
+    enabled: BoolProperty(name="In Simulation", description="Simulate this object")
+    source: StringProperty(description="Name of the object in the scene folder that it was imported from")
+    cache: StringProperty(description="Name of the object in its bakes, so that it can be renamed")
+    role: from_field(
+        SceneObject,
+        "role",
+        "Role",
+        "Role in the simulation",
+        items=[
+            ("dynamic", "Moves", "Simulated: falls, bounces, deforms"),
+            ("collider", "Collider", "Static or animated obstacle that other objects collide with"),
+        ],
+    )
+    material: PointerProperty(type=PHYSGEN_PG_material)
+    fill: from_field(SceneObject, "fill", "Solid", "Filled with material; off: a hollow, lighter shell")
+    shell_thickness: from_field(
+        SceneObject,
+        "shell_thickness",
+        "Wall",
+        "Wall thickness of a hollow object; 0: the thinnest that the quality resolves",
+        min=0.0,
+        soft_max=0.1,
+    )
+    sandy: BoolProperty(name="Turns to Sand", description="Turn the object into sand")
+    sandy_frame: IntProperty(name="From Frame", description="First frame as sand", default=1, min=0, soft_max=250)
+
+    own_surface: BoolProperty(name="Own Surface", description="Use own friction and bounce instead of the ground's")
+    contact_mode: from_field(
+        SceneObject,
+        "contact_mode",
+        "Contact",
+        "Contact with other objects",
+        items=[
+            ("separate", "Rub", "Slides with friction and can separate"),
+            ("slip", "Slip", "Slides without friction and cannot separate"),
+            ("sticky", "Stick", "Neither slides nor separates"),
+        ],
+    )
+
+    splats_as: EnumProperty(
+        name="Seen As",
+        description="Display of Gaussian splats",
+        items=[
+            ("ELLIPSOIDS", "Splats", "Soft ellipsoids that deform with the material"),
+            ("POINTS", "Points", "Small spheres, fast to draw"),
+            ("MESH", "Mesh", "The simulated closed mesh around them"),
+        ],
+        update=_show_splats,
+    )
+
+    velocity: FloatVectorProperty(
+        name="Velocity",
+        description="Initial velocity. Drag the arrow in the viewport to change it",
+        subtype="VELOCITY",
+        unit="VELOCITY",
+        soft_min=-10.0,
+        soft_max=10.0,
+    )
+    speed: FloatProperty(
+        name="Speed",
+        description="Magnitude of the velocity; keeps its direction (X if at rest)",
+        min=0.0,
+        max=1e4,
+        soft_max=10.0,
+        unit="VELOCITY",
+        get=_get_speed,
+        set=_set_speed,
+    )
+    spin: FloatVectorProperty(
+        name="Spin",
+        description="Initial angular velocity in radians a second about the centre of mass; one turn a second is 6.28",
+        subtype="XYZ",
+        soft_min=-50.0,
+        soft_max=50.0,
+    )
+    start_frame: IntProperty(
+        name="Starts at Frame",
+        description="Static and without collisions before this frame. 0: start of the simulation",
+        default=0,
+        min=0,
+        soft_max=250,
+    )
+    pins: CollectionProperty(type=PHYSGEN_PG_pin)
+    pin_index: IntProperty(name="Pin", description="Active pin")
+    goal_stiffness: from_field(
+        SceneObject,
+        "goal_stiffness",
+        "Hold Shape",
+        "Stiffness towards the initial shape: acceleration over distance in 1/s²; 0: none",
+        soft_max=1000.0,
+    )
+    goal_damping: from_field(
+        SceneObject,
+        "goal_damping",
+        "Hold Damping",
+        "Damping of Hold Shape, as a share of critical damping",
+        subtype="FACTOR",
+    )
+
+
+def register_body_properties() -> None:
+    """Add ``physgen`` to objects."""
+    bpy.types.Object.physgen = PointerProperty(type=PHYSGEN_PG_body)
+
+
+def unregister_body_properties() -> None:
+    """Remove it; values stored in files are kept."""
+    del bpy.types.Object.physgen
+
+
+def is_body(item: bpy.types.Object | None) -> bool:
+    """Return whether ``item`` is simulated."""
+    return item is not None and item.type == "MESH" and item.physgen.enabled
+
+
+def bodies(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Return the simulated objects of ``scene``, sorted by name."""
+    return sorted(filter(is_body, scene.objects), key=lambda item: item.name)

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blender properties generated from fields of the scene's dataclasses: type, default, range and unit are theirs."""
+
+import dataclasses
+import math
+import types
+import typing
+from typing import Any
+
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty
+
+UNITS = {
+    "metres": {"unit": "LENGTH"},
+    "radians": {"subtype": "ANGLE"},
+    "seconds": {"unit": "TIME_ABSOLUTE"},
+}
+"""Unit of a field → arguments of its property. Blender has no units for the others."""
+
+TYPES = {bool: BoolProperty, float: FloatProperty, int: IntProperty, str: EnumProperty, tuple: FloatVectorProperty}
+
+
+def from_field(kind: type, field: str, name: str, description: str = "", **arguments: Any) -> Any:
+    """Return the Blender property of the field ``field`` of the dataclass ``kind``, labelled ``name``.
+
+    description: tooltip; by default the field's ``--help`` text. arguments: of the property; they override those that
+    follow from the field, such as a default for None. A text field needs ``items``.
+    """
+    spec: dataclasses.Field[Any] = kind.__dataclass_fields__[field]  # type: ignore[attr-defined]
+    low, high = spec.metadata.get("range", (-math.inf, math.inf))
+    own: dict[str, Any] = {"name": name, "description": description or help_text(kind, field)}
+    own |= UNITS.get(spec.metadata.get("unit", ""), {})
+    own |= {key: limit for key, limit in (("min", low), ("max", high)) if math.isfinite(limit)}
+    if spec.default is not None:
+        own["default"] = spec.default
+    return TYPES[_type(kind, field)](**(own | arguments))
+
+
+def help_text(kind: type, field: str) -> str:
+    """Return the ``--help`` text of a field as a tooltip."""
+    text: str = kind.__dataclass_fields__[field].metadata.get("help", "")  # type: ignore[attr-defined]
+    return text[:1].upper() + text[1:]
+
+
+def _type(kind: type, field: str) -> type:
+    """Return the type of a field; of ``float | None``, float; of ``tuple[float, ...]``, tuple."""
+    hint = typing.get_type_hints(kind)[field]
+    if isinstance(hint, types.UnionType):
+        hint = next(part for part in typing.get_args(hint) if part is not type(None))
+    return typing.get_origin(hint) or hint

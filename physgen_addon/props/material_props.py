@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Material properties of an object, and the presets they come from."""
+
+import dataclasses
+import math
+import zlib
+from pathlib import Path
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...sim.constitutive import models
+from ...sim.errors import InputError
+from ...sim.scene.material import PRESET_FOLDER, Material, PresetFolder, read_presets
+from ..text import decimal, readable
+from .generated_properties import from_field
+from .preferences import ADDON
+
+CUSTOM = "custom"
+_SHIPPED = read_presets(PRESET_FOLDER)
+
+_own = PresetFolder()
+_read_at: list[tuple[str, int]] = []
+_items: dict[tuple[str, str], tuple[str, str, str, str, int]] = {}
+"""Keeps the strings of a dynamic enum alive, which Blender does not."""
+
+
+def own_folder(*, create: bool = False) -> Path:
+    """Return the folder of user presets. Raises InputError if it cannot be created."""
+    try:
+        if ADDON.startswith("bl_ext."):
+            return Path(bpy.utils.extension_path_user(ADDON, path="materials", create=create))
+        # Registered by a script: Blender has no folder for this extension.
+        folder = bpy.utils.user_resource("CONFIG", path=str(Path("physgen") / "materials"), create=create)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be made ({error.strerror}); check the permissions") from error
+    if not folder:
+        raise InputError("Blender has no folder for the user's files; set BLENDER_USER_RESOURCES to one")
+    return Path(folder)
+
+
+def own_presets() -> PresetFolder:
+    """Return the user presets, reread when a file was added or removed."""
+    global _own
+    try:
+        folder = own_folder()
+        stamp = [(str(folder), folder.stat().st_mtime_ns)]
+    except (OSError, InputError):
+        _own, _read_at[:] = PresetFolder(), []
+        return _own
+    if stamp != _read_at:
+        _own, _read_at[:] = _without_shipped(read_presets(folder)), stamp
+    return _own
+
+
+def _without_shipped(found: PresetFolder) -> PresetFolder:
+    for name in set(found.good) & set(_SHIPPED.good):
+        del found.good[name]
+        found.broken[name] = "PhysGen brings a preset of the same name; rename the file"
+    return found
+
+
+def forget_presets() -> None:
+    """Reread the files at the next access."""
+    _read_at.clear()
+
+
+def find_preset(name: str) -> Material | None:
+    """Return the preset ``name``; None for "custom", a broken one and one missing on this computer."""
+    return _SHIPPED.good.get(name) or own_presets().good.get(name)
+
+
+def preset_items(chosen: str) -> list[tuple[str, str, str, str, int]]:
+    """Return the menu's entries, numbered by position; ``chosen`` is included even if missing."""
+    own = own_presets()
+    rows = [(name, name.capitalize(), _SHIPPED.descriptions[name], "NONE") for name in _SHIPPED.good]
+    rows += [(name, name, own.descriptions[name] or "User preset", "USER") for name in own.good]
+    # The colon is in no valid name, so that a broken file never stands in for a preset.
+    rows += [(f"broken:{name}", f"{name} (broken)", f"Unusable: {why}", "ERROR") for name, why in own.broken.items()]
+    rows.append((CUSTOM, "Custom", "Custom values", "NONE"))
+    if chosen not in (row[0] for row in rows):
+        rows.append((chosen, f"{chosen} (missing)", "Not on this computer; the object keeps its values", "ERROR"))
+    return [_items.setdefault((row[0], repr((row, index))), (*row, index)) for index, row in enumerate(rows)]
+
+
+def preset_title(name: str) -> str:
+    """Return the display name of the preset ``name``."""
+    return name.capitalize() if name in _SHIPPED.good or name == CUSTOM else name
+
+
+def _summary(model: type) -> str:
+    return (model.__doc__ or "").splitlines()[0].rstrip(".")
+
+
+_STORED_NUMBERS = ("fixed_corotated", "neo_hookean", "von_mises", "snow", "sand", "fluid", "rigid")
+"""Laws by their number in .blend files; any other law is stored by the CRC of its name."""
+
+
+def _law_item(law: str, label: str, hint: str) -> tuple[str, str, str, str, int]:
+    number = _STORED_NUMBERS.index(law) if law in _STORED_NUMBERS else zlib.crc32(law.encode()) >> 1
+    return law, label, hint, "NONE", number
+
+
+LAW_ITEMS = [
+    *(_law_item(model.law, model.label or readable(model.law), model.hint or _summary(model)) for model in models()),
+    _law_item("rigid", "Rigid", "Never deforms: wood, stone"),
+]
+"""Menu of constitutive models."""
+
+NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "preset")
+"""Fields of ``sim.scene.material.Material`` that the user can set."""
+
+LAW_FIELDS = {
+    "rigid": (),
+    **{model.law: tuple(name for name in model.reads if name not in model.hidden) for model in models()},
+}
+"""Fields besides the density that a constitutive model uses; the others are stored without effect."""
+
+
+def _preset_items(
+    self: "PHYSGEN_PG_material", context: bpy.types.Context | None
+) -> list[tuple[str, str, str, str, int]]:
+    return preset_items(self.preset_name)
+
+
+def _get_preset(self: "PHYSGEN_PG_material") -> int:
+    return next(item[4] for item in preset_items(self.preset_name) if item[0] == self.preset_name)
+
+
+def _set_preset(self: "PHYSGEN_PG_material", number: int) -> None:
+    """Store the name, because positions in the menu differ between computers; a broken preset changes nothing."""
+    name = preset_items(self.preset_name)[number][0]
+    preset = find_preset(name)
+    if preset is not None:
+        set_material(self, preset)
+    if preset is not None or name == CUSTOM:
+        self.preset_name = name
+
+
+def set_material(target: "PHYSGEN_PG_material", material: Material) -> None:
+    """Set the values of ``material``; the preset's name is unchanged."""
+    for name in NUMBERS:
+        setattr(target, name, getattr(material, name))
+
+
+def get_material(source: "PHYSGEN_PG_material") -> Material:
+    """Return the material as simulated. Raises InputError for a value out of range."""
+    values = {name: decimal(getattr(source, name)) for name in NUMBERS if name not in ("law", "fibre_axis")}
+    x, y, z = (decimal(number) for number in source.fibre_axis)
+    return Material(preset=source.preset, law=source.law, fibre_axis=(x, y, z), **values)
+
+
+def is_modified(source: "PHYSGEN_PG_material") -> bool:
+    """Return whether a value differs from the preset's; False for "custom" and missing presets."""
+    preset = find_preset(source.preset_name)
+    return preset is not None and any(not _same(getattr(source, n), getattr(preset, n)) for n in NUMBERS)
+
+
+def _same(mine: object, theirs: object) -> bool:
+    if isinstance(theirs, tuple):
+        return all(_same(a, b) for a, b in zip(mine, theirs, strict=True))  # type: ignore[call-overload]
+    # Blender stores 32 bits.
+    return math.isclose(mine, theirs, rel_tol=1e-6) if isinstance(theirs, float) else mine == theirs  # type: ignore[arg-type]
+
+
+class PHYSGEN_PG_material(bpy.types.PropertyGroup):
+    """Material of an object."""
+
+    preset: EnumProperty(
+        name="Material",
+        description="Source of the values. Choosing a preset sets them all",
+        items=_preset_items,
+        get=_get_preset,
+        set=_set_preset,
+    )
+    preset_name: StringProperty(default="medium")
+    """Shown by ``preset``; also if there is no such preset on this computer."""
+    law: from_field(Material, "law", "Behaviour", "Constitutive model", items=LAW_ITEMS)
+    density: from_field(
+        Material,
+        "density",
+        "Density",
+        "Mass per volume in kg/m³: water 1000, wood 500, steel 7800",
+        min=1e-3,
+        soft_min=10.0,
+        soft_max=8000.0,
+        precision=1,
+    )
+    youngs_modulus: from_field(
+        Material,
+        "youngs_modulus",
+        "Stiffness",
+        "Young's modulus in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
+        soft_max=1e8,
+        precision=0,
+    )
+    poisson_ratio: from_field(
+        Material,
+        "poisson_ratio",
+        "Poisson's Ratio",
+        "Lateral bulging under compression: cork 0, most materials 0.3, rubber 0.45",
+        precision=3,
+    )
+    damping_time: from_field(
+        Material,
+        "damping_time",
+        "Damping",
+        "Damping time in seconds: viscosity over stiffness (Kelvin-Voigt). 0: none",
+        soft_max=0.1,
+        precision=4,
+    )
+    yield_stress: from_field(
+        Material,
+        "yield_stress",
+        "Yield Stress",
+        "Stress in Pa above which deformation is permanent",
+        soft_max=1e8,
+        precision=0,
+    )
+    friction_angle: from_field(
+        Material, "friction_angle", "Friction Angle", "Internal friction angle; about the slope of a heap"
+    )
+    critical_compression: from_field(
+        Material,
+        "critical_compression",
+        "Compression",
+        "Compressive strain above which snow packs permanently",
+        precision=4,
+    )
+    critical_stretch: from_field(
+        Material, "critical_stretch", "Stretch", "Tensile strain above which snow tears", precision=4
+    )
+    hardening: from_field(Material, "hardening", "Hardening", "Stiffening of packed snow")
+    bulk_modulus: from_field(
+        Material,
+        "bulk_modulus",
+        "Bulk Modulus",
+        "Bulk modulus of a fluid in Pa. Real water has 2.2e9; 2e5 is enough here, and faster",
+        soft_max=1e7,
+        precision=0,
+    )
+    viscosity: from_field(
+        Material,
+        "viscosity",
+        "Viscosity",
+        "Dynamic viscosity in Pa s: water 0.001, honey 10",
+        soft_max=100.0,
+        precision=3,
+    )
+    fibre_modulus: from_field(
+        Material,
+        "fibre_modulus",
+        "Fibre Modulus",
+        "Stiffness in Pa that fibres add along their axis; 0 for none",
+        soft_max=1e8,
+        precision=0,
+    )
+    fibre_axis: from_field(Material, "fibre_axis", "Fibre Axis", "Direction of the fibres at rest", subtype="DIRECTION")
+
+
+# Parameters that a constitutive model adds to the material.
+PHYSGEN_PG_material.__annotations__.update(
+    {p.name: from_field(Material, p.name, readable(p.name)) for model in models() for p in model.parameters}
+)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Properties of rendering into the photo, and ``RenderOptions`` made from them.
+
+Blender reads the class's annotations as properties, so they must not be postponed to strings.
+"""
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...sim.validation import range_of
+from ..paths import RELATIVE
+from ..render.render_options import RenderOptions
+from ..text import decimal
+from .generated_properties import from_field, help_text
+
+LEAST_F_NUMBER = range_of(RenderOptions, "f_number")[0]
+"""Of a real lens; 0 stands for none."""
+
+FRAME_FORMATS = {"png": ("png", None), "png16": ("png", 16), "exr": ("exr", None), "exr_layers": ("exr-layers", None)}
+"""Menu entry → type of frame, and bits a channel unless default."""
+
+
+def _on_f_number(self: "PHYSGEN_PG_rendering", context: bpy.types.Context) -> None:
+    if 0 < self.f_number < LEAST_F_NUMBER:
+        self.f_number = LEAST_F_NUMBER
+
+
+class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
+    """Settings of rendering a scene into its photo."""
+
+    engine: from_field(
+        RenderOptions,
+        "engine",
+        "Engine",
+        items=[
+            ("cycles", "Cycles", "Traces rays"),
+            ("eevee", "EEVEE", "Rasterises on the graphics card: nearly the same image; slow without one"),
+        ],
+    )
+    device: from_field(
+        RenderOptions,
+        "device",
+        "Device",
+        "Render device of Cycles; falls back to the CPU",
+        items=[
+            ("cpu", "CPU", "CPU: frames are small, and the graphics card stays free for Blender's windows"),
+            ("auto", "Automatic", "A graphics card, if there is one that Cycles can use"),
+            ("optix", "OptiX", "NVIDIA cards with ray tracing hardware"),
+            ("cuda", "CUDA", "NVIDIA cards"),
+            ("hip", "HIP", "AMD cards"),
+            ("oneapi", "oneAPI", "Intel cards"),
+            ("metal", "Metal", "Apple's graphics"),
+        ],
+    )
+    samples: from_field(
+        RenderOptions,
+        "samples",
+        "Samples",
+        f"{help_text(RenderOptions, 'samples')}; 0 is the engine's default",
+        default=0,
+        min=0,
+        soft_max=256,
+    )
+    scale: from_field(RenderOptions, "scale", "Size", min=0.05, soft_max=1.0)
+    format: EnumProperty(
+        name="Format",
+        description="Of the frames' files; each format needs an output folder of its own",
+        items=[
+            ("png", "PNG", "8 bits a channel, as in the photo"),
+            ("png16", "PNG 16 Bit", "For later colour grading"),
+            ("exr", "EXR", "Linear light, 16-bit floats: keeps highlights above white"),
+            (
+                "exr_layers",
+                "EXR Layers",
+                "Also objects, ground, shadow, depth, object ids and flow, for compositing",
+            ),
+        ],
+    )
+    video: EnumProperty(
+        name="Video",
+        description="What Render Video writes beside the frames",
+        items=[("mp4", "MP4", "H.264: plays everywhere"), ("webm", "WebM", "VP9: for web pages")],
+    )
+    output: StringProperty(
+        name="Output",
+        description="Folder of the frames; // is beside the .blend",
+        subtype="DIR_PATH",
+        default="//physgen_render",
+        options=RELATIVE,
+    )
+    motion_blur: from_field(RenderOptions, "motion_blur", "Motion Blur", subtype="FACTOR")
+    grain: from_field(RenderOptions, "grain", "Grain")
+    match_sharpness: from_field(RenderOptions, "match_sharpness", "Sharpness")
+    reflections: from_field(
+        RenderOptions,
+        "reflections",
+        "Reflections",
+        f"{help_text(RenderOptions, 'reflections')} (ground.reflectivity of the scene folder)",
+    )
+    f_number: from_field(
+        RenderOptions,
+        "f_number",
+        "F-Number",
+        f"{help_text(RenderOptions, 'f_number')}; 0: off",
+        min=0.0,
+        soft_max=22.0,
+        precision=1,
+        step=10,
+        update=_on_f_number,
+    )
+    focus_distance: from_field(
+        RenderOptions,
+        "focus_distance",
+        "Focus",
+        "Distance of the plane of focus; 0: each object is in focus at rest",
+        soft_max=10.0,
+    )
+    result: StringProperty(name="Result", description="Last rendered file", subtype="FILE_PATH", options=RELATIVE)
+
+
+def render_options(rendering: PHYSGEN_PG_rendering) -> RenderOptions:
+    """Return the options set in the panel. Raises InputError for invalid combinations."""
+    kind, bits = FRAME_FORMATS[rendering.format]
+    return RenderOptions(
+        engine=rendering.engine,
+        device=rendering.device if rendering.engine == "cycles" else RenderOptions.device,
+        samples=rendering.samples or RenderOptions.samples,
+        scale=decimal(rendering.scale),
+        format=kind,
+        bits=bits,
+        motion_blur=decimal(rendering.motion_blur),
+        grain=rendering.grain,
+        match_sharpness=rendering.match_sharpness,
+        reflections=rendering.reflections,
+        f_number=decimal(rendering.f_number) or None,
+        focus_distance=decimal(rendering.focus_distance) or None,
+    )

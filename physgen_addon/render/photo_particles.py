@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Particles of a photo's objects: grains or a fluid's surface, in the photo's colours and light, where the skin tears.
+
+Until its skin tears an object is its mesh, which equals the photo at rest. Afterwards grains show where the skin is
+gone, and a fluid is the surface around its particles. A particle keeps the colour, and the reference lighting, of the
+nearest skin at rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...sim.cache.pc2 import Pc2Reader
+from ...sim.composite.srgb import srgb_to_linear
+from ...sim.scene.folder import Scene
+from ...sim.scene.meshes import load_object_mesh
+from ...sim.skinning import TORN_STRETCH, first_torn
+from ..playback import particles, point_caches
+from ..playback.bake_record import spacing
+from ..playback.geometry_nodes import Tree, set_input
+from .render_scene import COLOUR_LAYER, REST_LIGHT, UV, RenderObject, get_rest_light
+
+SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen photo surface"
+REST_LENGTH = "rest_length"
+"""Attribute of the skin's edges, m."""
+STEP = "Step"
+EACH, SMALLER = 8, 0.5
+"""Grains per particle, and their relative size. A particle is millimetres of sand and starts on a lattice, which single
+grains would show.
+"""
+COLOUR, MIXED = "flow_colour", "flow_mixed"
+"""Attributes of particles and of a fluid's surface: texture colour, linear; and how mixed it is."""
+BLUR = 6
+"""Smoothing steps of particle attributes along a fluid's surface."""
+MIXED_FROM, MIXED_TO = 0.7, 2.0
+"""Distance on the image of the parts of a fluid that meet, over the spacing of neighbouring particles, at which the
+texture starts and ends to give way to the mean of its colours.
+"""
+
+
+def find_tears(bake: point_caches.Bake, folder: Scene) -> point_caches.Bake:
+    """Return ``bake`` with the first samples at which particles are shown."""
+
+    def samples(cache: Pc2Reader) -> Iterator[NDArray[np.float32]]:
+        return (cache.sample(index) for index in range(cache.sample_count))
+
+    flows = []
+    for source, cache, flow in zip(folder.model.objects, bake.caches, bake.flows, strict=True):
+        if flow is not None:
+            torn = first_torn(samples(cache), load_object_mesh(folder, source).faces)
+            flow = dataclasses.replace(flow, from_sample=torn)
+        flows.append(flow)
+    return dataclasses.replace(bake, flows=tuple(flows))
+
+
+def add(
+    target: RenderObject, flow: point_caches.Flow, cache: Pc2Reader, first_frame: int, *, carried: tuple[str, ...] = ()
+) -> tuple[bpy.types.Object, float]:
+    """Make ``target``, which plays ``cache`` and has reference lighting, show the particles of ``flow``.
+
+    carried: vector attributes of particles to transfer to the shown geometry. Returns the objects that hold the
+    particles, and the maximum distance at which they are visible around a particle's centre, m.
+    """
+    assert flow.from_sample is not None
+    rest = flow.cache.sample(0)
+    distance = spacing(rest)
+    radius = distance * (particles.SURFACE if flow.surface else particles.GRAIN)
+    mesh = bpy.data.meshes.new(f"{target.item.name} particles")
+    mesh.vertices.add(len(rest))
+    mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(rest, dtype=np.float32).ravel())
+    _wear(mesh, target, rest)
+    mesh.materials.append(_material(target.item.data.materials[0], mixes=flow.surface))
+    item = bpy.data.objects.new(mesh.name, mesh)
+    for collection in target.item.users_collection:
+        collection.objects.link(item)
+    point_caches.attach(item, flow.cache, first_frame)
+    look = item.modifiers.new(particles.MODIFIER, "NODES")
+    look.node_group = _surface_group(carried) if flow.surface else _grains_group()
+    set_input(look, particles.RADIUS, radius)
+    set_input(look, STEP, _step(mesh, rest, distance))
+    set_input(look, particles.FROM, first_frame + flow.from_sample)
+    set_input(look, particles.MATERIAL, mesh.materials[0])
+    _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
+    # Grains stray by half the particle spacing along each of three axes.
+    reach = radius if flow.surface else radius * SMALLER * particles.LARGEST + math.sqrt(0.75) * distance
+    return item, reach
+
+
+def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32]) -> None:
+    """Give the vertices of ``mesh`` at ``rest`` (N, 3) the texture and light of the nearest skin."""
+    skin = target.item.data
+    corners = np.empty(len(skin.loops), dtype=np.int32)
+    skin.loops.foreach_get("vertex_index", corners)
+    by_corner = np.empty(2 * len(corners), dtype=np.float32)
+    skin.uv_layers[UV].data.foreach_get("uv", by_corner)
+    uv = np.zeros((len(target.mesh.vertices), 3), dtype=np.float32)
+    uv[corners, :2] = by_corner.reshape(-1, 2)
+    _, nearest = KDTree(target.mesh.vertices).query(rest)
+    for name, values in ((UV, uv), (REST_LIGHT, get_rest_light(target)), (COLOUR, _colours(target, uv))):
+        attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+        attribute.data.foreach_set("vector", np.ascontiguousarray(values[nearest], dtype=np.float32).ravel())
+
+
+def _colours(target: RenderObject, uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return linear colours (V, 3) of the texture of ``target`` at the texture coordinates ``uv`` (V, 3)."""
+    material = target.item.data.materials[0]
+    image = next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
+    width, height = image.size
+    pixels = np.empty(4 * width * height, dtype=np.float32)
+    image.pixels.foreach_get(pixels)
+    columns = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
+    rows = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
+    # The pixels of an 8-bit image are as stored: sRGB.
+    return srgb_to_linear(pixels.reshape(height, width, 4)[rows, columns, :3])
+
+
+def _step(mesh: bpy.types.Mesh, rest: NDArray[np.float32], distance: float) -> float:
+    """Return the distance of neighbouring particles of ``mesh`` on the image, in texture coordinates.
+
+    rest: (N, 3) world positions, ``distance`` apart.
+    """
+    uv = np.empty(3 * len(rest), dtype=np.float32)
+    mesh.attributes[UV].data.foreach_get("vector", uv)
+    extent = np.percentile(uv.reshape(-1, 3), 98, axis=0) - np.percentile(uv.reshape(-1, 3), 2, axis=0)
+    size = np.percentile(rest, 98, axis=0) - np.percentile(rest, 2, axis=0)
+    return float(np.linalg.norm(extent) / max(float(np.linalg.norm(size)), 1e-9)) * distance
+
+
+def _material(skin: bpy.types.Material, *, mixes: bool) -> bpy.types.Material:
+    """Return the material of the ``skin`` for geometry with texture coordinates as an attribute instead of a UV map.
+
+    mixes: also blend to the mixed colours.
+    """
+    material = skin.copy()
+    tree = material.node_tree
+
+    def attribute(name: str, socket: str) -> bpy.types.NodeSocket:
+        node = tree.nodes.new("ShaderNodeAttribute")
+        node.attribute_name = name
+        return node.outputs[socket]
+
+    picture = next(node for node in tree.nodes if node.type == "TEX_IMAGE")
+    layer = next(node for node in tree.nodes if node.type == "OUTPUT_AOV" and node.aov_name == COLOUR_LAYER)
+    tree.links.new(attribute(UV, "Vector"), picture.inputs["Vector"])
+    if mixes:
+        mix = tree.nodes.new("ShaderNodeMix")
+        mix.data_type = "VECTOR"
+        values = (attribute(MIXED, "Fac"), picture.outputs["Color"], attribute(COLOUR, "Vector"))
+        for value, socket in zip(values, [item for item in mix.inputs if item.enabled], strict=True):
+            tree.links.new(value, socket)
+        tree.links.new(next(item for item in mix.outputs if item.enabled), layer.inputs["Color"])
+    return material
+
+
+def _tear(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool) -> None:
+    """Open the skin where it is stretched, from ``from_frame`` on; or remove it if it is ``gone``."""
+    data = target.item.data
+    ends = np.empty(2 * len(data.edges), dtype=np.int32)
+    data.edges.foreach_get("vertices", ends)
+    rest = cache.sample(0)[ends.reshape(-1, 2)]
+    attribute = data.attributes.new(REST_LENGTH, "FLOAT", "EDGE")
+    attribute.data.foreach_set("value", np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).astype(np.float32))
+    modifier = target.item.modifiers.new(SKIN, "NODES")
+    modifier.node_group = _skin_group()
+    set_input(modifier, particles.FROM, from_frame)
+    set_input(modifier, "Gone", gone)
+
+
+def _skin_group() -> bpy.types.NodeTree:
+    tree = Tree(SKIN, {particles.FROM: ("Int", 1), "Gone": ("Bool", False)})
+    ends = tree.node("GeometryNodeInputMeshEdgeVertices").outputs
+    length = tree.out("ShaderNodeVectorMath", ends["Position 1"], ends["Position 2"], operation="DISTANCE")
+    longest = tree.math("MULTIPLY", tree.attribute(REST_LENGTH, "FLOAT"), TORN_STRETCH)
+    torn = tree.compare("GREATER_THAN", length, longest)
+    open_skin = tree.out("GeometryNodeDeleteGeometry", tree.inputs["Geometry"], torn, domain="EDGE", mode="EDGE_FACE")
+    left = particles.switch(tree, tree.inputs["Gone"], open_skin, None)
+    return tree.finish(particles.switch(tree, particles.begun(tree), tree.inputs["Geometry"], left))
+
+
+def _grains_group() -> bpy.types.NodeTree:
+    tree = Tree(GRAINS, {**_inputs(), STEP: ("Float", 0.01)})
+    radius, step = tree.inputs[particles.RADIUS], tree.inputs[STEP]
+    # Switch before the expensive part: frames without particles cost nothing.
+    shown = particles.switch(tree, particles.begun(tree), None, tree.inputs["Geometry"])
+    many = tree.out("GeometryNodeDuplicateElements", shown, None, EACH, domain="POINT")
+    half = tree.math("MULTIPLY", radius, 0.5 / particles.GRAIN)
+    place = _strayed(tree, tree.out("GeometryNodeInputPosition"), half)
+    # Each grain samples its own part of the texture.
+    where = _strayed(tree, tree.attribute(UV, "FLOAT_VECTOR"), tree.math("MULTIPLY", step, 0.5), seed=1)
+    store = "GeometryNodeStoreNamedAttribute"
+    many = tree.out(store, many, None, UV, where, data_type="FLOAT_VECTOR", domain="POINT")
+    size = tree.out("FunctionNodeRandomValue", particles.SMALLEST, particles.LARGEST, data_type="FLOAT")
+    size = tree.math("MULTIPLY", tree.math("MULTIPLY", radius, SMALLER), size)
+    grains = tree.out("GeometryNodeMeshToPoints", many, None, place, size)
+    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[particles.MATERIAL])
+    return tree.finish(coloured)
+
+
+def _strayed(tree: Tree, value: Any, reach: Any, seed: int = 0) -> Any:
+    """Return ``value`` plus a random offset of up to ``reach`` along each axis."""
+    stray = tree.node("FunctionNodeRandomValue", data_type="FLOAT_VECTOR")
+    lowest, highest = (item for item in stray.inputs if item.enabled and item.type == "VECTOR")
+    tree.group.links.new(tree.math("MULTIPLY", reach, -1.0), lowest)
+    tree.group.links.new(reach, highest)
+    next(item for item in stray.inputs if item.name == "Seed").default_value = seed
+    moved = next(item for item in stray.outputs if item.enabled)
+    return tree.out("ShaderNodeVectorMath", value, moved, operation="ADD")
+
+
+def _surface_group(carried: tuple[str, ...]) -> bpy.types.NodeTree:
+    """Return a group: the surface around the particles, with attributes of the nearest of them, including
+    ``carried``.
+    """
+    tree = Tree(SURFACE, {**_inputs(), STEP: ("Float", 0.01)})
+    inputs = tree.inputs
+    shown = particles.switch(tree, particles.begun(tree), None, tree.inputs["Geometry"])
+    surface = particles.enclosing_surface(tree, shown, tree.inputs[particles.RADIUS])
+    nearest = tree.out("GeometryNodeSampleNearest", shown, tree.out("GeometryNodeInputPosition"), domain="POINT")
+    store = "GeometryNodeStoreNamedAttribute"
+    for name in (UV, REST_LIGHT, COLOUR, *carried):
+        value = tree.attribute(name, "FLOAT_VECTOR")
+        there = tree.out("GeometryNodeSampleIndex", shown, value, nearest, data_type="FLOAT_VECTOR", domain="POINT")
+        even = tree.out("GeometryNodeBlurAttribute", there, BLUR, data_type="FLOAT_VECTOR")
+        if name == UV:
+            apart = tree.out("ShaderNodeVectorMath", there, even, operation="DISTANCE")
+            apart = tree.math("DIVIDE", apart, inputs[STEP])
+            apart = tree.out("GeometryNodeBlurAttribute", apart, BLUR, data_type="FLOAT")
+            mixed = tree.out("ShaderNodeMapRange", apart, MIXED_FROM, MIXED_TO, interpolation_type="SMOOTHSTEP")
+            surface = tree.out(store, surface, None, MIXED, mixed, data_type="FLOAT", domain="POINT")
+        surface = tree.out(store, surface, None, name, even, data_type="FLOAT_VECTOR", domain="POINT")
+    return tree.finish(tree.out("GeometryNodeSetMaterial", surface, None, tree.inputs[particles.MATERIAL]))
+
+
+def _inputs() -> dict[str, tuple[str, Any]]:
+    return {particles.RADIUS: ("Float", 0.01), particles.FROM: ("Int", 1), particles.MATERIAL: ("Material", None)}

@@ -1,0 +1,438 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The scene folder and its bake as three Blender scenes: objects, ground, and the light on both."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ...sim.errors import InputError
+from ...sim.scene.equirectangular import LUMINANCE, irradiance
+from ...sim.scene.folder import Scene, require_photo
+from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
+from ...sim.scene.model import Camera, Ground, SceneObject
+from .. import compat
+from ..frames.frame_files import read_layers
+from ..playback import point_caches
+from ..scene_io.photo_view import add_camera, aim_camera, new_sun, photo_uv, render_size
+from . import render_engines
+from .render_options import RenderOptions
+from .render_regions import Box, plane_axes
+from .sky_lamps import SkyLamp, sky_lamps
+
+REST_LIGHT = "rest_light"
+"""Vertex colour attribute: L₀ + k, radiance of a white surface at rest plus the ambient term."""
+COLOUR_LAYER = "texture"
+"""Name of the pass with the photo's colours."""
+AMBIENT_NODE = "ambient"
+UV = "photo"
+"""Name of the texture coordinates."""
+
+
+@dataclass(frozen=True)
+class RenderObject:
+    """One object. ``mesh`` holds the rest positions in world metres; ``item`` is its Blender object."""
+
+    source: SceneObject
+    mesh: ObjectMesh
+    item: bpy.types.Object
+
+
+def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObject) -> RenderObject:
+    """Load ``source`` and link it to ``collection``. Raises InputError if its mesh is unreadable."""
+    mesh = load_object_mesh(folder, source)
+    uv, image = _appearance(folder, source, mesh)
+    data = bpy.data.meshes.new(source.name)
+    data.from_pydata(mesh.vertices, [], mesh.faces)
+    corners = np.empty(len(data.loops), dtype=np.int32)
+    data.loops.foreach_get("vertex_index", corners)
+    data.uv_layers.new(name=UV).data.foreach_set("uv", uv.astype(np.float32)[corners].ravel())
+    data.shade_smooth()
+    attribute = data.color_attributes.new(REST_LIGHT, "FLOAT_COLOR", "POINT")
+    attribute.data.foreach_set("color", np.ones(4 * len(mesh.vertices), dtype=np.float32))
+    data.color_attributes.active_color = attribute
+    data.materials.append(_object_material(source.name, image))
+    item = bpy.data.objects.new(source.name, data)
+    collection.objects.link(item)
+    return RenderObject(source=source, mesh=mesh, item=item)
+
+
+def set_rest_light(target: RenderObject, values: NDArray[np.floating], ambient: float) -> None:
+    """Set L₀ + k (V, 3) at the vertices and the ambient term k, both radiances."""
+    data = target.item.data
+    padded = np.concatenate([values, np.ones((len(values), 1))], axis=1).astype(np.float32)
+    data.color_attributes[REST_LIGHT].data.foreach_set("color", padded.ravel())
+    data.materials[0].node_tree.nodes[AMBIENT_NODE].inputs["Scale"].default_value = ambient
+    data.update_tag()
+
+
+def get_rest_light(target: RenderObject) -> NDArray[np.float64]:
+    """Return L₀ + k (V, 3) at the vertices."""
+    values = np.empty(4 * len(target.mesh.vertices), dtype=np.float32)
+    target.item.data.color_attributes[REST_LIGHT].data.foreach_get("color", values)
+    return values.reshape(-1, 4)[:, :3].astype(np.float64)
+
+
+def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[NDArray[np.float64], bpy.types.Image]:
+    """Return texture coordinates (V, 2), origin at the bottom left, and the image.
+
+    A mesh without a texture gets the photo, projected along the camera's rays.
+    """
+    visual = read_mesh(folder.file(source.mesh)).visual
+    uv, image = getattr(visual, "uv", None), _base_colour(visual)
+    if uv is not None and image is not None and len(uv) == len(mesh.vertices) and np.isfinite(uv).all():
+        return np.asarray(uv, dtype=np.float64), _load_image(source.name, image.convert("RGB"))
+    with Image.open(folder.file(folder.model.photo_files[0])) as photo:
+        return photo_uv(folder.model.camera, mesh.vertices), _load_image(source.name, photo.convert("RGB"))
+
+
+def _base_colour(visual: Any) -> Image.Image | None:
+    material = getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    return image if isinstance(image, Image.Image) else None
+
+
+def _load_image(name: str, image: Image.Image) -> bpy.types.Image:
+    """Return a packed Blender image, so that a saved .blend needs no file beside it."""
+    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+        path = Path(folder) / "texture.png"
+        image.save(path, compress_level=0)
+        loaded = bpy.data.images.load(str(path))
+        loaded.colorspace_settings.name = "sRGB"
+        loaded.alpha_mode = "NONE"
+        loaded.pack()
+    loaded.name = name
+    return loaded
+
+
+def _object_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
+    """Return a material: diffuse with albedo 1 / (L₀ + k) plus emission k / (L₀ + k); radiance (L + k) / (L₀ + k), 1 at
+    rest.
+    """
+    material = bpy.data.materials.new(name)
+    # Emission towards the camera only: emission that Cycles samples as a lamp costs time and adds noise.
+    if hasattr(material, "cycles"):
+        material.cycles.emission_sampling = "NONE"
+    tree = compat.node_tree(material)
+    new, link = tree.nodes.new, tree.links.new
+    rest = new("ShaderNodeAttribute")
+    rest.attribute_name = REST_LIGHT
+    inverse = new("ShaderNodeVectorMath")
+    inverse.operation = "DIVIDE"
+    inverse.inputs[0].default_value = (1.0, 1.0, 1.0)
+    link(rest.outputs["Color"], inverse.inputs[1])
+    ambient = new("ShaderNodeVectorMath")
+    ambient.operation = "SCALE"
+    ambient.name = AMBIENT_NODE
+    ambient.inputs["Scale"].default_value = 0.0
+    link(inverse.outputs["Vector"], ambient.inputs[0])
+    diffuse, emission, both = (new(f"ShaderNode{kind}") for kind in ("BsdfDiffuse", "Emission", "AddShader"))
+    link(inverse.outputs["Vector"], diffuse.inputs["Color"])
+    link(ambient.outputs["Vector"], emission.inputs["Color"])
+    link(diffuse.outputs["BSDF"], both.inputs[0])
+    link(emission.outputs["Emission"], both.inputs[1])
+    output = new("ShaderNodeOutputMaterial")
+    link(both.outputs["Shader"], output.inputs["Surface"])
+    texture = new("ShaderNodeTexImage")
+    texture.image = image
+    # Area-averaged whole texels, so that at rest a pixel shows the photo's pixel without interpolation.
+    texture.interpolation = "Closest"
+    texture.extension = "EXTEND"
+    colour = new("ShaderNodeOutputAOV")
+    colour.aov_name = COLOUR_LAYER
+    link(texture.outputs["Color"], colour.inputs["Color"])
+    return material
+
+
+ALBEDO = 0.8
+REACH = 200.0
+"""Half the plane's width over the camera's height: beyond, no shadow would be visible."""
+
+
+def add_ground(scene: bpy.types.Scene, ground: Ground, camera: Camera) -> bpy.types.Object:
+    """Add the plane to ``scene``. It receives light but neither blocks it nor is visible to other surfaces.
+
+    Light from below the horizon, which represents the photo's ground, thus reaches the objects as if bounced.
+    """
+    point, normal = np.asarray(ground.point, dtype=float), np.asarray(ground.normal, dtype=float)
+    first, second = plane_axes(normal)
+    height = abs(float((camera.position - point) @ normal))
+    half = REACH * max(height, 0.1)
+    centre = camera.position - ((camera.position - point) @ normal) * normal
+    corners = [centre + half * (a * first + b * second) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    mesh = bpy.data.meshes.new("ground")
+    mesh.from_pydata([tuple(corner) for corner in corners], [], [(0, 1, 2, 3)])
+    mesh.materials.append(_ground_material())
+    item = bpy.data.objects.new("ground", mesh)
+    item.visible_diffuse = item.visible_glossy = item.visible_transmission = item.visible_shadow = False
+    scene.collection.objects.link(item)
+    return item
+
+
+def _ground_material() -> bpy.types.Material:
+    material = bpy.data.materials.new("ground")
+    tree = compat.node_tree(material)
+    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    diffuse.inputs["Color"].default_value = (ALBEDO, ALBEDO, ALBEDO, 1.0)
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])
+    return material
+
+
+LAMPS_ABOVE, LAMPS_BELOW = 16, 8
+OPEN_RADIANCE = 2.0
+"""EEVEE's lamps are scaled so that open white ground has this radiance: it stores a surface's colour, here 1 over the
+reference lighting, with few bits and up to 8. Only ratios of light affect the image.
+"""
+
+
+@dataclass(frozen=True)
+class _Sky:
+    """The environment. path: its file, None for uniform white. radiance: (H, W, 3). colour: RGB (3,) irradiance of
+    the open ground.
+    """
+
+    path: Path | None
+    radiance: NDArray[np.float32]
+    colour: NDArray[np.float64]
+
+    @property
+    def irradiance(self) -> float:
+        return float(self.colour @ LUMINANCE)
+
+
+def add_environment(scenes: list[bpy.types.Scene], folder: Scene) -> float:
+    """Light all ``scenes`` as ``folder`` specifies; return the luminance of the irradiance on the open ground.
+
+    Raises InputError if the environment map is unreadable or black.
+    """
+    sky = _sky(folder)
+    world = bpy.data.worlds.new("environment")
+    tree = compat.node_tree(world)
+    shader = tree.nodes.new("ShaderNodeBackground")
+    output = tree.nodes.new("ShaderNodeOutputWorld")
+    tree.links.new(shader.outputs["Background"], output.inputs["Surface"])
+    if sky.path is None:
+        shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    else:
+        texture = tree.nodes.new("ShaderNodeTexEnvironment")
+        texture.image = bpy.data.images.load(str(sky.path))
+        texture.image.colorspace_settings.name = "Linear Rec.709"
+        tree.links.new(texture.outputs["Color"], shader.inputs["Color"])
+        # Sampled at the map's own resolution; the automatic choice is larger and costs time in every frame.
+        world.cycles.sampling_method = "MANUAL"
+        world.cycles.sample_map_resolution = int(np.clip(sky.radiance.shape[1], 4, 1024))
+    for scene in scenes:
+        scene.world = world
+    sun = _add_sun(scenes, folder, sky, 1.0)
+    return sky.irradiance * (1.0 if sun is None else 1.0 + folder.model.light.sun_strength)
+
+
+def add_lamps(light_scene: bpy.types.Scene, shadow_scene: bpy.types.Scene, folder: Scene) -> float:
+    """The same for EEVEE, whose world casts no shadows: the sky as lamps, uniformly scaled (``OPEN_RADIANCE``).
+
+    Return the scaled luminance of the irradiance on the open ground. Raises InputError as ``add_environment`` does.
+    """
+    sky, normal = _sky(folder), folder.model.ground_plane.unit_normal
+    both = [light_scene, shadow_scene]
+    strength = folder.model.light.sun_strength if folder.model.light.sun_direction is not None else 0.0
+    scale = OPEN_RADIANCE * math.pi / (sky.irradiance * (1.0 + strength))
+    # A quarter of what a pixel of light spans on the ground: light comes in low there, and a coarser map would darken
+    # the surroundings of contacts.
+    camera, width = folder.model.camera, shadow_scene.render.resolution_x
+    height = abs(float((camera.position - np.asarray(folder.model.ground_plane.point)) @ normal))
+    finest = 0.25 * height / (camera.fx * width / camera.width)
+    above, below = sky_lamps(sky.radiance, normal, above=LAMPS_ABOVE, below=LAMPS_BELOW)
+    for lamps, scenes in ((above, both), (below, [light_scene])):
+        for lamp in lamps:
+            render_engines.add_lamp(scenes, SkyLamp(lamp.direction, lamp.irradiance * scale, lamp.angle), finest=finest)
+    sun = _add_sun(both, folder, sky, scale)
+    if sun is not None:
+        render_engines.sharpen(sun, finest=finest)
+    return OPEN_RADIANCE * math.pi
+
+
+def _add_sun(scenes: list[bpy.types.Scene], folder: Scene, sky: _Sky, scale: float) -> bpy.types.Light | None:
+    light = folder.model.light
+    if light.sun_direction is None or light.sun_strength <= 0:
+        return None
+    normal = folder.model.ground_plane.unit_normal
+    data, turn = new_sun(light, normal, light.sun_strength * sky.irradiance * scale, sky.colour / sky.irradiance)
+    item = bpy.data.objects.new("sun", data)
+    item.rotation_euler = turn.to_euler()
+    for scene in scenes:
+        scene.collection.objects.link(item)
+    return data
+
+
+def _sky(folder: Scene) -> _Sky:
+    name = folder.model.light.environment
+    if name is None:
+        return _Sky(None, np.ones((32, 64, 3), np.float32), np.full(3, math.pi))
+    path = folder.file(name)
+    radiance = _read_environment(path)
+    sky = _Sky(path, radiance, irradiance(radiance, folder.model.ground_plane.unit_normal))
+    if not (math.isfinite(sky.irradiance) and sky.irradiance > 0):
+        raise InputError(f"{path}: lights the ground with {sky.irradiance}; give an environment with finite light")
+    return sky
+
+
+def _read_environment(path: Path) -> NDArray[np.float32]:
+    channels = read_layers(path)
+    try:
+        return np.stack([channels[name] for name in "RGB"], axis=-1)
+    except KeyError:
+        raise InputError(f"{path}: has channels {sorted(channels)}; an environment needs R, G and B") from None
+
+
+@dataclass
+class BlenderScene:
+    """Result of ``build``. ``open_irradiance``: luminance of the light on the open ground."""
+
+    folder: Scene
+    options: RenderOptions
+    objects: list[RenderObject]
+    collection: bpy.types.Collection
+    colour_scene: bpy.types.Scene
+    light_scene: bpy.types.Scene
+    shadow_scene: bpy.types.Scene
+    open_irradiance: float
+    first_frame: int
+    own: list[bpy.types.ID] = field(default_factory=list)
+
+    def colours(self, number: int, box: Box, folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the objects' colours (h, w, 3), premultiplied, and coverage (h, w) in ``box`` at frame ``number``.
+
+        ``folder`` takes temporary files. Raises RenderError if Blender fails.
+        """
+        if self.options.engine == "eevee":
+            side = render_engines.subpixels(self.options)
+            return render_engines.colours(self.colour_scene, COLOUR_LAYER, number, box, side, folder)
+        channels = render_engines.render_passes(self.colour_scene, number, box, folder)
+        return render_engines.stack(channels, COLOUR_LAYER), channels["Combined.A"]
+
+    def ground_light(self, number: int, box: Box, folder: Path) -> NDArray[np.float32]:
+        """Return the light on the ground in ``box`` (h, w, 3) at frame ``number``, with nothing in front of it.
+
+        ``folder`` takes temporary files. Raises RenderError if Blender fails.
+        """
+        hidden = render_engines.unseen(self.collection) if self.options.engine == "eevee" else contextlib.nullcontext()
+        with hidden:
+            return render_engines.stack(
+                render_engines.render_passes(self.shadow_scene, number, box, folder), "Combined"
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames."""
+        return render_size(self.folder.model.camera, self.options.scale)
+
+    @property
+    def drawn_size(self) -> tuple[int, int]:
+        """Width and height at which colours are drawn, including subpixels."""
+        return _size(self.colour_scene)
+
+    @property
+    def light_size(self) -> tuple[int, int]:
+        """Width and height at which light is computed."""
+        return _size(self.shadow_scene)
+
+
+def _size(scene: bpy.types.Scene) -> tuple[int, int]:
+    return scene.render.resolution_x, scene.render.resolution_y
+
+
+def build(folder: Scene, bake: point_caches.Bake | None, options: RenderOptions) -> BlenderScene:
+    """Build ``folder`` beside the .blend's other contents; with ``bake`` its objects follow their caches.
+
+    Raises InputError for a scene without a photo or ground, and for an unusable mesh, texture, light or cache; nothing
+    is left behind then.
+    """
+    require_photo(folder)
+    if options.engine == "cycles":
+        compat.enable_cycles()
+    before = everything()
+    try:
+        built = _build(folder, bake, options)
+    except Exception:
+        _remove_all(everything() - before)
+        raise
+    built.own = list(everything() - before)
+    return built
+
+
+def aim(built: BlenderScene, camera: Camera) -> None:
+    """Set the camera of all scenes of ``built`` to ``camera``."""
+    for scene in (built.colour_scene, built.light_scene, built.shadow_scene):
+        aim_camera(scene, camera)
+
+
+def remove(built: BlenderScene) -> None:
+    """Delete all that ``build`` added."""
+    _remove_all(set(built.own))
+    built.own = []
+
+
+def _build(folder: Scene, bake: point_caches.Bake | None, options: RenderOptions) -> BlenderScene:
+    scene = folder.model
+    colour_scene, light_scene, shadow_scene = scenes = [
+        bpy.data.scenes.new(f"PhysGen {name}") for name in ("colours", "light", "shadows")
+    ]
+    collection = bpy.data.collections.new("PhysGen objects")
+    size = render_size(scene.camera, options.scale)
+    side = render_engines.subpixels(options) if options.engine == "eevee" else 1
+    drawn = (size[0] * side, size[1] * side)
+    light_scale = options.scale * options.light_scale_for(max(size))
+    for item in scenes:
+        item.collection.children.link(collection)
+        render_engines.set_up_passes(item)
+        add_camera(item, scene.camera, drawn if item is colour_scene else render_size(scene.camera, light_scale))
+    colour_scene.view_layers[0].aovs.add().name = COLOUR_LAYER
+    add_ground(shadow_scene, scene.ground_plane, scene.camera)
+    if options.engine == "cycles":
+        for item in scenes:
+            render_engines.set_up_cycles(item, options, denoise=item is not colour_scene)
+        open_irradiance = add_environment([light_scene, shadow_scene], folder)
+    else:
+        render_engines.set_up_colours(colour_scene, options)
+        for item in (light_scene, shadow_scene):
+            render_engines.set_up_eevee(item, options)
+        open_irradiance = add_lamps(light_scene, shadow_scene, folder)
+    objects = [add_object(collection, folder, source) for source in scene.objects]
+    # The ground's light without the objects in front of it, but with their shadows.
+    if options.engine == "cycles":
+        compat.layer_collection(shadow_scene.view_layers[0], collection.name).indirect_only = True
+    if bake is not None:
+        for target, cache in zip(objects, bake.caches, strict=True):
+            point_caches.attach(target.item, cache, bake.first_frame)
+    return BlenderScene(
+        folder=folder,
+        options=options,
+        objects=objects,
+        collection=collection,
+        colour_scene=colour_scene,
+        light_scene=light_scene,
+        shadow_scene=shadow_scene,
+        open_irradiance=open_irradiance,
+        first_frame=bake.first_frame if bake is not None else 1,
+    )
+
+
+def everything() -> set[bpy.types.ID]:
+    """Return all data that ``build`` and its completions can have added."""
+    kinds = ("scenes", "collections", "objects", "meshes", "materials", "images", "worlds", "lights", "cameras")
+    return {item for kind in (*kinds, "node_groups") for item in getattr(bpy.data, kind)}
+
+
+def _remove_all(items: set[bpy.types.ID]) -> None:
+    if items:
+        bpy.data.batch_remove(items)

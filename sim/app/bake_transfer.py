@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""Transfer the bake of a scene exported from Blender to the photo's scene that was imported there.
+
+Blender bakes its own objects: meshes in their own space, under the names they have there. The render stage needs the
+photo's scene folder and world metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cache.bake_folder import MESH_SPACE, WORLD_SPACE, BakedObject, BakeManifest, load_manifest, save_manifest
+from ..cache.pc2 import Pc2Reader, Pc2Writer
+from ..errors import InputError
+from ..events import OnEvent, ignore
+from ..scene.folder import Scene, load_scene
+from ..scene.meshes import load_object_mesh
+from ..scene.model import SceneObject
+from .bake_options import geometry_hash
+
+MOVED_SHARE = 0.01
+"""Fraction of an object's size; farther from its position in the photo it counts as moved."""
+
+
+def transfer_bake(
+    photo: Path, baked_scene: Path, bake: Path, out: Path, names: Mapping[str, str], on_event: OnEvent = ignore
+) -> BakeManifest:
+    """Write ``bake`` of the scene folder ``baked_scene`` into ``out`` as a bake of the scene folder ``photo``.
+
+    names: name in ``photo`` → name in ``baked_scene``; objects left out stay where the photo shows them.
+    out: a folder that does not exist yet. Returns its manifest.
+
+    Raises InputError when ``baked_scene`` has changed since the bake, an object is missing from it, or an object's
+    vertices differ from the photo's scene.
+    """
+    target, source, manifest = load_scene(photo), load_scene(baked_scene), load_manifest(bake)
+    if manifest.geometry_hash and manifest.geometry_hash != geometry_hash(source):
+        raise InputError(f"{bake}: was baked from other meshes or positions; bake the scene again")
+    files = {item.name: item for item in manifest.objects}
+    bodies = {item.name: item for item in source.model.objects}
+    out.mkdir(parents=True)
+    placed = []
+    for item in target.model.objects:
+        name = names.get(item.name)
+        if name is not None and (name not in files or name not in bodies):
+            raise InputError(f"{bake}: has no cache of object {name!r}; bake the scene again")
+        cache = None if name is None else (Pc2Reader(bake / files[name].file), files[name], bodies[name])
+        placed.append(_transfer_object(target, item, cache, manifest.frames_done, out, on_event))
+    result = dataclasses.replace(manifest, objects=tuple(placed), geometry_hash=geometry_hash(target))
+    save_manifest(out, result)
+    return result
+
+
+def _transfer_object(
+    folder: Scene,
+    item: SceneObject,
+    cache: tuple[Pc2Reader, BakedObject, SceneObject] | None,
+    samples: int,
+    out: Path,
+    on_event: OnEvent,
+) -> BakedObject:
+    rest = load_object_mesh(folder, item).vertices
+    result = BakedObject(name=item.name, file=f"{item.name}.pc2", vertices=len(rest), space=WORLD_SPACE)
+    if cache is None:
+        with Pc2Writer(out / result.file, vertex_count=len(rest)) as writer:
+            for _ in range(samples):
+                writer.append(rest)
+        return result
+    reader, baked, body = cache
+    if reader.vertex_count != len(rest):
+        raise InputError(
+            f"object {item.name!r}: its mesh has {reader.vertex_count} vertices and had {len(rest)} in the photo's "
+            "scene, whose texture it uses: undo the change of the mesh and bake again"
+        )
+    matrix = np.asarray(body.world_from_mesh) if baked.space == MESH_SPACE else np.eye(4)
+    _write_transformed(reader, matrix, samples, out / result.file)
+    if np.abs(_transformed(reader.sample(0), matrix) - rest).max() > MOVED_SHARE * item.size_m:
+        message = f"{item.name} does not start where the photo shows it; frames differ from the photo there"
+        on_event({"event": "notice", "stage": "render", "message": message})
+    if baked.points_file is None:
+        return result
+    points = Pc2Reader(reader.path.parent / baked.points_file)
+    file = f"{item.name}.points.pc2"
+    _write_transformed(points, matrix, samples, out / file)
+    return dataclasses.replace(result, points_file=file, points=points.vertex_count, points_as=baked.points_as)
+
+
+def _write_transformed(reader: Pc2Reader, matrix: NDArray[np.float64], samples: int, path: Path) -> None:
+    with Pc2Writer(path, vertex_count=reader.vertex_count) as writer:
+        for index in range(samples):
+            writer.append(_transformed(reader.sample(index), matrix))
+
+
+def _transformed(sample: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    return sample.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]

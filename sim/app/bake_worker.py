@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""The simulation process: ``python -m physgen.sim.app.bake_worker JOB.json``.
+
+The job file is ``{"format": "physgen-job/1", "use_case": "bake", "scene": …, "out": …, "options": {…}}``. Events
+go to standard output as JSON lines; SIGTERM, or the parent's death, cancels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from ..errors import Cancelled, InputError, PhysGenError
+from ..events import Event, IsCancelled, OnEvent
+from ..scene.folder import load_scene
+from ..validation import parse, read_json, to_json
+from .bake import BakeOptions, bake
+from .bake_options import inputs_hash
+
+JOB_FORMAT = "physgen-job/1"
+UNHEARD_S = 0.5
+"""A bake checks for cancelling every tenth of a second. One that does not react within this time is compiling kernels
+or preparing the scene, so there is nothing to save, and the process ends at once, as after a crash."""
+
+RUNNING_UNHEARD_S = 3.0
+"""The same once frames are computed: with millions of particles, or on a busy machine, a launch takes longer, and there
+is something to save."""
+
+RUNNING_LOOKS = 50
+"""After this many checks a bake is computing frames."""
+
+LAST_GRACE_S = 15.0
+"""Longer than the caller waits before it kills (``run_stage``), in case the caller is gone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeJob:
+    """One bake.
+
+    scene, out: absolute folders.
+    expected_inputs: the caller's ``inputs_hash``, so that a scene changed by another process is never baked under the
+    wrong name; None accepts the scene as it is.
+    """
+
+    scene: str
+    out: str
+    options: BakeOptions = field(default_factory=BakeOptions)
+    expected_inputs: str | None = None
+
+
+def job_to_json(job: BakeJob) -> dict[str, Any]:
+    """Return the content of a job file."""
+    return {"format": JOB_FORMAT, "use_case": "bake", **to_json(job)}
+
+
+def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
+    """Run the job file at ``path``; return the ``done`` event."""
+    data = read_json(path)
+    if not isinstance(data, dict) or data.pop("format", None) != JOB_FORMAT:
+        raise InputError(f"{path}: not a job of format {JOB_FORMAT!r}")
+    use_case = data.pop("use_case", None)
+    if use_case != "bake":
+        raise InputError(f"{path}: use_case is {use_case!r}: this version knows 'bake'")
+    job = parse(BakeJob, data, str(path))
+    if job.expected_inputs not in (None, inputs_hash(load_scene(Path(job.scene)), job.options)):
+        raise InputError(f"{job.scene}: was changed by another run since this one started; run it again")
+    manifest = bake(
+        load_scene(Path(job.scene)), out=job.out, options=job.options, on_event=emit, cancelled=cancelled
+    ).manifest
+    return {"event": "done", "stage": "bake", "out": job.out, "frames": manifest.frames_done}
+
+
+class _Wish:
+    """Whether this process is to stop, and whether its work has heard of it."""
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+        self.heard = threading.Event()
+        self.looks = 0
+        self._parent = os.getppid()
+
+    def listen(self) -> None:
+        """Take the signals that ask to stop, at once: Python's handlers wait until the main thread's present call into
+        NumPy or SciPy is over, which can take seconds. The main thread calls this."""
+        read, write = os.pipe()
+        if os.name != "nt":
+            os.set_blocking(write, False)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGTERM)):
+            signal.signal(number, lambda *_: self.asked.set())
+        threading.Thread(target=self._await_signal, args=(read,), daemon=True).start()
+
+    def _await_signal(self, pipe: int) -> None:
+        os.read(pipe, 1)
+        self.asked.set()
+
+    def pending(self) -> bool:
+        """Return whether cancelling was requested, or the caller is gone."""
+        return self.asked.is_set() or os.getppid() != self._parent
+
+    def cancelled(self) -> bool:
+        """The same, asked by the work itself, which then stops in good order."""
+        self.looks += 1
+        if self.pending():
+            self.heard.set()
+        return self.heard.is_set()
+
+
+def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
+    """End the process when it was asked to stop and does not."""
+    while not wish.pending():
+        time.sleep(0.05)
+    if not wish.heard.wait(UNHEARD_S if wish.looks < RUNNING_LOOKS else RUNNING_UNHEARD_S):
+        with contextlib.suppress(OSError):
+            emit(_error(Cancelled("bake cancelled in the middle of a long step; run it again to continue")))
+    else:
+        time.sleep(LAST_GRACE_S)
+    os._exit(Cancelled.exit_code)
+
+
+def _error(error: PhysGenError) -> Event:
+    return {"event": "error", "kind": type(error).__name__, "message": str(error)}
+
+
+def main(arguments: list[str]) -> int:
+    """Entry of the process; the exit code of docs/cli.md."""
+    wish = _Wish()
+    wish.listen()
+    # Libraries print to standard output; events get a descriptor of their own.
+    events: TextIO = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+
+    def emit(event: Event) -> None:
+        events.write(json.dumps(event, ensure_ascii=False) + "\n")
+
+    threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
+    try:
+        if len(arguments) != 1:
+            raise InputError(f"worker: expected one job file, found {len(arguments)} arguments")
+        emit(run_job(Path(arguments[0]), emit, wish.cancelled))
+    except PhysGenError as error:
+        emit(_error(error))
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

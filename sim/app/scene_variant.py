@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""Scene folder → new scene folder with the same objects and other physics."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+from ..atomic import replacing
+from ..cache.folder_lock import folder_lock
+from ..effects.registry import effect
+from ..errors import InputError
+from ..scene.folder import (
+    SCENE_FILE,
+    Scene,
+    inside,
+    load_scene,
+    parse_scene,
+    referenced_files,
+    save_scene,
+    scene_to_json,
+)
+from ..scene.model import SceneModel
+from .bake_options import file_hash
+from .reconstruct import Physics, with_physics
+
+
+def make_variant(
+    source: Scene,
+    *,
+    out: Path,
+    physics: Physics,
+    effects: str | None = None,
+) -> Scene:
+    """Return ``source`` with other physics (see ``with_physics``) as the scene folder ``out``.
+
+    effects: all that the variant has, as JSON of the list in ``scene.json``; None keeps those of the scene.
+    Files are shared with ``source`` by hard links where the file system has them, else copied; those that are the same
+    already are left alone. Every file is written whole, ``scene.json`` last.
+
+    Raises InputError for unusable scenes, physics or effects, and for a folder with other content.
+    """
+    scene = with_physics(source.model, physics)
+    if effects is not None:
+        scene = _with_effects(scene, effects)
+    if out.resolve() == source.root.resolve():
+        raise InputError(f"{out}: is the scene itself; choose another folder for the variant")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a folder for the variant")
+    if out.is_dir() and not (out / SCENE_FILE).is_file() and any(not p.name.startswith(".") for p in out.iterdir()):
+        leftovers = {Path(name).parts[0] for name in referenced_files(scene)}
+        if any(p.name not in leftovers for p in out.iterdir() if not p.name.startswith(".")):
+            raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
+    with folder_lock(out):
+        for name in referenced_files(scene):
+            _link_or_copy(source.file(name), inside(out, name))
+        try:
+            if load_scene(out).model == scene:
+                return Scene(root=out, model=scene)
+        except InputError:
+            pass
+        return save_scene(out, scene)
+
+
+def _with_effects(scene: SceneModel, text: str) -> SceneModel:
+    try:
+        listed = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"effects: not readable as JSON ({error}); give a list as in scene.json") from None
+    if not isinstance(listed, list):
+        raise InputError("effects: expected a list of effects as in scene.json")
+    changed = parse_scene({**scene_to_json(scene), "effects": listed}, "effects")
+    for index, item in enumerate(changed.effects):
+        try:
+            effect(item.name).checked(dict(item.parameters))
+        except InputError as error:
+            raise InputError(f"effects[{index}]: {error}") from None
+    return changed
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    """Make ``target`` a hard link to ``source``, or a copy."""
+    try:
+        if target.is_file() and (target.samefile(source) or file_hash(target) == file_hash(source)):
+            return
+    except OSError:
+        pass
+    with replacing(target) as partial:
+        try:
+            os.link(source, partial)
+        except OSError:
+            shutil.copyfile(source, partial)

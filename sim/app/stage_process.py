@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""Run a stage in its own process: events come back as JSON lines, cancelling is requested, then enforced.
+
+Taichi and bpy cannot share a process (docs/design.md), and a stage's memory is freed when it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from queue import Empty, Queue
+
+from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
+from ..events import Event, IsCancelled, OnEvent
+
+CANCEL_GRACE_S = 10.0
+"""Time for a stage to clean up before it is killed."""
+
+MOST_LINE_BYTES = 2**20
+"""Longer lines are cut; ours are far shorter."""
+
+_ERRORS: dict[str, type[PhysGenError]] = {e.__name__: e for e in (InputError, SimulationError, RenderError, Cancelled)}
+_STRIPPED = ("PYTHON", "LD_", "DYLD_")
+_KEPT = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
+NO_WINDOW = 0x08000000 if os.name == "nt" else 0
+"""``creationflags`` of every child: no console window on Windows."""
+_LAUNCHER = Path(__file__).with_name("launch.py")
+
+
+def child_environment() -> dict[str, str]:
+    """Return this environment without variables that would make another interpreter load wrong libraries or wait.
+
+    Events are lines of UTF-8, also on Windows, where Python would use another encoding for pipes.
+    """
+    kept = {key: value for key, value in os.environ.items() if key in _KEPT or not key.upper().startswith(_STRIPPED)}
+    return {**kept, "PYTHONUTF8": "1"}
+
+
+def own_command(
+    module: str,
+    *arguments: str,
+    python: str = sys.executable,
+    packages: str = "",
+    folder: Path | None = None,
+    ends_with_us: bool = False,
+) -> list[str]:
+    """Return the command that runs ``module`` of this tree, whatever the package is called in this process.
+
+    module: from the tree's root, such as ``batch.cli``. python: interpreter, this one's by default. packages: a
+    site-packages folder that it would not find by itself; those that this process was launched with are inherited
+    through the environment. folder: working folder, this one's by default. ends_with_us: it stops when we die.
+    """
+    options = [*(["--packages", packages] if packages else []), *(["--folder", str(folder)] if folder else [])]
+    if ends_with_us:
+        options += ["--parent", str(os.getpid())]
+    return [python, str(_LAUNCHER), *options, module, *arguments]
+
+
+def start_process(command: Sequence[str], *, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
+    """Start ``command`` with pipes for its output, in its own session; return the process.
+
+    Ctrl-C then reaches only this process, which asks the other to stop cleanly. Raises InputError when it cannot be
+    started, such as an interpreter that has been deleted.
+    """
+    try:
+        return subprocess.Popen(
+            list(command),
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=child_environment(),
+            start_new_session=os.name != "nt",
+            creationflags=0x00000200 | NO_WINDOW if os.name == "nt" else 0,  # a process group of its own
+        )
+    except OSError as error:
+        raise InputError(
+            f"{command[0]}: cannot be started ({error.strerror or error}); put it back, or choose another interpreter"
+        ) from error
+
+
+def run_stage(
+    command: Sequence[str],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+    *,
+    failure: type[PhysGenError] = SimulationError,
+    restarts: int = 0,
+) -> Event:
+    """Run ``command`` to its end, relay its events and return its final ``done`` event.
+
+    restarts: number of restarts, with a notice, after a crash; for stages that resume from finished work.
+    Raises the PhysGenError that the stage reported; Cancelled when ``cancelled()`` became true; ``failure`` with the
+    last lines of its output when it died without reporting an error.
+    """
+    while True:
+        final, code, tail = _run_once(command, on_event, cancelled)
+        if restarts == 0 or final is not None or not _crashed(code):
+            break
+        restarts -= 1
+        on_event({"event": "notice", "message": f"the process crashed (code {code}); it is restarted and resumes"})
+    if final is not None and final.get("event") == "error":
+        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
+    # A process that is asked to stop after its work was done may be killed by the signal while it ends.
+    if final is None or (code != 0 and not cancelled()):
+        words = "\n".join(tail).strip() or "no output"
+        raise failure(f"{_how_it_ended(code)}: {words}")
+    return final
+
+
+def _crashed(code: int) -> bool:
+    """Return whether a process with this exit code crashed by itself, and was not killed."""
+    faults = {getattr(signal, name, None) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGFPE", "SIGILL")}
+    return -code in faults or (os.name == "nt" and code & 0xF0000000 == 0xC0000000)
+
+
+def _how_it_ended(code: int) -> str:
+    """Return the start of a sentence about a process with this exit code."""
+    text = f"the process ended with code {code}"
+    if code == -getattr(signal, "SIGKILL", 0):
+        return f"{text} (it was killed, possibly because memory ran out)"
+    return f"{text} (it crashed)" if _crashed(code) else text
+
+
+def _run_once(
+    command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
+) -> tuple[Event | None, int, deque[str]]:
+    """Return the final event of ``command`` if any, its exit code and the last lines of its other output."""
+    process = start_process(command)
+    # Bounded, so that endless output blocks instead of filling memory.
+    lines: Queue[bytes | None] = Queue(maxsize=256)
+    tail: deque[str] = deque(maxlen=30)
+    readers = [
+        threading.Thread(target=_read_events, args=(process, lines), daemon=True),
+        threading.Thread(target=read_errors, args=(process, tail), daemon=True),
+    ]
+    for reader in readers:
+        reader.start()
+    try:
+        final = _relay(process, lines, tail, on_event, cancelled)
+    finally:
+        _stop(process)
+        for reader in readers:
+            reader.join(timeout=5)
+    return final, process.returncode, tail
+
+
+def _relay(
+    process: subprocess.Popen[bytes],
+    lines: Queue[bytes | None],
+    tail: deque[str],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> Event | None:
+    final: Event | None = None
+    asked_at: float | None = None
+    while True:
+        if asked_at is None and cancelled():
+            asked_at = time.monotonic()
+            ask_to_stop(process)
+        if asked_at is not None and time.monotonic() - asked_at > CANCEL_GRACE_S:
+            process.kill()
+            raise Cancelled("cancelled; the stage did not stop in time and was killed, complete frames are kept")
+        try:
+            line = lines.get(timeout=0.1)
+        except Empty:
+            continue
+        if line is None:
+            process.wait()
+            if final is None and asked_at is not None:
+                raise Cancelled("cancelled while starting; run it again to continue")
+            return final
+        event = parse_event(line)
+        if event is None:
+            tail.append(line.decode("utf-8", "replace").rstrip())
+        elif event["event"] in ("done", "error"):
+            final = event
+        else:
+            on_event(event)
+
+
+def parse_event(line: bytes) -> Event | None:
+    """Return the event on ``line``, or None for other output, such as a library's."""
+    try:
+        value = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) and "event" in value else None
+
+
+def _read_events(process: subprocess.Popen[bytes], lines: Queue[bytes | None]) -> None:
+    assert process.stdout is not None
+    while line := process.stdout.readline(MOST_LINE_BYTES):
+        lines.put(line)
+    lines.put(None)
+
+
+def read_errors(process: subprocess.Popen[bytes], tail: deque[str]) -> None:
+    """Collect the last lines of standard error of ``process`` in ``tail``, until it ends; for a thread."""
+    assert process.stderr is not None
+    while line := process.stderr.readline(MOST_LINE_BYTES):
+        tail.append(line.decode("utf-8", "replace").rstrip())
+
+
+def ask_to_stop(process: subprocess.Popen[bytes]) -> None:
+    """Send ``process`` the signal on which our processes stop cleanly."""
+    with contextlib.suppress(ProcessLookupError):
+        process.send_signal(signal.CTRL_BREAK_EVENT if os.name == "nt" else signal.SIGTERM)  # type: ignore[attr-defined]
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    """Kill the process if it still runs, whatever happened here."""
+    if process.poll() is None:
+        process.kill()
+    process.wait()

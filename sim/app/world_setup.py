@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: MIT
+"""From a scene's material to the engine's.
+
+Hollow bodies: of the particles that fill a mesh, those near its surface.
+
+How the surfaces of a scene meet, pair by pair, from the numbers of each surface and of named pairs.
+
+Where a pair is not named, friction is the geometric mean of the two coefficients, so that anything slides on ice, and
+restitution the larger of the two, so that a ball that bounces well does so on anything: the rules of Box2D
+(b2MixFriction and b2MixRestitution, E. Catto, box2d.org). No law of physics gives a pair's numbers from two surfaces.
+
+From a scene and its meshes to the engine's world: bodies, colliders, contacts, tracks, effects. No Taichi.
+
+Everything that can be wrong with a scene is found here, before the engine starts, and named by object and field."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from trimesh.remesh import subdivide_to_size
+from trimesh.triangles import closest_point
+
+from ..constitutive import DeformableMaterial, RigidMaterial, model_of
+from ..effects.registry import apply_effects
+from ..errors import InputError
+from ..mpm.bodies import BodyParticles
+from ..mpm.colliders import Collider, Surface, Track
+from ..mpm.cost_estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, sample_interior
+from ..mpm.solver_options import SolverOptions
+from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
+from ..mpm.world_setup import WorldSetup
+from ..scene.folder import Scene
+from ..scene.meshes import ObjectMesh, load_vertex_track
+from ..scene.model import Contact, Ground, Keys, Material, Motion, SceneModel, SceneObject
+from ..scene.units import Similarity
+from ..weak_cache import WeakCache
+from .bake_options import BakeOptions
+from .bake_quality import Quality, load_quality
+from .world_setup_checks import (
+    collider_warnings,
+    overlap_warnings,
+    require_above_ground,
+    resolve,
+    surface_warnings,
+    vertices_at,
+)
+
+
+def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:
+    """The constitutive model of the material's law, with the parameters that it reads."""
+    if material.law == "rigid":
+        return RigidMaterial(density=material.density)
+    model = model_of(material.law)
+    return model(density=material.density, **{name: getattr(material, name) for name in model.reads})
+
+
+SHELL_CELLS = 2.0
+"""Thickness in grid cells of a shell whose object does not say one: the thinnest that bends about as it should."""
+
+
+def keep_shell(sample: InteriorSample, mesh: ObjectMesh, thickness: float, spacing: float) -> InteriorSample:
+    """The particles of ``sample`` whose middle is within ``thickness`` m of the surface of ``mesh``.
+
+    The inside is empty: mass and inertia are the shell's, and nothing but the shell resists bending and pressure. The
+    volume is right to about half a particle ``spacing`` of thickness. Raises InputError for a shell thinner than the
+    spacing, which would have holes.
+    """
+    if thickness < spacing:
+        raise InputError(
+            f"shell_thickness is {thickness:g} m: give {spacing:.2g} m (the particle spacing) or more, or bake finer"
+        )
+    points, faces, owners = subdivide_to_size(
+        mesh.vertices, mesh.faces, max_edge=max(spacing, 1e-9), max_iter=24, return_index=True
+    )
+    nearest = cKDTree(points[faces].mean(axis=1)).query(sample.positions)[1]
+    triangles = mesh.vertices[mesh.faces[owners[nearest]]]
+    distance = np.linalg.norm(closest_point(triangles, sample.positions) - sample.positions, axis=1)
+    keep = distance <= thickness
+    if int(keep.sum()) < MIN_PARTICLES:
+        raise InputError(f"shell_thickness is {thickness:g} m: that leaves {int(keep.sum())} particles; give more")
+    return InteriorSample(
+        positions=sample.positions[keep], volumes=sample.volumes[keep], contact_radii=sample.contact_radii[keep]
+    )
+
+
+HOLDS = ("separate", "slip", "sticky")
+"""Modes by how much they hold; of two surfaces the stronger one counts."""
+
+
+def contact_table(scene: SceneModel) -> ContactTable:
+    """The contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is.
+
+    Where there is no ground, as made of what a new scene's ground is.
+    """
+    usual = scene.ground or Ground()
+    ground = SurfaceContact(
+        friction=usual.friction, static_friction=usual.static_friction, restitution=usual.restitution
+    )
+    surfaces = {item.name: surface(item, ground) for item in scene.objects}
+    if scene.ground is not None:
+        surfaces = {GROUND_NAME: ground, **surfaces}
+    named = {frozenset(contact.between): contact for contact in scene.contacts}
+    table = ContactTable(default=ground)
+    for a, b in itertools.combinations(surfaces, 2):
+        contact = named.get(frozenset((a, b)))
+        mixed = mix(surfaces[a], surfaces[b])
+        if contact is not None:
+            table = table.with_pair(a, b, _named(contact, mixed))
+        elif surfaces[a] != ground or surfaces[b] != ground:
+            table = table.with_pair(a, b, mixed)
+    return table
+
+
+def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:
+    """The surface of ``item``: its own numbers, its roughness, or what the ground has."""
+    friction, static = item.friction, item.static_friction
+    if friction is None and item.roughness is not None:
+        friction = friction_from_roughness(item.roughness)
+    if friction is None:
+        friction, static = ground.friction, ground.static_friction
+    return SurfaceContact(
+        friction=friction,
+        static_friction=static,
+        restitution=ground.restitution if item.restitution is None else item.restitution,
+        mode=item.contact_mode or ground.mode,
+    )
+
+
+def mix(a: SurfaceContact, b: SurfaceContact) -> SurfaceContact:
+    """How two surfaces meet that were each judged alone."""
+    static = None
+    friction = math.sqrt(a.friction * b.friction)
+    if a.static_friction is not None or b.static_friction is not None:
+        static = max(friction, math.sqrt(a.sticking * b.sticking))
+    return SurfaceContact(
+        friction=friction,
+        static_friction=static,
+        restitution=max(a.restitution, b.restitution),
+        mode=max(a.mode, b.mode, key=HOLDS.index),
+    )
+
+
+def _named(contact: Contact, mixed: SurfaceContact) -> SurfaceContact:
+    friction, static = contact.friction, contact.static_friction
+    if friction is None:
+        friction, static = mixed.friction, mixed.static_friction
+    return SurfaceContact(
+        friction=friction,
+        static_friction=static,
+        restitution=mixed.restitution if contact.restitution is None else contact.restitution,
+        mode=contact.mode or mixed.mode,
+        rolling_resistance=contact.rolling_resistance,
+        adhesion=contact.adhesion,
+        adhesion_reach=contact.adhesion_reach,
+    )
+
+
+_SURFACES: WeakCache[ObjectMesh, Surface] = WeakCache()
+_SAMPLES: WeakCache[ObjectMesh, InteriorSample] = WeakCache()
+_WARNINGS: WeakCache[ObjectMesh, list[str]] = WeakCache()
+
+JUMP = 1e-3
+"""Share of its size by which a collider's motion may begin off the place of its mesh."""
+
+JITTER = 0.2
+"""Share of the particle spacing by which a seed other than 0 moves each particle off the lattice along each axis."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedWorld:
+    """All that the engine is told, and what the user should hear before it starts.
+
+    body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
+    cost: of the whole bake, estimated for ``arch``; stable_step, duration: in s, what it was estimated from.
+    """
+
+    setup: WorldSetup
+    solver: SolverOptions
+    similarity: Similarity
+    body_of_object: tuple[int | None, ...]
+    collider_of_object: tuple[int | None, ...]
+    warnings: tuple[str, ...]
+    cost: Estimate
+    stable_step: float
+    duration: float
+    arch: str
+
+    @property
+    def particle_count(self) -> int:
+        """Particles of all bodies that deform."""
+        return _soft_count(self.setup)
+
+    def require_affordable(self) -> None:
+        """Raise InputError when the bake would take too long or more memory than there is."""
+        on_host = self.arch in ("cpu", "metal")
+        refuse_excess(self.cost, self.particle_count, available_memory() if on_host else None)
+
+    def on(self, arch: str) -> PreparedWorld:
+        """The same, with the cost on another architecture."""
+        cost = estimate(self.particle_count, len(self.setup.bodies), self.stable_step, self.duration, arch)
+        return dataclasses.replace(self, arch=arch, cost=cost)
+
+
+def prepare_world(
+    folder: Scene, meshes: Sequence[ObjectMesh], options: BakeOptions, quality: Quality | None = None
+) -> PreparedWorld:
+    """The world of the scene in ``folder``, whose objects have ``meshes``.
+
+    quality: in place of the preset that ``options`` name. What depends on a mesh alone is worked out once for each of
+    ``meshes``, as long as the caller keeps it.
+
+    Raises InputError for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that
+    stand in the ground or in each other, and for what no machine could compute.
+    """
+    scene = folder.model
+    moving = [i for i, item in enumerate(scene.objects) if item.role == "dynamic"]
+    still = [i for i, item in enumerate(scene.objects) if item.role == "collider"]
+    if not moving:
+        raise InputError("objects: none has the role 'dynamic', so nothing would move")
+    warnings: list[str] = []
+    quality = quality or load_quality(options.quality)
+    solver, similarity = resolve(
+        [scene.objects[i].name for i in moving], [meshes[i] for i in moving], quality, options.arch
+    )
+    cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
+    for item, mesh in zip(scene.objects, meshes, strict=True):
+        warnings += _surface_warnings(mesh, item.name, cell)
+    if scene.ground is not None:
+        for i in moving:
+            require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
+    bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
+    warnings += overlap_warnings(bodies, spacing, cell)
+    colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
+    warnings += collider_warnings(bodies, colliders, cell)
+    warnings += [text for collider in colliders for text in _jump(collider)]
+    setup = WorldSetup(
+        bodies=bodies,
+        ground=scene.ground,
+        gravity=scene.gravity,
+        gravity_track=_track(scene.gravity_track),
+        colliders=colliders,
+        contacts=contact_table(scene),
+    )
+    setup = apply_effects(setup, scene.effects)
+    step = stable_step(setup.bodies, cell, solver)
+    duration = (options.frames - 1) / options.fps
+    count = _soft_count(setup)
+    body_index = {scene_index: index for index, scene_index in enumerate(moving)}
+    collider_index = {scene_index: index for index, scene_index in enumerate(still)}
+    return PreparedWorld(
+        setup=setup,
+        solver=solver,
+        similarity=similarity,
+        body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
+        collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
+        warnings=tuple(warnings),
+        cost=estimate(count, len(setup.bodies), step, duration, options.arch),
+        stable_step=step,
+        duration=duration,
+        arch=options.arch,
+    )
+
+
+def _soft_count(setup: WorldSetup) -> int:
+    """Particles that the engine moves; those of rigid bodies only tell their mass and carry their mesh."""
+    return sum(body.count for body in setup.bodies if not body.rigid)
+
+
+def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int) -> BodyParticles:
+    if item.material.law == "rigid" and (item.pins or item.goal_stiffness > 0):
+        raise InputError(
+            f"object {item.name}: has pins or goal_stiffness and the law 'rigid': choose another law or leave them "
+            "out; role 'collider' with motion holds or leads a rigid thing"
+        )
+    try:
+        sample = _SAMPLES.get(
+            mesh,
+            (spacing, seed),
+            lambda: sample_interior(mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed),
+        )
+        if not item.fill:
+            thickness = SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness
+            sample = keep_shell(sample, mesh, thickness, spacing)
+    except InputError as error:
+        raise InputError(f"object {item.name}: {error}") from None
+    return BodyParticles(
+        name=item.name,
+        positions=sample.positions,
+        volumes=sample.volumes,
+        contact_radii=sample.contact_radii,
+        material=engine_material(item.material),
+        surface=_surface(mesh),
+        velocity=item.velocity,
+        spin=item.spin,
+        start_time=item.start_time,
+        acceleration=_track(item.acceleration),
+        velocity_keys=_track(item.velocity_keys),
+        pins=_pins(item, sample),
+        pin_motion=_track(item.pin_motion),
+        goal_stiffness=item.goal_stiffness,
+        goal_damping=item.goal_damping,
+    )
+
+
+def _pins(item: SceneObject, sample: InteriorSample) -> NDArray[np.bool_] | None:
+    """Which particles lie in a box of pins; None without boxes. Raises InputError for a box that holds none."""
+    if not item.pins:
+        return None
+    pinned = np.zeros(len(sample.positions), dtype=np.bool_)
+    for i, box in enumerate(item.pins):
+        inside = ((sample.positions >= box.low) & (sample.positions <= box.high)).all(axis=1)
+        if not inside.any():
+            low, high = sample.positions.min(axis=0), sample.positions.max(axis=0)
+            raise InputError(
+                f"object {item.name}: pins[{i}] from {box.low} to {box.high} holds none of its matter, which is "
+                f"between {low.round(4).tolist()} and {high.round(4).tolist()}: move or enlarge the box"
+            )
+        pinned |= inside
+    return pinned
+
+
+def _collider(folder: Scene, item: SceneObject, mesh: ObjectMesh) -> Collider:
+    motion = item.motion or Motion()
+    vertices = None
+    if motion.vertices_file is not None:
+        times, values = load_vertex_track(folder.file(motion.vertices_file), len(mesh.vertices))
+        vertices = Track(times=times, values=values)
+    return Collider(
+        name=item.name,
+        surface=_surface(mesh),
+        translations=_track(motion.translations),
+        rotations=_track(motion.rotations),
+        pivot=motion.pivot,
+        vertices=vertices,
+    )
+
+
+def _jump(collider: Collider) -> list[str]:
+    """Frame 1 shows every mesh where it stands; a motion that begins elsewhere jumps after it."""
+    rest = collider.surface.vertices
+    off = float(np.abs(vertices_at(collider, 0.0) - rest).max())
+    if off <= JUMP * float(np.ptp(rest, axis=0).max()):
+        return []
+    return [f"{collider.name}: its motion begins {off:.2g} m from where its mesh stands, so it jumps after frame 1"]
+
+
+def _surface(mesh: ObjectMesh) -> Surface:
+    return _SURFACES.get(mesh, None, lambda: Surface(vertices=mesh.vertices, faces=mesh.faces))
+
+
+def _surface_warnings(mesh: ObjectMesh, name: str, cell: float) -> list[str]:
+    return _WARNINGS.get(mesh, (name, cell), lambda: surface_warnings(_surface(mesh), name, cell))
+
+
+def _track(keys: Keys) -> Track | None:
+    if not keys:
+        return None
+    return Track(times=np.array([key.time_s for key in keys]), values=np.array([key.value for key in keys]))
+
+
+def cost_text(prepared: PreparedWorld) -> str:
+    """What the bake will take, in a line for people."""
+    cost = prepared.cost
+    return (
+        f"about {_duration(cost.seconds)} of computing and {cost.bytes / 2**20:.0f} MiB: {prepared.particle_count} "
+        f"particles, {cost.substeps} time steps of {prepared.stable_step * 1e6:.0f} µs, cells of "
+        f"{prepared.solver.cell_size(prepared.similarity) * 1000:.3g} mm"
+    )
+
+
+def _duration(seconds: float) -> str:
+    for limit, size, unit in ((120.0, 1.0, "s"), (7200.0, 60.0, "min"), (172800.0, 3600.0, "h")):
+        if seconds < limit:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:.3g} days"

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""One frame from its layers, in linear light (derivation: docs/rendering.md).
+
+    frame = T·R + (1 − A)·K        K = B·S            inside the objects' masks
+                                   K = lerp(B, P / S₀, w)·S   elsewhere
+
+A coverage of the objects; T their photo colours, premultiplied by A; R their light now over their light at rest;
+P photo; B clean plate (photo without the objects); S light on the ground with the objects over light without; S₀ the
+same at rest; w how much everything is still at rest there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .srgb import Linear
+
+MAX_RATIO = 8.0
+"""Largest ratio of light now to light at rest; beyond three stops it is division by noise."""
+
+MIN_SHADOW = 0.05
+"""Darkest shadow that the photo is divided by: darker pixels hold no colour worth brightening 20 times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectLayer:
+    """The objects of one frame, full image size.
+
+    texture: (H, W, 3), photo colours averaged over each pixel, premultiplied by ``alpha``.
+    alpha: (H, W), coverage 0 to 1.
+    light: (H, W, 3), light over reference lighting, not premultiplied.
+    """
+
+    texture: Linear
+    alpha: NDArray[np.float32]
+    light: Linear
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameLayers:
+    """One frame and its layers, full image size, in linear light.
+
+    ground: (H, W, 3), background without objects, also behind them.
+    shadow: (H, W, 3), light on the ground with the objects over light without.
+    objects: the objects, with light and colours apart.
+    beauty: (H, W, 3), the finished frame.
+    """
+
+    ground: Linear
+    shadow: Linear
+    objects: ObjectLayer
+    beauty: Linear
+
+
+def empty_layer(width: int, height: int) -> ObjectLayer:
+    """Return a layer without any object in view."""
+    return ObjectLayer(
+        texture=np.zeros((height, width, 3), np.float32),
+        alpha=np.zeros((height, width), np.float32),
+        light=np.ones((height, width, 3), np.float32),
+    )
+
+
+def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:
+    """Return light over reference lighting (H, W, 3) from its premultiplied form and coverage (H, W); 1 far away.
+
+    Where an object barely covers a pixel, the quotient of two small noisy numbers would sparkle along the outline;
+    there, and for two pixels around, it is taken from the neighbourhood.
+    """
+    near_light = cv2.GaussianBlur(premultiplied, (5, 5), 1.0)
+    near_alpha = cv2.GaussianBlur(alpha, (5, 5), 1.0)[..., None]
+    near = np.where(near_alpha > 1e-3, near_light / np.maximum(near_alpha, 1e-3), 1.0)
+    own = np.where(alpha[..., None] > 1e-3, premultiplied / np.maximum(alpha[..., None], 1e-3), near)
+    weight = np.clip((alpha[..., None] - 0.25) / 0.5, 0.0, 1.0)
+    return np.asarray(np.clip(near + (own - near) * weight, 0.0, MAX_RATIO), dtype=np.float32)
+
+
+def ground_layer(
+    *,
+    photo: Linear,
+    background: Linear,
+    shadow: Linear,
+    rest_shadow: Linear,
+    at_rest: NDArray[np.float32],
+    masks: NDArray[np.bool_],
+) -> Linear:
+    """Return the background (H, W, 3) that is seen where no object is.
+
+    shadow, rest_shadow: (H, W, 3), light on the ground over light on the empty ground, now and at rest.
+    at_rest: (H, W), weight w, 1 where nothing has moved.
+    masks: (H, W), True where the photo shows an object; the photo is never used there.
+    """
+    weight = np.where(masks, 0.0, at_rest).astype(np.float32)[..., None]
+    now, rest = np.maximum(shadow, MIN_SHADOW), np.maximum(rest_shadow, MIN_SHADOW)
+    revealed = background * shadow
+    # Exactly the photo where the light is the same. Elsewhere P·S/S₀ overshoots when the rendered shadow is deeper
+    # than the photo's, so it is clipped to the range of the photo and the clean plate in shadow.
+    kept = np.where(now == rest, photo, photo * (now / rest))
+    kept = np.clip(kept, np.minimum(photo, revealed), np.maximum(photo, revealed))
+    return np.where(weight == 1.0, kept, revealed + (kept - revealed) * weight).astype(np.float32)
+
+
+def compose(layer: ObjectLayer, ground: Linear) -> Linear:
+    """Return the frame (H, W, 3): objects over ground."""
+    return layer.texture * layer.light + (1.0 - layer.alpha[..., None]) * ground

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""Sim-to-real gap on held-out data, gap closure, negative controls and localisation of the discrepancy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from .capture import Capture
+from .capture_geometry import metres_per_unit, observed_residual
+from .diagnosis import (
+    DIRECTIONS,
+    NONE,
+    UNKNOWN,
+    Array,
+    CandidateFit,
+    Discrepancy,
+    Fits,
+    Gap,
+    IntervalShare,
+    Localisation,
+    ObjectShare,
+)
+from .model_comparison import ModelComparison
+
+RESOLVABLE = 1.5
+"""Gap over noise floor below which gap closure is not resolvable."""
+
+RESAMPLES = 400
+
+SHOWN_S = 0.15
+"""Seconds counted as the first frames of a trial where no predict trial defines them."""
+
+
+def measure_gap(capture: Capture, fits: Fits, found: CandidateFit) -> Gap:
+    """Return distances on held-out trials, each predicted from its first frames, without the confidence interval."""
+    before, after, floor = fits.nominal.heldout_rms_m, found.heldout_rms_m, fits.floor_rms_m
+    room = before - floor
+    return Gap(
+        before_rms_m=before,
+        refitted_rms_m=fits.refitted.heldout_rms_m,
+        after_rms_m=after,
+        noise_floor_rms_m=floor,
+        closed_fraction=(before - after) / room if room > 0 else math.nan,
+        closed_fraction_ci95=(math.nan, math.nan),
+        resolvable=bool(before > RESOLVABLE * floor),
+        numerics_rms_m=fits.numerics_rms_m,
+    )
+
+
+def bootstrap_interval(
+    capture: Capture,
+    nominal: Mapping[str, Array],
+    found: Mapping[str, Array],
+    fit: CandidateFit,
+    gap: Gap,
+) -> tuple[float, float]:
+    """Return the 95 % interval of the closed fraction by bootstrap over trials (Efron, Ann. Statist. 7 (1979)).
+
+    nominal, found: (T, K, 3) m by trial. Complete trials are resampled; the spread of their fraction is centred on the
+    fraction measured on held-out trials. (NaN, NaN) with fewer than two trials.
+    """
+    rows = []
+    for trial in capture.fit_trials:
+        unit = metres_per_unit(capture, trial, nominal[trial.name])
+        squares = [
+            float(np.nanmean(np.square(observed_residual(capture, trial, points, which)).sum(axis=-1))) * unit**2
+            for points, which in ((nominal[trial.name], None), (found[trial.name], fit))
+        ]
+        if all(math.isfinite(s) for s in squares):
+            rows.append(squares)
+    if len(rows) < 2 or not math.isfinite(gap.closed_fraction):
+        return math.nan, math.nan
+    table = np.array(rows)
+    picks = np.random.default_rng(0).integers(0, len(table), size=(RESAMPLES, len(table)))
+    left = np.sqrt(table[picks].mean(axis=1))
+    floor = gap.noise_floor_rms_m
+    fractions = (left[:, 0] - left[:, 1]) / np.maximum(left[:, 0] - floor, 1e-12)
+    whole = np.sqrt(table.mean(axis=0))
+    shift = gap.closed_fraction - (whole[0] - whole[1]) / max(whole[0] - floor, 1e-12)
+    low, high = np.quantile(fractions + shift, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def carried_residual(capture: Capture, nominal: Mapping[str, Array]) -> float:
+    """Return the RMS distance in m of complete trials from the nominal model with its last residual carried forward.
+
+    nominal: (T, K, 3) m by trial. A baseline without any physics.
+    """
+    shown = [len(t.times) * np.diff(t.times).mean() for t in capture.predict_trials]
+    lead = float(np.median(shown)) if shown else SHOWN_S
+    squares = []
+    for trial in capture.fit_trials:
+        residual = observed_residual(capture, trial, nominal[trial.name])
+        first = int(np.searchsorted(trial.times - trial.times[0], lead))
+        if not 0 < first < len(residual):
+            continue
+        tail = residual[max(0, first - 3) : first]
+        known = np.isfinite(tail)
+        last = np.where(known, tail, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        off = np.square(residual[first:] - last).sum(axis=-1)
+        squares.append(off[np.isfinite(off)] * metres_per_unit(capture, trial, nominal[trial.name]) ** 2)
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else math.nan
+
+
+def negative_controls(
+    capture: Capture, fits: Fits, weighed: ModelComparison, found: CandidateFit, nominal: Mapping[str, Array]
+) -> dict[str, float]:
+    """Return the held-out errors of wrong models, which a true cause must beat.
+
+    wrong_effect_rms_m: the least likely effect with a number of parameters closest to the verdict's.
+    last_residual_rms_m: the nominal model with its last residual carried forward.
+    nominal: (T, K, 3) m by trial, simulated from its first frames.
+    """
+    freedom = sum(len(p) for p in found.parameters.values())
+    wrong = [
+        fit
+        for fit in fits.candidates
+        if len(fit.effects) == 1
+        and fit.effects[0] not in (weighed.verdict.effect, *weighed.verdict.alternatives, *weighed.verdict.effects)
+        and math.isfinite(fit.heldout_rms_m)
+    ]
+    if weighed.verdict.effect in (NONE, UNKNOWN):
+        freedom = 1
+
+    def unlike(fit: CandidateFit) -> tuple[int, float]:
+        return abs(sum(len(p) for p in fit.parameters.values()) - freedom), fit.log_evidence
+
+    chosen = min(wrong, key=unlike).heldout_rms_m if wrong else math.nan
+    return {"wrong_effect_rms_m": chosen, "last_residual_rms_m": carried_residual(capture, nominal)}
+
+
+def localise(capture: Capture, discrepancies: Mapping[str, Discrepancy]) -> Localisation:
+    """Return the shares of the discrepancy, each group summing to 1; equal shares without any discrepancy."""
+    objects = np.zeros(len(capture.objects))
+    spans: list[tuple[IntervalShare, float]] = []
+    directions = dict.fromkeys(DIRECTIONS, 0.0)
+    for trial in capture.trials:
+        found = discrepancies[trial.name]
+        weight = _durations(trial.times) * np.nan_to_num(found.frame_score)
+        scores = np.nan_to_num(found.point_score).sum(axis=0)
+        objects += np.bincount(trial.object_index, weights=scores, minlength=len(objects))
+        for interval in found.intervals:
+            inside = (trial.times >= interval.start_s) & (trial.times < interval.end_s)
+            if interval is found.intervals[-1]:
+                inside |= trial.times == interval.end_s
+            span = IntervalShare(
+                trial=trial.name, start_s=interval.start_s, end_s=interval.end_s, phase=interval.phase, share=0.0
+            )
+            spans.append((span, float(weight[inside].sum())))
+        for name in DIRECTIONS:
+            directions[name] += found.directions.get(name, 0.0) * float(weight.sum())
+    shares = _shares(np.array([amount for _, amount in spans]))
+    return Localisation(
+        objects=tuple(
+            ObjectShare(name=item.name, share=float(share))
+            for item, share in zip(capture.objects, _shares(objects), strict=True)
+        ),
+        intervals=tuple(
+            IntervalShare(trial=s.trial, start_s=s.start_s, end_s=s.end_s, phase=s.phase, share=float(share))
+            for (s, _), share in zip(spans, shares, strict=True)
+        ),
+        direction=dict(
+            zip(DIRECTIONS, (float(v) for v in _shares(np.array([directions[n] for n in DIRECTIONS]))), strict=True)
+        ),
+    )
+
+
+def _durations(times: Array) -> Array:
+    """Return the duration in s of each frame."""
+    edges = np.concatenate([times[:1], 0.5 * (times[1:] + times[:-1]), times[-1:]])
+    return np.asarray(np.diff(edges))
+
+
+def _shares(amounts: Array) -> Array:
+    total = amounts.sum()
+    return amounts / total if total > 0 else np.full(len(amounts), 1.0 / max(1, len(amounts)))

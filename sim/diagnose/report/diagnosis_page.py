@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: MIT
+"""The diagnosis report: one HTML page, from the template ``diagnosis_page.html``, and its figures as files."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ...atomic import write_bytes
+from ...html import page_head, page_style, picture_style, render, short_number, shortened
+from ...version import VERSION
+from ..capture import Capture
+from ..diagnosis import NONE, PAGE_FILE, UNKNOWN, Diagnosis
+from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
+from .diagnosis_figures import Pictures, draw_pictures, gap_bars
+from .object_heatmaps import VIEWS
+from .wording import (
+    DIRECTIONS,
+    PHASES,
+    alternatives_sentence,
+    assumptions,
+    closure_sentence,
+    control_sentences,
+    effect_label,
+    estimate_text,
+    found_effects,
+    headline,
+    listed,
+    meaning,
+    number_text,
+    percent_text,
+    quantity_text,
+    shares_sentence,
+)
+
+MAX_ROWS = 80
+"""Rows in the table of time intervals; the largest shares are kept."""
+
+_TEMPLATE = Path(__file__).with_name("diagnosis_page.html")
+_MARKS = {"found-fill": "verdict", "nominal-fill": "indistinguishable from it"}
+_BAR = 110.0
+"""Width of a probability bar in CSS pixels, as in the template."""
+
+
+def scene_effects(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return entries for the ``effects`` list of ``scene.json``, parameters rounded to six digits.
+
+    Empty where nothing was found, where the effect only concerns the recording, or where a parameter is not finite.
+    """
+    ranked = {item.name: item for item in diagnosis.effects}
+    entries = []
+    for name in found_effects(diagnosis.verdict):
+        if name not in ranked or ranked[name].kind == "observation":
+            continue
+        values = {key: estimate.value for key, estimate in ranked[name].parameters.items()}
+        if not values or not all(math.isfinite(value) for value in values.values()):
+            return []
+        entries.append({"name": name, "parameters": {key: float(f"{value:.6g}") for key, value in values.items()}})
+    return entries
+
+
+def scene_effects_json(diagnosis: Diagnosis) -> str | None:
+    """Return the same entries as JSON text, one effect per line; None where there is nothing to add."""
+    entries = scene_effects(diagnosis)
+    if not entries:
+        return None
+    lines = ",\n".join(f"  {json.dumps(entry, ensure_ascii=False)}" for entry in entries)
+    return f'"effects": [\n{lines}\n]'
+
+
+def write_report(diagnosis: Diagnosis, capture: Capture, out: Path) -> None:
+    """Write ``report.html`` and its figures into the folder ``out``, created if missing.
+
+    The page is self-contained: style and figures are inline, nothing is loaded, no script runs. The figures are also
+    written as ``timeline.svg``, ``object.svg``, ``ranking.svg``, ``gap.svg`` and, if there are trials, ``tracks.svg``.
+    The same diagnosis gives the same bytes. NaN, empty trials and missing predictions are shown as unknown.
+
+    Raises InputError, with the remedy, when a file cannot be written.
+    """
+    pictures = draw_pictures(diagnosis, capture)
+    style = picture_style()
+    for name, picture in pictures.files().items():
+        write_bytes(out / name, picture.file(style).encode())
+    write_bytes(out / PAGE_FILE, render_page(diagnosis, capture, pictures).encode())
+
+
+def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> str:
+    """Return the page as text."""
+    verdict, effects = diagnosis.verdict, diagnosis.effects
+    title = headline(diagnosis)
+    shown = [item for i, item in enumerate(effects) if i < ALWAYS or _finite(item.probability) >= LEAST]
+    folded = effects[len(shown) :]
+    intervals = sorted(diagnosis.where.intervals, key=lambda i: -_finite(i.share))[:MAX_ROWS]
+    kinds = {item.name: item.kind for item in effects}
+    observed = [effect_label(name) for name in found_effects(verdict) if kinds.get(name) == "observation"]
+    notes = [*control_sentences(diagnosis), *diagnosis.warnings, *capture.warnings]
+    return render(
+        _TEMPLATE,
+        head=page_head(f"Diagnosis: {title}", page_style()),
+        diagnosis=diagnosis,
+        pictures=pictures,
+        version=VERSION,
+        headline=title,
+        explanation=[s for s in (meaning(verdict), alternatives_sentence(verdict)) if s],
+        facts=_facts(diagnosis),
+        notes=list(dict.fromkeys(notes)),
+        shares=_shares(diagnosis, several=len(capture.objects) > 1),
+        bands=bands(diagnosis, capture),
+        intervals=intervals,
+        objects=_object_rows(pictures),
+        shown=shown,
+        folded=folded,
+        folded_probability=sum(_finite(item.probability) for item in folded),
+        closure=closure_sentence(diagnosis),
+        gap_bars=gap_bars(diagnosis),
+        next_experiment=_next_experiment(diagnosis),
+        observed=listed(observed, "and"),
+        scene_entry=scene_effects_json(diagnosis),
+        nothing_to_add=_nothing_to_add(diagnosis),
+        assumptions=assumptions(capture),
+        verification=[
+            (shortened(str(key).replace("_", " "), 60), _value(value)) for key, value in diagnosis.confirmation.items()
+        ],
+        took=f"{diagnosis.seconds:.0f} s" if _finite(diagnosis.seconds) > 0 else None,
+        marks=_MARKS,
+        bar_class=bar_class,
+        bar_width=lambda probability: short_number(max(min(_finite(probability), 1.0) * _BAR, 1.0)),
+        effect_label=effect_label,
+        estimate_text=estimate_text,
+        length=lambda value: quantity_text(value, "m"),
+        number=number_text,
+        percent=percent_text,
+        seconds=lambda value: f"{value:.3f}" if math.isfinite(value) else "–",
+        shortened=shortened,
+    )
+
+
+def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Return (name, value, detail) of the numbers at the top."""
+    verdict, gap = diagnosis.verdict, diagnosis.gap
+    probability = {NONE: "Probability that nothing is missing", UNKNOWN: "Probability of an unknown cause"}
+    chances = {item.name: item.probability for item in diagnosis.effects}
+    others = (f"{effect_label(n)} {percent_text(chances[n])}" for n in verdict.alternatives[:3] if n in chances)
+    name = probability.get(verdict.effect, "Probability of this cause")
+    facts = [(name, percent_text(verdict.probability), ", ".join(others))]
+    if not gap.resolvable:
+        facts.append(("Gap closed", "not resolvable", "too close to the noise floor"))
+    elif found_effects(verdict):
+        low, high = gap.closed_fraction_ci95
+        spread = f"95 %: {percent_text(low)} to {percent_text(high)}" if math.isfinite(low + high) else ""
+        facts.append(("Gap closed on held-out trials", percent_text(gap.closed_fraction), spread))
+    before, after, floor = (
+        quantity_text(value, "m", digits=2) for value in (gap.before_rms_m, gap.after_rms_m, gap.noise_floor_rms_m)
+    )
+    if found_effects(verdict):
+        facts.append(("Error, before → after", f"{before} → {after}", f"noise floor: {floor}"))
+    else:
+        facts.append(("Error of the nominal model", before, f"noise floor: {floor}"))
+    return facts
+
+
+def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
+    """Return the localisation of the discrepancy in sentences."""
+    if diagnosis.verdict.effect == NONE:
+        return ["No discrepancy above the noise was found: the figures below show mostly noise."]
+    where = diagnosis.where
+    phases: dict[str, float] = {}
+    for interval in where.intervals:
+        phases[interval.phase] = phases.get(interval.phase, 0.0) + _finite(interval.share)
+    groups: tuple[tuple[str, Iterable[tuple[str, float]]], ...] = (
+        ("Discrepancy by phase", ((PHASES.get(phase, phase), share) for phase, share in phases.items())),
+        ("Direction of the missing force", ((DIRECTIONS.get(n, n), s) for n, s in where.direction.items())),
+        ("Discrepancy by object", ((shortened(o.name, 40), o.share) for o in where.objects if several)),
+    )
+    sentences = ((title, shares_sentence(shares)) for title, shares in groups)
+    return [f"{title}: {shares}." for title, shares in sentences if shares]
+
+
+def _object_rows(pictures: Pictures) -> list[list[Any]]:
+    """Return a row of views for each object, with the colour legend in the first."""
+    *views, legend = pictures.objects
+    rows = [views[i : i + len(VIEWS)] for i in range(0, len(views), len(VIEWS))] or [[]]
+    return [[*rows[0], legend], *rows[1:]]
+
+
+def _next_experiment(diagnosis: Diagnosis) -> str:
+    if diagnosis.next_experiment:
+        return diagnosis.next_experiment
+    if diagnosis.verdict.effect == UNKNOWN:
+        return "No recording is known that would narrow it down; vary one thing at a time."
+    return "No further recording is needed to distinguish the causes."
+
+
+def _nothing_to_add(diagnosis: Diagnosis) -> str:
+    return {
+        NONE: "There is nothing to add: keep the scene as it is.",
+        UNKNOWN: "There is nothing to add: no known effect is right. Do not tune one until it fits.",
+    }.get(diagnosis.verdict.effect, "The effect’s parameters are not known well enough to add it to a scene.")
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float | int):
+        return number_text(float(value), digits=4)
+    return shortened(value, 200)
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: MIT
+"""Words of the report: numbers with units, effect names, sentences, assumptions and the summary."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from types import MappingProxyType
+
+from ...html import shortened
+from ..capture import Capture, CaptureObject
+from ..diagnosis import NONE, UNKNOWN, Diagnosis, Estimate, Gap, Verdict
+
+NOTHING = "–"
+"""Placeholder for a missing number."""
+
+_SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
+    "m": ((1e-4, 1e6, "µm"), (0.1, 1e3, "mm"), (math.inf, 1.0, "m")),
+    "s": ((0.1, 1e3, "ms"), (math.inf, 1.0, "s")),
+    "Pa": ((1e3, 1.0, "Pa"), (1e6, 1e-3, "kPa"), (1e9, 1e-6, "MPa"), (math.inf, 1e-9, "GPa")),
+    "rad": ((math.inf, 180 / math.pi, "°"),),
+    "px": ((math.inf, 1.0, "px"),),
+}
+"""Unit → (upper limit, factor, display name) in rising order."""
+
+
+def quantity_text(value: float | None, unit: str, *, digits: int = 3) -> str:
+    """Return ``value`` with ``digits`` significant digits and a suitable unit, such as "3.4 mm"; a dash for NaN."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    factor, name = _scale(abs(value), unit)
+    return with_unit(number_text(value * factor, digits=digits), name)
+
+
+def with_unit(number: str, unit: str) -> str:
+    """Return ``number`` and its unit, joined by a no-break space; no unit for "1"."""
+    if unit in ("", "1"):
+        return number
+    return f"{number}{unit}" if unit == "°" else f"{number}\u00a0{unit}"
+
+
+def number_text(value: float | None, *, digits: int = 3) -> str:
+    """Return ``value`` with ``digits`` significant digits, in powers of ten where it is very large or small."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    exponent = int(f"{value:.{digits - 1}e}".split("e")[1])
+    if not -4 <= exponent < 5:
+        mantissa = f"{value:.{digits - 1}e}".split("e")[0]
+        return f"{_signed(mantissa)}\u00a0×\u00a010{_raised(exponent)}"
+    return _signed(f"{value:.{max(digits - 1 - exponent, 0)}f}")
+
+
+def tick_text(value: float) -> str:
+    """Return an axis tick label without trailing zeros."""
+    return _signed(f"{value:.6g}") if value == 0 or 1e-4 <= abs(value) < 1e6 else number_text(value, digits=1)
+
+
+def axis_unit(largest: float, unit: str) -> tuple[float, str]:
+    """Return (factor, name) of the display unit of an axis that ends at ``largest``."""
+    return _scale(abs(largest), unit) if math.isfinite(largest) else (1.0, unit)
+
+
+def percent_text(value: float | None) -> str:
+    """Return a share as a percentage, with a decimal below 1 %; never 0 or 100 % unless exactly that."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    per_cent = round(100 * value, 9)  # sums of shares miss 100 by rounding errors
+    if 0 < per_cent < 0.1:
+        return "<\u00a00.1\u00a0%"
+    if 99.5 <= per_cent < 100:
+        return "99.9\u00a0%" if per_cent >= 99.9 else f"{math.floor(per_cent * 10) / 10:.1f}\u00a0%"
+    return f"{_signed(f'{per_cent:.1f}' if 0 < abs(per_cent) < 0.95 else f'{per_cent:.0f}')}\u00a0%"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """Return the value with unit and 95 % interval, with as many digits as the interval supports.
+
+    "0.0405 1/m (95 %: 0.0381 to 0.0429)"; without the interval where it is unknown. Radians are shown in degrees.
+    """
+    known = [abs(x) for x in (estimate.value, estimate.low, estimate.high) if math.isfinite(x)]
+    if not math.isfinite(estimate.value):
+        return NOTHING
+    factor, unit = _scale(max(known), estimate.unit)
+    value, low, high = (x * factor for x in (estimate.value, estimate.low, estimate.high))
+    if not (math.isfinite(low) and math.isfinite(high)) or not (high - low) / 2 > 0:
+        return with_unit(number_text(value), unit)
+    largest = max(abs(value), abs(low), abs(high))
+    if not 1e-4 <= largest < 1e5:
+        return f"{with_unit(number_text(value), unit)} (95\u00a0%: {number_text(low)} to {number_text(high)})"
+    # Two digits of the half width, but at most five of the largest number.
+    finest = max(math.floor(math.log10((high - low) / 2)) - 1, math.floor(math.log10(largest)) - 4)
+    places = max(-finest, 0)
+    shown, from_, to = (_signed(f"{x:.{places}f}") for x in (value, low, high))
+    return f"{with_unit(shown, unit)} (95\u00a0%: {from_} to {to})"
+
+
+def parameter_text(name: str, estimate: Estimate) -> str:
+    """Return a fitted parameter on one line: name in words, value, unit and 95 % interval.
+
+    "drag per mass 0.0405 1/m (95 %: 0.0381 to 0.0429)". Radians are shown in degrees, lengths in mm where small.
+    """
+    return f"{name.replace('_', ' ')} {estimate_text(estimate)}"
+
+
+def _scale(size: float, unit: str) -> tuple[float, str]:
+    if unit not in _SCALES:
+        return 1.0, unit
+    if size == 0:
+        return (180 / math.pi, "°") if unit == "rad" else (1.0, unit)
+    return next((factor, name) for limit, factor, name in _SCALES[unit] if size < limit or limit == math.inf)
+
+
+def _signed(number: str) -> str:
+    bare = number.removeprefix("-")
+    return bare if bare == number or not any(c in "123456789" for c in bare) else f"−{bare}"
+
+
+def _raised(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+LABELS = MappingProxyType(
+    {
+        "air_drag": "air drag",
+        "wind": "wind",
+        "magnus": "Magnus lift",
+        "buoyancy": "buoyancy",
+        "gravity_tilt": "tilted ground",
+        "tether": "a hidden tether",
+        "friction": "friction",
+        "restitution": "restitution",
+        "rolling_resistance": "rolling resistance",
+        "adhesion": "adhesion",
+        "stiffness": "stiffness",
+        "internal_damping": "internal damping",
+        "plastic_yield": "plastic yield",
+        "anisotropy": "anisotropic stiffness",
+        "stiffness_gradient": "a stiffness gradient",
+        "sandy": "granular breakup",
+        "mass_offset": "an off-centre mass",
+        "time_scale": "the recording's clock rate",
+        "camera_pose": "the camera pose",
+        NONE: "nothing missing",
+        UNKNOWN: "unknown cause",
+    }
+)
+
+_MEANING = MappingProxyType(
+    {
+        "air_drag": "Air resistance slows the real object; the simulation had none.",
+        "wind": "Moving air pushes the real object; the simulation had still air or none.",
+        "magnus": "The real object spins, and the air deflects it sideways like a curve ball.",
+        "buoyancy": "The real object falls as if it were lighter: the surrounding medium carries part of its weight.",
+        "gravity_tilt": "Gravity is not along the simulated vertical: the ground or the camera's level is tilted.",
+        "tether": "Something unmodelled holds or pulls the real object towards a fixed point.",
+        "friction": "Friction is higher or lower than assumed.",
+        "restitution": "The real object bounces more or less than assumed.",
+        "rolling_resistance": "The real object loses speed while rolling; the simulated one does not.",
+        "adhesion": "The surface holds the real object back as it separates.",
+        "stiffness": "The material is stiffer or softer than assumed.",
+        "internal_damping": "The material damps its own vibration faster than assumed.",
+        "plastic_yield": "The real object keeps dents; the simulated one springs back.",
+        "anisotropy": "The material is stiffer along one direction, like wood along the grain.",
+        "stiffness_gradient": "The material is stiffer on one side than on the other.",
+        "sandy": "The material breaks up into grains at some point.",
+        "mass_offset": "The centre of mass is not in the middle: something heavy sits to one side.",
+        "time_scale": "The recording's clock runs fast or slow; the scene itself is right.",
+        "camera_pose": "The camera was not quite where it was assumed to be; the scene itself is right.",
+        NONE: "No effect needs to be added.",
+        UNKNOWN: "Something acts that none of the known effects describes.",
+    }
+)
+
+PHASES = MappingProxyType({"flight": "in flight", "impact": "at impacts", "contact": "in contact", "rest": "at rest"})
+
+DIRECTIONS = MappingProxyType(
+    {
+        "normal": "along the ground normal",
+        "along_velocity": "along the motion",
+        "along_gravity": "vertical in flight",
+        "other": "in other directions",
+    }
+)
+
+
+def effect_label(name: str) -> str:
+    """Return the label of an effect, or of several joined by "+"; unknown names without underscores."""
+    parts = [part.strip() for part in name.split("+")]
+    return listed([LABELS.get(part, part.replace("_", " ")) for part in parts], "and")
+
+
+def listed(words: Sequence[str], conjunction: str) -> str:
+    """Return "a", "a and b" or "a, b and c"."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} {conjunction} {words[-1]}"
+
+
+def found_effects(verdict: Verdict) -> tuple[str, ...]:
+    """Return the names of the effects that the verdict adds; () for ``none`` and ``unknown``."""
+    if verdict.effect in (NONE, UNKNOWN):
+        return ()
+    return verdict.effects or (verdict.effect,)
+
+
+_AFTER = MappingProxyType(
+    {
+        "friction": "corrected friction",
+        "restitution": "corrected restitution",
+        "stiffness": "corrected stiffness",
+        "time_scale": "corrected clock rate",
+        "camera_pose": "corrected camera pose",
+        "gravity_tilt": "tilted ground",
+    }
+)
+"""Effects that change an existing property or the recording; all others are added."""
+
+
+def found_label(verdict: Verdict) -> str:
+    """Return the label of the model with the verdict's effects, such as "with air drag"."""
+    names = found_effects(verdict)
+    return f"with {listed([_AFTER.get(n, effect_label(n)) for n in names], 'and')}" if names else "no effect added"
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """Return the verdict on one line."""
+    verdict = diagnosis.verdict
+    if verdict.effect == NONE:
+        return "Nothing is missing that this recording could show"
+    if verdict.effect == UNKNOWN:
+        return "Something is missing, and it is none of the known effects"
+    names = [effect_label(name) for name in found_effects(verdict)]
+    first = listed(names, "and")
+    return f"{first[:1].upper()}{first[1:]}: {_sureness(verdict.probability)}"
+
+
+def _sureness(probability: float) -> str:
+    if not math.isfinite(probability):
+        return "probability not known"
+    for limit, words in ((0.95, "almost certainly"), (0.8, "very likely"), (0.5, "more likely than not")):
+        if probability >= limit:
+            return f"{words} the cause"
+    return "only the best guess"
+
+
+def meaning(verdict: Verdict) -> str:
+    """Return what the verdict means physically, in a sentence or two."""
+    names = found_effects(verdict) or (verdict.effect,)
+    return " ".join(_MEANING[n] for n in names if n in _MEANING)
+
+
+def alternatives_sentence(verdict: Verdict) -> str | None:
+    """Return the sentence on effects that cannot be distinguished from the verdict; None without any."""
+    if not verdict.alternatives:
+        return None
+    others = listed([effect_label(name) for name in verdict.alternatives], "or")
+    if verdict.effect == NONE:
+        return f"Too small for this recording to rule out: {others}."
+    if verdict.effect == UNKNOWN:
+        return f"Closest known effects, but not good enough: {others}."
+    return (
+        f"This recording cannot distinguish it from {others}. "
+        "Treat them as one finding until another recording decides."
+    )
+
+
+def closure_sentence(diagnosis: Diagnosis) -> str:
+    """Return the sentence on how much of the gap is closed, or why no number is given."""
+    gap = diagnosis.gap
+    if not gap.resolvable:
+        return (
+            "Not resolvable: the nominal model is already so close to the noise floor "
+            f"({_length(gap.before_rms_m)} against {_length(gap.noise_floor_rms_m)}) that a share of the gap "
+            "would be meaningless."
+        )
+    if not found_effects(diagnosis.verdict):
+        if diagnosis.verdict.effect == NONE:
+            return "No effect was added, so there is no gap to close."
+        return (
+            f"The gap on held-out trials is {_length(gap.before_rms_m)}, of which noise explains only "
+            f"{_length(gap.noise_floor_rms_m)}. Nothing was added."
+        )
+    low, high = gap.closed_fraction_ci95
+    spread = f" (95 %: {percent_text(low)} to {percent_text(high)})" if math.isfinite(low + high) else ""
+    return (
+        f"On held-out trials the error changes from {_length(gap.before_rms_m)} to "
+        f"{_length(gap.after_rms_m)}: {_closed(gap.closed_fraction)}{spread}."
+    )
+
+
+def _length(value: float) -> str:
+    return quantity_text(value, "m", digits=2)
+
+
+def _closed(fraction: float) -> str:
+    if not math.isfinite(fraction):
+        return "how much of the gap this closes is not known"
+    if fraction < 0:
+        return "the gap widens, so do not trust this cause"
+    return f"{percent_text(min(fraction, 1.0))} of the gap above the noise floor is closed"
+
+
+def control_sentences(diagnosis: Diagnosis) -> list[str]:
+    """Return warnings from the controls about the found cause; [] without a cause."""
+    if not found_effects(diagnosis.verdict):
+        return []
+    after, gap = diagnosis.gap.after_rms_m, diagnosis.gap
+    said = []
+    rivals = (
+        ("wrong_effect_rms_m", "an effect that the evidence rejected"),
+        ("last_residual_rms_m", "carrying the last observed error forward"),
+    )
+    for key, what in rivals:
+        if diagnosis.controls.get(key, math.nan) <= after:
+            said.append(
+                f"It predicts no better than {what} ({_length(diagnosis.controls[key])}). "
+                "A cause that does not beat its controls is not a cause: treat this verdict with caution."
+            )
+    if gap.refitted_rms_m <= after:
+        said.append(
+            "Re-fitting the nominal model's own parameters does as well "
+            f"({_length(gap.refitted_rms_m)}), without any new effect."
+        )
+    if gap.numerics_rms_m > 0.25 * gap.before_rms_m:
+        said.append(
+            f"{_length(gap.numerics_rms_m)} of the error is the simulator's own numerical error: raise "
+            "the quality before looking for physical causes."
+        )
+    return said
+
+
+def shares_sentence(shares: Iterable[tuple[str, float]]) -> str | None:
+    """Return "72 % in flight, 28 % at impacts", largest first, without negligible ones; None if none is left."""
+    known = sorted(((s, n) for n, s in shares if math.isfinite(s) and s >= 0.005), key=lambda pair: (-pair[0], pair[1]))
+    return ", ".join(f"{percent_text(share)} {name}" for share, name in known[:4]) or None
+
+
+MAX_OBJECTS = 8
+
+
+def assumptions(capture: Capture) -> list[str]:
+    """Return the assumptions of the nominal model, one sentence each."""
+    gravity, ground = capture.gravity, capture.ground
+    strength = math.hypot(*gravity)
+    straight = math.hypot(gravity[0], gravity[1]) < 1e-9 and gravity[2] < 0
+    way = "straight down" if straight else f"along ({', '.join(number_text(g) for g in gravity)})"
+    bounce = "not known" if ground.restitution is None else number_text(ground.restitution)
+    lines = [
+        f"Gravity is {number_text(strength)} m/s², {way}.",
+        f"The ground is flat, with friction {number_text(ground.friction)} and restitution {bounce}.",
+        *(_object(item) for item in capture.objects[:MAX_OBJECTS]),
+    ]
+    if len(capture.objects) > MAX_OBJECTS:
+        lines.append(f"{len(capture.objects) - MAX_OBJECTS} more objects are listed in capture.json.")
+    camera = capture.camera
+    if camera is not None:
+        lines.append(f"The camera is fixed at its given pose, with {camera.width} × {camera.height} pixels.")
+    noise = quantity_text(capture.noise_sigma, "m" if camera is None else "px")
+    lines.append(f"Tracking noise is {noise} per coordinate (standard deviation), independent for each.")
+    lines.append(
+        f"{len(capture.fit_trials)} complete trials, and {len(capture.predict_trials)} with only their first frames. "
+        "The initial state of each trial (position, velocity, spin) was estimated from its first frames."
+    )
+    return lines
+
+
+def _object(item: CaptureObject) -> str:
+    belief = item.belief
+    name = shortened(item.name, 60)
+    if belief.youngs_modulus_pa is None:
+        material = "is rigid"
+    else:
+        material = (
+            f"is {belief.stiffness} (Young’s modulus {quantity_text(belief.youngs_modulus_pa, 'Pa')}, "
+            f"Poisson’s ratio {number_text(belief.poisson_ratio)})"
+        )
+    return f"“{name}” {material} with a density of {number_text(belief.density_kg_m3)} kg/m³."
+
+
+def verdict_summary(verdict: Verdict, gap: Gap) -> str:
+    """Return the verdict in a sentence or two: cause, confidence, alternatives, gap closure."""
+    others = listed([effect_label(name) for name in verdict.alternatives], "or")
+    if verdict.effect == NONE:
+        return f"The nominal model explains the recording down to its noise ({_confidence(verdict)})."
+    if verdict.effect == UNKNOWN:
+        text = f"Something is missing from the model, and no known effect closes the gap ({_confidence(verdict)})."
+        return f"{text} Closest: {others}." if others else text
+    causes = [effect_label(name) for name in found_effects(verdict)]
+    opening = "The cause of the gap is" if len(causes) == 1 else "The causes of the gap are"
+    text = f"{opening} {listed(causes, 'and')} ({_confidence(verdict)})"
+    text += f"; the data cannot rule out {others}." if others else "."
+    if not gap.resolvable:
+        return text + " The gap is too close to the noise floor to say how much of it this closes."
+    if math.isfinite(gap.closed_fraction):
+        share = "nothing" if gap.closed_fraction <= 0.005 else _rounded_percent(min(gap.closed_fraction, 1.0))
+        text += f" It closes {share} of the gap on held-out trials."
+    return text
+
+
+def _confidence(verdict: Verdict) -> str:
+    return f"{_rounded_percent(verdict.probability)} confidence"
+
+
+def _rounded_percent(value: float) -> str:
+    shown = round(100 * value)
+    return "over 99 %" if shown >= 100 else "under 1 %" if shown < 1 else f"{shown} %"

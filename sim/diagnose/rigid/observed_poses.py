@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: MIT
+"""Quaternions, and what a trial observes of a body's pose: residuals, their Jacobians, poses from single frames.
+
+Quaternions are (..., 4), w first; rotation vectors (..., 3) are in world axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Camera, Capture, Trial
+from ..capture_geometry import nearest_rotation
+
+Array = NDArray[np.float64]
+
+
+def multiply(p: Array, q: Array) -> Array:
+    """Return the rotation by ``q``, then by ``p``."""
+    w, v = p[..., :1], p[..., 1:]
+    a, b = q[..., :1], q[..., 1:]
+    return np.concatenate([w * a - np.sum(v * b, axis=-1, keepdims=True), w * b + a * v + np.cross(v, b)], axis=-1)
+
+
+def conjugate(q: Array) -> Array:
+    """Return the inverse rotation."""
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def from_rotvec(way: Array) -> Array:
+    """Return the quaternion of a rotation vector."""
+    angle = np.linalg.norm(way, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * way], axis=-1)
+
+
+def as_rotvec(q: Array) -> Array:
+    """Return the shortest rotation vector."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0) * q[..., 1:]
+
+
+def as_matrix(q: Array) -> Array:
+    """Return rotation matrices (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def skew(v: Array) -> Array:
+    """Return cross product matrices (..., 3, 3) of ``v``."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([np.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+
+
+def perturbed(states: Array, change: Array) -> Array:
+    """Return states (..., 13) plus small changes (..., 12): translation, rotation, velocity, spin."""
+    return np.concatenate(
+        [
+            states[..., :3] + change[..., :3],
+            multiply(from_rotvec(change[..., 3:6]), states[..., 3:7]),
+            states[..., 7:13] + change[..., 6:12],
+        ],
+        axis=-1,
+    )
+
+
+def state_difference(a: Array, b: Array) -> Array:
+    """Return the change (..., 12) from states ``a`` to states ``b``."""
+    turn = as_rotvec(multiply(b[..., 3:7], conjugate(a[..., 3:7])))
+    return np.concatenate([b[..., :3] - a[..., :3], turn, b[..., 7:13] - a[..., 7:13]], axis=-1)
+
+
+SCALE_ERROR = 0.006
+"""Relative error of the scale along the path of a single tracked point."""
+
+TOGETHER = 4.0
+"""Frames, or fractions of a trial, with common errors where they are correlated."""
+
+STIFF = 0.3
+"""RMS change of point distances over the noise below which points must come from a tracked pose."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObservedBody:
+    """Observations of one body in one trial. T frames, K points.
+
+    times: (T,) s. seen: (T, K, 3) m or (T, K, 2) pixels, NaN where not seen. places: (K, 3) m, body axes, about its
+    centre. sigma: noise of one coordinate. columns: (K,) indices of its points in the trial.
+    """
+
+    trial: Trial
+    times: Array
+    seen: Array
+    places: Array
+    sigma: float
+    camera: Camera | None
+    columns: NDArray[np.int64]
+
+    @property
+    def poses_alone(self) -> bool:
+        """Return whether one frame determines a pose: three points not on a line."""
+        spread = self.places - self.places.mean(axis=0)
+        return len(self.places) >= 3 and float(np.linalg.svd(spread, compute_uv=False)[1]) > 1e-6
+
+    def residuals(self, x: Array, q: Array, frames: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return (observed minus modelled) / sigma (F, K, D), 0 where not seen, and its negative Jacobian (F, K, D, 6).
+
+        x (F, 3) and q (F, 4): poses at ``frames`` (F,). Derivatives are with translation and rotation in world axes.
+        """
+        lever = np.einsum("fij,kj->fki", as_matrix(q), self.places)
+        points = x[:, None] + lever
+        slope = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape[:2], 3, 3)), -skew(lever)], axis=-1)
+        seen = self.seen[frames]
+        if self.camera is None:
+            gap = seen - points
+        else:
+            gap, view = seen - project(self.camera, points), projection_jacobian(self.camera, points)
+            slope = view @ slope
+        there = np.isfinite(gap).all(axis=-1)
+        gap = np.where(there[..., None], gap, 0.0)
+        slope = np.where(there[..., None, None], slope, 0.0)
+        return gap / self.sigma, slope / self.sigma
+
+    def information(self, x: Array, q: Array, frames: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """Return chi² (F,), its descent direction (F, 6) and the information matrix of the pose (F, 6, 6)."""
+        gap, slope = self.residuals(x, q, frames)
+        size = gap.shape[0]
+        gap, slope = gap.reshape(size, -1), slope.reshape(size, -1, 6)
+        turned = slope.swapaxes(1, 2)
+        return np.sum(gap**2, axis=1), (turned @ gap[..., None])[..., 0], turned @ slope
+
+
+def observe_body(capture: Capture, trial: Trial, index: int, center: Array) -> ObservedBody:
+    """Return the observations of body ``index`` in ``trial``; center (3,): its centre of mass, rest frame."""
+    columns = np.flatnonzero(trial.object_index == index)
+    return ObservedBody(
+        trial=trial,
+        times=trial.times,
+        seen=trial.observed[:, columns],
+        places=trial.rest_points[columns] - center,
+        sigma=effective_sigma(capture, trial, columns),
+        camera=capture.camera if trial.pixels is not None else None,
+        columns=columns,
+    )
+
+
+def effective_sigma(capture: Capture, trial: Trial, columns: NDArray[np.int64]) -> float:
+    """Return the standard deviation of independent coordinates with the same information content.
+
+    Points that keep their distances far better than their noise come from a tracked pose, with errors correlated
+    between points and frames. A single distant point is read off an image, whose scale error varies slowly.
+    """
+    sigma = capture.noise_sigma
+    if trial.points is None:
+        return sigma
+    points = trial.points[:, columns]
+    if len(columns) == 1:
+        seen = points[np.isfinite(points).all(axis=(1, 2)), 0]
+        reach = float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
+        return float(np.hypot(sigma, SCALE_ERROR * reach * np.sqrt(max(1.0, len(seen) / TOGETHER))))
+    if len(columns) < 4:
+        return sigma
+    rest = trial.rest_points[columns]
+    off = []
+    for frame in points[np.isfinite(points).all(axis=(1, 2))][:40]:
+        apart = np.linalg.norm(frame[1:] - frame[:1], axis=1) - np.linalg.norm(rest[1:] - rest[:1], axis=1)
+        off.append(apart)
+    if len(off) >= 3 and float(np.sqrt(np.mean(np.square(off)))) < STIFF * sigma:
+        return float(sigma * np.sqrt(len(columns) / 2 * TOGETHER))
+    return sigma
+
+
+def project(camera: Camera, points: Array) -> Array:
+    """Return pixels (..., 2) of world points (..., 3)."""
+    matrix = camera.matrix
+    local = (points - matrix[:3, 3]) @ matrix[:3, :3]
+    depth = np.maximum(local[..., 2], 1e-3)
+    u = camera.fx * local[..., 0] / depth + camera.cx
+    v = camera.fy * local[..., 1] / depth + camera.cy
+    return np.stack([u, v], axis=-1)
+
+
+def projection_jacobian(camera: Camera, points: Array) -> Array:
+    """Return the Jacobian (..., 2, 3) of pixels with respect to world points."""
+    matrix = camera.matrix
+    local = (points - matrix[:3, 3]) @ matrix[:3, :3]
+    depth = np.maximum(local[..., 2], 1e-3)
+    zero = np.zeros_like(depth)
+    rows = [
+        np.stack([camera.fx / depth, zero, -camera.fx * local[..., 0] / depth**2], axis=-1),
+        np.stack([zero, camera.fy / depth, -camera.fy * local[..., 1] / depth**2], axis=-1),
+    ]
+    return np.stack(rows, axis=-2) @ matrix[:3, :3].T
+
+
+def fit_rotation(places: Array, found: Array) -> Array:
+    """Return the rotation (3, 3) that best aligns ``places`` (K, 3) with ``found`` (K, 3), both about their means."""
+    return nearest_rotation(found.T @ places)
+
+
+def frame_pose(
+    observations: ObservedBody, frame: int, guess: tuple[Array, Array] | None = None
+) -> tuple[Array, Array] | None:
+    """Return the pose (x (3,), rotation (3, 3)) from one frame alone; None with too few points.
+
+    Rigid alignment of points; perspective-n-point for pixels, starting from ``guess`` if given.
+    """
+    seen = observations.seen[frame]
+    there = np.isfinite(seen).all(axis=1)
+    places, found = observations.places[there], seen[there]
+    if observations.camera is None:
+        if len(found) == 0:
+            return None
+        if len(found) < 3 or not observations.poses_alone:
+            turn = np.eye(3) if guess is None else guess[1]
+            return found.mean(axis=0) - turn @ places.mean(axis=0), turn
+        turn = fit_rotation(places - places.mean(axis=0), found - found.mean(axis=0))
+        return found.mean(axis=0) - turn @ places.mean(axis=0), turn
+    if len(found) < 4:
+        return None
+    c = observations.camera
+    lens = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1.0]])
+    matrix = c.matrix
+    if guess is None:
+        good, way, shift = cv2.solvePnP(places, found, lens, None, flags=cv2.SOLVEPNP_SQPNP)
+    else:
+        local = matrix[:3, :3].T @ guess[1]
+        way, shift = cv2.Rodrigues(local)[0], (matrix[:3, :3].T @ (guess[0] - matrix[:3, 3]))[:, None]
+        good = True
+    if not good:
+        return None
+    good, way, shift = cv2.solvePnP(places, found, lens, None, way, shift, True, cv2.SOLVEPNP_ITERATIVE)
+    turn = matrix[:3, :3] @ cv2.Rodrigues(way)[0]
+    return matrix[:3, :3] @ shift[:, 0] + matrix[:3, 3], turn

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""Localisation of the missing force in rigid trials: measured, or as a candidate explains it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture
+from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
+from .multiple_shooting import Fit, Model, Problem, Segment, SegmentedTrial
+from .observed_poses import as_matrix, project
+from .rigid_candidates import BELIEFS, WorldSettings
+from .rigid_prediction import world_points
+
+Array = NDArray[np.float64]
+
+PARTS = 8
+"""Samples of a run per frame."""
+
+REST_SPEED = 0.02
+"""Speed in m/s of the fastest point below which a body is at rest."""
+
+
+def localise_discrepancies(capture: Capture, bodies: list[tuple[Fit, Fit | None]]) -> dict[str, Discrepancy]:
+    """Return the discrepancy by trial. bodies: nominal fit and explaining fit (None: raw measurement) of each."""
+    found: dict[str, Discrepancy] = {}
+    for trial in capture.trials:
+        size = (len(trial.times), len(trial.rest_points))
+        points = np.zeros(size)
+        residual = np.full(trial.observed.shape, np.nan)
+        force = np.zeros((len(trial.times), 3))
+        phases: list[str] = ["rest"] * len(trial.times)
+        velocity = np.zeros((len(trial.times), 3))
+        for nominal, fit in bodies:
+            for i, take in enumerate(nominal.problem.takes):
+                if take.observations.trial is not trial:
+                    continue
+                lack, body_phases, speed = _lack(nominal, fit, i)
+                points[:, take.observations.columns] = np.linalg.norm(lack, axis=1)[:, None]
+                strongest = np.linalg.norm(lack, axis=1) > np.linalg.norm(force, axis=1)
+                force = np.where(strongest[:, None], lack, force)
+                phases, velocity = body_phases, speed
+                modelled = _nominal_points(nominal, i)
+                if capture.camera is not None and trial.pixels is not None:
+                    modelled = project(capture.camera, modelled)
+                residual[:, take.observations.columns] = take.observations.seen - modelled
+        found[trial.name] = Discrepancy(
+            frame_score=points.max(axis=1) if points.shape[1] else np.zeros(size[0]),
+            point_score=points,
+            residual=residual,
+            intervals=_intervals(trial.times, phases),
+            directions=_directions(force, velocity, np.asarray(capture.gravity), capture.ground.unit_normal),
+        )
+    return found
+
+
+def _nominal_points(nominal: Fit, index: int) -> Array:
+    problem = nominal.problem
+    take = problem.takes[index]
+    state = nominal.states[index][0]
+    times = take.observations.times
+    setting = nominal.model.setting(problem.scene, nominal.z)
+    record = problem.simulator.run(state[None], problem.scene.numbers([setting]), [times - times[0]])[0]
+    return world_points(take, record[: len(times)])
+
+
+def _fine(fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return recorded times (M,), records (M, 17) and nearest frames (M,) of a trial, sampled between frames."""
+    problem = fit.problem
+    take, setting = problem.takes[index], fit.model.setting(problem.scene, fit.z)
+    times = take.observations.times
+    rows, clocks = [], []
+    spans = [*take.spans[:-1], (take.nodes[-1], len(times))]
+    for a, b in spans:
+        last = b if b < len(times) else b - 1
+        edges = times[a : last + 1]
+        fine = np.unique(
+            np.concatenate([np.linspace(s, e, PARTS, endpoint=False) for s, e in pairwise(edges)] + [edges[-1:]])
+        )
+        clocks.append(fine)
+    starts = fit.states[index]
+    table = np.repeat(problem.scene.numbers([setting]), len(spans), axis=0)
+    out = problem.simulator.run(starts, table, [(c - c[0]) * setting.rate for c in clocks])
+    for record, clock in zip(out, clocks, strict=True):
+        rows.append(record[: len(clock)])
+    clock = np.concatenate(clocks)
+    middle = 0.5 * (times[1:] + times[:-1])
+    return clock, np.concatenate(rows), np.searchsorted(middle, clock)
+
+
+def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], Array]:
+    """Return missing force per mass (T, 3), phase of every frame and velocity (T, 3)."""
+    used = nominal if fit is None else fit
+    take, scene = used.problem.takes[index], used.problem.scene
+    frames = len(take.observations.times)
+    clock, record, nearest = _fine(used, index)
+    normal = scene.capture.ground.unit_normal
+    gains = np.maximum(np.diff(record[:, 13:17], axis=0, append=record[-1:, 13:17]), 0.0)
+    gains[np.diff(clock, append=clock[-1]) <= 0] = 0.0
+    velocity = _by_frame(record[:, 7:10], nearest, frames)
+    spin = _by_frame(record[:, 10:13], nearest, frames)
+    pushed = _summed(gains[:, 0], nearest, frames)
+    touched = _summed(gains[:, 2], nearest, frames)
+    slid = _summed(gains[:, 3], nearest, frames)
+    spacing = np.gradient(take.observations.times)
+    weight = float(np.linalg.norm(scene.capture.gravity))
+    speed = np.linalg.norm(velocity, axis=1) + np.linalg.norm(spin, axis=1) * scene.body.bound
+    blow = pushed - weight * touched
+    phases = []
+    for f in range(frames):
+        if touched[f] <= 0:
+            phases.append("flight")
+        elif speed[f] < REST_SPEED:
+            phases.append("rest")
+        else:
+            phases.append("impact" if blow[f] > 0.05 else "contact")
+    lack = np.zeros((frames, 3))
+
+    if fit is None:
+        return measured_force(nominal, index), phases, velocity
+    base = Model(freedoms=()).setting(scene, fit.z[: BELIEFS.size])
+    setting = fit.model.setting(scene, fit.z)
+    lack += _by_frame(_force_difference(base, setting, record), nearest, frames)
+    rate = pushed / spacing
+    if setting.friction != base.friction:
+        way = velocity - (velocity @ normal)[:, None] * normal
+        way /= np.linalg.norm(way, axis=1, keepdims=True) + 1e-9
+        moving = (touched > 0) & (speed >= REST_SPEED)
+        share = np.where(moving, slid / np.maximum(touched, 1e-9), 0.0)
+        lack += ((base.friction - setting.friction) * rate * share)[:, None] * way
+    if setting.restitution != base.restitution:
+        lack += np.where(blow > 0.01, (setting.restitution - base.restitution) * blow / spacing, 0.0)[:, None] * normal
+    if setting.rolling > 0:
+        way = velocity / (np.linalg.norm(velocity, axis=1, keepdims=True) + 1e-9)
+        lack -= (setting.rolling / scene.body.bound * rate)[:, None] * way
+    if setting.pull > 0:
+        gap = _gap(used.problem, record)
+        held = (gap < setting.reach) * (record[:, 7:10] @ normal > 0) * (1 - np.maximum(gap, 0.0) / setting.reach)
+        lack -= (_by_frame(held[:, None], nearest, frames) * setting.pull) * normal
+    if setting.fraction > 0:
+        arm = np.einsum("fij,j->fi", as_matrix(record[:, 3:7]), setting.center)
+        w = record[:, 10:13]
+        lack += _by_frame(np.cross(w, np.cross(w, arm)), nearest, frames)
+    if setting.rate != 1.0:
+        lack += (setting.rate**2 - 1) * np.asarray(scene.capture.gravity)
+    if setting.camera is not None:
+        lack += np.linalg.norm(setting.camera[0] - np.eye(3)) * weight * normal
+    return lack, phases, velocity
+
+
+def _force_difference(base: WorldSettings, setting: WorldSettings, record: Array) -> Array:
+    """Return the force per mass (M, 3) of ``setting`` minus ``base`` at the states of ``record``."""
+    x, v, w = record[:, :3], record[:, 7:10], record[:, 10:13]
+    u = v - setting.wind
+    force = -setting.drag * np.linalg.norm(u, axis=1, keepdims=True) * u + setting.lift * np.cross(w, u)
+    force = force + (setting.gravity - base.gravity)
+    if setting.tether is not None:
+        stiffness, length, anchor = setting.tether
+        way = anchor - x
+        distance = np.linalg.norm(way, axis=1, keepdims=True)
+        force = force + stiffness * np.maximum(distance - length, 0.0) * way / np.maximum(distance, 1e-9)
+    return np.asarray(force)
+
+
+def _gap(problem: Problem, record: Array) -> Array:
+    """Return the distance (M,) of the body to the ground."""
+    body, ground = problem.scene.body, problem.scene.capture.ground
+    corners = record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), body.corners)
+    return np.asarray(((corners - np.asarray(ground.point)) @ ground.unit_normal).min(axis=1) - body.radius)
+
+
+def measured_force(fit: Fit, index: int) -> Array:
+    """Return the measured missing force per mass (T, 3): residual curvature in flight, defects in contact.
+
+    The expected contribution of noise is subtracted.
+    """
+    problem = fit.problem
+    take = problem.takes[index]
+    times = take.observations.times
+    lack = np.zeros((len(times), 3))
+    setting = fit.model.setting(problem.scene, fit.z)
+    for segment in fit.evaluation.segments:
+        if segment.take != index:
+            continue
+        free = np.flatnonzero(segment.record[:, 15] <= 0)
+        if len(free) >= 6:
+            lack[segment.frames[free]] = _curvature(problem, take, segment, free, setting)
+        if segment.defect is not None:
+            deviation = np.sqrt(np.diag(take.covers[segment.index])[6:9])
+            jump = segment.defect[6:9]
+            size = float(np.linalg.norm(jump / deviation))
+            jump = -jump * max(0.0, 1 - 2.5 / max(size, 1e-9))
+            touching = segment.frames[np.diff(segment.record[:, 15], prepend=0.0) > 0]
+            if len(touching):
+                span = max(times[touching[-1]] - times[max(touching[0] - 1, 0)], 1e-3)
+                lack[touching] += jump / span
+    return lack
+
+
+def _curvature(
+    problem: Problem, take: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
+) -> Array:
+    frames = segment.frames[free]
+    pose = problem.seen_poses(segment.record[None, free], [setting])[0]
+    _, slope, info = take.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    t = take.observations.times[frames]
+    found = np.zeros((len(frames), 3))
+    for k in range(len(frames)):
+        half = 0.03
+        while True:
+            near = np.flatnonzero(np.abs(t - t[k]) <= half)
+            if len(near) >= 5 or len(near) == len(frames):
+                break
+            half *= 1.5
+        s = t[near] - t[k]
+        basis = np.stack([np.ones_like(s), s, 0.5 * s**2], axis=1)
+        matrix = np.einsum("fa,fij,fb->aibj", basis, info[near], basis).reshape(18, 18)
+        pull = np.einsum("fa,fi->ai", basis, slope[near]).ravel()
+        cover = np.linalg.pinv(matrix + 1e-9 * np.trace(matrix) / 18 * np.eye(18))
+        a = (cover @ pull)[12:15]
+        noise = cover[12:15, 12:15]
+        size = float(np.sqrt(max(a @ np.linalg.pinv(noise) @ a, 0.0)))
+        found[k] = a * max(0.0, 1 - 2.0 / max(size, 1e-9))
+    return found
+
+
+def _summed(values: Array, nearest: NDArray[np.int64], frames: int) -> Array:
+    return np.bincount(nearest, weights=values, minlength=frames)[:frames]
+
+
+def _by_frame(values: NDArray[np.floating], nearest: NDArray[np.int64], frames: int) -> Array:
+    count = np.maximum(np.bincount(nearest, minlength=frames)[:frames], 1)
+    return np.stack([_summed(v, nearest, frames) / count for v in values.T], axis=1)
+
+
+def _intervals(times: Array, phases: list[str]) -> tuple[PhaseInterval, ...]:
+    found, begin = [], 0
+    for f in range(1, len(phases) + 1):
+        if f == len(phases) or phases[f] != phases[begin]:
+            end = times[min(f, len(times) - 1)]
+            found.append(PhaseInterval(start_s=float(times[begin]), end_s=float(end), phase=phases[begin]))
+            begin = f
+    return tuple(found)
+
+
+def _directions(force: Array, velocity: Array, gravity: Array, normal: Array) -> dict[str, float]:
+    """Return shares of the squared force by direction: assigned to the nearest axis within 45 degrees."""
+    size = np.linalg.norm(force, axis=1)
+    shares = dict.fromkeys(DIRECTIONS, 0.0)
+    total = float(np.sum(size**2))
+    if total <= 0:
+        return {**shares, "other": 1.0}
+    speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+    along_v = np.abs(np.sum(force * velocity / np.maximum(speed, 1e-6), axis=1)) / np.maximum(size, 1e-12)
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-9)
+    along_g = np.abs(force @ down) / np.maximum(size, 1e-12)
+    along_n = np.abs(force @ normal) / np.maximum(size, 1e-12)
+    for f in range(len(force)):
+        best = {"along_velocity": along_v[f], "along_gravity": along_g[f], "normal": along_n[f] - 1e-6}
+        name = max(best, key=lambda k: best[k])
+        shares[name if best[name] > 0.7 else "other"] += float(size[f] ** 2) / total
+    return shares

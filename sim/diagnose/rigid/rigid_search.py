@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: MIT
+"""Search for each candidate's parameters: single effects from the nominal fit, pairs from the best single ones.
+
+``misfit`` measures whether a fit leaves more than noise and contact uncertainty would: smooth remainders in flight,
+defects at contacts."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture
+from .multiple_shooting import CONTACT_DEGREES_OF_FREEDOM, Fit, Model, Problem, Segment, SegmentedTrial, solve
+from .observed_poses import frame_pose, observe_body
+from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings
+from .rigid_simulator import RigidWorlds, rigid_body
+from .state_tracking import initial_camera, track_states, weight_contacts
+
+Array = NDArray[np.float64]
+
+BEND_EVERY = 0.05
+"""Time in s per polynomial degree of the smooth remainder."""
+
+LEAST_FRAMES = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misfit:
+    """Normalised sums of squares: smooth remainders in flight, and defects at contacts."""
+
+    flight: float
+    flight_count: int
+    contact: float
+    contact_count: int
+
+    @property
+    def ratio(self) -> float:
+        """Return the overall RMS ratio to expectation."""
+        count = self.flight_count + self.contact_count
+        return float(np.sqrt((self.flight + self.contact) / count)) if count else 1.0
+
+
+def misfit(fit: Fit) -> Misfit:
+    """Return the misfit of ``fit``."""
+    problem = fit.problem
+    flight = contact = 0.0
+    flights = contacts = 0
+    setting = fit.model.setting(problem.scene, fit.z)
+    for segment in fit.evaluation.segments:
+        take = problem.takes[segment.take]
+        free = np.flatnonzero(segment.record[:, 15] <= 0)
+        if len(free) >= LEAST_FRAMES:
+            gain, count = _remainder(problem, take, segment, free, setting)
+            flight, flights = flight + gain, flights + count
+        if segment.defect is not None:
+            cover = take.covers[segment.index]
+            contact += float(segment.defect @ np.linalg.solve(cover, segment.defect))
+            contacts += 12
+    return Misfit(flight=flight, flight_count=flights, contact=contact, contact_count=contacts)
+
+
+def _remainder(
+    problem: Problem, take: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
+) -> tuple[float, int]:
+    """Return the chi² explained by a smooth change of the poses, and its degrees of freedom."""
+    frames = segment.frames[free]
+    pose = problem.seen_poses(segment.record[None, free], [setting])[0]
+    _, slope, info = take.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    t = take.observations.times[frames]
+    span = max(t[-1] - t[0], 1e-9)
+    degree = int(np.clip(2 + span / BEND_EVERY, 2, 9))
+    degree = min(degree, len(frames) - 2)
+    basis = np.polynomial.legendre.legvander(2 * (t - t[0]) / span - 1, degree)
+    matrix = np.einsum("fa,fij,fb->aibj", basis, info, basis).reshape((degree + 1) * 6, -1)
+    pull = np.einsum("fa,fi->ai", basis, slope).ravel()
+    values, vectors = np.linalg.eigh(matrix)
+    good = values > 1e-9 * values[-1]
+    gain = float(np.sum((vectors.T @ pull)[good] ** 2 / values[good]))
+    rank = int(good.sum())
+    return gain, max(rank - 2 * min(6, int(np.linalg.matrix_rank(info.sum(axis=0)))), 1)
+
+
+ROUNDS = 10
+
+CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion")
+"""Effects that act in contact only."""
+
+FLIES = 6
+"""Contact-free frames after a node that determine its state."""
+
+LOOSE = 300.0
+"""Factor on the contact uncertainty while only flights count."""
+
+PROMISING = 12.0
+"""Nats below the best within which a single effect is refined and combined with others."""
+
+FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
+"""Nats over the nominal model, and misfit, above which an effect is re-tracked with its own nodes."""
+
+RECONSIDERED = 3
+"""Best effects from whose states the nominal model is restarted."""
+
+MOVED_GUESS = 0.3
+"""Camera displacement from poses alone, in prior standard deviations, above which ``camera_pose`` is re-tracked."""
+
+MOVED_MISFIT = 3.0
+"""Misfit of the nominal model above which ``camera_pose`` is re-tracked."""
+
+PAIR_SHARE = 0.85
+"""Fraction of the nominal misfit that the best single effect must stay below: where it explains almost nothing, a
+second one does not help, and the cause is a different one."""
+
+PAIR_MISFIT = 1.6
+"""Misfit of the best single effect above which pairs are tested."""
+
+PAIRS_FINISHED = 3
+"""Pairs that are fitted to convergence."""
+
+BEHIND, BEHIND_SHARE = 60.0, 0.5
+"""Nats, and fraction of the best gain, behind which an effect is not fitted to convergence."""
+
+
+@dataclass(kw_only=True, eq=False)
+class BodyFits:
+    """All fits of one body, by effects; flown: with states determined by flights alone.
+
+    begun: unfinished fits to resume, by effects.
+    """
+
+    problem: Problem
+    fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    begun: dict[tuple[str, ...], list[Fit]] = field(default_factory=dict)
+
+
+def body_problem(capture: Capture, index: int) -> Problem:
+    """Return the trials of object ``index`` of ``capture``, with nodes and initial states."""
+    body = rigid_body(capture.objects[index])
+    simulator = RigidWorlds(body=body)
+    seen = [observe_body(capture, t, index, body.center) for t in capture.trials if (t.object_index == index).any()]
+    seen = [s for s in seen if np.isfinite(s.seen).all(axis=2).any()]
+    places = []
+    for observations in seen:
+        for frame in range(0, len(observations.times), max(1, len(observations.times) // 8)):
+            pose = frame_pose(observations, frame)
+            if pose is not None:
+                places.append(pose[0])
+    middle = np.median(places, axis=0) if places else np.zeros(3)
+    scene = BodyScene(capture=capture, body=body, middle=middle)
+    return Problem(scene=scene, simulator=simulator, takes=track_states(scene, simulator, seen))
+
+
+def fit_nominal(body: BodyFits) -> None:
+    """Fit the nominal model and set the contact uncertainty."""
+    problem, model = body.problem, Model(freedoms=())
+    z = np.zeros(BELIEFS.size)
+    for _ in range(2):
+        weight_contacts(problem, model, z)
+        fit = solve(problem, model, z, [t.states for t in problem.takes], rounds=6)
+        z = fit.z
+        for take, states in zip(problem.takes, fit.states, strict=True):
+            take.states = states
+    body.fits[()] = fit
+
+
+def reconsider_nominal(body: BodyFits, until: float) -> None:
+    """Restart the nominal model from the states of the best effects; keep it where it is better.
+
+    Every effect contains the nominal model. One that gains with zero amount has only found better states, which the
+    nominal model must get too.
+    """
+    singles = [f for k, f in body.fits.items() if len(k) == 1 and f.problem is body.problem]
+    for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
+        if time.monotonic() > until:
+            return
+        again = solve(body.problem, Model(freedoms=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
+        if again.evidence > body.fits[()].evidence:
+            body.fits[()] = again
+
+
+def begin_search(body: BodyFits, freedoms: tuple[CandidateEffect, ...], base: Fit | None = None) -> Fit:
+    """Return the first steps with ``freedoms`` from ``base`` (default: nominal), reusing its Jacobians."""
+    problem, nominal = body.problem, body.fits[()]
+    first = nominal if base is None else base
+    model = Model(freedoms=freedoms)
+    new = freedoms[len(first.model.freedoms) :]
+    slopes = nominal.evaluation if first.problem is problem else first.evaluation
+    problem = first.problem
+    starts: list[Array] = [first.z]
+    for freedom in new:
+        starts = [np.concatenate([z, s]) for z in starts for s in freedom.starts]
+    if new[0].name not in CONTACTS:
+        # Flight is nearly linear: contacts are added once the forces are about right.
+        loose = _loosened(problem)
+        flown = [solve(loose, model, z, first.states, rounds=3, held=slopes) for z in starts]
+        flown = sorted(flown, key=lambda f: -f.evidence)[:2]
+        fits = [(f.z, f.states) for f in flown]
+    else:
+        z, free = _scanned(body, first, model, new[-1])
+        fits = [(z, free), (z, first.states)]
+    begun = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
+    begun.sort(key=lambda f: -f.evidence)
+    key = tuple(f.name for f in freedoms)
+    body.begun[key] = [f for f in begun if f.evidence > begun[0].evidence - BEHIND]
+    _keep(body, key, begun[0])
+    return begun[0]
+
+
+def finish(body: BodyFits, key: tuple[str, ...]) -> Fit:
+    """Return the fit begun for ``key``, iterated to convergence."""
+    nominal = body.fits[()]
+    for fit in body.begun.pop(key, []):
+        slopes = nominal.evaluation if fit.problem is body.problem else fit.evaluation
+        _keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS, held=slopes))
+    return body.fits[key]
+
+
+def finish_best(body: BodyFits, until: float) -> None:
+    """Finish every single effect that may still become the best."""
+    nominal = body.fits[()].evidence
+    for key in sorted(body.begun, key=lambda k: -body.fits[k].evidence):
+        best = max(f.evidence for f in body.fits.values())
+        near = best - max(BEHIND, BEHIND_SHARE * (best - nominal))
+        if body.fits[key].evidence >= near and time.monotonic() < until:
+            finish(body, key)
+
+
+def _keep(body: BodyFits, key: tuple[str, ...], fit: Fit) -> None:
+    if key not in body.fits or body.fits[key].evidence < fit.evidence:
+        body.fits[key] = fit
+
+
+def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: CandidateEffect) -> tuple[Array, list[Array]]:
+    """Return start numbers and states of a contact effect: states from flights alone, numbers from a grid.
+
+    States of the nominal fit are biased by its wrong contacts.
+    """
+    problem = begin.problem
+    key = tuple(f.name for f in begin.model.freedoms)
+    if key not in body.flown:
+        body.flown[key] = solve(_loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
+    flown = body.flown[key]
+    spreads = _arrival_spreads(problem, flown)
+    base = begin.z.copy()
+    base[: BELIEFS.size] = 0.0
+    tried = [np.concatenate([base, s]) for s in freedom.grid]
+    costs = []
+    for z in tried:
+        look = problem.evaluate(model, z, flown.states, slopes=False)
+        squares = np.array(
+            [
+                s.defect @ np.linalg.solve(c, s.defect)
+                for s, c in zip(look.segments, spreads, strict=True)
+                if s.defect is not None and c is not None
+            ]
+        )
+        own = float(z[len(base) :] @ z[len(base) :])
+        costs.append(
+            own + float(np.sum((CONTACT_DEGREES_OF_FREEDOM + 12) * np.log1p(squares / CONTACT_DEGREES_OF_FREEDOM)))
+        )
+    # A state without a following flight is only known from its contacts and stays.
+    states = [s.copy() for s in begin.states]
+    for segment in flown.evaluation.segments:
+        if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
+            states[segment.take][segment.index] = flown.states[segment.take][segment.index]
+    return tried[int(np.argmin(costs))], states
+
+
+def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
+    """Return covariances (12, 12) of the defects with states from flights alone, including the contact uncertainty."""
+    found: list[Array | None] = []
+    for segment in flown.evaluation.segments:
+        if segment.defect is None or segment.come is None:
+            found.append(None)
+            continue
+        hessian = flown.evaluation.linear[segment.take].hessian
+        first, second = 12 * segment.index, 12 * segment.index + 12
+        here = np.linalg.pinv(hessian[first:second, first:second] + 1e-6 * np.eye(12))
+        there = np.linalg.pinv(hessian[second : second + 12, second : second + 12] + 1e-6 * np.eye(12))
+        come = segment.come[:, :12]
+        found.append(problem.takes[segment.take].covers[segment.index] + come @ here @ come.T + there)
+    return found
+
+
+def fit_camera_pose(body: BodyFits) -> None:
+    """Fit ``camera_pose`` with its own nodes: from another viewpoint contacts happen at other times."""
+    problem, nominal = body.problem, body.fits[()]
+    if misfit(nominal).ratio < MOVED_MISFIT:
+        return
+    freedom = CANDIDATE_EFFECTS["camera_pose"]
+    model = Model(freedoms=(freedom,))
+    guess = initial_camera(problem)
+    if float(np.abs(guess).max()) > MOVED_GUESS:
+        _followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
+
+
+def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
+    """Return ``model`` fitted from ``z`` with nodes at its own contacts, if that is better."""
+    problem = body.problem
+    takes = track_states(problem.scene, problem.simulator, [t.observations for t in problem.takes], model=model, z=z)
+    other = dataclasses.replace(problem, takes=takes)
+    weight_contacts(other, model, z)
+    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=3)
+    begin = flown.z if model.freedoms[-1].name not in CONTACTS else z
+    fit = solve(other, model, begin, flown.states, rounds=2)
+    fit = solve(other, model, fit.z, fit.states, rounds=ROUNDS, held=fit.evaluation)
+    _keep(body, tuple(f.name for f in model.freedoms), fit)
+    return fit
+
+
+def _loosened(problem: Problem) -> Problem:
+    takes = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.takes]
+    return dataclasses.replace(problem, takes=takes)
+
+
+def refine_promising(body: BodyFits, until: float) -> None:
+    """Refine the promising fits by a few steps with their own Jacobians."""
+    best = max(f.evidence for f in body.fits.values())
+    nominal = body.fits[()]
+    far = [f for k, f in body.fits.items() if k and f.evidence > max(best - PROMISING, nominal.evidence - 3)]
+    for fit in sorted(far, key=lambda f: -f.evidence)[:3]:
+        if time.monotonic() > until:
+            return
+        key = tuple(f.name for f in fit.model.freedoms)
+        new = solve(fit.problem, fit.model, fit.z, fit.states, rounds=4)
+        if new.evidence > fit.evidence:
+            body.fits[key] = new
+
+
+def refit_beliefs(body: BodyFits) -> None:
+    """Fit the nominal model with free contact coefficients, without a new effect."""
+    asked = ("friction",) in body.fits
+    first = body.fits["friction",] if asked else begin_search(body, (CANDIDATE_EFFECTS["friction"],))
+    begin_search(body, (CANDIDATE_EFFECTS["friction"], CANDIDATE_EFFECTS["restitution"]), first)
+    finish(body, ("friction", "restitution"))
+    if not asked:
+        del body.fits["friction",]
+
+
+def refit_best(body: BodyFits, until: float) -> None:
+    """Fit the best effects again with their own nodes, where those of the nominal model may be unsuitable."""
+    nominal = body.fits[()]
+    singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:2]
+    for fit in singles:
+        if time.monotonic() > until or fit.evidence < singles[0].evidence - BEHIND:
+            return
+        gained = fit.evidence - nominal.evidence
+        if fit.problem is body.problem and gained > FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
+            _followed(body, fit.model, fit.z)
+
+
+def search_pairs(body: BodyFits, wanted: list[CandidateEffect], until: float) -> None:
+    """Fit pairs of effects: the best one or two with each other one, where a single effect leaves too much."""
+    singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1]
+    if not singles:
+        return
+    singles.sort(key=lambda item: -item[1].evidence)
+    left = misfit(singles[0][1]).ratio
+    if left < PAIR_MISFIT or left > PAIR_SHARE * misfit(body.fits[()]).ratio:
+        return
+    tried = []
+    for name, fit in singles[:2]:
+        for freedom in wanted:
+            if time.monotonic() > until:
+                break
+            if freedom.name == name or tuple(sorted((name, freedom.name))) in {tuple(sorted(k)) for k in body.fits}:
+                continue
+            if {name, freedom.name} == {"air_drag", "wind"}:
+                continue
+            begin_search(body, (CANDIDATE_EFFECTS[name], freedom), fit)
+            tried.append((name, freedom.name))
+    for key in sorted(tried, key=lambda k: -body.fits[k].evidence)[:PAIRS_FINISHED]:
+        if time.monotonic() < until:
+            finish(body, key)

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""The whole diagnosis: capture → fits → model comparison → verification run → diagnosis (docs/diagnosis.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..effects.registry import effects
+from ..errors import InputError
+from ..events import IsCancelled, OnEvent, ignore, never
+from .capture import Capture
+from .diagnosis import NONE, UNKNOWN, Array, CandidateFit, Diagnosis, Discrepancy, Fits, Gap, RankedEffect, TrialArrays
+from .gap_metrics import bootstrap_interval, localise, measure_gap, negative_controls
+from .model_comparison import ComparisonSettings, ModelComparison, compare_models, kind_of, nominal_or_refitted
+from .report.wording import verdict_summary
+from .suggested_experiments import next_experiment
+from .verification_run import VerificationRun, run_verification
+
+CONFIRMED_TAKES = 2
+"""Trials of the verification run: each costs seconds, and the second separates chance from confirmation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseOptions:
+    """How a capture is diagnosed.
+
+    budget_s: time in s that the fits aim to stay below, 10 to 86400; the verification run comes on top.
+    effects: names of the candidates; None for all that can act on these objects.
+    confirm: whether to verify the verdict in the particle engine.
+    """
+
+    budget_s: float = 300.0
+    effects: tuple[str, ...] | None = None
+    confirm: bool = True
+
+    def __post_init__(self) -> None:
+        if not 10 <= self.budget_s <= 86400:
+            raise InputError(f"budget is {self.budget_s!r} s: give 10 s to 24 h")
+        known = [n for n, e in effects().items() if n != "sandy"]
+        for name in self.effects or ():
+            if name not in known:
+                raise InputError(f"effects names {name!r}: choose from {', '.join(known)}")
+        if self.effects is not None and not self.effects:
+            raise InputError("effects is empty: name at least one, or leave it out for all")
+
+
+def diagnose(
+    capture: Capture,
+    options: DiagnoseOptions | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Diagnosis:
+    """Return the diagnosis of ``capture``.
+
+    Raises InputError for a capture that cannot be diagnosed, SimulationError when the nominal model diverges, and
+    Cancelled when ``cancelled()`` becomes True.
+    """
+    options = options or DiagnoseOptions()
+    started = time.monotonic()
+    fits = _fit(capture, options, on_event, cancelled)
+    weighed = compare_models(fits, ComparisonSettings())
+    warnings = list(capture.warnings)
+    verdict, found = weighed.verdict, _found(fits, weighed)
+    gap = measure_gap(capture, fits, found)
+    nominal_points, found_points = fits.simulate(fits.nominal), fits.simulate(found)
+    gap = dataclasses.replace(
+        gap, closed_fraction_ci95=bootstrap_interval(capture, nominal_points, found_points, found, gap)
+    )
+    confirmations: list[VerificationRun] = []
+    if options.confirm and len(capture.objects) == 1 and verdict.effect not in (NONE, UNKNOWN):
+        confirmations, notes = _confirm(capture, fits, found, nominal_points, found_points, on_event, cancelled)
+        warnings += notes
+        if confirmations and all(math.isfinite(c.numerics_rms_m) for c in confirmations):
+            gap = dataclasses.replace(gap, numerics_rms_m=float(np.mean([c.numerics_rms_m for c in confirmations])))
+    discrepancies = fits.discrepancy(None if verdict.effect in (NONE, UNKNOWN) else found)
+    ranked = _ranking(fits, weighed, gap)
+    kinds = {item.name: item.kind for item in ranked}
+    predictions = fits.predict(fits.nominal), fits.predict(found)
+    return Diagnosis(
+        verdict=verdict,
+        effects=ranked,
+        gap=gap,
+        controls=negative_controls(capture, fits, weighed, found, nominal_points),
+        next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable),
+        where=localise(capture, discrepancies),
+        trials=_arrays(capture, discrepancies, nominal_points, found_points, *predictions),
+        summary=verdict_summary(verdict, gap),
+        warnings=tuple(warnings),
+        seconds=round(time.monotonic() - started, 2),
+        confirmation=_confirmation_json(confirmations),
+    )
+
+
+def _fit(capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelled: IsCancelled) -> Fits:
+    # Taichi is imported only here.
+    rigid = [item.belief.rigid for item in capture.objects]
+    if all(rigid):
+        from .rigid.rigid_fits import fit_rigid
+
+        return fit_rigid(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
+    if len(capture.objects) > 1:
+        soft = capture.objects[rigid.index(False)].name
+        raise InputError(
+            f"object {soft!r} is deformable and not alone: a capture holds either rigid objects or one deformable; "
+            "make a capture of it alone"
+        )
+    from .soft.soft_fits import fit_soft
+
+    return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
+
+
+def _found(fits: Fits, weighed: ModelComparison) -> CandidateFit:
+    """Return the fit that predicts ``after``: the verdict's.
+
+    For ``none`` that is the nominal model, for ``unknown`` the re-fitted one where it predicts better.
+    """
+    name = weighed.verdict.effect
+    if name == UNKNOWN and fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m:
+        return fits.refitted
+    return nominal_or_refitted(fits) if name in (NONE, UNKNOWN) else weighed.best[name]
+
+
+def _confirm(
+    capture: Capture,
+    fits: Fits,
+    found: CandidateFit,
+    nominal_points: Mapping[str, Array],
+    found_points: Mapping[str, Array],
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> tuple[list[VerificationRun], list[str]]:
+    results: list[VerificationRun] = []
+    for trial in capture.fit_trials[:CONFIRMED_TAKES]:
+        on_event({"event": "notice", "stage": "diagnose", "message": f"verification run of {trial.name} in the engine"})
+        try:
+            results.append(
+                run_verification(
+                    capture,
+                    trial,
+                    fits.nominal,
+                    found,
+                    nominal_points[trial.name],
+                    found_points[trial.name],
+                    cancelled,
+                )
+            )
+        except InputError as error:
+            return results, [f"the verification run of {trial.name} failed: {error}"]
+    against = [c.trial for c in results if c.word == "contradicted"]
+    if against:
+        return results, [f"the particle engine contradicts the verdict on {', '.join(against)}"]
+    if all(c.word == "undecided" for c in results):
+        return results, ["the particle engine cannot distinguish verdict and nominal model at its resolution"]
+    return results, []
+
+
+def _confirmation_json(items: list[VerificationRun]) -> Mapping[str, Any]:
+    return {"takes": [dataclasses.asdict(c) | {"word": c.word} for c in items]} if items else {}
+
+
+def _ranking(fits: Fits, weighed: ModelComparison, gap: Gap) -> tuple[RankedEffect, ...]:
+    room = gap.before_rms_m - gap.noise_floor_rms_m
+    items = []
+    for name, probability in weighed.probabilities.items():
+        fit = weighed.best.get(name)
+        if fit is None:
+            items.append(RankedEffect(name=name, kind=kind_of(name), probability=probability))
+            continue
+        closed = (gap.before_rms_m - fit.heldout_rms_m) / room if room > 0 else math.nan
+        items.append(
+            RankedEffect(
+                name=name,
+                kind=kind_of(name),
+                probability=probability,
+                parameters=fit.parameters.get(name, {}),
+                heldout_rms_m=fit.heldout_rms_m,
+                closed_fraction=closed,
+            )
+        )
+    verdict = weighed.verdict
+    for name in verdict.effects[1:]:
+        # The second of two causes takes its parameters from the fit of both.
+        fit = weighed.best[verdict.effect]
+        items = [
+            dataclasses.replace(item, parameters=fit.parameters[name], heldout_rms_m=fit.heldout_rms_m)
+            if item.name == name
+            else item
+            for item in items
+        ]
+    return tuple(sorted(items, key=lambda item: -item.probability))
+
+
+def _arrays(
+    capture: Capture,
+    discrepancies: Mapping[str, Discrepancy],
+    nominal: Mapping[str, Array],
+    found: Mapping[str, Array],
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+) -> dict[str, TrialArrays]:
+    result = {}
+    for trial in capture.trials:
+        d = discrepancies[trial.name]
+        result[trial.name] = TrialArrays(
+            times=trial.times,
+            frame_score=d.frame_score,
+            point_score=d.point_score,
+            residual=d.residual,
+            nominal=nominal[trial.name],
+            found=found[trial.name],
+            before=before.get(trial.name),
+            after=after.get(trial.name),
+        )
+    return result

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""Search over all candidates: nominal model, flights, contacts on a coarse and a fine lattice, pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import Cancelled, InputError
+from ...events import IsCancelled, OnEvent, StageProgress
+from ..capture import Capture
+from .body_mesh import body_mesh, coarser
+from .contact_search import LOST, CandidateSearch, ContactFit, ContactProblem, ModelError, Window, model_error_between
+from .flight_fits import FlightEstimate, Flights, GroundFrame, fit_in_flight, soft_trial
+from .soft_candidates import IN_FLIGHT, Candidate, WorldParameters, candidates
+from .soft_simulator import SoftWorlds
+
+Array = NDArray[np.float64]
+
+HORIZON = 0.085
+"""Fitted time in s after first contact: impact and first ringing, before small differences grow."""
+
+COARSER = 1.5
+"""Cell size of the coarse lattice over the fine one's; their difference gives the model error."""
+
+SEEN_IN_FLIGHT = 9.0
+"""Gain in chi² of the flights from which an effect that acts in flight is also searched in contact."""
+
+ROUNDS, FINE_ROUNDS, LAST_ROUNDS = 4, 2, 4
+HOPELESS, HOPELESS_ROUNDS = 2000.0, 2
+"""Cost above the best candidate's, and the few rounds that such a start gets."""
+
+OTHER_GROUND = 0.5
+"""Log ground stiffness of the fitted nominal model beyond which candidates also start from it."""
+
+DESCENTS = 2
+"""Starts of a candidate that are descended from on the coarse lattice."""
+
+NEARBY = (-0.12, 0.0, 0.12)
+"""Log offsets from the coarse optimum tried on the fine lattice, which is a little softer."""
+
+FULL_SEARCHES = 3
+"""Candidates searched on the fine lattice."""
+
+SOFT_GROUND = math.log(0.2)
+"""Second starting value of the log ground stiffness, besides its default."""
+
+UNEXPLAINED = 1.3
+"""Misfit of the best single effect above which pairs are tested."""
+
+FREEDOM = 4.0
+"""Evidence cost in nats of a previously fitted parameter, about the Laplace penalty in these fits."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FoundFit:
+    """A fit, the search that found it, and the effects added before the candidate's own."""
+
+    search: CandidateSearch
+    fit: ContactFit
+    in_flight: FlightEstimate | None = None
+    before: tuple[tuple[str, dict[str, float], FlightEstimate], ...] = ()
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Return the effect names, the last fitted one at the end."""
+        own = () if self.search.candidate is None else (self.search.candidate.name,)
+        return (*(name for name, _, _ in self.before), *own)
+
+
+class Survey:
+    """All searches on one capture. ``run`` sets ``believed``, ``plain`` (re-fitted) and ``found`` (with effects)."""
+
+    believed: ContactFit
+    plain: FoundFit
+    found: list[FoundFit]
+
+    def __init__(self, capture: Capture, *, on_event: OnEvent, cancelled: IsCancelled, budget_s: float) -> None:
+        self._begin, self._budget, self._cancelled = time.monotonic(), budget_s, cancelled
+        self._progress = StageProgress(on_event, "diagnose", 100)
+        self.frame = GroundFrame(capture)
+        item = capture.objects[0]
+        belief = item.belief
+        assert belief.youngs_modulus_pa is not None
+        mesh = body_mesh(item.vertices, item.faces)
+        self.takes = [soft_trial(t, self.frame, mesh.nodes) for t in capture.trials]
+        rest = capture.trials[0].rest_points
+        if any(t.rest_points.shape != rest.shape or np.abs(t.rest_points - rest).max() > 1e-9 for t in capture.trials):
+            raise InputError("rest_points differ between trials: track the same points in all trials of a soft object")
+        self.worlds = SoftWorlds(mesh, belief.density_kg_m3, rest)
+        self.flights = Flights(self.takes, self.worlds, capture.noise_sigma)
+        x, y, z = (float(c) for c in self.frame.direction(np.asarray(capture.gravity)))
+        self.base = WorldParameters(
+            modulus=belief.youngs_modulus_pa,
+            poisson_ratio=belief.poisson_ratio,
+            friction=max(capture.ground.friction, 1e-3),
+            gravity=(x, y, z),
+        )
+        self._size = float(np.ptp(mesh.nodes, axis=0).mean() / 2)
+        self.fit_takes = [i for i, t in enumerate(self.takes) if t.role == "fit"]
+        self._check()
+        coarse_mesh = coarser(mesh, item.vertices, item.faces, factor=COARSER)
+        self._coarse = Flights(self.takes, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma)
+        windows = [w for w in map(self._window, self.fit_takes) if w is not None]
+        self.numerics_rms_m, model_error = self._measure_grain(windows)
+        self.problem = ContactProblem(self.flights, windows, self.base, model_error=model_error, size=self._size)
+        self._rough = ContactProblem(
+            self._coarse, windows, self.base, model_error=model_error.times(1.5), size=self._size
+        )
+
+    def run(self, names: Sequence[str]) -> None:
+        """Search all candidates of ``names``."""
+        base, problem = self.base, self.problem
+        middle = np.mean([np.nanmean(t.points[: t.flying], axis=(0, 1)) for t in self.takes], axis=0)
+        known = candidates(base, self._size, middle)
+        neutral = CandidateSearch(problem, None)
+        rough = CandidateSearch(self._rough, None)
+        grounds = rough.try_all([rough.mean, np.array([0.0, SOFT_GROUND])])
+        end = min((rough.descend(g, ROUNDS, self._stop) for g in grounds), key=lambda f: f.cost)
+        self._common = end.free
+        self.believed, refitted = neutral.try_all([neutral.mean, end.free])
+        refitted = neutral.descend(min(self.believed, refitted, key=lambda f: f.cost), 2, self._stop)
+        self.plain = FoundFit(search=neutral, fit=refitted)
+        self._report(10, "nominal model")
+        self.flight_chi2 = np.array([self.flights.fit(i, base).chi2 for i in self.fit_takes])
+        self._flight_count = sum(self.flights.fit(i, base).count for i in self.fit_takes)
+        in_flight: list[tuple[Candidate, FlightEstimate]] = []
+        for candidate in (c for name in IN_FLIGHT if name in names for c in known[name]):
+            self._stop()
+            in_flight.append((candidate, fit_in_flight(self.flights, self.fit_takes, base, candidate)))
+        self._report(25, "flights")
+        tried = [c for n in names if n not in IN_FLIGHT for c in known[n]]
+        self.found = self._contact_effects(problem, self._rough, tried)
+        self.found += [self._landed(candidate, air) for candidate, air in in_flight]
+        self.found += self._pairs(tried)
+        self._report(92, "held-out motion")
+
+    def _landed(self, candidate: Candidate, air: FlightEstimate) -> FoundFit:
+        """Return an effect fitted in flight, also searched in contact where it is visible there."""
+        refitted, search = self.plain.fit, CandidateSearch(self.problem, candidate, air)
+        start = np.concatenate([air.free, refitted.free[-2:]])
+        if float(self.flight_chi2.sum() - air.chi2.sum()) > SEEN_IN_FLIGHT and not self._late(0.8):
+            fit = search.descend(search.try_all([start])[0], 2, self._stop)
+        else:
+            jacobians = refitted.jacobians
+            if jacobians is not None:
+                jacobians = [np.concatenate([np.zeros((len(j), len(air.free))), j], axis=1) for j in jacobians]
+            fit = search.judge(start, refitted.motions, jacobians)
+        return FoundFit(search=search, fit=fit, in_flight=air)
+
+    def _contact_effects(
+        self, problem: ContactProblem, rough: ContactProblem, tried: list[Candidate]
+    ) -> list[FoundFit]:
+        """Search ``tried`` from all their starts on the coarse lattice, then the best on the fine one."""
+        begun: list[tuple[Candidate, CandidateSearch, list[ContactFit]]] = []
+        for candidate in tried:
+            self._stop()
+            search = CandidateSearch(rough, candidate)
+            starts = [np.concatenate([s, np.zeros(2)]) for s in candidate.starts]
+            ends = sorted(search.try_all(starts), key=lambda f: f.cost)
+            if abs(self._common[1]) > OTHER_GROUND:
+                moved = [np.concatenate([e.free[:-2], self._common]) for e in ends[:DESCENTS]]
+                ends = sorted(ends + search.try_all(moved), key=lambda f: f.cost)
+            begun.append((candidate, search, ends))
+        # Most promising first, in case time runs out.
+        begun.sort(key=lambda entry: entry[2][0].cost)
+        found: list[tuple[float, Candidate, ContactFit]] = []
+        least = math.inf
+        for rank, (candidate, search, ends) in enumerate(begun):
+            followed = ends[: DESCENTS if rank < FULL_SEARCHES else 1]
+            if not self._late(0.45):
+                rounds = [HOPELESS_ROUNDS if e.cost > least + HOPELESS else ROUNDS for e in followed]
+                followed = [search.descend(e, n, self._stop) for e, n in zip(followed, rounds, strict=True)]
+            least = min(least, *(f.cost for f in followed))
+            end = min(followed, key=lambda f: f.cost)
+            found.append((end.cost, candidate, end))
+            self._report(30 + 20 * (rank + 1) // len(tried), candidate.name)
+        found.sort(key=lambda entry: entry[0])
+        out = []
+        for rank, (_, candidate, end) in enumerate(found):
+            search = CandidateSearch(problem, candidate)
+            near = rank < FULL_SEARCHES and len(candidate.mean) == 1
+            first = np.eye(len(end.free))[0]
+            about = [end.free + d * first for d in (NEARBY if near else (0.0,))]
+            fit = min(search.try_all(about), key=lambda f: f.cost)
+            if rank == 0:
+                # The best one is always refined: report and predictions depend on it.
+                fit = search.descend(fit, LAST_ROUNDS, self._leave)
+            elif rank < FULL_SEARCHES and not self._late(0.6):
+                fit = search.descend(fit, FINE_ROUNDS, self._stop)
+            else:
+                fit = dataclasses.replace(fit, jacobians=end.jacobians)
+            self._report(50 + 30 * (rank + 1) // len(found), candidate.name)
+            out.append(FoundFit(search=search, fit=fit))
+        return out
+
+    def _pairs(self, tried: list[Candidate]) -> list[FoundFit]:
+        """Return pairs of an effect visible in flight and one that acts in contact, where neither alone suffices."""
+        flying = [f for f in self.found if f.in_flight is not None and self._gain(f) > SEEN_IN_FLIGHT * 3]
+        if not flying or self._late(0.6):
+            return []
+        best = max(flying, key=self.evidence)
+        if self.contact_misfit(best) < UNEXPLAINED:
+            return []
+        assert best.search.candidate is not None and best.in_flight is not None
+        values = best.search.candidate.values(best.in_flight.free)
+        base = best.search.candidate.world(self.base, best.in_flight.free)
+        windows, size = self.problem.windows, self._size
+        problem = ContactProblem(self.flights, windows, base, model_error=self.problem.model_error, size=size)
+        rough = ContactProblem(self._coarse, windows, base, model_error=self._rough.model_error, size=size)
+        before = ((best.search.candidate.name, values, best.in_flight),)
+        return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, rough, tried)]
+
+    # Quality of a fit
+
+    def flight_part(self, found: FoundFit) -> Array:
+        """Return the chi² of the flights, (trials,)."""
+        if found.in_flight is not None:
+            return found.in_flight.chi2_at(found.fit.free[: found.search.own])
+        if found.before:
+            return found.before[0][2].chi2.copy()
+        return self.flight_chi2.copy()
+
+    def _gain(self, found: FoundFit) -> float:
+        return float(self.flight_chi2.sum() - self.flight_part(found).sum())
+
+    def evidence(self, found: FoundFit) -> float:
+        """Return the log evidence including the flights, which the search has only for effects that act there."""
+        if found.fit.cost >= LOST:
+            return -LOST
+        value = found.search.log_evidence(found.fit)
+        if found.in_flight is None:
+            value -= 0.5 * float(self.flight_part(found).sum())
+        for _, _, air in found.before:
+            value -= FREEDOM * len(air.free)
+        return value
+
+    def contact_misfit(self, found: FoundFit) -> float:
+        """Return the RMS of the whitened residual after first contact."""
+        chi2, count = found.search.chi2(found.fit)
+        return math.sqrt(chi2 / max(count, 1))
+
+    def flight_misfit(self, found: FoundFit) -> float:
+        """Return the RMS of the whitened residual in flight."""
+        return math.sqrt(float(self.flight_part(found).sum()) / max(self._flight_count, 1))
+
+    # Data
+
+    def _window(self, index: int) -> Window | None:
+        take, start = self.takes[index], self.flights.start(index, self.base)
+        if start is None:
+            return None
+        chosen = (take.times > start.time) & (take.times <= start.time + HORIZON)
+        if not (take.seen[chosen].any()):
+            return None
+        return Window(
+            take=index, times=take.times[chosen], points=take.points[chosen], seen=take.seen[chosen], contact=start.time
+        )
+
+    def _measure_grain(self, windows: list[Window]) -> tuple[float, ModelError]:
+        """Return the distance in m between the motions of both lattices, and the model error it implies."""
+        if not windows:
+            return 0.0, ModelError(drift=0.02, ringing=5e-4)
+        args = [w.take for w in windows], [self.base] * len(windows), [w.times for w in windows]
+        fine, coarse = self.flights.motion(*args), self._coarse.motion(*args)
+        apart = np.concatenate([((a - b) ** 2).sum(axis=2).ravel() for a, b in zip(fine, coarse, strict=True)])
+        apart = apart[np.isfinite(apart)]
+        rms = math.sqrt(float(apart.mean())) if len(apart) else 0.0
+        return rms, model_error_between(fine, coarse, [w.times - w.contact for w in windows], self._size)
+
+    def _check(self) -> None:
+        if not self.fit_takes:
+            raise InputError('no trial has role "fit": mark the complete trials as such')
+        for take in self.takes:
+            if (take.seen[: take.flying].sum(axis=1) >= 3).sum() < 3:
+                raise InputError(
+                    f"trial {take.name!r}: fewer than 3 frames with 3 points each before the first contact; "
+                    "start the recording earlier"
+                )
+
+    # Time
+
+    def _late(self, share: float) -> bool:
+        return time.monotonic() - self._begin > share * self._budget
+
+    def _stop(self) -> bool:
+        self._leave()
+        return self._late(0.85)
+
+    def _leave(self) -> bool:
+        if self._cancelled():
+            raise Cancelled("cancelled while effects were fitted")
+        return False
+
+    def _report(self, done: int, message: str) -> None:
+        self._progress.report(done, message)

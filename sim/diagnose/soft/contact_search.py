@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: MIT
+"""Fit of a candidate to the motion after first contact: whole simulations, Gauss-Newton, Laplace evidence.
+
+``ModelError`` is how far a correct model would still miss: camera noise, and the discretisation error after contact."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .flight_fits import FlightEstimate, Flights
+from .soft_candidates import Candidate, WorldParameters
+
+Array = NDArray[np.float64]
+
+LEVELS = (0.35, 0.6, 1.0, 1.7, 2.9)
+"""Levels of model error, relative to the expected one, over which the evidence is summed."""
+
+LEVEL_SPREAD = 0.6
+"""Prior standard deviation of the log model error about the expected one."""
+
+
+DRIFT_SHARE, RINGING_SHARE = 0.8, 0.9
+"""Model error of the fine lattice over the difference between both lattices, calibrated on bodies of known motion."""
+
+LEAST_DRIFT, LEAST_RINGING = 0.006, 1e-4
+"""Lower bounds in m/s and m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelError:
+    """Standard deviations of the model error after contact: drift in m/s, ringing in m."""
+
+    drift: float
+    ringing: float
+
+    def times(self, level: float) -> ModelError:
+        """Return the model error scaled by ``level``."""
+        return ModelError(drift=level * self.drift, ringing=level * self.ringing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whitened:
+    """Whitened trial: residuals over s, error modes over s, and the log determinant of the covariance."""
+
+    scale: Array
+    modes: Array
+    core: Array
+    log_det: float
+
+    def inner(self, a: Array, b: Array) -> Array:
+        """Return a^T C^-1 b of raw vectors (n,) or (n, m)."""
+        u, v = self._scaled(a), self._scaled(b)
+        return np.asarray(u.T @ v - (self.modes.T @ u).T @ np.linalg.solve(self.core, self.modes.T @ v))
+
+    def _scaled(self, a: Array) -> Array:
+        return np.asarray(a / (self.scale if a.ndim == 1 else self.scale[:, None]))
+
+
+def whiten(
+    points: Array, since: Array, seen: NDArray[np.bool_], *, noise: float, model_error: ModelError, size: float
+) -> Whitened:
+    """Return the covariance of coordinates ``seen`` (T, K) of ``points`` (T, K, 3), ``since`` (T,) s after contact."""
+    late = np.maximum(since, 0.0)
+    s = np.sqrt(noise**2 + (model_error.ringing * (late > 0)) ** 2)
+    scale = np.repeat(np.broadcast_to(s[:, None], seen.shape)[seen], 3)
+    modes = model_error.drift * modes_of(points, late, seen, size) / scale[:, None]
+    core = np.eye(6) + modes.T @ modes
+    log_det = 2 * float(np.log(scale).sum()) + float(np.linalg.slogdet(core)[1])
+    return Whitened(scale=scale, modes=modes, core=core, log_det=log_det)
+
+
+def modes_of(points: Array, late: Array, seen: NDArray[np.bool_], size: float) -> Array:
+    """Return error modes (n, 6): displacement of coordinates ``seen`` (T, K) per m/s of linear and angular drift."""
+    away = (points - points.mean(axis=1, keepdims=True)) / size
+    columns = []
+    for axis in np.eye(3):
+        columns.append(np.broadcast_to(late[:, None, None] * axis, points.shape)[seen].ravel())
+        columns.append((late[:, None, None] * np.cross(axis, away))[seen].ravel())
+    return np.stack(columns, axis=1)
+
+
+def model_error_between(fine: list[Array], coarse: list[Array], since: list[Array], size: float) -> ModelError:
+    """Return the model error from motions (T, K, 3) at two resolutions, ``since`` (T,) s after contact, by trial."""
+    drifts, rings = [], []
+    for a, b, t in zip(fine, coarse, since, strict=True):
+        seen = np.isfinite(a).all(axis=2) & np.isfinite(b).all(axis=2) & (t > 0)[:, None]
+        if seen.sum() < 4:
+            continue
+        modes, difference = modes_of(a, np.maximum(t, 0.0), seen, size), (a - b)[seen].ravel()
+        amounts = np.linalg.lstsq(modes, difference, rcond=None)[0]
+        drifts.append(float((amounts**2).mean()))
+        rings.append(float(((difference - modes @ amounts) ** 2).mean()))
+    if not drifts:
+        return ModelError(drift=0.02, ringing=5e-4)
+    return ModelError(
+        drift=max(LEAST_DRIFT, DRIFT_SHARE * math.sqrt(float(np.median(drifts)))),
+        ringing=max(LEAST_RINGING, RINGING_SHARE * math.sqrt(float(np.median(rings)))),
+    )
+
+
+def log_prior_of_level(level: float) -> float:
+    """Return the log prior of one of ``LEVELS``."""
+    weights = [math.exp(-0.5 * (math.log(x) / LEVEL_SPREAD) ** 2) for x in LEVELS]
+    return -0.5 * (math.log(level) / LEVEL_SPREAD) ** 2 - math.log(sum(weights))
+
+
+FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.4
+FRICTION_REACH, CONTACT_REACH = 0.3, 1.8
+"""Bounds of both logarithms. A clearly different friction is a cause and must not hide here; the ground stiffness is
+unknown."""
+
+COMMON_STEP = np.array([0.06, 0.1])
+LOST = 1e12
+"""Cost of a failed simulation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Compared part of a trial: recorded times (T,) from first contact on, points (T, K, 3), visibility (T, K)."""
+
+    take: int
+    times: Array
+    points: Array
+    seen: NDArray[np.bool_]
+    contact: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactFit:
+    """A candidate's parameters after the search.
+
+    free: own parameters, then log friction and log contact stiffness relative to the nominal ones. laws: the resulting
+    world parameters. cost: minus twice the log posterior, up to constants, under the expected model error. residuals:
+    per trial, (n,) raw, m. jacobians: per trial, (n, p + 2) of the simulated coordinates, or None if never computed.
+    motions: simulated points.
+    """
+
+    free: Array
+    world: WorldParameters
+    cost: float
+    residuals: list[Array]
+    jacobians: list[Array] | None
+    motions: list[Array]
+
+
+class ContactProblem:
+    """Windows of all fit trials and the residuals of simulations. grain: expected model error; size: of the body, m."""
+
+    def __init__(
+        self,
+        flights: Flights,
+        windows: Sequence[Window],
+        base: WorldParameters,
+        *,
+        model_error: ModelError,
+        size: float,
+    ) -> None:
+        self.flights, self.windows, self.base = flights, list(windows), base
+        self.model_error, self.size = model_error, size
+        self.simulated = 0
+
+    def motions(self, world: Sequence[WorldParameters]) -> list[list[Array]]:
+        """Return the simulated points of every window under each of ``world``."""
+        takes = [w.take for _ in world for w in self.windows]
+        times = [w.times for _ in world for w in self.windows]
+        found = self.flights.motion(takes, [a for a in world for _ in self.windows], times)
+        self.simulated += len(found)
+        n = len(self.windows)
+        return [found[i * n : (i + 1) * n] for i in range(len(world))]
+
+    def residual(self, window: Window, motion: Array) -> Array:
+        """Return observed minus simulated coordinates (n,), m."""
+        return np.asarray((window.points - motion)[window.seen].ravel())
+
+    def covariance(self, window: Window, motion: Array, level: float = 1.0) -> Whitened:
+        """Return the covariance of a window's residual at ``level`` times the expected model error."""
+        return whiten(
+            motion,
+            window.times - window.contact,
+            window.seen,
+            noise=self.flights.sigma,
+            model_error=self.model_error.times(level),
+            size=self.size,
+        )
+
+
+def common_laws(world: WorldParameters, base: WorldParameters, common: Array, *, friction: bool) -> WorldParameters:
+    """Return ``world`` with log friction (unless the candidate sets it) and log contact relative to ``base``."""
+    rubbing = base.friction * math.exp(common[0]) if friction else world.friction
+    return dataclasses.replace(world, friction=rubbing, contact=base.contact * math.exp(common[1]))
+
+
+class CandidateSearch:
+    """Gauss–Newton search for one candidate (None: nominal model). airborne: its estimate from the flights."""
+
+    def __init__(
+        self, problem: ContactProblem, candidate: Candidate | None, in_flight: FlightEstimate | None = None
+    ) -> None:
+        self.problem, self.candidate, self.in_flight = problem, candidate, in_flight
+        own = 0 if candidate is None else len(candidate.mean)
+        self.own = own
+        common = np.array([FRICTION_SPREAD, CONTACT_SPREAD])
+        self.mean = np.concatenate([[] if candidate is None else candidate.mean, np.zeros(2)])
+        self.spread = np.concatenate([[] if candidate is None else candidate.spread, common])
+        self.step = np.concatenate([[] if candidate is None else candidate.step, COMMON_STEP])
+        self.moves = np.ones(own + 2, dtype=bool)
+        self.moves[own] = candidate is None or candidate.name != "friction"
+
+    def world(self, free: Array) -> WorldParameters:
+        """Return the world parameters of ``free`` (p + 2,)."""
+        base = self.problem.base
+        own = base if self.candidate is None else self.candidate.world(base, free[: self.own])
+        return common_laws(own, base, free[self.own :], friction=bool(self.moves[self.own]))
+
+    def prior(self, free: Array) -> tuple[float, Array, Array]:
+        """Return -2 log of prior times flight likelihood (up to constants), minus half its gradient, curvature."""
+        d = free - self.mean
+        weight = np.diag(self.spread**-2.0)
+        cost, pull = float(d @ weight @ d), -weight @ d
+        if self.in_flight is not None:
+            n, air = self.own, self.in_flight
+            curvature, slope = air.curvatures.sum(axis=0), air.gradients.sum(axis=0)
+            away = free[:n] - air.free
+            cost += float(air.chi2_at(free[:n]).sum())
+            pull[:n] += slope - curvature @ away
+            weight[:n, :n] += curvature
+        return cost, pull, weight
+
+    def judge(self, free: Array, motions: list[Array], jacobians: list[Array] | None = None) -> ContactFit:
+        """Return the fit at ``free`` from the simulations made there."""
+        problem = self.problem
+        residuals = [problem.residual(w, m) for w, m in zip(problem.windows, motions, strict=True)]
+        cost = LOST
+        if all(np.isfinite(r).all() and float(np.abs(r).max(initial=0.0)) < 10.0 for r in residuals):
+            cost = self.prior(free)[0]
+            for w, m, r in zip(problem.windows, motions, residuals, strict=True):
+                c = problem.covariance(w, m)
+                cost += float(c.inner(r, r)) + c.log_det
+        return ContactFit(
+            free=free, world=self.world(free), cost=cost, residuals=residuals, jacobians=jacobians, motions=motions
+        )
+
+    def try_all(self, points: Sequence[Array]) -> list[ContactFit]:
+        """Return the fits at several ``points``, simulated in one launch."""
+        found = self.problem.motions([self.world(p) for p in points])
+        return [self.judge(p, m) for p, m in zip(points, found, strict=True)]
+
+    def with_jacobians(self, fit: ContactFit) -> ContactFit:
+        """Return ``fit`` with finite-difference jacobians."""
+        moving = np.flatnonzero(self.moves)
+        varied = [fit.free + self.step * (np.arange(len(fit.free)) == i) for i in moving]
+        found = self.problem.motions([self.world(v) for v in varied])
+        jacobians = []
+        for k, window in enumerate(self.problem.windows):
+            jacobian = np.zeros((len(fit.residuals[k]), len(fit.free)))
+            for i, motions in zip(moving, found, strict=True):
+                column = (motions[k] - fit.motions[k])[window.seen].ravel() / self.step[i]
+                jacobian[:, i] = np.where(np.isfinite(column), column, 0.0)
+            jacobians.append(jacobian)
+        return dataclasses.replace(fit, jacobians=jacobians)
+
+    def descend(self, fit: ContactFit, rounds: int, stop: Callable[[], bool]) -> ContactFit:
+        """Return ``fit`` improved by up to ``rounds`` steps, with jacobians of its last or last but one iterate."""
+        if fit.cost >= LOST or stop():
+            return fit
+        fit = self.with_jacobians(fit)
+        for _ in range(rounds):
+            if stop():
+                break
+            gradient, curvature = self.normal_equations(fit)
+            step = np.where(self.moves, np.linalg.solve(curvature, gradient), 0.0)
+            step *= min(1.0, 1.2 / max(1e-12, float(np.abs(step / self.spread).max())))
+            ends = self.try_all([self._inside(fit.free + s * step) for s in (1.0, 0.35)])
+            best = min(ends, key=lambda e: e.cost)
+            if best.cost > fit.cost - 0.3:
+                break
+            gain, old = fit.cost - best.cost, fit
+            small = float(np.abs((best.free - old.free) / self.spread).max()) < 0.05
+            fit = dataclasses.replace(best, jacobians=old.jacobians)
+            if small or gain < 2.0:
+                break
+            fit = self.with_jacobians(fit)
+        return fit
+
+    def normal_equations(
+        self, fit: ContactFit, *, without: int | None = None, level: float = 1.0
+    ) -> tuple[Array, Array]:
+        """Return gradient and curvature of the log posterior at ``fit``; ``without``: trial left out."""
+        assert fit.jacobians is not None
+        _, gradient, curvature = self.prior(fit.free)
+        problem = self.problem
+        for k, (w, m, r, j) in enumerate(zip(problem.windows, fit.motions, fit.residuals, fit.jacobians, strict=True)):
+            if k != without:
+                c = problem.covariance(w, m, level)
+                gradient = gradient + c.inner(j, r)
+                curvature = curvature + c.inner(j, j)
+        return gradient, curvature
+
+    def log_evidence(self, fit: ContactFit) -> float:
+        """Return the log evidence of all windows, parameters and model error integrated out (Laplace).
+
+        Includes the flights where the candidate has an estimate from them, up to constants.
+        """
+        if fit.cost >= LOST:
+            return -LOST
+        problem, n = self.problem, int(self.moves.sum())
+        prior = -0.5 * self.prior(fit.free)[0] - float(np.log(self.spread[self.moves]).sum())
+        if self.candidate is not None:
+            prior -= math.log(self.candidate.choices)
+        found = []
+        for level in LEVELS:
+            value = prior + log_prior_of_level(level)
+            for w, m, r in zip(problem.windows, fit.motions, fit.residuals, strict=True):
+                c = problem.covariance(w, m, level)
+                value -= 0.5 * (float(c.inner(r, r)) + c.log_det + len(r) * math.log(2 * math.pi))
+            if fit.jacobians is not None:
+                _, curvature = self.normal_equations(fit, level=level)
+                inner = curvature[np.ix_(self.moves, self.moves)]
+                value -= 0.5 * float(np.linalg.slogdet(inner)[1])
+            else:
+                # Never refined: the prior width stands in for the posterior's.
+                value += float(np.log(self.spread[self.moves]).sum()) - 0.5 * n
+            found.append(value)
+        top = max(found)
+        return top + math.log(sum(math.exp(v - top) for v in found))
+
+    def chi2(self, fit: ContactFit) -> tuple[float, int]:
+        """Return chi² of the whitened residual under the expected model error, and the number of coordinates."""
+        if fit.cost >= LOST:
+            return LOST, 1
+        problem = self.problem
+        total = sum(
+            float(problem.covariance(w, m).inner(r, r))
+            for w, m, r in zip(problem.windows, fit.motions, fit.residuals, strict=True)
+        )
+        return total, sum(len(r) for r in fit.residuals)
+
+    def held_out(self, fit: ContactFit) -> tuple[Array, list[Array]]:
+        """Return the log score and residual (n,) of each trial with the parameters fitted to the others.
+
+        Uses the linear model about ``fit``, including the uncertainty of those parameters.
+        """
+        problem, scores, residuals = self.problem, [], []
+        for k, (w, m, r) in enumerate(zip(problem.windows, fit.motions, fit.residuals, strict=True)):
+            if fit.jacobians is None or fit.cost >= LOST:
+                scores.append(-LOST if fit.cost >= LOST else self._score(problem.covariance(w, m), r))
+                residuals.append(r)
+                continue
+            gradient, curvature = self.normal_equations(fit, without=k)
+            change = np.where(self.moves, np.linalg.solve(curvature, gradient), 0.0)
+            change *= min(1.0, 1.0 / max(1e-12, float(np.abs(change / self.spread).max())))
+            j = fit.jacobians[k]
+            moved = r - j @ change
+            c = problem.covariance(w, m)
+            hidden = c.inner(j, j)
+            # Uncertainty of the parameters, by the matrix determinant lemma and the Woodbury identity.
+            total = curvature + hidden
+            pull = c.inner(j, moved)
+            score = self._score(c, moved) + 0.5 * float(pull @ np.linalg.solve(total, pull))
+            score -= 0.5 * float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(curvature)[1])
+            scores.append(score)
+            residuals.append(moved)
+        return np.array(scores), residuals
+
+    def covariance(self, fit: ContactFit) -> Array:
+        """Return the covariance (p + 2, p + 2) of the free parameters."""
+        if fit.jacobians is None or fit.cost >= LOST:
+            return np.asarray(np.diag(self.spread**2))
+        return np.asarray(np.linalg.inv(self.normal_equations(fit)[1]))
+
+    @staticmethod
+    def _score(c: Whitened, r: Array) -> float:
+        return -0.5 * (float(c.inner(r, r)) + c.log_det + len(r) * math.log(2 * math.pi))
+
+    def _inside(self, free: Array) -> Array:
+        out = free.copy()
+        if self.candidate is not None:
+            out[: self.own] = np.clip(free[: self.own], self.candidate.low, self.candidate.high)
+        reach = np.array([FRICTION_REACH, CONTACT_REACH])
+        out[self.own :] = np.clip(free[self.own :], -reach, reach)
+        return out

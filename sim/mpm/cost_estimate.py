@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: MIT
+"""Estimate of a run's cost before it starts: substeps, seconds, bytes. No Taichi.
+
+Right within a factor of about three: the substep is that of the start, the speed that of a typical machine.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..constitutive import DeformableMaterial
+from ..errors import InputError
+from .bodies import BodyParticles
+from .solver_options import SolverOptions
+
+CPU_RATE = 2.5e6
+"""Particle substeps a second and CPU core: 5 million on two cores (``physgen.benchmarks.mpm``)."""
+
+GPU_RATES = {"cuda": 1e8, "vulkan": 3e7, "metal": 3e7}
+"""Particle substeps a second on a graphics card. Chosen, not measured: cards differ by a factor of ten."""
+
+SUBSTEP_SECONDS = 5e-4
+"""Launching the kernels of one substep, whatever their size. Chosen; scenes of a few thousand particles feel it."""
+
+START_SECONDS = 5.0
+"""Starting the runtime and loading or compiling the kernels."""
+
+PARTICLE_BYTES = 400
+"""State of a particle twice (sorting copies it), what belongs to its contacts, and its host copies."""
+
+SAMPLING_BYTES = 2500
+"""Of main memory, a particle, while a mesh is filled: 27 test points each, and their nearest particles. Measured: 2300
+to 2500 from 30 to 500 thousand particles. Given back before the engine starts, so the larger of the two counts."""
+
+BLOCK_BYTES = 64 * 64
+"""A grid block of 4 x 4 x 4 nodes with 64 bytes each."""
+
+BLOCK_PARTICLES = 128
+"""Particles in a block, averaged over bodies whose skin half fills its blocks and needs empty ones around it."""
+
+BODY_BLOCKS = 27
+"""Blocks that the smallest body touches."""
+
+BASE_BYTES = 256 * 2**20
+"""Python, numpy and the runtime."""
+
+MAX_HOURS = 48.0
+"""A run that would take longer is refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Cost of a run.
+
+    substeps: of the whole run; particle_substeps: that times the particles.
+    seconds: of computing; bytes: of memory, on the graphics card where that computes.
+    """
+
+    substeps: int
+    particle_substeps: float
+    seconds: float
+    bytes: int
+
+
+def estimate(particles: int, bodies: int, stable_step: float, duration: float, arch: str) -> Estimate:
+    """The cost of simulating ``duration`` seconds of ``particles`` in ``bodies`` with substeps of ``stable_step`` s.
+
+    arch: as in ``SolverOptions``.
+    """
+    if not (math.isfinite(stable_step) and stable_step > 0):
+        raise InputError(
+            f"the longest stable time step is {stable_step!r} s: lower the velocity, Young's modulus or viscosity"
+        )
+    substeps = math.ceil(duration / stable_step)
+    work = float(substeps) * particles
+    rate = GPU_RATES.get(arch, CPU_RATE * _cores())
+    blocks = math.ceil(particles / BLOCK_PARTICLES) + BODY_BLOCKS * bodies
+    held = particles * PARTICLE_BYTES + blocks * BLOCK_BYTES
+    return Estimate(
+        substeps=substeps,
+        particle_substeps=work,
+        seconds=START_SECONDS + substeps * SUBSTEP_SECONDS + work / rate,
+        bytes=BASE_BYTES + (held if arch in GPU_RATES else max(held, particles * SAMPLING_BYTES)),
+    )
+
+
+def stable_step(bodies: Sequence[BodyParticles], cell: float, options: SolverOptions) -> float:
+    """Longest substep in s that ``bodies`` allow at the start, on a grid of cells of ``cell`` m (docs/physics.md).
+
+    Counts the fastest wave of all materials and the fastest of the velocities that bodies start with or are given.
+    """
+    wave = speed = 0.0
+    for body in bodies:
+        for material in (body.material, *body.materials):
+            if isinstance(material, DeformableMaterial):
+                wave = max(wave, body.bounding_speed(material, 1.0 / cell))
+        keys = 0.0 if body.velocity_keys is None else float(np.linalg.norm(body.velocity_keys.values, axis=1).max())
+        speed = max(speed, keys, float(np.linalg.norm(body.initial_velocities, axis=1).max()))
+    step = min([options.max_step, *(body.spring_step for body in bodies)])
+    if wave > 0:
+        step = min(step, options.cfl_elastic / wave)
+    if speed > 0:
+        step = min(step, options.cfl_velocity * cell / speed)
+    return step
+
+
+def refuse_excess(cost: Estimate, particles: int, available: int | None) -> None:
+    """Raise InputError when ``cost`` is more than ``MAX_HOURS`` or the ``available`` bytes; None: not known."""
+    hours = cost.seconds / 3600
+    if hours > MAX_HOURS:
+        raise InputError(
+            f"this would take about {hours:.3g} hours of computing ({cost.substeps:.2g} time steps of {particles} "
+            f"particles), more than {MAX_HOURS:g}: lower the velocity or Young's modulus, raise the density, bake "
+            "fewer frames, or choose a coarser quality"
+        )
+    require_memory(cost.bytes, particles, available)
+
+
+def require_memory(needed: int, particles: int, available: int | None) -> None:
+    """Raise InputError when ``needed`` bytes are more than ``available``; None: not known, so never."""
+    if available is not None and needed > available:
+        raise InputError(
+            f"this would take about {needed / 2**30:.3g} GiB of memory for {particles} particles, and "
+            f"{available / 2**30:.3g} GiB are available: choose a coarser quality, make more objects colliders, or "
+            "close other programs"
+        )
+
+
+def available_memory() -> int | None:
+    """Bytes of main memory that a new process may take without swapping; None where that cannot be found out.
+
+    Linux: MemAvailable, and what the control group leaves. Windows: available physical memory. Elsewhere (macOS): half
+    of all physical memory, since free memory means little there.
+    """
+    try:
+        if sys.platform == "win32":
+            return _windows_memory()
+        if sys.platform.startswith("linux"):
+            return _linux_memory(Path("/proc/meminfo"), Path("/sys/fs/cgroup"))
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _linux_memory(meminfo: Path, group: Path) -> int | None:
+    found = [
+        int(line.split()[1]) * 1024 for line in meminfo.read_text().splitlines() if line.startswith("MemAvailable:")
+    ]
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            found.append(max(0, int(limit) - int((group / "memory.current").read_text())))
+    except (OSError, ValueError):
+        pass
+    return min(found) if found else None
+
+
+def _windows_memory() -> int | None:
+    class Status(ctypes.Structure):
+        _fields_ = (
+            ("length", ctypes.c_ulong),
+            ("load", ctypes.c_ulong),
+            *((name, ctypes.c_ulonglong) for name in ("total", "available", "a", "b", "c", "d", "e")),
+        )
+
+    status = Status()
+    status.length = ctypes.sizeof(status)
+    good = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
+    return int(status.available) if good else None
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Closed triangle meshes: checks, signed distance, mass, interior sampling. No Taichi."""

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, SIM102
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Stress of the particles by their constitutive models; the models themselves are in ``sim/constitutive``.
+
+Besides the models' own stress:
+
+    fibres       psi += k/2 (s - 1)^2, s = |F a|: tau += k (s - 1) / s  F a (F a)^T      Bonet and Burton 1998
+    damping      tau += t (2 mu D + lambda tr D)      Kelvin–Voigt, with one retardation time t for shear and volume
+
+D is the symmetric part of the velocity gradient. Plastic models map the trial principal stretches s back onto the yield
+surface: F <- U diag(s_new / s) U^T F, which keeps everything else, so no right singular vectors are needed.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import taichi as ti
+
+from ...constitutive import (
+    DAMPED,
+    FIBRED,
+    FLUID,
+    GRANULAR,
+    ROW,
+    STABLE_WAVENUMBER,
+    ElasticMaterial,
+    models,
+)
+from ...constitutive.tensors import LEAST_STRETCH, eigen_symmetric, hencky_stress, isotropic, mat3, vec3, vec4
+from .kernel_arrays import ParticleArrays, WorldArrays
+from .kernel_bundles import func
+
+
+class DeviceModel(NamedTuple):
+    """A model as the kernels see it: its number and its ``DeviceFunctions``."""
+
+    number: int
+    stress: Any
+    return_map: Any
+    hencky_return_map: Any
+    advance_volume: Any
+
+
+class LawSet(NamedTuple):
+    """The models that occur in worlds; known to the compiler, which makes kernels of their own for each set."""
+
+    solid: tuple[DeviceModel, ...]
+    """Models with a stress that follows from F."""
+
+    stretch_plastic: tuple[DeviceModel, ...]
+    """Models with a return map of principal stretches."""
+
+    hencky_plastic: tuple[DeviceModel, ...]
+    """Models with a return map of Hencky strains."""
+
+    volumetric: tuple[DeviceModel, ...]
+    """Models that advance a volume ratio in place of F: fluids."""
+
+    log_volume: bool
+    """Whether some model's history variable is the ln of a volume ratio that det F does not contain."""
+
+    flowing: bool
+    """Whether there are granular materials or fluids."""
+
+    damped: bool
+    """Whether some solid has a damping time."""
+
+    fibred: bool
+    """Whether some solid has fibres."""
+
+    only_elastic: bool
+    """Whether there is nothing but plain fixed-corotated elasticity, for which the kernels are simplest."""
+
+
+FLOWING = (GRANULAR, FLUID)
+FLOWING_BITS = sum(1 << model.number for model in models() if model.cohesion in FLOWING)
+FLUIDS = tuple(model.number for model in models() if model.device().advance_volume is not None)
+HENCKY = tuple(model.number for model in models() if model.device().hencky_return_map is not None)
+PLASTIC = (*HENCKY, *(model.number for model in models() if model.device().return_map is not None))
+LOG_VOLUMES = tuple(model.number for model in models() if model.memory_is_log_volume)
+"""Numbers of models by property."""
+
+ONLY_ELASTIC = 1 << ElasticMaterial.number
+"""The set of laws of worlds that hold nothing but plain fixed-corotated solids."""
+
+
+@functools.cache
+def law_set(laws: int) -> LawSet:
+    """The models of the bits ``laws``, as ``DeformableMaterial.laws`` sets them."""
+    present = [model for model in models() if laws >> model.number & 1]
+    device = [DeviceModel(model.number, *model.device()) for model in present]
+    return LawSet(
+        solid=tuple(model for model in device if model.stress is not None and model.advance_volume is None),
+        stretch_plastic=tuple(model for model in device if model.return_map is not None),
+        hencky_plastic=tuple(model for model in device if model.hencky_return_map is not None),
+        volumetric=tuple(model for model in device if model.advance_volume is not None),
+        log_volume=any(model.memory_is_log_volume for model in present),
+        flowing=any(model.cohesion in FLOWING for model in present),
+        damped=bool(laws & DAMPED),
+        fibred=bool(laws & FIBRED),
+        only_elastic=laws == ONLY_ELASTIC,
+    )
+
+
+@ti.func
+def is_one_of(law: ti.i32, numbers: ti.template()):
+    """Whether ``law`` is one of the model numbers ``numbers``, at least one."""
+    found = law == numbers[0]
+    for number in ti.static(numbers[1:]):
+        found = found or law == number
+    return found
+
+
+@ti.func
+def is_fluid(law: ti.i32):
+    """Whether model number ``law`` advances a volume ratio in place of F."""
+    return is_one_of(law, FLUIDS)
+
+
+@ti.func
+def flows(law: ti.i32):
+    """Whether model number ``law`` is granular or fluid."""
+    return (FLOWING_BITS >> law) & 1 == 1
+
+
+@func
+def law_of(p: ti.i32, worlds: WorldArrays, particles: ParticleArrays):
+    """Number of the model of particle ``p``."""
+    return ti.cast(worlds.materials[particles.material[p] * ROW], ti.i32)
+
+
+@func
+def own_numbers(row: ti.i32, worlds: WorldArrays):
+    """The model's own numbers of the material at ``row``."""
+    return vec4(
+        worlds.materials[row + 2], worlds.materials[row + 3], worlds.materials[row + 4], worlds.materials[row + 5]
+    )
+
+
+@ti.func
+def map_back(law: ti.i32, laws: ti.template(), F: mat3, memory: ti.f32, two_mu: ti.f32, lam: ti.f32, own: vec4):
+    """Return mapping of the plastic models: F, memory, Kirchhoff stress, stiffness."""
+    squares, axes = eigen_symmetric(F @ F.transpose())
+    stretch = ti.sqrt(ti.max(squares, LEAST_STRETCH**2))
+    kept = stretch
+    tau = mat3(0.0)
+    stiffness = 0.0
+    remembered = memory
+    for model in ti.static(laws.stretch_plastic):
+        if law == model.number:
+            kept, remembered, principal, stiffness = model.return_map(stretch, memory, two_mu, lam, own)
+            tau = isotropic(principal, axes)
+    if ti.static(len(laws.hencky_plastic) > 0):
+        if is_one_of(law, HENCKY):
+            strain = ti.log(stretch)
+            for model in ti.static(laws.hencky_plastic):
+                if law == model.number:
+                    strain, remembered, yields = model.hencky_return_map(strain, memory, own)
+                    if yields:
+                        kept = ti.exp(strain)
+            principal, stiffness = hencky_stress(strain, two_mu, lam)
+            tau = isotropic(principal, axes)
+    mapped = F
+    if (kept != stretch).any() or squares.min() < LEAST_STRETCH**2:
+        mapped = isotropic(kept / stretch, axes) @ F
+        if squares.min() < LEAST_STRETCH**2:
+            mapped = isotropic(kept, axes)
+    return mapped, remembered, tau, stiffness
+
+
+@func
+def deform(laws: ti.template(), p: ti.i32, dt: ti.f32, C: mat3, worlds: WorldArrays, particles: ParticleArrays):
+    """Deformation gradient of particle ``p`` after ``dt``; of fluids only the volume changes, in ``memory``."""
+    Fp = particles.F[p]
+    if ti.static(len(laws.volumetric) > 0):
+        law = law_of(p, worlds, particles)
+        if is_fluid(law):
+            for model in ti.static(laws.volumetric):
+                if law == model.number:
+                    particles.memory[p] = model.advance_volume(particles.memory[p], dt, C)
+        else:
+            Fp += dt * C @ Fp
+    else:
+        Fp += dt * C @ Fp
+    return Fp
+
+
+@func
+def respond(
+    laws: ti.template(),
+    p: ti.i32,
+    Fp: mat3,
+    C: mat3,
+    fixed: vec4,
+    worlds: WorldArrays,
+    particles: ParticleArrays,
+):
+    """Kirchhoff stress of particle ``p`` and the stiffness m c^2 that bounds the substep; F and memory are mapped back.
+
+    Both carry the particle's volume, as ``fixed`` (the particle's ``constants``) does.
+    """
+    row = particles.material[p] * ROW
+    law = ti.cast(worlds.materials[row], ti.i32)
+    tau = mat3(0.0)
+    stiffness = 0.0
+    viscosity = 0.0
+    for model in ti.static(laws.solid):
+        if law == model.number:
+            own = own_numbers(row, worlds)
+            tau, stiffness, viscosity = model.stress(Fp, C, particles.memory[p], fixed[1], fixed[2], own)
+    if ti.static(len(laws.stretch_plastic) + len(laws.hencky_plastic) > 0):
+        if is_one_of(law, PLASTIC):
+            own = own_numbers(row, worlds)
+            mapped, remembered, stress, modulus = map_back(law, laws, Fp, particles.memory[p], fixed[1], fixed[2], own)
+            tau, stiffness = stress, modulus
+            particles.F[p] = mapped
+            particles.memory[p] = remembered
+    for model in ti.static(laws.volumetric):
+        if law == model.number:
+            own = own_numbers(row, worlds)
+            tau, stiffness, viscosity = model.stress(Fp, C, particles.memory[p], fixed[1], fixed[2], own)
+    if ti.static(laws.fibred):
+        fibres = worlds.materials[row + 6] * fixed[1]
+        if fibres > 0.0:
+            along = Fp @ vec3(worlds.materials[row + 7], worlds.materials[row + 8], worlds.materials[row + 9])
+            stretch = along.norm() + 1e-12
+            tau += (fibres * (stretch - 1.0) / stretch) * along.outer_product(along)
+            stiffness += fibres * stretch * stretch
+    if ti.static(laws.damped):
+        time = worlds.materials[row + 1]
+        if time > 0.0 and not is_fluid(law):
+            tau += (0.5 * time * fixed[1]) * (C + C.transpose())
+            for i in ti.static(range(3)):
+                tau[i, i] += time * fixed[2] * C.trace()
+            viscosity = time * (fixed[1] + fixed[2])
+    if ti.static(laws.damped or len(laws.volumetric) > 0):
+        if viscosity > 0.0:
+            # See constitutive.bounding_speed.
+            half = (0.5 * STABLE_WAVENUMBER) * viscosity / fixed[0]
+            speed = half + ti.sqrt(half * half + stiffness / fixed[0])
+            stiffness = fixed[0] * speed * speed
+    return tau, stiffness

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, SIM102
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Contact between deformable bodies: each has grid nodes of its own, and coinciding nodes exchange impulses.
+
+Bardenhagen et al. 2001 stop two bodies where both have mass at a node, which keeps them up to two cells apart. Here a
+node has its distance to each body, so they touch where their surfaces do (as Nairn et al. 2020 find the gap by
+regression). The share f of a body's volume around a node, smoothed by the B-spline, tells the distance: at d outside
+of a plane face, in cells,
+
+    f(d) = (3/2 - d)^3 / 6   for 1/2 <= d <= 3/2,     1/2 - 3/4 d + d^3 / 3   for |d| <= 1/2,     f(-d) = 1 - f(d)
+
+exactly, where the face lies across an axis of the grid, and nearly elsewhere, since the spline has the same variance in
+all directions. With the normal n from the gradients of both shares, gap = d_a + d_b, and the impulses j, t at the node
+
+    j >= 0,   v_n + gap / dt >= 0,   one of the two an equality;     |t| <= mu j (Coulomb)
+
+or, for the share e of it (the pair's restitution), j from a spring on the overlap, as in ``particle_contact``.
+They are equal and opposite and act at one point: momentum and angular momentum are exact. Edges and corners fill
+less of their surroundings than faces do and count as rounded, by about a third of a cell.
+"""
+
+import taichi as ti
+
+from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
+from .kernel_arrays import GridBlocks, NodeArrays, OverlapBlocks, ParticleArrays, ParticleBlocks, WorldArrays
+from .kernel_bundles import func
+from .layout import (
+    BLOCK_NODES,
+    CONTROL_ROW,
+    FIELD_INTEGERS,
+    FIELDS,
+    FIRST_FIELD,
+    FIRST_PAIR,
+    FIXED_ONE,
+    FULL,
+    MODE,
+    PHASE,
+    RECOVERY_SPEED,
+    RESTITUTION,
+    SEPARATE,
+    SLIDING,
+    SLIP,
+    SPREAD,
+    STEP,
+    STICKING,
+    TOUCH_ROW,
+    WINDOW_NODES,
+    WORLD,
+    WORLD_INTEGERS,
+    WORLD_ROW,
+    vec3,
+    vec4,
+)
+from .particle_contact import HOLD, SPRING, coulomb, parting_speed
+from .particle_transfer import sum_chosen_windows, weights
+
+LEAST_SHARE = 0.0026
+"""Share below which a body is too far from the node (1.25 cells) for a distance."""
+
+
+@ti.func
+def distance_of_share(share: ti.f32):
+    """Distance in cells outside a plane face at which a body fills ``share`` of a node's surroundings; see above."""
+    q = ti.min(ti.max(share, 1e-6), 1.0 - 1e-6)
+    outside = ti.min(q, 1.0 - q)
+    d = 0.0
+    if outside < 1.0 / 6.0:
+        d = 1.5 - ti.pow(6.0 * outside, 1.0 / 3.0)
+    else:
+        d = (0.5 - outside) / 0.75
+        for _ in ti.static(range(3)):
+            d -= (0.5 - 0.75 * d + d * d * d / 3.0 - outside) / (d * d - 0.75)
+    return ti.select(q > 0.5, -d, d)
+
+
+@func
+def scatter_shares(
+    laws: ti.template(),
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    overlap: OverlapBlocks,
+    particles: ParticleArrays,
+    nodes: NodeArrays,
+):
+    """Scatter the particles' present volumes (cells^3) and the gradient of their spread to the blocks' windows."""
+    for ss in range(overlap.particle_count * SPREAD):
+        if ss % SPREAD == 0:
+            k = overlap.particle_blocks[ss // SPREAD]
+            w = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                for i in range(WINDOW_NODES):
+                    nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                    volume = particles.volumes[p]
+                    law = 0
+                    if ti.static(laws.log_volume):
+                        law = law_of(p, worlds, particles)
+                    if not is_fluid(law):
+                        volume *= ti.max(particles.F[p].determinant(), 0.0)
+                    if ti.static(laws.log_volume):
+                        if is_one_of(law, LOG_VOLUMES):
+                            volume *= ti.exp(particles.memory[p])
+                    gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+                    base = ti.cast(gp - 0.5, ti.i32)
+                    fx = gp - ti.cast(base, ti.f32)
+                    w3 = weights(fx)
+                    # Derivatives of the weights by the node's place.
+                    s3 = [1.5 - fx, 2.0 * (fx - 1.0), 0.5 - fx]
+                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+                        n = first + (i * 64 + j * 8 + m)
+                        nodes.scattered[n] = nodes.scattered[n] + volume * vec4(
+                            s3[i][0] * w3[j][1] * w3[m][2],
+                            w3[i][0] * s3[j][1] * w3[m][2],
+                            w3[i][0] * w3[j][1] * s3[m][2],
+                            w3[i][0] * w3[j][1] * w3[m][2],
+                        )
+
+
+@func
+def gather_shares(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
+    """Sum the windows: gradient (1/cell) and share of the field at each node of the meeting blocks, in ``sums``."""
+    for ss in range(overlap.grid_count * SPREAD):
+        if ss % SPREAD == 0:
+            s = ss // SPREAD
+            g = overlap.grid_blocks[s]
+            w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                sum_chosen_windows(g, s, grid.neighbours, overlap.chosen, nodes.scattered, nodes.sums)
+
+
+@func
+def separate(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
+    """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``."""
+    for ss in range(overlap.lead_count * SPREAD):
+        if ss % SPREAD == 0:
+            lead = overlap.leads[ss // SPREAD]
+            f = grid.field[lead]
+            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            c = w * CONTROL_ROW
+            if worlds.control[c + PHASE] == FULL:
+                dt = ti.cast(worlds.control[c + STEP], ti.f32)
+                recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
+                first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
+                count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
+                a = lead
+                while overlap.mate[a] >= 0:
+                    b = overlap.mate[a]
+                    while b >= 0:
+                        pair = (
+                            worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
+                            + (grid.field[a] - first) * count
+                            + (grid.field[b] - first)
+                        ) * TOUCH_ROW
+                        for i in range(BLOCK_NODES):
+                            na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
+                            if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
+                                sa, sb = (
+                                    nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
+                                    nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
+                                )
+                                exchange(na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
+                        b = overlap.mate[b]
+                    a = overlap.mate[a]
+
+
+@func
+def exchange(
+    na: ti.i32,
+    nb: ti.i32,
+    sa: vec4,
+    sb: vec4,
+    pair: ti.i32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    worlds: WorldArrays,
+    nodes: NodeArrays,
+):
+    """Apply the impulse between node ``na`` of one field and the coinciding node ``nb`` of another."""
+    normal = vec3(sb[0] - sa[0], sb[1] - sa[1], sb[2] - sa[2])
+    length = normal.norm()
+    if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE and length > 1e-6:
+        normal /= length
+        gap = distance_of_share(sa[3]) + distance_of_share(sb[3])
+        ua, ub = nodes.velocity[na], nodes.velocity[nb]
+        relative = vec3(ua[0] - ub[0], ua[1] - ub[1], ua[2] - ub[2])
+        closing = relative.dot(normal)
+        wanted = parting_speed(gap, dt, recovery)
+        mode = ti.cast(worlds.pairs[pair + MODE], ti.i32)
+        elastic = worlds.pairs[pair + RESTITUTION]
+        push = (1.0 - elastic) * ti.max(0.0, closing + wanted) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
+        touching = push > 0.0
+        if mode != SEPARATE and gap < HOLD:
+            push = closing
+            touching = True
+        if touching:
+            rub = relative - closing * normal
+            if mode == SLIP:
+                rub *= 0.0
+            elif mode == SEPARATE:
+                rub = coulomb(rub, push, worlds.pairs[pair + STICKING], worlds.pairs[pair + SLIDING])
+            change = push * normal + rub
+            ma, mb = nodes.mass[na], nodes.mass[nb]
+            part = mb / (ma + mb)
+            nodes.velocity[na] = vec4(
+                ua[0] - part * change[0], ua[1] - part * change[1], ua[2] - part * change[2], ua[3]
+            )
+            part = ma / (ma + mb)
+            nodes.velocity[nb] = vec4(
+                ub[0] + part * change[0], ub[1] + part * change[1], ub[2] + part * change[2], ub[3]
+            )

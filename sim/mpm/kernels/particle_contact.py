@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Coulomb contact of particles with the ground plane, rigid bodies and colliders, and pins; resolved at the particles.
+
+Zeroing the velocity of nodes below a surface stops a body up to a cell too early, because a particle feels nodes 1.5
+cells away. Here the unknowns are one contact impulse m_p a_p per particle near a surface, spread to the nodes with the
+particle's own weights (so momentum is exact), and the conditions hold at the particles, whose distance to the surface
+is known far below a cell:
+
+    phi_p = distance(x_p) - r_p              r_p: contact radius, the particle's distance to its body's surface
+    a_n >= 0,   v_n + phi_p / dt >= 0,   one of the two an equality         (no attraction, no penetration)
+    |a_t| <= mu_s a_n,   v_t = 0 inside the cone, mu_k a_n beyond it        (Coulomb; v against the surface's velocity)
+
+Where the pair's restitution e is above 0, the share e of a_n comes from a spring on the depth instead, which gives back
+the energy of the layer that the inelastic condition stops.
+
+Of the surfaces around a particle the nearest is treated so; the next one only pushes, anew in each substep. A pin is
+a surface that holds the particle from all sides.
+
+One projected Jacobi sweep a substep, started from the impulses of the last substep, which the particles have already
+added to the grid. The sweep divides by the row sums of the contact matrix W M^-1 W^T (the share of contacting mass at
+the particle), which makes it exact for even contact and stable for any, by Gershgorin's theorem.
+"""
+
+import taichi as ti
+
+from .collider_distance import PUSH, add_push, solid_distance, solid_give, solid_velocity
+from .kernel_arrays import (
+    CouplingArrays,
+    GridBlocks,
+    NearBlocks,
+    NodeArrays,
+    ParticleArrays,
+    ParticleBlocks,
+    RigidArrays,
+    ShapeArrays,
+    WorldArrays,
+)
+from .kernel_bundles import func
+from .layout import (
+    BLOCK_NODES,
+    CONTROL_ROW,
+    ELAPSED,
+    FIELD_INTEGERS,
+    FIRST_SOLID,
+    FIRST_TOUCH,
+    FIXED_ONE,
+    FULL,
+    HAS_ANCHORS,
+    HAS_PLANE,
+    MODE,
+    PHASE,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
+    RECOVERY_SPEED,
+    RESTITUTION,
+    SEPARATE,
+    SLIDING,
+    SLIP,
+    SOLID_SPEED,
+    SOLIDS,
+    SPEED,
+    SPREAD,
+    STEP,
+    STICKING,
+    TOUCH_ROW,
+    WINDOW_NODES,
+    WORLD,
+    WORLD_INTEGERS,
+    WORLD_ROW,
+    triple,
+    vec3,
+    vec4,
+)
+from .particle_transfer import PIN, anchor_place, load_window, sum_chosen_windows, weights
+
+RECOVERY = 0.2
+"""Share of a particle's penetration that one substep may correct."""
+
+LEAST_REACH = 0.02
+"""Cells from a surface within which a particle at rest takes part in the contact."""
+
+SPRING = 0.15
+"""Share of a particle's depth, in velocity times substep, that an elastic contact gives back each substep: the spring
+of a layer one cell thick where waves travel 0.39 cells a substep, hence as stable as the body itself."""
+
+MOST_SLACK = 0.5
+"""Cells of travel at most before a block's particles are tested again."""
+
+AHEAD = 3.0
+"""Reaches from a rigid body within which a particle's mass counts as touching it: known one substep ahead, so that the
+first impact on a light body is not solved as if nothing else touched it."""
+
+REACH_FACTOR = 1.5
+"""Steps of the fastest particle within which a particle takes part in the contact."""
+
+HOLD = 0.1
+"""Cells within which surfaces that must not part count as touching."""
+
+
+@ti.func
+def parting_speed(gap: ti.f32, dt: ti.f32, recovery: ti.f32):
+    """Least separating speed (cells/s) of surfaces ``gap`` cells apart: they may touch; depth is reduced gently."""
+    speed = -gap / dt
+    if gap < 0.0:
+        speed = ti.min(RECOVERY * speed, recovery)
+    return speed
+
+
+@ti.func
+def coulomb(wanted: vec3, normal_size: ti.f32, sticking: ti.f32, sliding: ti.f32):
+    """Return the tangential impulse ``wanted`` to stop sliding, limited by friction on ``normal_size``."""
+    size = wanted.norm()
+    result = wanted
+    if size > sticking * normal_size:
+        result = wanted * (sliding * normal_size / size)
+    return result
+
+
+@func
+def press(
+    old: vec3,
+    velocity: vec3,
+    phi: ti.f32,
+    normal: vec3,
+    share: ti.f32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    touch: ti.i32,
+    worlds: WorldArrays,
+):
+    """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away."""
+    v_n = velocity.dot(normal)
+    wanted = parting_speed(phi, dt, recovery)
+    old_n = old.dot(normal)
+    elastic = worlds.contacts[touch + RESTITUTION]
+    new_n = (1.0 - elastic) * (old_n + (wanted - v_n) / share) + elastic * (SPRING * ti.max(0.0, -phi) / (dt * share))
+    new_t = old - old_n * normal - (velocity - v_n * normal) / share
+    mode = ti.cast(worlds.contacts[touch + MODE], ti.i32)
+    if mode == SEPARATE or phi > HOLD:
+        new_n = ti.max(0.0, new_n)
+        new_t = coulomb(new_t, new_n, worlds.contacts[touch + STICKING], worlds.contacts[touch + SLIDING])
+    elif mode == SLIP:
+        new_t *= 0.0
+    return new_n * normal + new_t
+
+
+@func
+def solve_contact(
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    near: NearBlocks,
+    particles: ParticleArrays,
+    nodes: NodeArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass."""
+    for ss in range(near.particle_count * SPREAD):
+        if ss % SPREAD == 0:
+            s = ss // SPREAD
+            k = near.particle_blocks[s]
+            f = blocks.field[k]
+            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            c = w * CONTROL_ROW
+            near.touched[k] = 0
+            for n in range(coupling.most_bodies * PUSH):
+                coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
+            dt = ti.cast(worlds.control[c + STEP], ti.f32)
+            fastest = ti.cast(ti.max(worlds.control[c + SPEED], worlds.control[c + SOLID_SPEED]), ti.f32)
+            if worlds.control[c + PHASE] == FULL:
+                near.slack[k] -= 2.0 * REACH_FACTOR * fastest * dt
+            if worlds.control[c + PHASE] == FULL and near.slack[k] <= 0.0:
+                # Particles farther away cannot touch in this substep.
+                reach = REACH_FACTOR * fastest * dt + LEAST_REACH
+                least = MOST_SLACK
+                recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
+                has_plane = worlds.numbers[w * WORLD_ROW + HAS_PLANE] > 0.5
+                plane = triple(worlds.numbers, w * WORLD_ROW + PLANE_NORMAL)
+                first_touch = worlds.field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
+                has_anchors = worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
+                first_solid = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
+                solid_count = worlds.integers[w * WORLD_INTEGERS + SOLIDS]
+                first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
+                level = plane.dot(first_node) - worlds.numbers[w * WORLD_ROW + PLANE_OFFSET]
+                time = ti.cast(worlds.control[c + ELAPSED], ti.f32) + dt
+                for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                    gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+                    fixed = particles.constants[p]
+                    past = particles.reaction[p]
+                    old = dt * vec3(past[0], past[1], past[2])
+                    # The nearest surface and the next: distance, normal, rate of approach, obstacle.
+                    phi, second = 1e9, 1e9
+                    normal, second_normal = plane, plane
+                    swelling, second_swelling = 0.0, 0.0
+                    obstacle, second_obstacle = 0, 0
+                    if has_plane:
+                        phi = level + plane.dot(gp) - fixed[3]
+                    for o in range(solid_count):
+                        found, along, rate = solid_distance(
+                            first_solid + o, first_node + gp, MOST_SLACK + AHEAD * reach + fixed[3], bodies, shapes
+                        )
+                        found -= fixed[3]
+                        if found < AHEAD * reach:
+                            coupling.pushes[(s * coupling.most_bodies + o) * PUSH + 6] += fixed[0]
+                        if found < phi:
+                            second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
+                            phi, normal, swelling, obstacle = found, along, rate, o + 1
+                        elif found < second:
+                            second, second_normal, second_swelling, second_obstacle = found, along, rate, o + 1
+                    pinned = False
+                    if has_anchors:
+                        pinned = particles.anchors[p][3] == PIN
+                    least = ti.min(least, phi)
+                    if phi < reach or old.norm_sqr() > 0.0 or pinned:
+                        least = 0.0
+                        if near.touched[k] == 0:
+                            near.touched[k] = 1
+                            load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
+                            for i in range(WINDOW_NODES):
+                                nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                        base = ti.cast(gp - 0.5, ti.i32)
+                        fx = gp - ti.cast(base, ti.f32)
+                        w3 = weights(fx)
+                        first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                        u = vec4(0.0)
+                        for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+                            u += (w3[i][0] * w3[j][1] * w3[m][2]) * nodes.window[first + (i * 64 + j * 8 + m)]
+                        share = 1.0
+                        if old.norm_sqr() > 0.0 and past[3] > 0.0:
+                            share = ti.max(past[3], 0.02)
+                        velocity = vec3(u[0], u[1], u[2])
+                        new = vec3(0.0)
+                        beside = vec3(0.0)
+                        here = first_node + gp
+                        if pinned:
+                            place, rate = anchor_place(f, time, particles.anchors[p], worlds)
+                            back = RECOVERY * (place - rate * dt - here) / dt
+                            new = old + (rate + back - velocity) / share
+                        else:
+                            surface = swelling * normal
+                            give = 0.0
+                            if obstacle > 0:
+                                i = first_solid + obstacle - 1
+                                surface += solid_velocity(i, here, bodies)
+                                give = coupling.touching[i] * solid_give(i, here, normal, bodies)
+                            new = press(
+                                old,
+                                velocity - surface,
+                                phi,
+                                normal,
+                                share + give,
+                                dt,
+                                recovery,
+                                (first_touch + obstacle) * TOUCH_ROW,
+                                worlds,
+                            )
+                            if second < reach:
+                                surface = second_swelling * second_normal
+                                if second_obstacle > 0:
+                                    surface += solid_velocity(first_solid + second_obstacle - 1, here, bodies)
+                                left = (velocity + share * (new - old) - surface).dot(second_normal)
+                                wanted = parting_speed(second, dt, recovery)
+                                beside = (ti.max(0.0, wanted - left) / (share + give)) * second_normal
+                        particles.reaction[p] = vec4(new[0] / dt, new[1] / dt, new[2] / dt, past[3])
+                        if (new + beside).norm_sqr() > 0.0 or old.norm_sqr() > 0.0:
+                            change = fixed[0] * (new + beside - old)
+                            mass = ti.select((new + beside).norm_sqr() > 0.0, fixed[0], 0.0)
+                            q = vec4(change[0], change[1], change[2], mass)
+                            for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+                                n = first + (i * 64 + j * 8 + m)
+                                nodes.scattered[n] = nodes.scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
+                            if obstacle > 0 and not pinned:
+                                row = (s * coupling.most_bodies + obstacle - 1) * PUSH
+                                add_push(first_solid + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
+                            if second_obstacle > 0 and beside.norm_sqr() > 0.0:
+                                row = (s * coupling.most_bodies + second_obstacle - 1) * PUSH
+                                given = -fixed[0] * beside
+                                add_push(first_solid + second_obstacle - 1, row, here, given, bodies, coupling)
+                near.slack[k] = least - AHEAD * reach
+
+
+@func
+def apply_contact(worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
+    """Add the change of impulse to the nodes' velocity; leave the share of contacting mass in their fourth number."""
+    for ss in range(near.grid_count * SPREAD):
+        if ss % SPREAD == 0:
+            s = ss // SPREAD
+            g = near.grid_blocks[s]
+            w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                any_touched = 0
+                for d in range(27):
+                    if grid.neighbours[g * 27 + d] >= 0:
+                        any_touched += near.touched[grid.neighbours[g * 27 + d]]
+                if any_touched == 0:
+                    continue
+                sum_chosen_windows(g, s, grid.neighbours, near.touched, nodes.scattered, nodes.sums)
+                for i in range(BLOCK_NODES):
+                    n = g * BLOCK_NODES + i
+                    if nodes.mass[n] > 0.0:
+                        q = nodes.sums[s * BLOCK_NODES + i] / nodes.mass[n]
+                        u = nodes.velocity[n]
+                        nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])

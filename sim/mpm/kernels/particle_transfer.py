@@ -1,0 +1,437 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, SIM102
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Particle-grid transfers of a substep, and the windows between particles and grid nodes.
+
+MLS-MPM (Hu et al. 2018), APIC (Jiang et al. 2015), quadratic B-splines; lengths in cells (see ``layout``), seconds,
+kilograms. A substep is
+
+    advance_nodes      gather the windows, momentum -> velocity, forces: ``grid``
+    contact            of deformable bodies: ``deformable_contact``; with plane, bodies, colliders: ``particle_contact``
+    advance_particles  grid -> particles -> grid in one pass over the particles, without atomics
+"""
+
+import taichi as ti
+
+from .constitutive_response import deform, is_fluid, law_of, respond
+from .constitutive_response import flows as material_flows
+from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
+from .kernel_bundles import func
+from .layout import (
+    BLOCK_NODES,
+    CONTROL_ROW,
+    ELAPSED,
+    FAR,
+    FIELD_INTEGERS,
+    FIELD_ROW,
+    FIXED_HIGH,
+    FIXED_LOW,
+    FIXED_ONE,
+    FULL,
+    GOAL_DAMPING,
+    GOAL_STIFFNESS,
+    HAS_ANCHORS,
+    HAS_PLANE,
+    IDLE,
+    MOTION,
+    MOTION_RATE,
+    NEXT_STEP,
+    PHASE,
+    PLANE_ADHESION,
+    PLANE_GAP,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
+    SCALARS_PER_BLOCK,
+    SCATTER,
+    SPREAD,
+    STEP,
+    STORE,
+    SUBSTEPS,
+    SUNK_LIMIT,
+    WINDOW_NODES,
+    WORLD,
+    WORLD_ROW,
+    Integers,
+    Vectors4,
+    ivec3,
+    mat3,
+    triple,
+    vec3,
+    vec4,
+)
+
+PIN, GOAL = 1.0, 2.0
+"""Types of anchors."""
+
+KEPT = 0.9
+"""Share of the velocity and spin that the grid cannot carry which a particle of granular or fluid material keeps per
+substep (Fei et al. 2021). The transfers then damp a tenth of what they damp without; 1 would keep all noise."""
+
+LEVELLED = 0.02
+"""Share of the part of a fluid particle's ln J that the grid cannot carry which is removed per substep: pressures that
+cancel on the nodes, so that they cause no force, vanish within some 50 substeps."""
+
+
+@ti.func
+def weights(fx: vec3):
+    """Quadratic B-spline weights (list of three vectors) at distance ``fx`` from the lowest node, 0.5 <= fx < 1.5."""
+    return [0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2]
+
+
+@ti.func
+def span(side: ti.i32):
+    """Window nodes [low, high) that fall in the block before (0), of (1) or after (2) the window's own block."""
+    low = ti.select(side == 0, 0, ti.select(side == 1, 1, 5))
+    high = ti.select(side == 0, 1, ti.select(side == 1, 5, 8))
+    return low, high
+
+
+@ti.func
+def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """Copy the nodes around particle block ``k`` into its private window."""
+    for d in range(27):
+        g = neighbours[k * 27 + d]
+        il, ih = span(d // 9)
+        jl, jh = span(d // 3 % 3)
+        ml, mh = span(d % 3)
+        for i in range(il, ih):
+            for j in range(jl, jh):
+                for m in range(ml, mh):
+                    node = ((i + 3) & 3) * 16 + ((j + 3) & 3) * 4 + ((m + 3) & 3)
+                    window[k * WINDOW_NODES + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
+
+
+@ti.func
+def add_window(k: ti.i32, d: ti.i32, s: ti.i32, window: Vectors4, sums: Vectors4):
+    """Add to slot ``s`` the part of block ``k``'s window that lies in the grid block whose neighbour ``d`` it is."""
+    di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
+    il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
+    jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
+    ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
+    shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
+    for i in range(il, ih):
+        for j in range(jl, jh):
+            for m in range(ml, mh):
+                n = s * BLOCK_NODES + i * 16 + j * 4 + m
+                sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
+
+
+@ti.func
+def sum_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """The nodes of grid block ``g``: the sum of the windows of the 27 particle blocks around it."""
+    for i in range(BLOCK_NODES):
+        nodes[g * BLOCK_NODES + i] = vec4(0.0)
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        if k >= 0:
+            add_window(k, d, g, window, nodes)
+
+
+@ti.func
+def sum_chosen_windows(g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, window: Vectors4, sums: Vectors4):
+    """The same into slot ``s`` of ``sums``, of the particle blocks that have a 1 in ``chosen``."""
+    for i in range(BLOCK_NODES):
+        sums[s * BLOCK_NODES + i] = vec4(0.0)
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        wanted = False
+        if k >= 0:
+            wanted = chosen[k] == 1
+        if wanted:
+            add_window(k, d, s, window, sums)
+
+
+@ti.func
+def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
+    """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis."""
+    w = weights(fx)
+    A = vec4(0.0)
+    B0 = vec4(0.0)
+    B1 = vec4(0.0)
+    B2 = vec4(0.0)
+    for i in ti.static(range(3)):
+        Ai = vec4(0.0)
+        B1i = vec4(0.0)
+        B2i = vec4(0.0)
+        for j in ti.static(range(3)):
+            Aj = vec4(0.0)
+            B2j = vec4(0.0)
+            for m in ti.static(range(3)):
+                u = window[first + (i * 64 + j * 8 + m)] * w[m][2]
+                Aj += u
+                if ti.static(m > 0):
+                    B2j += float(m) * u
+            Ai += w[j][1] * Aj
+            B2i += w[j][1] * B2j
+            if ti.static(j > 0):
+                B1i += (float(j) * w[j][1]) * Aj
+        A += w[i][0] * Ai
+        B1 += w[i][0] * B1i
+        B2 += w[i][0] * B2i
+        if ti.static(i > 0):
+            B0 += (float(i) * w[i][0]) * Ai
+    return A, B0 - fx[0] * A, B1 - fx[1] * A, B2 - fx[2] * A
+
+
+@ti.func
+def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: Vectors4):
+    """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
+    w = weights(fx)
+    for i in ti.static(range(3)):
+        bi = b4 + float(i) * c0
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            bj = wij * (bi + float(j) * c1)
+            cj = wij * c2
+            for m in ti.static(range(3)):
+                n = first + (i * 64 + j * 8 + m)
+                window[n] = window[n] + w[m][2] * (bj + float(m) * cj)
+
+
+@func
+def anchor_place(f: ti.i32, time: ti.f32, place: vec4, worlds: WorldArrays):
+    """Where the anchor at rest at ``place`` is ``time`` s into the segment (cells), and its velocity."""
+    row = f * FIELD_ROW
+    motion, rate = vec3(0.0), vec3(0.0)
+    for n in ti.static(range(3)):
+        rate[n] = worlds.field_numbers[row + MOTION_RATE + n]
+        motion[n] = worlds.field_numbers[row + MOTION + n] + time * rate[n]
+    return vec3(place[0], place[1], place[2]) + motion, rate
+
+
+@func
+def goal_step(
+    f: ti.i32,
+    c: ti.i32,
+    p: ti.i32,
+    dt: ti.f32,
+    first_node: vec3,
+    xi: ivec3,
+    v: vec3,
+    stiffness: ti.f32,
+    worlds: WorldArrays,
+    particles: ParticleArrays,
+):
+    """Change of velocity over ``dt`` by the spring and damper between particle ``p`` and its goal."""
+    change = vec3(0.0)
+    if particles.anchors[p][3] == GOAL:
+        time = ti.cast(worlds.control[c + ELAPSED], ti.f32)
+        if worlds.control[c + PHASE] == FULL:
+            time += ti.cast(worlds.control[c + STEP], ti.f32)
+        target, velocity = anchor_place(f, time, particles.anchors[p], worlds)
+        here = first_node + ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+        change = dt * (
+            stiffness * (target - here) + worlds.field_numbers[f * FIELD_ROW + GOAL_DAMPING] * (velocity - v)
+        )
+    return change
+
+
+@ti.func
+def scatter_past(
+    first: ti.i32,
+    fx: vec3,
+    mass: ti.f32,
+    velocity: vec3,
+    C: mat3,
+    packing: ti.f32,
+    slope: vec3,
+    past_scattered: Vectors4,
+):
+    """Momentum without any force, and mass times ln J (``packing``), to the window."""
+    q = mass * (velocity - C @ fx)
+    b4 = vec4(q[0], q[1], q[2], mass * (packing - slope.dot(fx)))
+    c0 = mass * vec4(C[0, 0], C[1, 0], C[2, 0], slope[0])
+    c1 = mass * vec4(C[0, 1], C[1, 1], C[2, 1], slope[1])
+    c2 = mass * vec4(C[0, 2], C[1, 2], C[2, 2], slope[2])
+    spread(first, fx, b4, c0, c1, c2, past_scattered)
+
+
+@func
+def advance_particles(
+    laws: ti.template(),
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    near: NearBlocks,
+    particles: ParticleArrays,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+):
+    """Grid to particles over ``STEP``, then particles to grid with the stress impulse of ``NEXT_STEP``.
+
+    laws: the models that occur, a ``LawSet``; of ``only_elastic`` ones neither ``material`` nor ``memory`` is read.
+    The world's phase leaves the first half out (after a sort), its SCATTER the second (before one); STORE writes ``v``
+    and ``C``, which are otherwise recomputed before they are read.
+
+    Granular and fluid materials store ``v`` and ``C`` every substep, to keep what the grid cannot carry. They still
+    move with the grid's velocity, so contacts hold as for all materials.
+    """
+    for kk in range(blocks.count * SPREAD):
+        if kk % SPREAD == 0:
+            k = kk // SPREAD
+            f = blocks.field[k]
+            world = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            c = world * CONTROL_ROW
+            phase = worlds.control[c + PHASE]
+            gather = phase == FULL
+            scatter = phase != IDLE and worlds.control[c + SCATTER] == 1.0
+            store = worlds.control[c + STORE] == 1.0
+            dt_gather = ti.cast(worlds.control[c + STEP], ti.f32)
+            dt_scatter = ti.cast(worlds.control[c + NEXT_STEP], ti.f32)
+            flows = False
+            law = 0
+            if ti.static(laws.flowing):
+                law = law_of(blocks.starts[k], worlds, particles)
+                flows = material_flows(law)
+            if gather:
+                load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
+                if ti.static(laws.flowing):
+                    if flows:
+                        load_window(k, blocks.neighbours, flow.window, flow.velocity)
+            if scatter:
+                for i in range(WINDOW_NODES):
+                    nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                if ti.static(laws.flowing):
+                    if flows:
+                        for i in range(WINDOW_NODES):
+                            flow.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+            touching = near.slot[k] >= 0
+            on_plane = touching and worlds.numbers[world * WORLD_ROW + HAS_PLANE] > 0.5
+            normal = triple(worlds.numbers, world * WORLD_ROW + PLANE_NORMAL)
+            first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
+            level = normal.dot(first_node) - worlds.numbers[world * WORLD_ROW + PLANE_OFFSET]
+            goal = 0.0
+            if worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1:
+                goal = worlds.field_numbers[f * FIELD_ROW + GOAL_STIFFNESS]
+            adheres = worlds.field_numbers[f * FIELD_ROW + PLANE_ADHESION] > 0.0
+            gap = FAR
+            speed2 = 0.0
+            stiffness = 0.0
+            sum2 = 0.0
+            lowest = FIXED_HIGH
+            highest = FIXED_LOW
+            first_p, last_p = blocks.starts[k], blocks.starts[k + 1]
+            if phase == IDLE:
+                last_p = first_p
+            for p in range(first_p, last_p):
+                xi = particles.x[p]
+                fixed = particles.constants[p]
+                vp = vec3(0.0)
+                Cp = mat3(0.0)
+                Fp = particles.F[p]
+                slope = vec3(0.0)
+                packing = 0.0
+                if ti.static(len(laws.volumetric) > 0):
+                    packing = particles.memory[p]
+                if gather:
+                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    base = ti.cast(gp - 0.5, ti.i32)
+                    fx = gp - ti.cast(base, ti.f32)
+                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                    for r in ti.static(range(3)):
+                        vp[r] = A[r]
+                        Cp[r, 0] = 4.0 * B0[r]
+                        Cp[r, 1] = 4.0 * B1[r]
+                        Cp[r, 2] = 4.0 * B2[r]
+                    if ti.static(laws.only_elastic):
+                        Fp += dt_gather * Cp @ Fp
+                    else:
+                        Fp = deform(laws, p, dt_gather, Cp, worlds, particles)
+                    particles.F[p] = Fp
+                    step = vp * dt_gather
+                    if ti.static(laws.flowing):
+                        if flows:
+                            speed2 = ti.max(speed2, vp.dot(vp))
+                            # Part of the particle's velocity that the grid, before the forces, does not carry.
+                            past, past0, past1, past2 = interpolate(first, fx, flow.window)
+                            vp += KEPT * (particles.v[p] - vec3(past[0], past[1], past[2]))
+                            # Only the spin of C: angular momentum needs it, and no stress feels it.
+                            kept = particles.C[p]
+                            a01 = 0.5 * KEPT * ((kept[0, 1] - 4.0 * past1[0]) - (kept[1, 0] - 4.0 * past0[1]))
+                            a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
+                            a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
+                            Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
+                            particles.v[p] = vp
+                            particles.C[p] = Cp
+                            if ti.static(len(laws.volumetric) > 0):
+                                if is_fluid(law):
+                                    particles.memory[p] -= LEVELLED * (packing - past[3])
+                                    slope = 4.0 * vec3(past0[3], past1[3], past2[3])
+                                    if store:
+                                        particles.slopes[p] = slope
+                    if touching:
+                        if on_plane:
+                            phi = level + normal.dot(gp) - fixed[3]
+                            floor = ti.min(phi, -worlds.field_numbers[f * FIELD_ROW + SUNK_LIMIT])
+                            moved = phi + normal.dot(step)
+                            if moved < floor:
+                                step += (floor - moved) * normal
+                        old = particles.reaction[p]
+                        particles.reaction[p] = vec4(old[0], old[1], old[2], A[3])
+                    # Never outside the window, whatever the velocity: this is what keeps memory safe.
+                    xi = ti.min(ti.max(xi + ti.floor(step * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH)
+                    particles.x[p] = xi
+                    lowest = ti.min(lowest, xi.min())
+                    highest = ti.max(highest, xi.max())
+                    here2 = vp.dot(vp)
+                    sum2 += here2
+                    speed2 = ti.max(speed2, here2)
+                    if store:
+                        particles.v[p] = vp
+                        particles.C[p] = Cp
+                else:
+                    vp = particles.v[p]
+                    Cp = particles.C[p]
+                    if ti.static(len(laws.volumetric) > 0):
+                        slope = particles.slopes[p]
+                if adheres:
+                    here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    gap = ti.min(gap, level + normal.dot(here) - fixed[3])
+                if scatter:
+                    own_v = vp  # before any force
+                    if goal > 0.0:
+                        vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, worlds, particles)
+                    mass = fixed[0]
+                    tau = mat3(0.0)
+                    modulus = 0.0
+                    if ti.static(laws.only_elastic):
+                        tau, modulus, _ = laws.solid[0].stress(Fp, Cp, 0.0, fixed[1], fixed[2], fixed)
+                    else:
+                        tau, modulus = respond(laws, p, Fp, Cp, fixed, worlds, particles)
+                    stiffness = ti.max(stiffness, modulus / mass)
+                    Q = (-4.0 * dt_scatter) * tau + mass * Cp
+                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                    base = ti.cast(gp - 0.5, ti.i32)
+                    fx = gp - ti.cast(base, ti.f32)
+                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    if touching:
+                        # Start the contact solve from the forces of the last substep.
+                        a = particles.reaction[p]
+                        vp += dt_scatter * vec3(a[0], a[1], a[2])
+                    q = mass * vp - Q @ fx
+                    b4 = vec4(q[0], q[1], q[2], mass)
+                    c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
+                    c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
+                    c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
+                    spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                    if ti.static(laws.flowing):
+                        if flows:
+                            packing = 0.0
+                            if is_fluid(law):
+                                packing = particles.memory[p]
+                            scatter_past(first, fx, mass, own_v, Cp, packing, slope, flow.scattered)
+            if adheres and phase != IDLE:
+                # The next whole substep reads this; the number that the present one has read waits for the one after.
+                now = ti.cast(worlds.control[c + SUBSTEPS], ti.i32) & 1
+                following = ti.select(gather, 1 - now, now)
+                worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + 1 - following] = FAR
+                ti.atomic_min(worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + following], gap)
+            margin = ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest)
+            r = k * SCALARS_PER_BLOCK
+            if gather:
+                blocks.report[r] = speed2
+                blocks.report[r + 2] = ti.cast(margin, ti.f32) * (1.0 / FIXED_ONE)
+                blocks.report[r + 4] = sum2
+            if scatter:
+                blocks.report[r + 1] = stiffness

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""Taichi's process-wide runtime: started once, reused by every world, with a fall-back to the CPU."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+from typing import Any
+
+import taichi as ti
+
+from ...errors import InputError
+from ..solver_options import SolverOptions
+
+logger = logging.getLogger(__name__)
+
+_GENERATION = 0
+_ASKED: tuple[str, int, str] | None = None
+_ARCH = "cpu"
+
+
+def ensure_started(options: SolverOptions) -> tuple[str, int]:
+    """Start Taichi for ``options`` unless it already runs that way.
+
+    Returns the architecture in use ("cpu" after a fallback, which is logged) and the generation of the runtime. A
+    change of architecture, thread count or cache folder restarts Taichi, which loses the arrays of earlier worlds; a
+    world compares its generation before each use.
+    """
+    global _ASKED, _ARCH, _GENERATION
+    folder = "" if options.cache_folder is None else str(options.cache_folder)
+    wanted = (_available(options.arch), options.threads, folder)
+    asked = wanted
+    if asked == _ASKED and ti.lang.impl.get_runtime().prog is not None:
+        return _ARCH, _GENERATION
+    arguments: dict[str, object] = {
+        "arch": getattr(ti, wanted[0]),
+        "default_fp": ti.f32,
+        "fast_math": True,
+        "offline_cache": True,
+        "log_level": ti.ERROR,
+        "enable_fallback": False,
+        # Of no measurable use to these kernels, and it takes a third to half of the compile time.
+        "cfg_optimization": False,
+    }
+    if wanted[1]:
+        arguments["cpu_max_num_threads"] = wanted[1]
+    if folder:
+        arguments["offline_cache_file_path"] = folder
+    try:
+        _start(arguments)
+    except RuntimeError as error:
+        if wanted[0] == "cpu":
+            raise InputError(f"solver option cache_folder is {folder!r}: Taichi did not start ({error})") from error
+        logger.warning("Taichi could not start on %s (%s); computing on the CPU", wanted[0], error)
+        _start({**arguments, "arch": ti.cpu})
+        wanted = ("cpu", options.threads, folder)
+    _ASKED, _ARCH = asked, wanted[0]
+    _GENERATION += 1
+    return wanted[0], _GENERATION
+
+
+def _start(arguments: dict[str, object]) -> None:
+    """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
+    _leave_source_lines_out()
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        ti.init(**arguments)
+    logger.debug("%s", said.getvalue().strip())
+
+
+def _leave_source_lines_out() -> None:
+    """Let Taichi say in which line a node of a kernel stands, without drawing that line.
+
+    It draws it for each of 40 000 nodes at every start, for messages that are hardly ever needed: a quarter of the time
+    that kernels from its cache take to get ready. The text is in its messages alone, neither in what is compiled nor in
+    the keys of its cache. Nothing of this is a promise of Taichi's: where a version has no such function, or its
+    arguments look different, all stays as that version has it.
+    """
+    try:
+        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    except ImportError:
+        return
+    drawn = getattr(ASTTransformerContext, "get_pos_info", None)
+    if drawn is None or getattr(drawn, "leaves_lines_out", False):
+        return
+
+    def named(context: Any, node: Any) -> str:
+        try:
+            line, kernel = node.lineno + context.lineno_offset, context.func.func.__name__
+            return f'File "{context.file}", line {line}, in {kernel}:\n'
+        except (AttributeError, TypeError):
+            return str(drawn(context, node))
+
+    named.leaves_lines_out = True  # type: ignore[attr-defined]
+    ASTTransformerContext.get_pos_info = named
+
+
+def generation() -> int:
+    """Number of times that Taichi was started in this process."""
+    return _GENERATION
+
+
+def _available(arch: str) -> str:
+    """``arch``, or "cpu" with a logged reason where this build or machine has none."""
+    if arch == "cpu":
+        return arch
+    if arch == "metal":
+        logger.warning(
+            "solver option arch 'metal': has no double precision, which the clock needs; computing on the CPU"
+        )
+        return "cpu"
+    if not ti.lang.misc.is_arch_supported(getattr(ti, arch)):
+        logger.warning("solver option arch %r: not available here; computing on the CPU", arch)
+        return "cpu"
+    return arch

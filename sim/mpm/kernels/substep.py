@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, ANN202
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""One substep of all worlds, as the kernels that ``engine`` launches in sequence:
+
+    advance_grid      nodes over STEP: velocities, forces
+    part_bodies       contact between deformable bodies that are near each other
+    resolve_contact   contact with plane, rigid bodies, colliders and pins; impulses on rigid bodies
+    (rigid)           motion of rigid bodies: ``rigid_motion.search_worlds``, ``rigid_motion.move_worlds``
+    advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
+
+Every world is in the phase that ``control`` says and takes its own step. The compiler takes more than twice as long for
+a kernel of twice the length, so there are several.
+"""
+
+import functools
+
+import taichi as ti
+
+from ..rigid.rigid_motion import move_worlds, predict, search_worlds
+from .collider_distance import gather_pushes
+from .constitutive_response import law_set
+from .deformable_contact import gather_shares, scatter_shares, separate
+from .grid import advance_nodes, gather_means
+from .kernel_arrays import (
+    CouplingArrays,
+    FlowArrays,
+    GridBlocks,
+    NearBlocks,
+    NodeArrays,
+    OverlapBlocks,
+    ParticleArrays,
+    ParticleBlocks,
+    RigidArrays,
+    ShapeArrays,
+    StepLimits,
+    WorldArrays,
+)
+from .kernel_bundles import BundledKernel, Launcher, kernel
+from .layout import CONTROL_ROW, FULL, PHASE, STEP, Integers
+from .particle_contact import apply_contact, solve_contact
+from .particle_transfer import advance_particles
+from .time_stepping import review
+
+
+@functools.cache
+def advance_grid_of(flowing: bool) -> BundledKernel:
+    """Kernel of grid nodes; ``flowing``: some materials are granular or fluid."""
+
+    @kernel
+    def advance_grid(worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays):
+        """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
+        advance_nodes(flowing, worlds, grid, nodes, flow)
+        gather_means(worlds, grid, nodes)
+
+    return advance_grid
+
+
+@functools.cache
+def part_bodies_of(laws: int) -> BundledKernel:
+    """Kernel of contact between deformable bodies for the set ``laws`` of constitutive models."""
+    models = law_set(laws)
+
+    @kernel
+    def part_bodies(
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        overlap: OverlapBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+    ):
+        """Impulses between coinciding nodes of different bodies."""
+        scatter_shares(models, worlds, blocks, overlap, particles, nodes)
+        gather_shares(worlds, grid, overlap, nodes)
+        separate(worlds, grid, overlap, nodes)
+
+    return part_bodies
+
+
+@kernel
+def plan_solids(worlds: WorldArrays, bodies: RigidArrays):
+    """Write the worlds' steps for the rigid kernels, 0 for idle worlds, and predict each solid's velocity."""
+    ti.loop_config(serialize=True)
+    for w in range(worlds.count):
+        bodies.steps[w] = 0.0
+        if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+            bodies.steps[w] = worlds.control[w * CONTROL_ROW + STEP]
+            predict(w, bodies.steps[w], bodies)
+
+
+@kernel
+def resolve_contact(
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    grid: GridBlocks,
+    near: NearBlocks,
+    particles: ParticleArrays,
+    nodes: NodeArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """Contact impulses between particles and plane, rigid bodies, colliders and pins."""
+    solve_contact(worlds, blocks, near, particles, nodes, bodies, shapes, coupling)
+    apply_contact(worlds, grid, near, nodes)
+    if coupling.body_count > 0:
+        gather_pushes(worlds, blocks, near, bodies, coupling)
+
+
+@functools.cache
+def advance_matter_of(laws: int) -> BundledKernel:
+    """Kernel of particles for the set ``laws`` of constitutive models; one is compiled for each set."""
+    models = law_set(laws)
+
+    @kernel
+    def advance_matter(
+        running: Integers,
+        limits: StepLimits,
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        near: NearBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        flow: FlowArrays,
+        bodies: RigidArrays,
+    ):
+        """Particles over STEP, then onto the grid; plans the next substep. running[0]: worlds that continue."""
+        advance_particles(models, worlds, blocks, near, particles, nodes, flow)
+        running[0] = review(limits, worlds, blocks, bodies)
+
+    return advance_matter
+
+
+REPEATS = 4
+"""Substeps in a launch; worlds that need fewer stay idle for the rest."""
+
+
+@functools.lru_cache(maxsize=32)
+def substep_launcher(generation: int, laws: int, overlap: bool, bodies: bool, near: bool) -> Launcher:
+    """Launcher of a substep for worlds of these ``laws``, with the kernels that they need.
+
+    generation: of the compute runtime; a launcher ends with it. overlap: several fields overlap; bodies: there are
+    rigid bodies or colliders; near: some particles are near the plane, a body or a collider, or are held.
+    """
+    kernels = [advance_grid_of(law_set(laws).flowing)]
+    if overlap:
+        kernels.append(part_bodies_of(laws))
+    if bodies:
+        kernels.append(plan_solids)
+    if near:
+        kernels.append(resolve_contact)
+    if bodies:
+        kernels += [search_worlds, move_worlds]
+    kernels.append(advance_matter_of(laws))
+    return Launcher(kernels, repeats=REPEATS)

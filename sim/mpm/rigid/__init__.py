@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Rigid bodies and colliders: shapes, contact, solver, motion."""

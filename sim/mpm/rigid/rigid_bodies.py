@@ -1,0 +1,491 @@
+# SPDX-License-Identifier: MIT
+"""Rigid bodies and colliders of worlds on the device; metres outside, cells in the arrays (``rigid_layout``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ...errors import InputError
+from ..bodies import BodyParticles, Vector
+from ..colliders import SAME_TIME, Collider, Surface
+from ..geometry.mass_properties import mass_properties
+from ..geometry.signed_distance import DistanceLattice
+from ..kernels.kernel_arrays import RigidArrays, RigidContacts, ShapeArrays
+from ..surface_contact import GROUND_NAME, MODES
+from ..world_setup import WorldSetup
+from . import rigid_layout as at
+from .collision_shapes import NO_POINTS, PointSet, lattice_of, points_of, reach_of, tables
+from .rigid_motion import move_worlds, search_worlds
+
+Array = NDArray[np.float64]
+
+RECOVERY_HEIGHT = 0.02
+"""Cells that a body which starts in another could fly up if the position correction were kept as velocity."""
+
+LEAST_RECOVERY = 1.0
+"""Speed of that correction without gravity, cells/s."""
+
+CHANGING = ("solids", "solid_kinds", "solid_numbers", "world_numbers", "memory")
+"""The arrays that a checkpoint holds."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigidPose:
+    """Pose and motion of a rigid body or collider. World metres; a point at rest p is now at rotation p + translation.
+
+    momentum: kg m/s; angular_momentum: about the centre of mass, kg m²/s; kinetic and potential energy: J. All three
+    are 0 of colliders, which have no mass.
+    """
+
+    rotation: Array
+    translation: Array
+    center: Array
+    velocity: Array
+    spin: Array
+    momentum: Array
+    angular_momentum: Array
+    kinetic: float
+    potential: float
+
+
+@dataclass(kw_only=True, eq=False)
+class _Solid:
+    """One solid of one world on the host."""
+
+    world: int
+    name: str
+    source: BodyParticles | Collider
+    center: Array
+    lattices: list[DistanceLattice]
+    points: PointSet
+    shape: int = 0
+
+
+class RigidBodies:
+    """The rigid bodies (in the order of the setup), then the colliders of each world, and their contact pairs.
+
+    scales: cells per metre of each world; origins: the world point of each that is cell (0, 0, 0).
+    Call ``set_segment`` before the first substep and wherever a track bends, gravity changes or a body starts.
+    """
+
+    def __init__(self, setups: Sequence[WorldSetup], scales: Sequence[float], origins: Sequence[Vector]) -> None:
+        if not setups or not len(setups) == len(scales) == len(origins):
+            raise InputError(
+                f"setups, scales and origins are {len(setups)}, {len(scales)}, {len(origins)}: give one of each a world"
+            )
+        for scale in scales:
+            if not (math.isfinite(scale) and scale > 0):
+                raise InputError(f"scale is {scale!r}: give cells per metre above 0")
+        self.setups = tuple(setups)
+        self.scales = tuple(float(scale) for scale in scales)
+        self.origins = np.asarray(origins, dtype=np.float64)
+        self._solids: list[_Solid] = []
+        self._baked: dict[tuple[int, float], DistanceLattice] = {}
+        self._segments: dict[int, tuple[float, float]] = {}
+        self._keys_done = np.full(len(setups), -np.inf)
+        self.arrays: dict[str, ti.Ndarray] = {}
+        spans = []
+        for w, setup in enumerate(self.setups):
+            first = len(self._solids)
+            self._solids += [self._new_body(w, body) for body in setup.bodies if body.rigid]
+            self._solids += [self._new_collider(w, collider) for collider in setup.colliders]
+            spans.append((first, len(self._solids)))
+        self._pack(spans)
+        self.set_segments(dict.fromkeys(range(len(self.setups)), (0.0, 1.0)))
+
+    # ---- packing ------------------------------------------------------------------------------------------------
+
+    def _new_body(self, w: int, body: BodyParticles) -> _Solid:
+        assert body.surface is not None
+        center = np.asarray(mass_properties(body.positions, body.masses, volumes=body.volumes).center)
+        return _Solid(
+            world=w,
+            name=body.name,
+            source=body,
+            center=center,
+            lattices=[lattice_of(body.surface)],
+            points=points_of(body.surface, center),
+        )
+
+    def _new_collider(self, w: int, collider: Collider) -> _Solid:
+        center = collider.middle
+        if collider.vertices is not None:
+            return _Solid(world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS)
+        return _Solid(
+            world=w,
+            name=collider.name,
+            source=collider,
+            center=center,
+            lattices=[collider.lattice or lattice_of(collider.surface)],
+            points=points_of(collider.surface, center),
+        )
+
+    def _pack(self, spans: list[tuple[int, int]]) -> None:
+        worlds, count = len(self.setups), len(self._solids)
+        kinds = np.zeros((max(count, 1), at.KINDS), dtype=np.int32)
+        numbers = np.zeros((max(count, 1), at.NUMBERS))
+        state = np.zeros((max(count, 1), at.SOLID))
+        rows, balls, starts = [], [], [np.zeros(1, dtype=np.int64)]
+        shape = cluster = point = 0
+        for i, solid in enumerate(self._solids):
+            scale = self.scales[solid.world]
+            points = solid.points
+            layers = 2 if not solid.lattices else 1
+            solid.shape = shape
+            kinds[i, at.SHAPE], kinds[i, at.LAYERS] = shape, layers
+            kinds[i, at.CLUSTERS : at.CLUSTERS_END + 1] = cluster, cluster + points.hull, cluster + len(points.balls)
+            shape += layers
+            cluster += len(points.balls)
+            lengths = np.ones(at.POINT)
+            lengths[[0, 1, 2, 9, 10]] = scale
+            rows.append(points.rows * lengths)
+            balls.append(points.balls * scale)
+            starts.append(points.starts[1:] + point)
+            point += len(points.rows)
+            numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
+                np.array([points.radius, points.spacing, points.bulge]) * scale
+            )
+            if isinstance(solid.source, Collider) and solid.source.lattice is not None:
+                numbers[i, at.RADIUS] = max(points.radius, reach_of(solid.source.lattice, solid.center)) * scale
+            if isinstance(solid.source, Collider) and solid.source.vertices is not None:
+                farthest = np.linalg.norm(solid.source.vertices.values - solid.center, axis=2).max()
+                numbers[i, at.RADIUS] = float(farthest) * scale
+            state[i, at.X : at.X + 3] = (solid.center - self.origins[solid.world]) * scale
+            state[i, at.Q] = 1.0
+            state[i, at.R : at.R + 9] = np.eye(3).ravel()
+            if isinstance(solid.source, BodyParticles):
+                self._pack_body(solid.source, scale, self.origins[solid.world], numbers[i], state[i])
+                kinds[i, at.KIND] = at.DYNAMIC
+            else:
+                moves = solid.source.translations is not None or solid.source.rotations is not None
+                moves = moves or solid.source.vertices is not None
+                kinds[i, at.KIND] = at.KINEMATIC if moves else at.STATIC
+        pairs, pair_numbers, pair_spans = self._pairs(spans)
+        world_spans = np.array([[*a, *b] for a, b in zip(spans, pair_spans, strict=True)], dtype=np.int32)
+        self._put("steps", np.zeros(worlds), ti.f64)
+        self._put("world_spans", world_spans, ti.i32)
+        self._put("world_numbers", self._world_numbers(), ti.f64)
+        self._put("world_report", np.zeros((worlds, at.REPORT)), ti.f64)
+        self._put("solid_kinds", kinds, ti.i32)
+        self._put("solid_numbers", numbers, ti.f64)
+        self._put("solids", state, ti.f64)
+        self._put("impulses", np.zeros((max(count, 1), 6)), ti.f64)
+        self._put("clusters", np.concatenate([*balls, np.zeros((1, 4))]), ti.f32)
+        self._put("cluster_starts", np.concatenate(starts), ti.i32)
+        self._put("points", np.concatenate([*rows, np.zeros((1, at.POINT))]), ti.f32)
+        self._put("pairs", pairs, ti.i32)
+        self._put("pair_numbers", pair_numbers, ti.f64)
+        self._put("counts", np.zeros(len(pairs)), ti.i32)
+        self._put("contacts", np.zeros(len(pairs) * at.SLOTS * at.ROW), ti.f64)
+        self._put("memory", np.zeros(len(pairs) * at.SLOTS * at.MEMORY), ti.f64)
+        self._put("reaches", np.zeros(len(pairs)), ti.f64)
+        self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
+        self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
+        self._put_shapes({i: [solid.lattices[0]] for i, solid in enumerate(self._solids) if solid.lattices})
+
+    def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
+        properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
+        inertia = np.asarray(properties.inertia) * scale**2
+        numbers[at.INVERSE_MASS], numbers[at.MASS] = 1 / properties.mass, properties.mass
+        numbers[at.INERTIA : at.INERTIA + 9] = inertia.ravel()
+        numbers[at.INVERSE_INERTIA : at.INVERSE_INERTIA + 9] = np.linalg.inv(inertia).ravel()
+        numbers[at.GRAVITY_FACTOR : at.TETHER_STRING + 1] = body.forces.in_cells(scale, origin)
+        state[at.V : at.V + 3] = np.asarray(body.velocity) * scale
+        state[at.W : at.W + 3] = body.spin
+        state[at.L : at.L + 3] = inertia @ np.asarray(body.spin)
+        state[at.J : at.J + 9] = np.linalg.inv(inertia).ravel()
+
+    def _pairs(self, spans: list[tuple[int, int]]) -> tuple[NDArray[np.int32], Array, list[tuple[int, int]]]:
+        """Every solid that can move freely against the plane and against all others, either way round."""
+        rows: list[tuple[int, int, int, int]] = []
+        laws: list[Array] = []
+        pair_spans = []
+        for w, (first, end) in enumerate(spans):
+            begin = len(rows)
+            bodies = [i for i in range(first, end) if isinstance(self._solids[i].source, BodyParticles)]
+            if self.setups[w].ground is not None:
+                for i in bodies:
+                    rows.append((i, -1, -1, len(laws)))
+                    laws.append(self._law(w, self._solids[i].name, GROUND_NAME))
+            for i in bodies:
+                for j in range(i + 1, end):
+                    p = len(rows)
+                    both = len(self._solids[j].points.rows) > 0
+                    rows.append((i, j, p + 1 if both else -1, len(laws)))
+                    if both:
+                        rows.append((j, i, p, len(laws)))
+                    laws.append(self._law(w, self._solids[i].name, self._solids[j].name))
+            pair_spans.append((begin, len(rows)))
+        rows = rows or [(0, -1, -1, 0)]
+        return np.asarray(rows, dtype=np.int32), np.asarray(laws or [np.zeros(at.CONTACT)]), pair_spans
+
+    def _law(self, w: int, a: str, b: str) -> Array:
+        contact, scale = self.setups[w].contact(a, b), self.scales[w]
+        law = np.zeros(at.CONTACT)
+        law[at.KINETIC], law[at.STATIC_FRICTION] = contact.friction, contact.sticking
+        law[at.RESTITUTION], law[at.MODE] = contact.restitution, MODES.index(contact.mode)
+        law[at.LEVER] = contact.rolling_resistance * scale
+        law[at.ADHESION], law[at.ADHESION_REACH] = contact.adhesion * scale, contact.adhesion_reach * scale
+        return law
+
+    def _world_numbers(self) -> Array:
+        numbers = np.zeros((len(self.setups), at.WORLD))
+        for w, setup in enumerate(self.setups):
+            axes, offset = np.eye(3), 0.0
+            if setup.ground is not None:
+                normal = setup.ground.unit_normal
+                first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+                first /= np.linalg.norm(first)
+                axes = np.stack([first, np.cross(normal, first), normal])
+                offset = -float(setup.ground.heights(self.origins[w])) * self.scales[w]
+            numbers[w, at.PLANE : at.PLANE + 9] = axes.ravel()
+            numbers[w, at.OFFSET] = offset
+        return numbers
+
+    def _put(self, name: str, values: NDArray[np.generic], kind: object) -> None:
+        flat = np.ascontiguousarray(values).ravel().astype(ti.lang.util.to_numpy_type(kind))
+        if name not in self.arrays or self.arrays[name].shape != flat.shape:
+            self.arrays[name] = ti.ndarray(kind, flat.shape)
+        self.arrays[name].from_numpy(flat)
+
+    def _put_shapes(self, changed: Mapping[int, list[DistanceLattice]]) -> None:
+        for i, lattices in changed.items():
+            self._solids[i].lattices = lattices
+        parts = []
+        for solid in self._solids:
+            lattices = solid.lattices or [lattice_of(solid.source.surface)] * 2  # type: ignore[arg-type, union-attr]
+            solid.lattices = lattices
+            parts += [(lattice, solid.center, self.scales[solid.world]) for lattice in lattices]
+        table = tables(parts)
+        self._put("shape_numbers", np.append(table.numbers, np.float32(1)), ti.f32)
+        self._put("shape_dims", np.append(table.dims, np.int32(2)), ti.i32)
+        self._put("distances", table.distances, ti.f32)
+
+    # ---- finding ------------------------------------------------------------------------------------------------
+
+    def index(self, w: int, name: str) -> int:
+        """Row in the arrays of the solid ``name`` of world ``w``."""
+        for i, solid in enumerate(self._solids):
+            if solid.world == w and solid.name == name:
+                return i
+        raise InputError(f"world {w} has no rigid body or collider {name!r}")
+
+    def name(self, i: int) -> str:
+        """Name of the solid in row ``i`` of the arrays."""
+        return self._solids[i].name
+
+    @property
+    def count(self) -> int:
+        """Solids of all worlds."""
+        return len(self._solids)
+
+    @property
+    def bodies(self) -> RigidArrays:
+        """State of all bodies as the kernels take it."""
+        names = ("steps", "world_spans", "world_numbers", "world_report", "solid_kinds", "solid_numbers", "solids")
+        return RigidArrays(len(self.setups), *(self.arrays[name] for name in (*names, "impulses")))
+
+    @property
+    def shapes(self) -> ShapeArrays:
+        """Surfaces of all bodies as the kernels take them."""
+        names = ("clusters", "cluster_starts", "points", "shape_numbers", "shape_dims", "distances")
+        return ShapeArrays(*(self.arrays[name] for name in names))
+
+    @property
+    def contacts(self) -> RigidContacts:
+        """Pairs and their contacts as the kernels take them."""
+        names = ("pairs", "pair_numbers", "counts", "contacts", "memory", "reaches", "scores", "chosen")
+        return RigidContacts(*(self.arrays[name] for name in names))
+
+    # ---- time ---------------------------------------------------------------------------------------------------
+
+    def set_segment(self, w: int, start: float, end: float) -> None:
+        """``set_segments`` of world ``w`` alone."""
+        self.set_segments({w: (start, end)})
+
+    def set_segments(self, segments: Mapping[int, tuple[float, float]]) -> None:
+        """Prepare the worlds named, each for its time from start to end in s over which all tracks are linear: gravity,
+        poses and speeds of colliders, uniform accelerations, bodies that start and velocities set at the start."""
+        world = self._get("world_numbers", at.WORLD)
+        for w, (start, end) in segments.items():
+            if not (math.isfinite(start) and math.isfinite(end) and end > start):
+                raise InputError(f"segment is {start!r} to {end!r}: give finite seconds in rising order")
+            if not 0 <= w < len(self.setups):
+                raise InputError(f"world is {w}: give 0 to {len(self.setups) - 1}")
+            gravity = np.asarray(self.setups[w].gravity_at(0.5 * (start + end))) * self.scales[w]
+            world[w, at.GRAVITY : at.GRAVITY + 3] = gravity
+            flight = math.sqrt(2 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
+            world[w, at.RECOVERY] = max(flight, LEAST_RECOVERY)
+        kinds, numbers = self._get("solid_kinds", at.KINDS), self._get("solid_numbers", at.NUMBERS)
+        state = self._get("solids", at.SOLID)
+        changed: dict[int, list[DistanceLattice]] = {}
+        for i, solid in enumerate(self._solids):
+            if solid.world not in segments:
+                continue
+            start, end = segments[solid.world]
+            if isinstance(solid.source, BodyParticles):
+                self._set_body(solid, start, end, kinds[i], numbers[i], state[i])
+            elif solid.source.vertices is not None:
+                changed |= self._set_deforming(i, start, end, state[i], numbers[i])
+            elif kinds[i, at.KIND] == at.KINEMATIC:
+                self._set_pose(solid, start, end, state[i])
+        for w, (start, end) in segments.items():
+            self._keys_done[w] = start + SAME_TIME
+            self._segments[w] = (start, end)
+        self._put("world_numbers", world, ti.f64)
+        self._put("solid_kinds", kinds, ti.i32)
+        self._put("solid_numbers", numbers, ti.f64)
+        self._put("solids", state, ti.f64)
+        if changed:
+            self._put_shapes(changed)
+
+    def _set_body(
+        self, solid: _Solid, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
+    ) -> None:
+        body, scale = solid.source, self.scales[solid.world]
+        assert isinstance(body, BodyParticles)
+        starts = body.start_time <= start + SAME_TIME
+        kinds[at.KIND] = at.DYNAMIC if starts else at.WAITING
+        if body.acceleration is not None:
+            numbers[at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
+        if body.velocity_keys is not None and starts:
+            done = self._keys_done[solid.world]
+            due = [k for k, t in enumerate(body.velocity_keys.times) if done < t <= start + SAME_TIME]
+            if due:
+                state[at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
+
+    def _set_pose(self, solid: _Solid, start: float, end: float, state: Array) -> None:
+        collider = solid.source
+        assert isinstance(collider, Collider)
+        scale, origin = self.scales[solid.world], self.origins[solid.world]
+        here, there = np.zeros(3), np.zeros(3)
+        if collider.translations is not None:
+            here, there = collider.translations.at(start), collider.translations.at(end)
+        turn, spin = Rotation.identity(), np.zeros(3)
+        if collider.rotations is not None:
+            turn, spin = _turn(collider.rotations.times, collider.rotations.values, start, end)
+        x, y, z, s = turn.as_quat()
+        state[at.X : at.X + 3] = (solid.center + here - origin) * scale
+        state[at.Q : at.Q + 4] = s, x, y, z
+        state[at.V : at.V + 3] = (there - here) * scale / (end - start)
+        state[at.W : at.W + 3] = spin
+        state[at.R : at.R + 9] = turn.as_matrix().ravel()
+
+    def _set_deforming(
+        self, i: int, start: float, end: float, state: Array, numbers: Array
+    ) -> dict[int, list[DistanceLattice]]:
+        """Lattices of the keyframes around the segment; returns those that are new."""
+        collider = self._solids[i].source
+        assert isinstance(collider, Collider)
+        assert collider.vertices is not None
+        track = collider.vertices
+        middle = 0.5 * (start + end)
+        k = int(np.clip(np.searchsorted(track.times, middle, side="right") - 1, 0, len(track.times) - 1))
+        n = min(k + 1, len(track.times) - 1)
+        if middle < track.times[0]:
+            n = k
+        state[at.BLEND], numbers[at.BLEND_RATE] = 0.0, 0.0
+        if n > k:
+            span = track.times[n] - track.times[k]
+            state[at.BLEND] = np.clip((start - track.times[k]) / span, 0, 1)
+            numbers[at.BLEND_RATE] = 1 / span
+        lattices = []
+        for key, other in ((k, n), (n, k)):
+            if (i, float(key)) not in self._baked:
+                way = float(np.abs(track.values[key] - track.values[other]).max())
+                surface = Surface(vertices=track.values[key], faces=collider.surface.faces)
+                self._baked[(i, float(key))] = lattice_of(surface, margin=way)
+            lattices.append(self._baked[(i, float(key))])
+        self._baked = {key: value for key, value in self._baked.items() if key[0] != i or key[1] in (k, n)}
+        old = self._solids[i].lattices
+        return {} if len(old) == 2 and all(a is b for a, b in zip(old, lattices, strict=True)) else {i: lattices}
+
+    def advance(self, dt: float | Sequence[float], substeps: int = 1) -> None:
+        """``substeps`` substeps of ``dt`` seconds (one number, or one a world) of worlds without particles."""
+        steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(self.setups),))
+        if not (np.isfinite(steps).all() and (steps > 0).all()):
+            raise InputError(f"dt is {dt!r}: give seconds above 0")
+        self._put("steps", steps, ti.f64)
+        for _ in range(substeps):
+            search_worlds(self.bodies, self.shapes, self.contacts)
+            move_worlds(self.bodies, self.contacts)
+
+    # ---- state --------------------------------------------------------------------------------------------------
+
+    def _get(self, name: str, stride: int) -> NDArray[np.generic]:
+        return self.arrays[name].to_numpy().reshape(-1, stride)
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything needed to continue, as arrays for ``numpy.savez``."""
+        state = {name: self.arrays[name].to_numpy() for name in CHANGING}
+        state["keys_done"] = self._keys_done.copy()
+        state["segments"] = np.array([self._segments[w] for w in range(len(self.setups))])
+        return state
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Restore what ``state`` returned for bodies of the same setups, scales and origins."""
+        for name in (*CHANGING, "keys_done", "segments"):
+            if name not in state:
+                raise InputError(f"checkpoint has no {name}: it was not written by this engine")
+            if name in CHANGING and state[name].shape != self.arrays[name].shape:
+                raise InputError(f"checkpoint is of another scene: {name} has shape {state[name].shape}")
+        times = np.asarray(state["segments"], dtype=np.float64)
+        self.set_segments({w: (float(start), float(end)) for w, (start, end) in enumerate(times)})
+        self.put_back(state)
+        self._keys_done = np.array(state["keys_done"], dtype=np.float64)
+
+    def put_back(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Restore what ``state`` returned in the same segments of time."""
+        for name in CHANGING:
+            self.arrays[name].from_numpy(np.ascontiguousarray(state[name]))
+
+    def pose(self, w: int, name: str) -> RigidPose:
+        """Pose and motion of the rigid body or collider ``name`` of world ``w``."""
+        i = self.index(w, name)
+        solid, scale = self._solids[i], self.scales[w]
+        row = np.asarray(self._get("solids", at.SOLID)[i], dtype=np.float64)
+        numbers = self._get("solid_numbers", at.NUMBERS)[i]
+        rotation = row[at.R : at.R + 9].reshape(3, 3)
+        center = row[at.X : at.X + 3] / scale + self.origins[w]
+        velocity, spin = row[at.V : at.V + 3] / scale, row[at.W : at.W + 3].copy()
+        mass = float(numbers[at.MASS])
+        momentum = row[at.L : at.L + 3] / scale**2
+        world = np.asarray(self._get("world_numbers", at.WORLD)[w], dtype=np.float64)
+        gravity = world[at.GRAVITY : at.GRAVITY + 3] / scale
+        return RigidPose(
+            rotation=rotation,
+            translation=center - rotation @ solid.center,
+            center=center,
+            velocity=velocity,
+            spin=spin,
+            momentum=mass * velocity,
+            angular_momentum=momentum,
+            kinetic=0.5 * mass * float(velocity @ velocity) + 0.5 * float(spin @ momentum),
+            potential=-mass * float(numbers[at.GRAVITY_FACTOR]) * float(gravity @ center),
+        )
+
+
+def _turn(times: Array, values: Array, start: float, end: float) -> tuple[Rotation, Array]:
+    """Orientation at ``start`` and angular velocity (3,) up to ``end`` of keyframes of rotation vectors."""
+
+    def between(t: float) -> tuple[Rotation, Array]:
+        if t <= times[0] or len(times) == 1:
+            return Rotation.from_rotvec(values[0]), np.zeros(3)
+        if t >= times[-1]:
+            return Rotation.from_rotvec(values[-1]), np.zeros(3)
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        a, b = values[k], values[k + 1]
+        way = b - a
+        if np.linalg.norm(np.cross(a, b)) > 1e-9 * max(1.0, float(np.linalg.norm(a) * np.linalg.norm(b))):
+            way = (Rotation.from_rotvec(b) * Rotation.from_rotvec(a).inv()).as_rotvec()
+        share = (t - times[k]) / (times[k + 1] - times[k])
+        return Rotation.from_rotvec(share * way) * Rotation.from_rotvec(a), way / (times[k + 1] - times[k])
+
+    return between(start)[0], between(0.5 * (start + end))[1]

@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: MIT
+"""Worlds that advance in the same launches: those with the same constitutive models, hence the same kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import Cancelled, InputError, SimulationError
+from ..events import IsCancelled, never
+from ..scene.units import ENGINE_BOX_SIZE, Similarity
+from . import packing
+from .colliders import SAME_TIME
+from .diagnostics import FittedGradients
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks
+from .kernels import layout, runtime
+from .kernels.time_stepping import SOLID_LOST
+from .rigid.rigid_bodies import RigidBodies, RigidPose
+from .solver_options import SolverOptions
+from .world_setup import WorldSetup, check_start
+
+Array = NDArray[np.float64]
+State = dict[str, NDArray[np.generic]]
+
+CHECKPOINT_FORMAT = 2
+
+SOLIDS = "solids."
+"""Prefix of the rigid bodies' arrays in a checkpoint."""
+
+ROUNDING = 1e-12
+"""Rounding error of sums of times, s."""
+
+
+class WorldGroup:
+    """Worlds with the same set of constitutive models; ``world.Worlds`` holds one group for each set.
+
+    numbers: of the worlds in messages, one each; see ``Worlds`` for the rest.
+    """
+
+    def __init__(
+        self,
+        setups: Sequence[WorldSetup],
+        *,
+        numbers: Sequence[int | None],
+        similarity: Similarity,
+        options: SolverOptions,
+    ) -> None:
+        self.setups = tuple(setups)
+        self.numbers = tuple(numbers)
+        self.options = options
+        self.similarity = similarity
+        self.cells = Similarity(
+            scale=self.similarity.scale * self.options.grid / ENGINE_BOX_SIZE, origin=self.similarity.origin
+        )
+        for setup in self.setups:
+            check_start(setup, self.cells)
+        self.arch, self._generation = runtime.ensure_started(self.options)
+        self._places = packing.world_slots(self.setups, [self.cells] * len(self.setups))
+        counts = [body.count for setup in self.setups for body in setup.bodies]
+        self._first_body = np.concatenate([[0], np.cumsum([len(setup.bodies) for setup in self.setups])])
+        self._offsets = np.concatenate([[0], np.cumsum(counts)])
+        self._started = np.zeros(len(counts), dtype=bool)
+        self._times = np.zeros(len(self.setups))
+        self._between = False
+        self._solids = self._new_solids()
+        self._engine = self._new_engine()
+        self._host: State | None = None
+        self._poses: dict[tuple[int, str], RigidPose] = {}
+        self._fits: dict[int, FittedGradients] = {}
+        self._reach_times(np.full(len(self), -math.inf))
+
+    def _new_solids(self) -> RigidBodies:
+        origin = self.cells.points_to_world(np.zeros((1, 3)))[0]
+        place = (float(origin[0]), float(origin[1]), float(origin[2]))
+        return RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
+
+    def _new_engine(self) -> Engine:
+        soft = [not body.rigid for setup in self.setups for body in setup.bodies]
+        return Engine(
+            capacity=int(np.diff(self._offsets)[soft].sum()),
+            cfl_elastic=self.options.cfl_elastic,
+            cfl_velocity=self.options.cfl_velocity,
+            numbers=packing.pack(self._places),
+            solids=self._solids,
+        )
+
+    def __len__(self) -> int:
+        return len(self.setups)
+
+    # ---- time ---------------------------------------------------------------------------------------------------
+
+    def time(self, world: int = 0) -> float:
+        """Simulated time in s of world ``world``."""
+        return float(self._times[world])
+
+    def control(self, world: int) -> Array:
+        """Progress of world ``world`` as the engine keeps it, see ``layout``."""
+        return self._engine.control()[world]
+
+    def stable_step(self, world: int) -> float:
+        """Longest substep in s that the present state of world ``world`` allows."""
+        return min(float(self._engine.stable_steps()[world]), self._longest_step(self._places[world]))
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes that the engine's arrays take on the device."""
+        return self._engine.device_bytes
+
+    @property
+    def retries(self) -> int:
+        """Stretches of substeps that were repeated with shorter steps because they had diverged."""
+        return self._engine.retries
+
+    def advance(self, duration: float, stop: IsCancelled = never) -> None:
+        """Advance all worlds by exactly ``duration`` seconds, in substeps that are stable.
+
+        Raises Cancelled when ``stop`` returns True, SimulationError that names the body when a world diverges
+        and shorter substeps do not help.
+        """
+        if not (math.isfinite(duration) and duration >= 0):
+            raise InputError(f"duration is {duration!r}: give seconds, 0 or more")
+        self._check_generation()
+        self._check_whole()
+        end = self._times[0] + duration
+        while (self._times < end - ROUNDING).any():
+            stops = np.array([self._next_stop(place, end) for place in self._places])
+            self._engine.set_rows(
+                worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
+                fields=packing.field_rows(self._places, list(self._times), list(stops)),
+            )
+            if self._solids.count:
+                moving = np.flatnonzero(stops > self._times)
+                self._solids.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
+            self._poses = {}
+            longest = [self._longest_step(place) for place in self._places]
+            self._host = None
+            try:
+                self._engine.advance(stops - self._times, longest_step=np.array(longest), stop=stop)
+            except Stopped:
+                self._between = True
+                raise Cancelled("the simulation was stopped in the middle of a step") from None
+            except Diverged as failure:
+                self._times = self._times + self._engine.control()[:, layout.ELAPSED]
+                raise self._lost(failure) from None
+            before = self._times.copy()
+            self._times = stops
+            self._reach_times(before)
+
+    def _longest_step(self, place: packing.WorldSlot) -> float:
+        """Longest substep in s apart from waves: the option's, and that of springs."""
+        return min([self.options.max_step, *(body.spring_step for body in place.setup.bodies)])
+
+    def _next_stop(self, place: packing.WorldSlot, end: float) -> float:
+        """The next time, up to ``end``, at which something in the world starts or changes its slope."""
+        now = float(self._times[place.world])
+        setup = place.setup
+        tracks = [setup.gravity_track]
+        single = []
+        for body in setup.bodies:
+            tracks += [body.acceleration, body.pin_motion, body.velocity_keys]
+            single += [body.start_time, *(time for time, _ in body.material_track)]
+        for collider in setup.colliders:
+            tracks += [collider.translations, collider.rotations, collider.vertices]
+        knots = [t for t in single if now + SAME_TIME < t < end - SAME_TIME]
+        knots += [t for track in tracks if track is not None for t in track.knots(now + SAME_TIME, end - SAME_TIME)]
+        return min([end, *knots])
+
+    def _reach_times(self, before: Array) -> None:
+        """Apply what starts at the worlds' present times, after ``before`` (W,): bodies, velocities, materials."""
+        fresh = []
+        moved = [place for place in self._places if self._times[place.world] > before[place.world]]
+        for place in moved:
+            now = float(self._times[place.world]) + SAME_TIME
+            for i, body in enumerate(place.setup.bodies):
+                number = int(self._first_body[place.world]) + i
+                if not self._started[number] and body.start_time <= now:
+                    self._started[number] = True
+                    if not body.rigid:
+                        choice = self._material_choice(place, i, now)
+                        fresh.append(packing.particles(place, i, int(self._offsets[number]), choice))
+        if fresh:
+            self._engine.add(fresh)
+            self._host = None
+        for place in moved:
+            now, then = float(self._times[place.world]) + SAME_TIME, float(before[place.world]) + SAME_TIME
+            for i, body in enumerate(place.setup.bodies):
+                if self._started[int(self._first_body[place.world]) + i] and not body.rigid:
+                    if any(then < time <= now for time, _ in body.material_track):
+                        self._change_material(place, i, now)
+                    keys = body.velocity_keys
+                    due = [] if keys is None else [k for k, t in enumerate(keys.times) if then < t <= now]
+                    if keys is not None and due:
+                        self._set_velocity(place, i, keys.values[due[-1]])
+
+    @staticmethod
+    def _material_choice(place: packing.WorldSlot, body_index: int, now: float) -> NDArray[np.int32]:
+        """Material of each particle at time ``now``, counted as in ``material_index``."""
+        body = place.setup.bodies[body_index]
+        past = [index for time, index in body.material_track if time <= now]
+        if past:
+            return np.full(body.count, past[-1], dtype=np.int32)
+        return np.zeros(body.count, dtype=np.int32) if body.material_index is None else body.material_index
+
+    def material_choice(self, world: int, index: int) -> NDArray[np.int32]:
+        """Present material of each particle of body ``index``, counted as in ``material_index``."""
+        return self._material_choice(self._places[world], index, float(self._times[world]) + SAME_TIME)
+
+    def _rows_of(self, state: State, number: int) -> NDArray[np.bool_]:
+        ids = np.asarray(state["ids"], dtype=np.int64)
+        return (ids >= self._offsets[number]) & (ids < self._offsets[number + 1])
+
+    def _change_material(self, place: packing.WorldSlot, body_index: int, now: float) -> None:
+        """Switch the body's particles to another material from now on; their history variables are reset."""
+        choice = self._material_choice(place, body_index, now)
+        number = int(self._first_body[place.world]) + body_index
+        state = self._engine.state()
+        mine = self._rows_of(state, number)
+        order = np.asarray(state["ids"])[mine] - self._offsets[number]
+        constants, wave_speed = packing.stiffness(place.setup.bodies[body_index], choice, place.cells)
+        state["constants"][mine, 1:3] = constants[order]
+        state["material"][mine] = packing.first_material(place, body_index) + choice[order]
+        state["memory"][mine] = 0.0
+        self._engine.replace(state)
+        self._engine.expect(place.world, wave_speed=wave_speed)
+        self._host = None
+
+    def _set_velocity(self, place: packing.WorldSlot, body_index: int, velocity: Array) -> None:
+        """Set the body's mean velocity, m/s."""
+        number = int(self._first_body[place.world]) + body_index
+        state = self._engine.state()
+        mine = self._rows_of(state, number)
+        given = np.asarray(state["v"][mine], dtype=np.float64)
+        masses = np.asarray(state["constants"][mine, 0], dtype=np.float64)
+        given += velocity * place.cells.scale - np.average(given, axis=0, weights=masses)
+        state["v"][mine] = given.astype(np.float32)
+        self._engine.replace(state)
+        fastest = float(np.linalg.norm(given, axis=1).max())
+        self._engine.expect(place.world, speed=fastest)
+        self._host = None
+
+    def set_motion(
+        self,
+        world: int,
+        index: int,
+        *,
+        velocities: Array,
+        velocity_gradients: Array | None = None,
+        positions: Array | None = None,
+        gradients: Array | None = None,
+    ) -> None:
+        """Set the state of every particle of body ``index`` of world ``world``; see ``World.set_motion``."""
+        number = self.body_number(world, index)
+        place, body = self._places[world], self.setups[world].bodies[index]
+        if body.rigid or not self._started[number]:
+            kind = "is rigid" if body.rigid else "has not started"
+            raise InputError(f"body {body.name!r} {kind}: give motion to bodies of particles that have started")
+        given = _checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
+        state = dict(self.state())
+        mine = np.flatnonzero(self._rows_of(state, number))
+        order = np.asarray(state["ids"])[mine] - self._offsets[number]
+        scale = place.cells.scale
+        still = np.zeros((body.count, 3, 3))
+        new: dict[str, NDArray[np.generic]] = {
+            "v": given["velocities"] * scale,
+            "C": given.get("velocity_gradients", still),
+        }
+        if "gradients" in given:
+            new["F"] = given["gradients"]
+        if "positions" in given:
+            x, keys = places_in_blocks(place.field(index), place.cells.points_to_engine(given["positions"]))
+            new |= {"x": x, "keys": keys}
+            # Contact impulses at another place do not apply here.
+            new["reaction"] = np.zeros((body.count, 4))
+        for name, values in new.items():
+            changed = np.array(state[name])
+            changed[mine] = values[order].astype(changed.dtype)
+            state[name] = changed
+        self._engine.replace(state)
+        self._engine.expect(world, speed=float(np.linalg.norm(given["velocities"], axis=1).max()) * scale)
+        self._host = None
+
+    def _lost(self, failure: Diverged) -> SimulationError:
+        place = self._places[failure.world]
+        time = float(self._times[failure.world])
+        number = self.numbers[failure.world]
+        where = "" if number is None else f" of world {number}"
+        soft = place.soft
+        index = failure.field - place.first_field
+        name = place.setup.bodies[soft[index] if 0 <= index < len(soft) else 0].name
+        if failure.field >= SOLID_LOST:
+            name = self._solids.name(failure.field - SOLID_LOST)
+        return SimulationError(
+            f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened to "
+            f"1/{2**MOST_RETRIES} did not help: check its density and Young's modulus, what hits it and how fast, or "
+            f"lower the solver option cfl_elastic ({self.options.cfl_elastic:g})"
+        )
+
+    def _check_whole(self) -> None:
+        """Raise SimulationError for a state between two times, because ``advance`` was stopped."""
+        if self._between:
+            raise SimulationError("the world was stopped in the middle of a step: restore a checkpoint to continue")
+
+    def _check_generation(self) -> None:
+        if self._generation != runtime.generation():
+            raise SimulationError(
+                "the compute runtime was restarted with other options after this world was made: make a new world and "
+                "restore its checkpoint"
+            )
+
+    # ---- state --------------------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """The engine's state; kept until the next advance."""
+        self._check_generation()
+        self._check_whole()
+        if self._host is None:
+            self._host = self._engine.state()
+        return self._host
+
+    def pose(self, world: int, name: str) -> RigidPose:
+        """Pose and motion of the rigid body or collider ``name`` of world ``world``."""
+        self._check_generation()
+        self._check_whole()
+        if (world, name) not in self._poses:
+            self._poses[(world, name)] = self._solids.pose(world, name)
+        return self._poses[(world, name)]
+
+    def started(self, number: int) -> bool:
+        """Whether body ``number`` of all has entered the simulation."""
+        return bool(self._started[number])
+
+    def body_number(self, world: int, index: int) -> int:
+        """Number among all bodies of body ``index`` of world ``world``. Raises InputError when there is none."""
+        if not 0 <= index < len(self.setups[world].bodies):
+            raise InputError(f"body index is {index}: give 0 to {len(self.setups[world].bodies) - 1}")
+        return int(self._first_body[world]) + index
+
+    def fitted(self, number: int, rest: Array) -> FittedGradients:
+        """The fit of deformation gradients to body ``number`` of all, whose places at rest are ``rest``."""
+        if number not in self._fits:
+            self._fits[number] = FittedGradients(rest)
+        return self._fits[number]
+
+    def gather(self, name: str, number: int, resting: Array) -> Array:
+        """Values of body ``number`` of all in the order of its particles; ``resting`` where it has not started."""
+        if not self._started[number]:
+            return resting
+        state = self.state()
+        mine = self._rows_of(state, number)
+        values = np.asarray(state[name][mine], dtype=np.float64)
+        ordered = np.empty_like(values)
+        ordered[np.asarray(state["ids"])[mine] - self._offsets[number]] = values
+        return ordered
+
+    def checkpoint(self) -> State:
+        """Everything needed to continue, as arrays for ``numpy.savez``; a restored run continues with equal bytes."""
+        state = dict(self.state())
+        del state["position"]
+        state["format"] = np.array(CHECKPOINT_FORMAT)
+        state["times"] = self._times.copy()
+        state["started"] = self._started.copy()
+        state["offsets"] = self._offsets.astype(np.int64)
+        state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
+        state["grid"] = np.array(self.options.grid)
+        if self._solids.count:
+            state |= {f"{SOLIDS}{name}": values for name, values in self._solids.state().items()}
+        return state
+
+    def restore(self, checkpoint: Mapping[str, NDArray[np.generic]]) -> None:
+        """Restore a state that ``checkpoint`` returned in worlds of the same setups, similarity and grid."""
+        self._check_generation()
+        wanted = {"format", "times", "started", "offsets", "similarity", "grid", "keys", "control", "means"}
+        missing = wanted - set(checkpoint)
+        if missing:
+            raise InputError(f"checkpoint has no {', '.join(sorted(missing))}: it was not written by this engine")
+        if int(checkpoint["format"]) != CHECKPOINT_FORMAT:
+            raise InputError(f"checkpoint format is {int(checkpoint['format'])}: this engine reads {CHECKPOINT_FORMAT}")
+        same = (
+            np.array_equal(checkpoint["offsets"], self._offsets)
+            and np.array_equal(checkpoint["similarity"], [self.similarity.scale, *self.similarity.origin])
+            and int(checkpoint["grid"]) == self.options.grid
+            and len(checkpoint["times"]) == len(self)
+        )
+        if not same:
+            raise InputError("checkpoint is of another scene: bodies, similarity and grid must be the same")
+        self._times = np.array(checkpoint["times"], dtype=np.float64)
+        self._started = np.array(checkpoint["started"], dtype=bool)
+        self._solids = self._new_solids()
+        if self._solids.count:
+            solids = {name.removeprefix(SOLIDS): checkpoint[name] for name in checkpoint if name.startswith(SOLIDS)}
+            self._solids.restore(solids)
+        self._engine = self._new_engine()
+        self._engine.restore(checkpoint)
+        self._between = False
+        self._host = None
+        self._poses = {}
+
+
+def _checked_motion(
+    name: str,
+    count: int,
+    velocities: Array,
+    velocity_gradients: Array | None,
+    positions: Array | None,
+    gradients: Array | None,
+) -> dict[str, Array]:
+    """The arguments that are given, as float64. Raises InputError on a wrong shape or a number that is not finite."""
+    shapes = {
+        "velocities": (velocities, (count, 3)),
+        "velocity_gradients": (velocity_gradients, (count, 3, 3)),
+        "positions": (positions, (count, 3)),
+        "gradients": (gradients, (count, 3, 3)),
+    }
+    given = {}
+    for field, (values, shape) in shapes.items():
+        if values is not None:
+            array = np.asarray(values, dtype=np.float64)
+            if array.shape != shape:
+                raise InputError(f"body {name!r}: {field} have shape {array.shape}: give {shape}, one a particle")
+            if not np.isfinite(array).all():
+                bad = int(np.argmin(np.isfinite(array.reshape(count, -1)).all(axis=1)))
+                raise InputError(f"body {name!r}: {field} of particle {bad} are {array[bad].tolist()}: give numbers")
+            given[field] = array
+    return given

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""Inpainting by LaMa (Suvorov et al., WACV 2022) or a similar model, from a user's ONNX file through onnxruntime.
+
+Such files take a picture 1x3xHxW from 0 to 1 and a mask 1x1xHxW, 1 in the hole; or both as 1x4xHxW, the picture black
+in the hole; H and W fixed (512) or free. They return 1x3xHxW from 0 to 1, or to 255. The variant is detected from the
+file or from its output.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ...errors import InputError
+from .protocols import Mask, Pixels, checked_pixels
+
+CONTEXT = 2.0
+"""Side of the model's crop over that of the hole."""
+LEAST_SIDE, MOST_SIDE, STEP = 256, 1024, 32
+"""Sides of the crop for a model of free size, in pixels: multiples that can be halved five times."""
+BLEND_PX = 6.0
+"""Distance from the hole's border, in the model's pixels, over which the result is corrected towards the surrounding
+colours."""
+MAX_MODEL_BYTES = 8 * 2**30
+_TYPES: dict[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LamaInpainter:
+    """``protocols.Inpainter`` by an ONNX model. size: height and width of its input, or None for any.
+
+    inputs: names of picture and mask, or of both in one; kind: number type.
+    """
+
+    session: Any
+    inputs: tuple[str, ...]
+    size: tuple[int, int] | None
+    kind: type[np.floating[Any]]
+    where: str
+
+    def __call__(self, pixels: Pixels, hole: Mask) -> Pixels:
+        """As the protocol says: hole by hole, each in a square crop around it. Raises InputError."""
+        result, left = pixels.copy(), hole.copy()
+        count, labels = cv2.connectedComponents(cv2.dilate(hole.astype(np.uint8), np.ones((5, 5), np.uint8)))
+        for label in range(1, count):
+            part = hole & (labels == label)
+            rows, columns = square_around(part, LEAST_SIDE if self.size is None else min(self.size))
+            window = (rows, columns)
+            filled = self._fill(result[window], left[window])
+            result[window][part[window]] = filled[part[window]]
+            left &= ~part
+        return checked_pixels(result, pixels, hole, self.where)
+
+    def _fill(self, pixels: Pixels, hole: Mask) -> Pixels:
+        """``pixels`` (h, w, 3) with ``hole`` inpainted at the model's own size."""
+        height, width = hole.shape
+        size = self.size or _free_size(height, width)
+        if not hole.all():
+            # Otherwise resizing would smear the hole's content over its border.
+            near = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
+            pixels = pixels[near[0], near[1]]
+        way = cv2.INTER_AREA if size[0] < height else cv2.INTER_CUBIC
+        picture = np.asarray(cv2.resize(pixels, size[::-1], interpolation=way), dtype=np.float32) / np.float32(255)
+        # Every pixel of the model that overlaps the hole.
+        share = cv2.resize(hole.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA)
+        nearest = cv2.resize(hole.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+        mask = (share > 0) | (nearest > 0)
+        filled = blended(picture, self._answer(picture, mask), mask)
+        large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_CUBIC)
+        return np.asarray(np.clip(large * 255 + 0.5, 0, 255), dtype=np.uint8)
+
+    def _answer(self, picture: Array, mask: Mask) -> Array:
+        """The model's output (h, w, 3), from 0 to 1, for ``picture`` (h, w, 3) and ``mask`` (h, w)."""
+        planes = np.transpose(picture, (2, 0, 1))[None].astype(self.kind)
+        holes = mask[None, None].astype(self.kind)
+        if len(self.inputs) == 1:
+            feed = {self.inputs[0]: np.concatenate([planes * (1 - holes), holes], axis=1)}
+        else:
+            feed = {self.inputs[0]: planes, self.inputs[1]: holes}
+        try:
+            answer = np.asarray(self.session.run(None, feed)[0], dtype=np.float32)
+        # onnxruntime raises its own exceptions, depending on the operator.
+        except Exception as error:
+            raise InputError(f"{self.where}: the model failed ({type(error).__name__}: {str(error)[:300]})") from error
+        if answer.shape != planes.shape:
+            raise InputError(f"{self.where}: returned {answer.shape}, expected a picture of {planes.shape}")
+        if not np.isfinite(answer).all():
+            raise InputError(f"{self.where}: returned numbers that are not finite; try the model's 32 bit version")
+        values = np.transpose(answer[0], (1, 2, 0))
+        return np.clip(values * _unit(values, picture, mask), 0, 1)
+
+
+def _unit(values: Array, picture: Array, mask: Mask) -> float:
+    """Factor that scales the model's ``values`` to 0 to 1: 1 or 1/255, whichever reproduces the picture outside the
+    hole."""
+    known = ~mask if not mask.all() else np.ones_like(mask)
+    errors = {unit: float(np.abs(values[known] * unit - picture[known]).mean()) for unit in (1.0, 1 / 255)}
+    if float(values.max()) > 2.0:
+        return 1 / 255
+    return min(errors, key=lambda unit: errors[unit]) if not mask.all() else 1.0
+
+
+def _free_size(height: int, width: int) -> tuple[int, int]:
+    scale = min(1.0, MOST_SIDE / max(height, width))
+    return (
+        max(STEP, math.ceil(height * scale / STEP) * STEP),
+        max(STEP, math.ceil(width * scale / STEP) * STEP),
+    )
+
+
+def square_around(part: Mask, least: int) -> tuple[slice, slice]:
+    """Return rows and columns of a square around ``part`` (H, W), ``CONTEXT`` times its size, shifted into the picture.
+
+    least: smallest side in pixels; the square is cut where the picture is smaller.
+    """
+    places = []
+    extents = [np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))]
+    side = max(least, math.ceil(CONTEXT * max(int(e[-1]) + 1 - int(e[0]) for e in extents)))
+    for extent, length in zip(extents, part.shape, strict=True):
+        middle = (int(extent[0]) + int(extent[-1]) + 1) // 2
+        start = min(max(0, middle - side // 2), max(0, length - side))
+        places.append(slice(start, min(length, start + side)))
+    return places[0], places[1]
+
+
+def blended(picture: Array, filled: Array, mask: Mask) -> Array:
+    """Return ``filled`` in ``mask`` and ``picture`` outside, (h, w, 3) and (h, w), without a visible edge between them.
+
+    The model's error just outside the hole is extrapolated into it and fades there.
+    """
+    outside = (~mask).astype(np.float32)
+    missed = (picture - filled) * outside[..., None]
+    sigma = BLEND_PX / 2
+    weight = cv2.GaussianBlur(outside, (0, 0), sigma)
+    spread = cv2.GaussianBlur(missed, (0, 0), sigma) / np.maximum(weight, 1e-4)[..., None]
+    depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    moved = filled + spread * np.exp(-np.maximum(depth - 1, 0) / BLEND_PX)[..., None]
+    return np.asarray(np.where(mask[..., None], np.clip(moved, 0, 1), picture), dtype=np.float32)
+
+
+def load_lama(path: Path, where: str) -> LamaInpainter:
+    """Return the model in ``path``, checked to be an inpainting model. Raises InputError."""
+    if not path.is_file():
+        raise InputError(f"{where}: there is no such file; bring your own model, nothing is downloaded")
+    if path.stat().st_size > MAX_MODEL_BYTES:
+        raise InputError(f"{where}: {path.stat().st_size >> 30} GiB is larger than any supported model")
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise InputError(f"{where}: needs onnxruntime ({error}); install physgen[onnx]") from None
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    # onnxruntime's exceptions have no common base class.
+    except Exception as error:
+        raise InputError(f"{where}: is not a model that onnxruntime can read ({str(error)[:300]})") from error
+    return _checked_session(session, where)
+
+
+def _checked_session(session: Any, where: str) -> LamaInpainter:
+    given = {item.name: item for item in session.get_inputs()}
+    found = ", ".join(f"{name} {item.shape} {item.type}" for name, item in given.items())
+    problem = InputError(
+        f"{where}: takes {found[:300]}; expected a picture 1x3xHxW and a mask 1x1xHxW of floats, or both as 1x4xHxW"
+    )
+    by_channels: dict[int, str] = {}
+    for name, item in given.items():
+        channels = item.shape[1] if len(item.shape) == 4 else None
+        if not isinstance(channels, int):
+            # Left free by the export: decided by name.
+            channels = 1 if "mask" in name.lower() else 3
+        by_channels[channels] = name
+    if len(given) == 1 and 4 in by_channels:
+        inputs: tuple[str, ...] = (by_channels[4],)
+    elif len(given) == 2 and {1, 3} == set(by_channels):
+        inputs = (by_channels[3], by_channels[1])
+    else:
+        raise problem
+    first = given[inputs[0]]
+    kinds = {given[name].type for name in inputs}
+    if len(kinds) != 1 or first.type not in _TYPES or len(first.shape) != 4:
+        raise problem
+    sides = [side if isinstance(side, int) and side > 0 else None for side in first.shape[2:]]
+    if (None in sides and sides != [None, None]) or any(side is not None and not 32 <= side <= 4096 for side in sides):
+        raise problem
+    size = None if sides[0] is None or sides[1] is None else (sides[0], sides[1])
+    return LamaInpainter(session, inputs, size, _TYPES[first.type], where)

@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: MIT
+"""Methods of inpainting one part of a hole, and the choice between them by trial.
+
+Trial holes of the same shape are cut where the truth is known and inpainted by every method; the method whose results
+are most similar to the truth is used. Squared error alone would favour blur, so the strength of details counts as
+well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...composite.inpaint import FillOptions, inpaint_once
+from ...scene.model import Camera
+from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
+from .texture_prediction import shift_to_known, shifted
+from .top_view import to_photo, to_top_view, top_views, visible_in_photo
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.float32]
+
+BANDS = (1.0, 2.0)
+"""Blurs in pixels that separate the bands of detail."""
+GAINS = (0.6, 1.8)
+"""Limits of the gain on details."""
+REACH = 0.2
+"""Blur of their strength over the hole's size."""
+
+
+def match_grain(picture: Picture, hole: Mask, known: Mask) -> Picture:
+    """Return ``picture`` (h, w, 3) with the details in ``hole`` as strong as in its ``known`` surroundings nearby."""
+    reach = max(4.0, REACH * float(np.sqrt(hole.sum())))
+    result, finer = np.zeros_like(picture), picture
+    inner = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    if inner.sum() < 100:
+        return picture
+    for blur in BANDS:
+        coarser = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur), dtype=np.float32)
+        detail = finer - coarser
+        size = np.asarray(np.abs(detail).mean(axis=-1), dtype=np.float32)
+        # Mean sizes with large ones clipped: a few edges are not grain.
+        size = np.minimum(size, np.float32(4.0 * float(np.median(size[inner])) + 0.5))
+        wanted, has = _local(size, inner, reach), _local(size, hole, reach)
+        gain = np.clip(wanted / np.maximum(has, 1e-2), *GAINS)
+        result += np.where(hole[..., None], gain[..., None] * detail, detail)
+        finer = coarser
+    return np.asarray(result + finer, dtype=np.float32)
+
+
+def _local(values: NDArray[np.float32], where: Mask, blur: float) -> NDArray[np.float32]:
+    """Local mean of ``values`` (h, w) over pixels ``where``."""
+    scale = min(1.0, 6.0 / blur)
+    size = (max(4, round(where.shape[1] * scale)), max(4, round(where.shape[0] * scale)))
+    weight = where.astype(np.float32)
+    total, share = (
+        cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), blur * scale)
+        for part in (np.asarray(values * weight, dtype=np.float32), weight)
+    )
+    # Deep inside no known pixel is near: fall back to the global mean.
+    mean = float(values[where].mean())
+    local = (total + 1e-3 * mean) / (share + 1e-3)
+    return np.asarray(
+        cv2.resize(local, (where.shape[1], where.shape[0]), interpolation=cv2.INTER_LINEAR), dtype=np.float32
+    )
+
+
+VIEW_PIXELS = 1_300_000
+"""Largest size of one view; larger ones are coarser than the photo."""
+MIN_KNOWN = 0.06
+"""Least visible share of a view to inpaint the rest from."""
+MARGIN = 0.8
+"""Margin of the photo around a hole, over the size of the hole."""
+CONTRAST = 45.0
+"""Standard deviation of a surface without its illumination in PatchMatch's 256 steps."""
+
+SOLVE_SIDE = 160.0
+"""Hole size in pixels for PatchMatch without illumination; larger holes are scaled down."""
+
+
+@dataclass(frozen=True)
+class InpaintingTask:
+    """A part of the hole to inpaint.
+
+    picture: (H, W, 3), values 0 to 255. target: (H, W) pixels to inpaint. closed: (H, W) other pixels that are not a
+    source.
+    """
+
+    picture: Picture
+    target: Mask
+    closed: Mask
+    camera: Camera
+    options: FillOptions
+
+
+Method = Callable[[InpaintingTask], Picture]
+
+
+def by_rows(task: InpaintingTask) -> Picture:
+    """Return the picture inpainted by PatchMatch as it is, preferring sources at the same height."""
+    return _in_photo(task, _searched_by_rows)
+
+
+def by_rows_without_light(task: InpaintingTask) -> Picture:
+    """Like ``by_rows``, with the smooth illumination removed before and restored after."""
+    return _in_photo(task, _searched_without_light)
+
+
+def as_surface(task: InpaintingTask) -> Picture:
+    """Return the picture inpainted as one surface seen frontally."""
+    return _in_photo(task, fill_surface)
+
+
+def as_ground(task: InpaintingTask) -> Picture:
+    """Return the picture inpainted as ground in top views; ground too far away for that, in the photo's view."""
+    result, left = task.picture.copy(), task.target.copy()
+    for view, part in top_views(task.camera, task.target, VIEW_PIXELS):
+        # Ground inpainted so far is known to the next view, so that patterns continue.
+        shown = visible_in_photo(view, np.zeros_like(left))
+        known = visible_in_photo(view, task.closed | left)
+        hole = shown & ~visible_in_photo(view, left & ~task.closed) & ~known
+        if known.mean() < MIN_KNOWN or not hole.any():
+            continue
+        filled = fill_surface(to_top_view(result, view), hole, ~known & ~hole, task.options)
+        rows, columns = box(part, 0)
+        back = to_photo(filled, view, rows, columns)
+        inner = part[rows, columns]
+        result[rows, columns][inner] = back[inner]
+        left &= ~part
+    if left.any():
+        return by_rows(InpaintingTask(result, left, task.closed, task.camera, task.options))
+    return result
+
+
+def _in_photo(task: InpaintingTask, fill: Callable[[Picture, Mask, Mask, FillOptions], Picture]) -> Picture:
+    extent = int(np.ptp(np.argwhere(task.target), axis=0).max())
+    rows, columns = box(task.target, max(48, round(MARGIN * extent)))
+    hole, barred = task.target[rows, columns], task.closed[rows, columns] & ~task.target[rows, columns]
+    if (~(hole | barred)).mean() < MIN_KNOWN:
+        rows, columns = slice(0, len(task.target)), slice(0, task.target.shape[1])
+        hole, barred = task.target, task.closed & ~task.target
+    result = task.picture.copy()
+    if (hole | barred).all():
+        return result
+    piece = np.ascontiguousarray(task.picture[rows, columns])
+    filled = fill(piece, hole, barred, task.options)
+    result[rows, columns][hole] = filled[hole]
+    return result
+
+
+def _searched_by_rows(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
+    pixels = np.clip(picture + 0.5, 0, 255).astype(np.uint8)
+    filled = inpaint_once(pixels, hole, barred, options, _heights(hole)).astype(np.float32)
+    return match_grain(np.where(hole[..., None], filled, picture), hole, ~(hole | barred))
+
+
+def _searched_without_light(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
+    known = ~(hole | barred)
+    logs = logarithms(picture)
+    slow, lack = light_field(logs, known, hole)
+    pattern = logs - slow - lack
+    centre = pattern[known].mean(axis=0)
+    pattern = np.where(known[..., None], pattern - centre, 0.0)
+    gain = min(CONTRAST / max(float(pattern[known].std()), 1e-3), 400.0)
+    pixels = np.clip(127.5 + gain * pattern, 0, 255).astype(np.uint8)
+    filled = inpaint_once(pixels, hole, barred, options, _heights(hole), SOLVE_SIDE).astype(np.float32)
+    new = np.where(hole[..., None], (filled - 127.5) / gain + slow + centre, logs).astype(np.float32)
+    result = np.where(hole[..., None], np.exp(clamp_to_surroundings(new, hole, known)), picture)
+    return match_grain(result.astype(np.float32), hole, known)
+
+
+def _heights(hole: Mask) -> NDArray[np.float32]:
+    guide = np.zeros((*hole.shape, 2), dtype=np.float32)
+    guide[..., 0] = np.linspace(0.0, 1.0, len(guide), dtype=np.float32)[:, None]
+    return guide
+
+
+def box(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """Return rows and columns of the bounding box of ``mask`` (H, W) with a ``margin`` in pixels."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin)),
+        slice(max(0, int(columns[0]) - margin), min(mask.shape[1], int(columns[-1]) + 1 + margin)),
+    )
+
+
+METHODS: dict[str, Method] = {
+    "by rows": by_rows,
+    "by rows without light": by_rows_without_light,
+    "as a surface": as_surface,
+    "as ground": as_ground,
+}
+
+
+TRIALS = 2
+PIXELS = 20_000
+"""Largest size of the copy for trials."""
+LEAST_SIDE = 6.0
+SIZES = (1.0, 0.7)
+"""Sizes of trial holes over the hole's, tried in turn."""
+SEEN = 0.5
+"""Least share of the hole's pixels in a trial hole."""
+DETAIL = 3.0
+"""Penalty in decibels for details too strong or too weak by a factor e."""
+MORE = 0.3
+"""Margin in decibels by which a method must beat those before it."""
+
+BEHIND = 3.0
+"""Deficit in decibels at which a method is dropped after one trial."""
+
+
+@dataclass(frozen=True)
+class MethodChoice:
+    """way: its name in ``WAYS``. scores: decibels of each that was tried, empty where no trial hole fits.
+
+    certain: decibels by which the best beats a hole filled with the mean of its surroundings.
+    """
+
+    way: str
+    scores: dict[str, float]
+    certain: float
+
+
+def choose_method(task: InpaintingTask, ways: Sequence[str]) -> MethodChoice:
+    """Return the one of ``ways`` that does best around ``task``'s hole; the first if no trial is possible."""
+    small = _smaller(task)
+    trials = trial_holes(small.target, ~(small.closed | small.target))
+    if not trials or len(ways) == 1:
+        return MethodChoice(ways[0], {}, 0.0)
+    scores: dict[str, list[float]] = {way: [] for way in ways}
+    plain: list[float] = []
+    left = list(ways)
+    for hole in trials:
+        closed = small.closed | small.target
+        # Pixels hidden in the trial must not help any method.
+        known = ~(closed | hole)
+        near = known & (cv2.dilate(hole.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0)
+        mean = small.picture[near if near.any() else known].mean(axis=0)
+        emptied = np.where(hole[..., None], mean, small.picture).astype(np.float32)
+        plain.append(similarity(emptied, small.picture, hole))
+        for way in left:
+            filled = METHODS[way](replace(small, picture=emptied, target=hole, closed=closed))
+            scores[way].append(similarity(filled, small.picture, hole))
+        # Drop methods that are far behind.
+        most = max(scores[way][-1] for way in left)
+        left = [way for way in left if scores[way][-1] > most - BEHIND]
+        if len(left) == 1:
+            break
+    means = {way: float(np.mean(scores[way])) for way in ways}
+    best = left[0]
+    for way in left[1:]:
+        if means[way] > means[best] + MORE:
+            best = way
+    return MethodChoice(best, means, means[best] - float(np.mean(plain)))
+
+
+def trial_holes(hole: Mask, known: Mask) -> list[Mask]:
+    """Return at most ``TRIALS`` disjoint copies of ``hole`` (h, w) where it is ``known``."""
+    result: list[Mask] = []
+    free = known.copy()
+    for size in SIZES:
+        form = hole if size == 1.0 else _shrunk(hole, size)
+        while len(result) < TRIALS:
+            shift = shift_to_known(form, free)
+            if shift is None:
+                break
+            found = shifted(form, *shift) & free
+            if found.sum() < max(SEEN * size * hole.sum(), LEAST_SIDE**2) * (1.0 if size == 1.0 else 0.8):
+                break
+            # Leave enough surroundings.
+            if found.sum() > 0.6 * known.sum():
+                break
+            result.append(found)
+            free &= ~found
+        if result:
+            break
+    return result
+
+
+def similarity(filled: Picture, truth: Picture, where: Mask) -> float:
+    """Return the similarity of ``filled`` and ``truth`` ``where``, both (h, w, 3) of 0 to 255: PSNR in decibels less a
+    penalty for different detail."""
+    error = float(np.square(filled[where] - truth[where]).mean())
+    lost = 0.0
+    blurs = (0.0, 1.0, 2.0, 4.0)
+    pictures = [
+        np.asarray(np.where(where[..., None], picture, truth), np.float32).mean(axis=-1) for picture in (filled, truth)
+    ]
+    for fine, coarse in pairwise(blurs):
+        sizes = []
+        for picture in pictures:
+            first = cv2.GaussianBlur(picture, (0, 0), fine) if fine else picture
+            detail = np.square(first - cv2.GaussianBlur(picture, (0, 0), coarse))
+            sizes.append(0.5 * np.log(cv2.GaussianBlur(detail, (0, 0), 4.0 + 2.0 * coarse) + 0.5))
+        lost += float(np.abs(sizes[0] - sizes[1])[where].mean()) / (len(blurs) - 1)
+    return 10.0 * float(np.log10(255.0**2 / max(error, 0.1))) - DETAIL * lost
+
+
+def _smaller(task: InpaintingTask) -> InpaintingTask:
+    height, width = task.target.shape
+    scale = min(1.0, float(np.sqrt(PIXELS / task.target.size)))
+    if scale > 0.9:
+        return task
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    target, closed = (
+        cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.02
+        for mask in (task.target, task.closed)
+    )
+    across, down = size[0] / width, size[1] / height
+    camera = task.camera
+    return replace(
+        task,
+        picture=np.asarray(cv2.resize(task.picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32),
+        target=np.asarray(target),
+        closed=np.asarray(closed & ~target),
+        camera=replace(
+            camera,
+            width=size[0],
+            height=size[1],
+            fx=camera.fx * across,
+            fy=camera.fy * down,
+            cx=camera.cx * across,
+            cy=camera.cy * down,
+        ),
+    )
+
+
+def _shrunk(mask: Mask, size: float) -> Mask:
+    """``mask`` scaled by ``size`` about its centre."""
+    y, x = (float(axis.mean()) for axis in np.nonzero(mask))
+    matrix = np.array([[size, 0.0, (1.0 - size) * x], [0.0, size, (1.0 - size) * y]])
+    return np.asarray(cv2.warpAffine(mask.astype(np.float32), matrix, (mask.shape[1], mask.shape[0])) > 0.5)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: MIT
+"""Shadow masks of the objects, and the holes to inpaint (PhysGen3D, supplement A.2).
+
+The paper's threshold takes everything darker than a fixed grey value that is connected to the object; that value fits
+one ground under one light. By default a shadow is where both agree: proxy bodies may cast one there
+(``shadow_model``), and the ground has the colour of its own texture with less light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ...composite.srgb import bytes_to_linear
+from ...scene.model import Camera
+from ..segmentation.mask_cleanup import enclosed_holes
+from .ground_pixels import GroundPixels, ground_pixels, proxy_body
+from .shadow_model import fit_light, light_level_posterior, light_shares, shadow_probability
+
+Mask = NDArray[np.bool_]
+
+
+def threshold_shadows(pixels: NDArray[np.uint8], masks: Sequence[Mask], threshold: float) -> list[Mask]:
+    """Return shadows (H, W) of the objects in ``masks`` (H, W) by a grey threshold (PhysGen3D, supplement A.2).
+
+    Per object, the largest connected component of dark pixels and the object, without any object. pixels: (H, W, 3)
+    sRGB. threshold: grey value 0 to 255; darker pixels count (PhysGen3D's code uses 50). Where components of several
+    objects meet, each pixel belongs to the nearest object.
+    """
+    dark = cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY) < threshold
+    covered = np.logical_or.reduce(masks)
+    found = []
+    for mask in masks:
+        number, labels = cv2.connectedComponents(((dark & ~covered) | mask).astype(np.uint8), connectivity=8)
+        sizes = np.bincount(labels.ravel(), minlength=number)
+        own = np.unique(labels[mask])
+        largest = own[np.argmax(sizes[own])] if len(own) else -1
+        found.append((labels == largest) & ~covered)
+    shared = np.sum(found, axis=0) > 1
+    if shared.any():
+        distances = np.stack(
+            [
+                np.where(shadow, ndimage.distance_transform_edt(~mask), np.inf)
+                for shadow, mask in zip(found, masks, strict=True)
+            ]
+        )
+        nearest = distances.argmin(axis=0)
+        found = [shadow & (~shared | (nearest == index)) for index, shadow in enumerate(found)]
+    return [np.asarray(shadow) for shadow in found]
+
+
+DEEPEST_KEPT = 0.65
+"""Largest share of light in a hard shadow, to distinguish it from uneven ground."""
+EVEN = 0.4
+"""Spread of the ground's log brightness over the shadow's depth above which the ground is too uneven."""
+ALIKE, TINT = 0.3, 0.12
+"""Tolerances of the extension: share of the shadow's depth in log brightness, and log chroma."""
+MOST = 2.0
+"""Largest added area over that of the shadow; more is another object."""
+
+
+def extend_hard_shadow(pixels: NDArray[np.uint8], shadow: Mask, closed: Mask) -> Mask:
+    """Return ``shadow`` (H, W) extended over adjacent pixels of the same darkness and tint in ``pixels`` (H, W, 3)
+    sRGB.
+
+    Completes a hard shadow whose light was estimated slightly wrong, if the case is clear: even ground, a deep shadow.
+    closed: (H, W) excluded pixels. Otherwise returns ``shadow`` unchanged.
+    """
+    area = int(shadow.sum())
+    if area < 60:
+        return shadow
+    reach = max(4, round(0.8 * np.sqrt(area)))
+    rows, columns = np.flatnonzero(shadow.any(axis=1)), np.flatnonzero(shadow.any(axis=0))
+    window = (
+        slice(max(0, rows[0] - 2 * reach), rows[-1] + 1 + 2 * reach),
+        slice(max(0, columns[0] - 2 * reach), columns[-1] + 1 + 2 * reach),
+    )
+    own, barred = shadow[window], closed[window]
+    logs = np.log(bytes_to_linear(np.ascontiguousarray(cv2.blur(pixels[window], (3, 3)))) + 0.01)
+    core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    near = cv2.dilate(own.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)) > 0
+    lit = near & ~(cv2.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~barred
+    if core.sum() < 40 or lit.sum() < 40:
+        return shadow
+    inside = np.median(logs[core], axis=0)
+    brightness = logs.mean(axis=-1)
+    depth = float(np.median(brightness[lit]) - inside.mean())
+    spread = 1.48 * float(np.median(np.abs(brightness[lit] - np.median(brightness[lit]))))
+    if depth < -np.log(DEEPEST_KEPT) or spread > EVEN * depth:
+        return shadow
+    difference = logs - inside
+    level = difference.mean(axis=-1)
+    tint = np.abs(difference - level[..., None]).max(axis=-1)
+    alike = (np.abs(level) < ALIKE * depth) & (tint < TINT) & ~barred
+    _, labels = cv2.connectedComponents((alike | own).astype(np.uint8), connectivity=4)
+    grown = np.isin(labels, np.unique(labels[own])) & alike & ~own
+    added = int(grown.sum())
+    edge = np.zeros_like(grown)
+    edge[[0, -1]] = edge[:, [0, -1]] = True
+    if added > MOST * area or (grown & edge).any():
+        return shadow
+    result = shadow.copy()
+    result[window] |= cv2.morphologyEx((own | grown).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    return result & (~closed | shadow)
+
+
+PENUMBRA_DILATION = 20.0
+"""Side of the kernel in a photo of 1024 pixels if shadows come with penumbras (``cast_shadows``). With the paper's 50
+around the shadow alone the hole is as large, but more darkness stays outside it."""
+
+
+def object_holes(masks: Sequence[Mask], shadows: Sequence[Mask], dilation: float) -> list[Mask]:
+    """Return the hole of each object: mask and shadow, dilated, but never over another object.
+
+    shadows: (H, W), best with their penumbras. dilation: side of the kernel in pixels of this photo; half of it covers
+    an outline. An object's hole may cover another object's shadow.
+    """
+    side = max(1, round(dilation)) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    holes = []
+    for index, (mask, shadow) in enumerate(zip(masks, shadows, strict=True)):
+        hole = cv2.dilate((mask | shadow).astype(np.uint8), kernel) > 0
+        # A rest of the photo inside a strap would remain as an island.
+        hole |= enclosed_holes(hole)
+        for other, blocked in enumerate(masks):
+            if other != index:
+                hole &= ~(blocked & ~mask)
+        holes.append(np.asarray(hole))
+    return holes
+
+
+Values = NDArray[np.float64]
+
+FEWEST = 50
+"""Fewest ground pixels for an estimate."""
+FAR = 0.25
+"""Weight of a distance of one object side against the log of the blocked light, where shadows meet."""
+
+
+@dataclass(frozen=True)
+class CastShadow:
+    """shadow: (H, W) where the object blocks a tenth of the ground's light or more. penumbra: (H, W) the same with its
+    soft border, which must leave the photo with the object too."""
+
+    shadow: Mask
+    penumbra: Mask
+
+
+def cast_shadows(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera) -> list[CastShadow]:
+    """Return the shadow of each of ``masks`` (H, W), visible pixels of the objects, with its penumbra.
+
+    pixels: (H, W, 3) sRGB. camera: above the ground z = 0; pixels above the horizon are not ground. Both masks of a
+    shadow are disjoint from all objects and from other shadows. A pixel in several shadows belongs to the object that
+    blocks most of its light. An object without a pixel, or above the horizon, has no shadow.
+    """
+    found = [CastShadow(*np.zeros((2, *pixels.shape[:2]), dtype=bool)) for _ in masks]
+    standing = [(index, body) for index, mask in enumerate(masks) if (body := proxy_body(mask, camera)) is not None]
+    if not standing:
+        return found
+    bodies = [body for _, body in standing]
+    ground = ground_pixels(pixels, masks, camera, bodies)
+    if ground is None or len(ground.rows) < FEWEST:
+        return found
+    total, alone, hidden = light_shares(ground, bodies, fit_light(ground, bodies))
+    owner = _owner(ground, alone, [masks[index] for index, _ in standing])
+    inner, outer = shadow_probability(ground, light_level_posterior(ground, total, hidden), _part(ground, alone, owner))
+    taken = np.logical_or.reduce(masks)
+    for position, (index, _) in enumerate(standing):
+        own = owner == position
+        dark = (_full_size(ground, np.where(own, inner, 0.0), taken.shape) > 0.5) & ~taken
+        dim = (_full_size(ground, np.where(own, outer, 0.0), taken.shape) > 0.5) & ~taken
+        shadow = extend_hard_shadow(pixels, _connected(dark, masks[index], ground, alone[position]), taken)
+        penumbra = shadow | _touching(dim, shadow)
+        found[index] = CastShadow(shadow=shadow, penumbra=penumbra)
+        taken |= penumbra
+    return found
+
+
+def _owner(ground: GroundPixels, alone: Values, masks: Sequence[Mask]) -> NDArray[np.int64]:
+    """Index (N,) of the object that blocks most of each pixel's light, nearer ones preferred."""
+    size = ground.known.shape[::-1]
+    costs = []
+    for kept, mask in zip(alone, masks, strict=True):
+        small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+        distance = cv2.distanceTransform((small == 0).astype(np.uint8), cv2.DIST_L2, 5)
+        far = distance[ground.rows, ground.columns] / ground.object_side
+        costs.append(ground.blurred(np.log(kept), 1.5) + FAR * far)
+    return np.asarray(np.argmin(costs, axis=0))
+
+
+def _part(ground: GroundPixels, alone: Values, owner: NDArray[np.int64]) -> Values:
+    """Share (N,) of the ``owner`` (N,) in the lost light, as a logarithm, at least half."""
+    lost = np.stack([ground.blurred(-np.log(kept), 1.5) for kept in alone])
+    own = np.take_along_axis(lost, owner[None], axis=0)[0]
+    return np.clip((own + 1e-3) / (lost.sum(axis=0) + 1e-3), 0.5, 1.0)
+
+
+def _full_size(ground: GroundPixels, values: Values, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """``values`` (N,) at the photo's size; the seam along the objects is filled from the ground beside it."""
+    picture = ground.picture(values)
+    beside = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    weight = cv2.GaussianBlur(ground.known, (0, 0), 1.5)
+    filled = np.where(ground.known > 0, picture, np.where(weight > 0.05, beside / np.maximum(weight, 1e-3), 0.0))
+    return np.asarray(cv2.resize(filled.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def _connected(dark: Mask, mask: Mask, ground: GroundPixels, kept: Values) -> Mask:
+    """The parts of ``dark`` that touch the object in ``mask``, or lie mostly in its cast shadow."""
+    shape = dark.shape
+    gap = max(1, round(0.02 * ground.object_side * shape[1] / ground.known.shape[1]))
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * gap + 1,) * 2, np.uint8)) > 0
+    cast = cv2.resize(ground.picture((kept < 0.8).astype(np.float32)), shape[::-1]) > 0.5
+    number, labels = _components(dark)
+    sizes = np.bincount(labels.ravel(), minlength=number)
+    keep = np.bincount(labels[near], minlength=number) > 0
+    keep |= np.bincount(labels[cast], minlength=number) > 0.5 * sizes
+    keep[0] = False
+    return np.asarray(keep[labels])
+
+
+def _components(region: Mask) -> tuple[int, NDArray[np.int64]]:
+    number, labels = cv2.connectedComponents(region.astype(np.uint8), connectivity=8)
+    return number, np.asarray(labels, dtype=np.int64)
+
+
+def _touching(region: Mask, seed: Mask) -> Mask:
+    """The connected components of ``region`` that contain some of ``seed``."""
+    number, labels = _components(region)
+    keep = np.bincount(labels[seed], minlength=number) > 0
+    keep[0] = False
+    return np.asarray(keep[labels])

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: MIT
+"""Decompose the photo into layers: masks, shadows, occlusion order, hidden parts and the clean background.
+
+Objects are removed from front to back with their shadows, and the gap is inpainted, so that the next one can be
+segmented again on a picture in which nothing stands in front of it (PhysGen3D, supplement A.1). The remaining hidden
+part is completed by shape. The background itself is inpainted at once, from the photo: every inpainting of an inpainted
+picture would be a little worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..composite.inpaint import FillOptions
+from ..errors import InputError
+from ..scene.model import Camera
+from .adapters.adapter_registry import adapter_content
+from .background.background_inpainting import blend, fill_background
+from .lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes, threshold_shadows
+from .reconstruct_options import ReconstructOptions
+from .segmentation.amodal_completion import complete_colours, complete_outline
+from .segmentation.box_segmentation import Box, segment
+from .segmentation.occlusion_order import Order, occlusion_order
+from .stage_cache import Notice, StageCache, Steps
+
+Mask = NDArray[np.bool_]
+Pixels = NDArray[np.uint8]
+Inpainter = Callable[[Pixels, Mask], Pixels]
+
+TOUCHING = 3
+"""Largest gap, in pixels at 1024, between masks of which one may hide a part of the other."""
+PAPER_DILATION = 50.0
+"""Side in pixels at 1024 of the kernel by which the paper dilates masks and hard shadows."""
+LEAST_HIDDEN = 0.004
+"""Smallest hidden share of an object's mask that is completed."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Layers of a photo, (H, W) bool or (H, W, 3) uint8 at working size, in the order of the objects.
+
+    seen: visible pixels of each object; full: its whole mask. shadows, holes: of each object, without other objects.
+    colours: the photo with the hidden part of each object painted in its own colours. front_to_back: indices.
+    uncovered: by index, the picture after each removal that revealed something.
+    """
+
+    seen: tuple[Mask, ...]
+    full: tuple[Mask, ...]
+    shadows: tuple[Mask, ...]
+    holes: tuple[Mask, ...]
+    colours: tuple[Pixels, ...]
+    background: Pixels
+    front_to_back: tuple[int, ...]
+    uncovered: Mapping[int, Pixels]
+
+
+def separate_layers(
+    pixels: Pixels,
+    seen: Sequence[Mask],
+    boxes: Sequence[Box],
+    names: Sequence[str],
+    view: Camera,
+    options: ReconstructOptions,
+    *,
+    depth: NDArray[np.float32] | None,
+    inpainter: Inpainter | None,
+    store: StageCache,
+    steps: Steps,
+) -> Layers:
+    """Return the layers of the photo ``pixels`` (H, W, 3), whose objects show ``seen`` and lie in ``boxes``.
+
+    view: camera above z = 0. depth: (H, W) metres or None. inpainter: replaces the built-in inpainting. Raises
+    InputError when hardly any background is left, or ``options.order`` does not name the objects.
+    """
+    steps.begin("shadows")
+    cast = store.run(
+        "shadows",
+        {"pixels": pixels, "seen": seen, "view": view, "threshold": options.shadow_threshold},
+        lambda notice: _cast(pixels, seen, view, options.shadow_threshold),
+    )
+    shadows = [np.asarray(shadow, dtype=bool) for shadow in cast["shadows"]]
+    darkened = [np.asarray(shadow, dtype=bool) for shadow in cast["darkened"]]
+    steps.begin("order")
+    order = _order(seen, names, options, depth, steps.notice)
+    fill = _filler(pixels, view, options, inpainter)
+    full, colours, uncovered = _complete(pixels, seen, shadows, boxes, names, order, view, options, fill, store, steps)
+    # Where the penumbra is known, less dilation is needed.
+    share = PENUMBRA_DILATION / PAPER_DILATION if options.shadow_threshold is None else 1.0
+    holes = object_holes(seen, darkened, share * options.hole_dilation * max(pixels.shape[:2]) / 1024.0)
+    steps.begin("background")
+    union, objects = np.logical_or.reduce(holes), np.logical_or.reduce(list(seen))
+    made = store.run(
+        "background",
+        {**_fill_inputs(pixels, view, options), "hole": union, "objects": objects},
+        partial(_filled, fill, pixels, union, objects),
+    )
+    return Layers(
+        seen=tuple(seen),
+        full=tuple(full),
+        shadows=tuple(shadows),
+        holes=tuple(holes),
+        colours=tuple(colours),
+        background=made["picture"],
+        front_to_back=order,
+        uncovered=uncovered,
+    )
+
+
+Fill = Callable[[Pixels, Mask, Mask, Notice], Pixels]
+
+
+def _filler(pixels: Pixels, view: Camera, options: ReconstructOptions, inpainter: Inpainter | None) -> Fill:
+    settings = FillOptions(radius=options.patch_radius, limit=options.inpaint_pixels, seed=options.seed)
+
+    def fill(picture: Pixels, hole: Mask, objects: Mask, notice: Notice) -> Pixels:
+        if inpainter is None:
+            return fill_background(picture, hole, objects, view, settings, notice)
+        return blend(picture, inpainter(picture, hole), hole, objects) if hole.any() else picture.copy()
+
+    return fill
+
+
+def _fill_inputs(pixels: Pixels, view: Camera, options: ReconstructOptions) -> dict[str, object]:
+    return {
+        "pixels": pixels,
+        "view": view,
+        "options": [options.patch_radius, options.inpaint_pixels, options.seed, options.inpainter],
+        "files": adapter_content("inpainter", options.inpainter),
+    }
+
+
+def _cast(pixels: Pixels, seen: Sequence[Mask], view: Camera, threshold: float | None) -> dict[str, NDArray[np.bool_]]:
+    """The objects' shadows, and the same with their penumbras."""
+    if threshold is not None:
+        shadows = np.stack(threshold_shadows(pixels, seen, threshold))
+        return {"shadows": shadows, "darkened": shadows}
+    cast = cast_shadows(pixels, seen, view)
+    return {"shadows": np.stack([c.shadow for c in cast]), "darkened": np.stack([c.penumbra for c in cast])}
+
+
+def _filled(fill: Fill, picture: Pixels, hole: Mask, objects: Mask, notice: Notice) -> dict[str, Pixels]:
+    return {"picture": fill(picture, hole, objects, notice)}
+
+
+def _order(
+    seen: Sequence[Mask],
+    names: Sequence[str],
+    options: ReconstructOptions,
+    depth: NDArray[np.float32] | None,
+    notice: Notice,
+) -> tuple[int, ...]:
+    if options.order:
+        if sorted(options.order) != sorted(names):
+            raise InputError(f"order is {', '.join(options.order)}: name {', '.join(names)}, each once, front to back")
+        return tuple(list(names).index(name) for name in options.order)
+    found: Order = occlusion_order(seen, depth=depth)
+    for pair in found.pairs:
+        if pair.touching:
+            front, behind = names[pair.front], names[pair.behind]
+            notice(f"{front} is in front of {behind}: {pair.reason}; give the order if this is wrong")
+    return found.front_to_back
+
+
+def _complete(
+    pixels: Pixels,
+    seen: Sequence[Mask],
+    shadows: Sequence[Mask],
+    boxes: Sequence[Box],
+    names: Sequence[str],
+    order: Sequence[int],
+    view: Camera,
+    options: ReconstructOptions,
+    fill: Fill,
+    store: StageCache,
+    steps: Steps,
+) -> tuple[list[Mask], list[Pixels], dict[int, Pixels]]:
+    """Whole masks, pictures with the hidden parts painted in, and by index the picture after removals that revealed
+    more."""
+    full, colours = list(seen), [pixels] * len(seen)
+    uncovered: dict[int, Pixels] = {}
+    current, removed = pixels, np.zeros_like(seen[0])
+    reach = max(1, round(TOUCHING * max(pixels.shape[:2]) / 1024.0))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    for place, index in enumerate(order):
+        name = names[index]
+        steps.begin(f"complete {name}")
+        blocked = np.asarray(cv2.dilate(removed.astype(np.uint8), kernel) > 0)
+        if (blocked & seen[index]).any():
+            made = store.run(
+                "complete",
+                {"pixels": pixels, "picture": current, "seen": seen[index], "before": removed, "box": boxes[index]},
+                partial(_whole, pixels, current, seen[index], removed, boxes[index], name, options),
+            )
+            full[index], colours[index] = np.asarray(made["full"], dtype=bool), made["colours"]
+            hidden = full[index] & ~seen[index]
+            current = np.where(hidden[..., None], colours[index], current)
+        behind = order[place + 1 :]
+        near = cv2.dilate(seen[index].astype(np.uint8), kernel) > 0
+        if any((near & seen[other]).any() for other in behind):
+            hole = cv2.dilate((full[index] | shadows[index]).astype(np.uint8), kernel) > 0
+            for other in behind:
+                hole &= ~seen[other]
+            made = store.run(
+                "uncover",
+                {**_fill_inputs(current, view, options), "hole": hole, "objects": seen[index]},
+                partial(_filled, fill, current, hole, seen[index]),
+            )
+            current = made["picture"]
+            uncovered[index] = current
+        removed = removed | seen[index]
+    return full, colours, uncovered
+
+
+def _whole(
+    pixels: Pixels,
+    picture: Pixels,
+    seen: Mask,
+    before: Mask,
+    box: Box,
+    name: str,
+    options: ReconstructOptions,
+    notice: Notice,
+) -> dict[str, NDArray[np.generic]]:
+    again: Mask | None
+    try:
+        again = segment(picture, box, name, options.grabcut_iterations)
+    except InputError:
+        again = None
+    full = complete_outline(seen, before, seen_again=again)
+    hidden = int((full & ~seen).sum())
+    if hidden < LEAST_HIDDEN * full.sum():
+        return {"full": seen, "colours": pixels}
+    notice(
+        f"{name}: {100 * hidden / full.sum():.0f} % of it is hidden by objects in front; its outline and colours "
+        "there are a guess"
+    )
+    return {"full": full, "colours": complete_colours(pixels, seen, full)}

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""What things are made of: asked of a model, looked up in a table, or chosen."""

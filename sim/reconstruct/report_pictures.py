@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""Pictures of the report, (h, w, 3) uint8 sRGB: overlays on the photo, turntable views of bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ..scene.model import Camera, Ground
+from .user_mesh.mesh_alignment import sample_surface
+
+Pixels = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Colour = tuple[int, int, int]
+
+COLOURS: tuple[Colour, ...] = (
+    (255, 122, 41),
+    (46, 160, 255),
+    (66, 200, 110),
+    (226, 84, 190),
+    (245, 205, 60),
+    (130, 110, 245),
+)
+"""One per object, distinct on most photos; repeated after the last."""
+GRID_LINES = 12
+"""Grid lines on each side of the centre."""
+
+
+def colour_of(index: int) -> Colour:
+    """Return the colour of the object number ``index``."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def shrunk(pixels: Pixels, width: int) -> Pixels:
+    """Return ``pixels`` at most ``width`` wide."""
+    scale = width / pixels.shape[1]
+    if scale >= 1.0:
+        return pixels
+    size = (width, max(1, round(pixels.shape[0] * scale)))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def outlined(pixels: Pixels, masks: Sequence[Mask], *, fill: float = 0.0, names: Sequence[str] = ()) -> Pixels:
+    """Return the picture with the outline of each mask in its colour; ``fill``: opacity of the colour inside, 0 to
+    1."""
+    picture = pixels.copy()
+    thick = max(1, round(max(picture.shape) / 500))
+    for index, mask in enumerate(masks):
+        colour = colour_of(index)
+        if fill:
+            picture[mask] = ((1 - fill) * picture[mask] + fill * np.array(colour)).astype(np.uint8)
+        contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, contours, -1, (255, 255, 255), thick + 2, cv2.LINE_AA)
+        cv2.drawContours(picture, contours, -1, colour, thick, cv2.LINE_AA)
+    for index, (mask, name) in enumerate(zip(masks, names, strict=False)):
+        _label(picture, mask, name, colour_of(index))
+    return picture
+
+
+def _label(picture: Pixels, mask: Mask, name: str, colour: Colour) -> None:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return
+    scale = max(picture.shape) / 1100
+    ascii_name = name.encode("ascii", "replace").decode()
+    font, thick = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(2 * scale))
+    (width, height), base = cv2.getTextSize(ascii_name, font, scale, thick)
+    x = int(np.clip((columns[0] + columns[-1]) / 2 - width / 2, 4, max(4, picture.shape[1] - width - 4)))
+    y = int(max(height + 6, rows[0] - 8))
+    cv2.rectangle(picture, (x - 4, y - height - 5), (x + width + 4, y + base), colour, cv2.FILLED)
+    cv2.putText(picture, ascii_name, (x, y - 1), font, scale, (255, 255, 255), thick, cv2.LINE_AA)
+
+
+def cut_out(pixels: Pixels, seen: Mask, full: Mask) -> Pixels:
+    """Return the object alone on grey, with its completed part hatched."""
+    rows, columns = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))
+    pad = 6 + round(0.06 * max(len(rows), len(columns)))
+    window = (
+        slice(max(0, rows[0] - pad), min(full.shape[0], rows[-1] + 1 + pad)),
+        slice(max(0, columns[0] - pad), min(full.shape[1], columns[-1] + 1 + pad)),
+    )
+    y, x = np.mgrid[window]
+    paper = np.where(((y // 12 + x // 12) % 2 == 0)[..., None], 214, 226).astype(np.uint8)
+    picture = np.where(full[window][..., None], pixels[window], np.broadcast_to(paper, (*y.shape, 3)))
+    hatched = (full & ~seen)[window] & ((x + y) % 12 < 2)
+    picture[hatched] = (255, 255, 255)
+    return np.ascontiguousarray(picture, dtype=np.uint8)
+
+
+def shadowed(pixels: Pixels, shadows: Sequence[Mask], holes: Sequence[Mask]) -> Pixels:
+    """Return shadows in their objects' colours, and the outline of all inpainted pixels."""
+    grey = cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY)
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    for index, shadow in enumerate(shadows):
+        picture[shadow] = (0.35 * picture[shadow] + 0.65 * np.array(colour_of(index))).astype(np.uint8)
+    contours, _ = cv2.findContours(
+        np.logical_or.reduce(list(holes)).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    cv2.drawContours(picture, contours, -1, (255, 255, 255), max(1, round(max(picture.shape) / 600)), cv2.LINE_AA)
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def ground_grid(pixels: Pixels, camera: Camera, ground: Ground, spacing: float) -> Pixels:
+    """Return the photo with a square grid on the ground, ``spacing`` metres wide, and the horizon in yellow."""
+    picture = pixels.copy()
+    thick = max(1, round(max(picture.shape) / 900))
+    normal = ground.unit_normal
+    forward = np.asarray(camera.world_from_camera)[:3, 2]
+    away = forward - (forward @ normal) * normal
+    away = away / max(float(np.linalg.norm(away)), 1e-9)
+    right = np.cross(away, normal)
+    middle = np.asarray(ground.point, dtype=np.float64)
+    reach = GRID_LINES * spacing
+    for k in range(-GRID_LINES, GRID_LINES + 1):
+        for along, across in ((away, right), (right, away)):
+            steps = np.linspace(-reach, reach, 200)[:, None]
+            _line(picture, camera, middle + k * spacing * across + steps * along, (255, 255, 255), thick)
+    directions = np.linspace(-1.4, 1.4, 200)[:, None]
+    far = camera.position + 1e6 * (np.cos(directions) * away + np.sin(directions) * right)
+    _line(picture, camera, far, (255, 214, 0), 2 * thick)
+    return picture
+
+
+def _line(picture: Pixels, camera: Camera, points: NDArray[np.float64], colour: Colour, thick: int) -> None:
+    projected = camera.project(points)
+    limit = 8.0 * max(picture.shape)
+    good = (projected[:, 2] > 1e-6) & (np.abs(projected[:, :2]) < limit).all(axis=1)
+    for first, second, a, b in zip(projected[:-1], projected[1:], good[:-1], good[1:], strict=True):
+        if a and b:
+            start, end = ((round(16 * float(p[0])), round(16 * float(p[1]))) for p in (first, second))
+            cv2.line(picture, start, end, colour, thick, cv2.LINE_AA, shift=4)
+
+
+def tone_mapped(radiance: NDArray[np.floating], width: int) -> Pixels:
+    """Return an environment map (h, w, 3) of linear light as a picture; twice its mean is white."""
+    mean = max(float(radiance.mean()), 1e-6)
+    shown = np.clip(radiance / (2.0 * mean), 0.0, 1.0) ** (1 / 2.2)
+    size = (width, max(1, round(width * radiance.shape[0] / radiance.shape[1])))
+    enlarged = cv2.resize(np.asarray(shown, dtype=np.float32), size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(enlarged * 255.0 + 0.5, dtype=np.uint8)
+
+
+def grid_spacing(size_m: float) -> float:
+    """Return a round length, 1, 2 or 5 times a power of ten, near ``size_m`` metres."""
+    power = 10.0 ** math.floor(math.log10(size_m))
+    return min((1, 2, 5, 10), key=lambda factor: abs(math.log(size_m / (factor * power)))) * power
+
+
+SAMPLES = 260_000
+LIGHT = np.array([-0.4, -0.55, 0.73])
+"""Towards the light, beside and above the viewer."""
+PAPER = (233, 232, 228)
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on a surface: places (n, 3), normals (n, 3), colours (n, 3) 0 to 255."""
+
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    colours: NDArray[np.float64]
+
+
+def surface_points(mesh: trimesh.Trimesh, count: int = SAMPLES) -> SurfacePoints:
+    """Return ``count`` points evenly over ``mesh``, in its own coordinates; grey without a texture."""
+    points = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
+    faces = np.asarray(mesh.faces)[points.faces]
+    normals = np.einsum("nc,nci->ni", points.weights, np.asarray(mesh.vertex_normals)[faces])
+    return SurfacePoints(points.places, normals, _colours(mesh, faces, points.weights))
+
+
+def _colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    uv = getattr(mesh.visual, "uv", None)
+    image = getattr(getattr(mesh.visual, "material", None), "baseColorTexture", None)
+    if uv is None or image is None:
+        return np.full((len(faces), 3), 190.0)
+    texture = np.asarray(image.convert("RGB"), dtype=np.float64)
+    at = np.einsum("nc,nci->ni", corners, np.asarray(uv)[faces])
+    columns = np.clip(at[:, 0] * texture.shape[1], 0, texture.shape[1] - 1).astype(int)
+    rows = np.clip((1 - at[:, 1]) * texture.shape[0], 0, texture.shape[0] - 1).astype(int)
+    return np.asarray(texture[rows, columns])
+
+
+def view_from(points: SurfacePoints, turn: float, rise: float, side: int, radius: float) -> Pixels:
+    """Return a distant view of the points, ``side`` pixels square, with ``radius`` around their centre visible.
+
+    turn: radians to the right around the vertical, starting from the direction of y; rise: above the horizontal.
+    """
+    middle = (points.places.min(axis=0) + points.places.max(axis=0)) / 2
+    right = np.array([np.cos(turn), np.sin(turn), 0.0])
+    ahead = np.array([-np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), -np.sin(rise)])
+    up = np.cross(right, ahead)
+    local = points.places - middle
+    x = ((local @ right) / radius * 0.5 + 0.5) * side
+    y = (0.5 - (local @ up) / radius * 0.5) * side
+    light = LIGHT[0] * right + LIGHT[1] * ahead + LIGHT[2] * up
+    lit = 0.5 + 0.5 * np.clip(points.normals @ (light / np.linalg.norm(light)), 0.0, None)
+    colours = np.clip(points.colours * lit[:, None], 0, 255).astype(np.uint8)
+    columns, rows = np.floor(x).astype(int), np.floor(y).astype(int)
+    # Far points first: the last one written to a pixel is the nearest.
+    order = np.argsort(-(local @ ahead), kind="stable")
+    inside = (columns >= 0) & (columns < side) & (rows >= 0) & (rows < side)
+    order = order[inside[order]]
+    picture = np.full((side, side, 3), PAPER, dtype=np.uint8)
+    picture[rows[order], columns[order]] = colours[order]
+    return picture
+
+
+def turntable(mesh: trimesh.Trimesh, side: int = 220) -> Pixels:
+    """Return views from the photo's direction, the right, behind and above, side by side (side, 4 side, 3)."""
+    points = surface_points(mesh)
+    extent = np.ptp(points.places, axis=0)
+    radius = 0.55 * float(np.linalg.norm(extent))
+    views = ((0.0, 0.35), (np.pi / 2, 0.2), (np.pi, 0.35), (0.0, np.pi / 2 - 0.01))
+    return np.concatenate([view_from(points, turn, rise, side, radius) for turn, rise in views], axis=1)

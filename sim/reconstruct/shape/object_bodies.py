@@ -1,0 +1,425 @@
+# SPDX-License-Identifier: MIT
+"""A body for each object (primitive, inflated mesh or user mesh), and which supports which.
+
+Where the photo shows another object right below an object's foot, the foot touches that object. Scaling a body about
+the camera moves nothing in the photo, so it is moved to the depth at which the ray through its foot meets its support.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...scene.model import Camera
+from ..adapters.adapter_registry import adapter_content
+from ..adapters.protocols import Mesher
+from ..adapters.resolve import resolve
+from ..photo_layers import Layers
+from ..reconstruct_options import ObjectRequest, ReconstructOptions
+from ..stage_cache import Arrays, Notice, StageCache, Steps
+from ..user_mesh.fit_user_mesh import fit_mesh
+from .body_texture import TexturedSurface, colour_pixels, crop_texture, textured
+from .inflate import Crop, crop_mask, inflate
+from .inflated_mesh import WORTH_SAYING, BodyMesh, inflated_mesh, shadow_mesh, stability
+from .primitive_choice import KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
+from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
+from .primitives import rasterize
+
+Mask = NDArray[np.bool_]
+Points = NDArray[np.float64]
+TriangleMesh = tuple[Points, NDArray[np.int64]]
+
+BELOW = 0.012
+"""Height of the band below a foot, over the photo's longer side."""
+SHARE = 0.6
+"""Share of the foot's width that another object must cover below it."""
+FOOT = 0.06
+"""Lowest share of an object's height that is its foot."""
+NEAREST = 0.2
+"""Least distance of a moved body from the camera, over its distance on the ground."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """``upper`` stands on ``lower`` (indices); ``factor``: its distance from the camera over that on the ground."""
+
+    upper: int
+    lower: int
+    factor: float
+
+
+def resting_on(seen: Sequence[Mask]) -> dict[int, int]:
+    """Return, by index of an object, the index of its support: the object that the photo shows below its foot.
+
+    seen: (H, W) visible pixels of each object. Objects on the ground, and cycles, are left out.
+    """
+    found: dict[int, int] = {}
+    for i, mask in enumerate(seen):
+        below = _below_foot(mask)
+        if not below.any():
+            continue
+        shares = [0.0 if j == i else float((below & other).sum() / below.sum()) for j, other in enumerate(seen)]
+        best = int(np.argmax(shares))
+        if shares[best] >= SHARE and not _stands_on(found, best, i):
+            found[i] = best
+    return found
+
+
+def _stands_on(found: dict[int, int], upper: int, lower: int) -> bool:
+    """Whether ``upper`` stands on ``lower``, directly or indirectly."""
+    while upper in found:
+        upper = found[upper]
+        if upper == lower:
+            return True
+    return False
+
+
+def _below_foot(mask: Mask) -> Mask:
+    """A band of pixels (H, W) right below the lowest part of ``mask``."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    band = max(2, round(BELOW * max(mask.shape)))
+    bottom = int(rows[-1]) + 1
+    foot = mask[bottom - max(1, round(FOOT * len(rows))) : bottom].any(axis=0)
+    result = np.zeros_like(mask)
+    # Skip the seam between two objects, which mixes both.
+    result[bottom + 1 : bottom + 1 + band] = foot
+    return np.asarray(result & ~mask)
+
+
+def place_on_supports(camera: Camera, seen: Sequence[Mask], meshes: Sequence[TriangleMesh]) -> list[Support]:
+    """Return how bodies must be scaled about ``camera`` to stand on the supports that the photo shows.
+
+    seen: (H, W); meshes: vertices (V, 3) and faces (T, 3) of all objects, standing on z = 0, in the camera's unit.
+    Lower ones come first. A body whose ray misses its support stays on the ground.
+    """
+    on = resting_on(seen)
+    factors = [1.0] * len(seen)
+    placed: list[Support] = []
+    for upper in sorted(on, key=lambda i: _height(on, i)):
+        lower = on[upper]
+        vertices = camera.position + factors[lower] * (meshes[lower][0] - camera.position)
+        pixel = _foot_pixel(seen[upper])
+        ray = camera.rays(pixel)
+        depth = first_hit(camera.position, ray, vertices, meshes[lower][1])
+        own = float(camera.project(meshes[upper][0])[:, 2].min())
+        ground = -camera.position[2] / ray[2] if ray[2] < -1e-6 else np.inf
+        factor = depth / ground
+        if np.isfinite(factor) and NEAREST < factor < 0.999 and own > 0:
+            factors[upper] = float(factor)
+            placed.append(Support(upper, lower, float(factor)))
+    return placed
+
+
+def _height(on: dict[int, int], index: int) -> int:
+    steps = 0
+    while index in on:
+        index, steps = on[index], steps + 1
+    return steps
+
+
+def _foot_pixel(mask: Mask) -> Points:
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask[rows[-1]])
+    return np.array([(columns[0] + columns[-1] + 1) / 2.0, rows[-1] + 1.0])
+
+
+def first_hit(origin: Points, ray: Points, vertices: Points, faces: NDArray[np.int64]) -> float:
+    """Return the distance in lengths of ``ray`` (3,) from ``origin`` (3,) to the first triangle that it meets; inf for
+    none.
+
+    Möller & Trumbore, Journal of Graphics Tools 2(1), 1997.
+    """
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    edge, other = b - a, c - a
+    across = np.cross(ray, other)
+    determinant = np.einsum("ti,ti->t", edge, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        start = origin - a
+        u = np.einsum("ti,ti->t", start, across) / determinant
+        turned = np.cross(start, edge)
+        v = turned @ ray / determinant
+        distance = np.einsum("ti,ti->t", other, turned) / determinant
+        hit = (np.abs(determinant) > 1e-15) & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 1e-9)
+    return float(distance[hit].min()) if hit.any() else float("inf")
+
+
+TOPPLES = 0.05
+"""Stability below which a notice says that the body may topple."""
+BENT = 0.98
+"""Silhouette overlap above which the warped primitive is the body; below, the outline is cut out of it."""
+KEPT = 0.96
+"""Overlap of the finished silhouette with the mask that a primitive has to reach."""
+UNLIKELY = 0.8
+"""Overlap of a requested shape below which a notice reports the mismatch."""
+
+
+@dataclass(frozen=True)
+class BuiltBody:
+    """The body of one object. The camera is 1 unit above the ground z = 0.
+
+    mesh: closed surface, world units. shape: ``box``, ``cylinder``, ``sphere`` or ``inflated``. stability: 1 for a
+    cube, negative if it topples; a sphere counts as standing. fit: overlap (IoU) of its silhouette in the photo's view
+    with its mask.
+    """
+
+    mesh: BodyMesh
+    shape: str
+    stability: float
+    fit: float
+
+
+def build_body(
+    camera: Camera,
+    full: Mask,
+    request: ObjectRequest,
+    options: ReconstructOptions,
+    notice: Notice,
+    *,
+    seen: Mask | None = None,
+    pixels: NDArray[np.uint8] | None = None,
+) -> BuiltBody:
+    """Return the body whose silhouette in the photo is ``full``.
+
+    camera: 1 unit above the ground z = 0. full: (H, W), not empty, the object's whole mask. seen: (H, W) its visible
+    part; None for all. pixels: (H, W, 3) sRGB, the photo, whose inner edges help to separate a box' depth from its
+    height.
+
+    Raises InputError when the mask is empty or too thin for a closed surface.
+    """
+    if not full.any():
+        raise InputError(f"{request.name or 'object'}: its outline is empty; draw the box around the object")
+    name = request.name or "object"
+    seen = full if seen is None else seen & full
+    kind = shape_of_kind(request.kind)
+    crop = crop_mask(full)
+    # Choosing a back implies an inflated body.
+    shape = "inflated" if request.shape == "auto" and request.back != "auto" else request.shape
+    choice = choose_primitive(camera, crop, full, seen, pixels, shape=shape, kind=kind, thickness=request.thickness)
+    if choice is None and request.shape not in ("auto", "inflated"):
+        notice(f"{name}: no {request.shape} on the ground has this outline; it is inflated instead, check the horizon")
+    if choice is not None and request.shape != "auto" and choice.overlap < UNLIKELY:
+        notice(
+            f"{name}: its outline overlaps that of the best {request.shape} by only {choice.overlap:.2f}; "
+            "shape auto or inflated may fit better"
+        )
+    if choice is None:
+        mesh, margin, lost = _inflated(camera, full, request, kind, options.mesh_vertices)
+        shape = "inflated"
+    else:
+        part = 1.0 if request.thickness is None or choice.primitive.name == "box" else request.thickness
+        mesh, lost = _solid(camera, crop, choice, full, part, options.mesh_vertices)
+        shape = choice.primitive.name
+        margin = 1.0 if shape == "sphere" else stability(mesh.vertices, mesh.faces)
+    fit = silhouette_overlap(camera, mesh, full)
+    if choice is not None and fit < KEPT and request.shape == "auto":
+        # Reject an automatic primitive that does not keep the outline.
+        choice, shape = None, "inflated"
+        mesh, margin, lost = _inflated(camera, full, request, kind, options.mesh_vertices)
+        fit = silhouette_overlap(camera, mesh, full)
+    elif fit < KEPT:
+        notice(f"{name}: the body's silhouette overlaps its mask by {fit:.2f} only; give another shape or mask")
+    if lost > WORTH_SAYING:
+        notice(f"{name}: {lost:.0%} of its surface was disconnected and was removed; check its mask")
+    if margin < TOPPLES:
+        notice(f"{name}: may topple, its centre of mass is not above its base; a larger thickness helps")
+    mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, None if choice is None else choice.primitive))
+    return BuiltBody(mesh=mesh, shape=shape, stability=margin, fit=fit)
+
+
+def _solid(
+    camera: Camera, crop: Crop, choice: PrimitiveChoice, full: Mask, thickness: float, target: int
+) -> tuple[BodyMesh, float]:
+    own = rasterize(choice.primitive, camera, crop.mask.shape, crop.left, crop.top)
+    fitted = warp_to_outline(crop, own)
+    bent = bent_mesh(camera, crop, choice.primitive, fitted, target)
+    if not fitted.parts.any() and silhouette_overlap(camera, bent, full) >= BENT:
+        return bent, 0.0
+    return solid_mesh(camera, crop, choice.primitive, fitted, target, thickness)
+
+
+def _inflated(
+    camera: Camera, full: Mask, request: ObjectRequest, kind: KindShape | None, target: int
+) -> tuple[BodyMesh, float, float]:
+    thickness = request.thickness
+    if thickness is None and kind is not None and kind.shape == "inflated":
+        thickness = kind.thickness
+    back = request.back
+    if back == "auto":
+        back = "symmetric" if kind is None else kind.back
+    silhouette = inflate(full, thickness)
+    if request.shape == "inflated" and silhouette.slab and thickness is None:
+        silhouette = inflate(full, 1.0)
+    return inflated_mesh(camera, silhouette, target, flat=back == "flat")
+
+
+def silhouette_overlap(camera: Camera, mesh: BodyMesh, full: Mask) -> float:
+    """Return the IoU of the silhouette of ``mesh`` in the photo's view with ``full`` (H, W), inside the photo."""
+    corners = camera.project(mesh.vertices)[:, :2][mesh.faces]
+    low = np.floor(corners.min(axis=(0, 1))).astype(int) - 2
+    high = np.ceil(corners.max(axis=(0, 1))).astype(int) + 2
+    low = np.maximum(low, 0)
+    high = np.minimum(high, [full.shape[1], full.shape[0]])
+    if (high <= low).any():
+        return 0.0
+    scale = 2 if (high - low).max() > 900 else 4
+    image = np.zeros(((high[1] - low[1]) * scale, (high[0] - low[0]) * scale), np.uint8)
+    for triangle in np.round(((corners - low) * scale - 0.5) * 16).astype(np.int32):
+        cv2.fillConvexPoly(image, triangle, 255, shift=4)
+    drawn_mask = np.zeros_like(full)
+    part = cv2.resize(image, (int(high[0] - low[0]), int(high[1] - low[1])), interpolation=cv2.INTER_AREA) > 127
+    drawn_mask[low[1] : high[1], low[0] : high[0]] = part
+    return float((drawn_mask & full).sum() / max(1, int((drawn_mask | full).sum())))
+
+
+Pixels = NDArray[np.uint8]
+
+USER_MESH = "mesh"
+"""Shape name of a body that comes from a user's mesh or a mesher."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """surface: closed, in the camera's unit, standing on z = 0 or a support. shape: a primitive's name, ``inflated`` or
+    ``USER_MESH``."""
+
+    surface: TexturedSurface
+    shape: str
+
+    @property
+    def extent(self) -> float:
+        """Largest extent along the world's axes, in the camera's unit."""
+        return float(np.ptp(self.surface.vertices, axis=0).max())
+
+
+def make_bodies(
+    layers: Layers,
+    view: Camera,
+    objects: Sequence[ObjectRequest],
+    options: ReconstructOptions,
+    store: StageCache,
+    steps: Steps,
+) -> list[Body]:
+    """Return the bodies of ``objects``, whose names and kinds are resolved, each where the photo shows it.
+
+    Raises InputError for an outline or mesh that no body can be made from.
+    """
+    mesher = None if options.mesher is None else resolve("mesher", options.mesher, steps.cancelled)
+    bodies = []
+    for i, item in enumerate(objects):
+        steps.begin(f"mesh {item.name}")
+        full, seen, colours = layers.full[i], layers.seen[i], layers.colours[i]
+        inputs = {"full": full, "seen": seen, "pixels": colours, "view": view, "name": item.name}
+        if item.mesh is None and mesher is None:
+            fields = {name: getattr(item, name) for name in ("kind", "shape", "back", "thickness")}
+            made = store.run(
+                "mesh",
+                {**inputs, **fields, "vertices": options.mesh_vertices},
+                partial(_built, view, full, seen, colours, item, options),
+            )
+        else:
+            given = {
+                "up": item.mesh_up,
+                "points": item.mesh_points,
+                "mesher": adapter_content("mesher", options.mesher),
+            }
+            file = None if item.mesh is None else _content(item.mesh)
+            made = store.run(
+                "fit", {**inputs, **given, "file": file}, partial(_fitted, view, full, seen, colours, item, mesher)
+            )
+        surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"])
+        bodies.append(Body(surface, str(made["shape"])))
+    return _on_supports(view, layers.seen, bodies, objects, steps.notice)
+
+
+def _content(path: Path) -> NDArray[np.uint8]:
+    try:
+        return np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its name") from None
+
+
+def _arrays(surface: TexturedSurface, shape: str) -> Arrays:
+    return {
+        "vertices": surface.vertices,
+        "faces": surface.faces,
+        "uv": surface.uv,
+        "picture": surface.picture,
+        "shape": np.array(shape),
+    }
+
+
+def _built(
+    view: Camera,
+    full: Mask,
+    seen: Mask,
+    colours: Pixels,
+    item: ObjectRequest,
+    options: ReconstructOptions,
+    notice: Notice,
+) -> Arrays:
+    body = build_body(view, full, item, options, notice, seen=seen, pixels=colours)
+    return _arrays(textured(body.mesh, crop_texture(colours, full)), body.shape)
+
+
+def _fitted(
+    view: Camera,
+    full: Mask,
+    seen: Mask,
+    colours: Pixels,
+    item: ObjectRequest,
+    mesher: Mesher | None,
+    notice: Notice,
+) -> Arrays:
+    with tempfile.TemporaryDirectory(prefix="physgen-mesh-") as place:
+        path = item.mesh
+        if path is None:
+            assert mesher is not None
+            path = mesher(colours, full, Path(place))
+        fitted = fit_mesh(
+            path,
+            view,
+            seen,
+            full,
+            colours,
+            name=item.name or "object",
+            up=item.mesh_up,
+            points=item.mesh_points,
+            notice=notice,
+        )
+    return _arrays(fitted.surface, USER_MESH)
+
+
+def _on_supports(
+    view: Camera, seen: Sequence[Mask], bodies: Sequence[Body], objects: Sequence[ObjectRequest], notice: Notice
+) -> list[Body]:
+    """``bodies``, with those that stand on other bodies moved onto them."""
+    placed = list(bodies)
+    for found in place_on_supports(view, seen, [(body.surface.vertices, body.surface.faces) for body in bodies]):
+        surface = placed[found.upper].surface
+        vertices = view.position + found.factor * (surface.vertices - view.position)
+        placed[found.upper] = replace(placed[found.upper], surface=replace(surface, vertices=vertices))
+        notice(f"{objects[found.upper].name} stands on {objects[found.lower].name}; it is placed there")
+    return placed
+
+
+def shadow_casters(view: Camera, full: Sequence[Mask], bodies: Sequence[Body]) -> list[TriangleMesh]:
+    """Meshes that cast the shadows: plain inflated masks for inflated bodies, the bodies' own surfaces otherwise.
+
+    An inflated body is moved back until it stands, so its shadow would be displaced.
+    """
+    result = []
+    for mask, body in zip(full, bodies, strict=True):
+        if body.shape == "inflated":
+            bare = shadow_mesh(view, inflate(mask))
+            result.append((bare.vertices, bare.faces))
+        else:
+            result.append((body.surface.vertices, body.surface.faces))
+    return result

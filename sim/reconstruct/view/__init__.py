@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Where the camera was: focal length, horizon, ground, depth, scale."""

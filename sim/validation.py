@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""Field checks, and JSON to dataclasses and back, with errors that name the field, value and remedy.
+
+Only the types that the project's own formats use are supported: nested dataclasses, tuples, optional values, strings,
+paths, numbers and booleans. Unknown keys are rejected, so that a misspelt field is never silently ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+from .errors import InputError
+
+
+def require(condition: bool, field_name: str, value: object, remedy: str) -> None:
+    """Raise InputError, "FIELD is VALUE: REMEDY", unless ``condition`` holds."""
+    if not condition:
+        raise InputError(f"{field_name} is {value!r}: {remedy}")
+
+
+def finite(*numbers: float) -> bool:
+    """Return whether all ``numbers`` are finite."""
+    return all(math.isfinite(n) for n in numbers)
+
+
+def require_range(field_name: str, value: float | None, low: float, high: float, unit: str = "a number") -> None:
+    """Raise InputError unless ``value`` is None or lies from ``low`` to ``high``."""
+    good = value is None or (finite(value) and low <= value <= high)
+    require(good, field_name, value, f"give {unit} from {low:g} to {high:g}")
+
+
+def quantity(default: Any, low: float, high: float, unit: str = "a number") -> Any:
+    """Return a dataclass field with range and unit as metadata, for checks and Blender's properties."""
+    return dataclasses.field(default=default, metadata={"range": (low, high), "unit": unit})
+
+
+def range_of(kind: type, name: str) -> tuple[float, float]:
+    """Return the range of the field ``name``, a ``quantity`` of the dataclass ``kind``."""
+    low, high = kind.__dataclass_fields__[name].metadata["range"]  # type: ignore[attr-defined]
+    return low, high
+
+
+def require_quantities(item: Any, where: str) -> None:
+    """Raise InputError unless every ``quantity`` of ``item`` is None or in range; ``where`` precedes its name."""
+    for spec in dataclasses.fields(item):
+        if "range" in spec.metadata:
+            low, high = spec.metadata["range"]
+            require_range(f"{where}{spec.name}", getattr(item, spec.name), low, high, spec.metadata["unit"])
+
+
+T = TypeVar("T")
+
+MAX_JSON_BYTES = 16 * 2**20
+"""Larger files are refused unread; scenes, manifests and jobs are far smaller."""
+
+
+def read_json(path: Path) -> Any:
+    """Return the parsed JSON file ``path``. Raises InputError when it is missing, too large, not UTF-8 or not JSON."""
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise InputError(f"{path}: larger than {MAX_JSON_BYTES >> 20} MiB, so it is no file of PhysGen")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+
+
+def parse(kind: type[T], value: Any, path: str) -> T:
+    """Return the dataclass ``kind`` built from parsed JSON ``value``; ``path`` names it in messages."""
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected an object with fields, found {_brief(value)}")
+    hints = typing.get_type_hints(kind)
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(value) - set(fields))
+    if unknown:
+        raise InputError(
+            f"{path}.{unknown[0]}: unknown field; known are {', '.join(fields)}; "
+            "remove it, or update PhysGen if a newer version wrote it"
+        )
+    arguments = {}
+    for name, spec in fields.items():
+        if name in value:
+            arguments[name] = _convert(hints[name], value[name], f"{path}.{name}")
+        elif spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING:
+            raise InputError(f"{path}.{name}: missing")
+    try:
+        return kind(**arguments)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, path: str) -> Any:
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(next(a for a in arguments if a is not type(None)), value, path)
+    if origin is tuple:
+        return _convert_tuple(arguments, value, path)
+    if dataclasses.is_dataclass(hint):
+        return parse(typing.cast(type, hint), value, path)
+    if hint is Any:
+        return value
+    return _convert_scalar(hint, value, path)
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{path}: expected a list, found {_brief(value)}")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return tuple(_convert(arguments[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+    if len(value) != len(arguments):
+        raise InputError(f"{path}: expected {len(arguments)} entries, found {len(value)}")
+    return tuple(_convert(a, item, f"{path}[{i}]") for i, (a, item) in enumerate(zip(arguments, value, strict=True)))
+
+
+def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if math.isfinite(number):
+            return number
+        raise InputError(f"{path}: expected a finite number, found {_brief(value)}")
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if hint in (str, bool) and isinstance(value, hint):
+        return value
+    if hint is Path and isinstance(value, str) and value and "\0" not in value:
+        return Path(value)
+    names = {float: "a number", int: "a whole number", str: "a text", Path: "the path of a file", bool: "true or false"}
+    raise InputError(f"{path}: expected {names.get(hint, hint)}, found {_brief(value)}")
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def to_json(value: Any) -> Any:
+    """Return the JSON form of a dataclass; ``parse`` returns the equal object."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple | list):
+        return [to_json(item) for item in value]
+    return value.as_posix() if isinstance(value, Path) else value

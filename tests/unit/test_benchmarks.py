@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every benchmark starts by its module's name and runs to its end with ``--quick``."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import pytest
+from physgen.benchmarks.__main__ import benchmarks, main
+
+FAST = ("diagnosis", "farm", "farm_dask", "main_thread", "mpm", "playback", "render", "splats", "worlds")
+SLOW = ("compose", "demo", "first_frame", "light", "reconstruct")
+NEEDS = {
+    **dict.fromkeys((*SLOW, "main_thread", "playback", "render"), "bpy"),
+    "farm_dask": "distributed",
+}
+
+
+def test_the_list_names_every_benchmark_with_what_it_measures(capsys):
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == sorted((*FAST, *SLOW)) == list(benchmarks())
+    assert all(len(line.split()) > 3 for line in lines)
+    with pytest.raises(SystemExit):
+        main(["no_such_benchmark"])
+
+
+@pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_a_benchmark_runs_quickly_and_prints_json(name):
+    if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
+        pytest.skip(f"needs {NEEDS[name]}")
+    command = [sys.executable, "-m", f"physgen.benchmarks.{name}", "--quick", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    # Blender logs to standard output, too, before the redirection begins.
+    assert isinstance(json.loads(done.stdout.strip().splitlines()[-1]), dict)
+
+
+def test_defaults_of_quick_yield_to_given_options():
+    from physgen.benchmarks.common import benchmark_parser
+
+    parser = benchmark_parser("x", None, frames=2, size=3)
+    parser.add_argument("--frames", type=int, default=48)
+    parser.add_argument("--size", type=int, default=64)
+    slow, quick = parser.parse_args(["--size", "5"]), parser.parse_args(["--size", "5", "--quick"])
+    assert (slow.frames, slow.size, slow.quick) == (48, 5, False)
+    assert (quick.frames, quick.size, quick.quick) == (2, 5, True)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: MIT
+"""Segmentation and the filled background, on drawn photos with known answers."""
+
+import numpy as np
+import pytest
+from physgen.sim.composite.inpaint import FillOptions, inpaint
+from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.segmentation.box_segmentation import check_distinct, pixel_box, segment
+from physgen.sim.reconstruct.segmentation.mask_cleanup import (
+    drop_ground_shadow,
+    fill_holes,
+    largest_component,
+    settle_outline,
+)
+from scipy import ndimage
+
+WIDTH, HEIGHT = 320, 240
+
+
+def ground(seed=0):
+    """Streaky, noisy boards."""
+    rng = np.random.default_rng(seed)
+    streaks = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), (0.7, 12)) * 60
+    grain = rng.normal(scale=4, size=(HEIGHT, WIDTH))
+    return np.clip(np.array([180.0, 150, 110]) + (streaks + grain)[..., None], 0, 255)
+
+
+def disc(x, y, radius):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def paint(shapes, shadows=(), seed=0):
+    """Photo with ``shapes`` (mask, colour) on the ground, darkened in ``shadows``."""
+    image = ground(seed)
+    for shadow in shadows:
+        image[shadow] *= 0.45
+    for mask, colour in shapes:
+        noise = np.random.default_rng(seed + 1).normal(scale=6, size=(HEIGHT, WIDTH, 1))
+        image = np.where(mask[..., None], np.asarray(colour, float) + noise, image)
+    return np.clip(ndimage.gaussian_filter(image, (0.5, 0.5, 0)), 0, 255).astype(np.uint8)
+
+
+def overlap(first, second):
+    return (first & second).sum() / (first | second).sum()
+
+
+@pytest.mark.parametrize("slack", [4, 25, 45])
+def test_disc_is_found_in_tight_and_loose_boxes(slack):
+    truth = disc(150, 120, 45)
+    mask = segment(paint([(truth, (40, 80, 190))]), (105 - slack, 75 - slack, 195 + slack, 165 + slack), "ball")
+    assert overlap(mask, truth) > 0.96
+
+
+def test_same_photo_gives_the_same_mask():
+    photo = paint([(disc(150, 120, 45), (40, 80, 190))])
+    assert (segment(photo, (90, 60, 210, 180), "a") == segment(photo, (90, 60, 210, 180), "a")).all()
+
+
+def test_print_is_filled_and_a_see_through_hole_stays():
+    truth = disc(150, 120, 60)
+    opening = disc(165, 120, 18)
+    label = disc(120, 120, 12)
+    photo = paint([(truth & ~opening, (40, 80, 190)), (label, (20, 200, 40))])
+    mask = segment(photo, (80, 50, 220, 190), "ring")
+    assert mask[label].all()
+    assert mask[opening].mean() < 0.1
+
+
+def test_pinholes_are_filled_whatever_their_colour():
+    mask = disc(150, 120, 60)
+    pierced = mask & ~disc(140, 110, 2)
+    assert (fill_holes(paint([]), pierced) == mask).all()
+
+
+def test_contact_shadow_is_not_part_of_the_object():
+    truth = disc(150, 100, 45)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    # Darkest where it meets the object, fading away from it, as under anything that stands on a floor.
+    away = ndimage.distance_transform_edt(~truth)
+    cast = (((columns - 155) / 48) ** 2 + ((rows - 138) / 16) ** 2 < 1) & ~truth & (rows > 118)
+    image = ground(2)
+    image[cast] *= np.clip(0.2 + away[cast] / 25.0, 0, 0.8)[:, None]
+    image[truth] = (60, 90, 200)
+    photo = np.clip(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    cleaned = drop_ground_shadow(photo, truth | cast, most=0.3)
+    assert cleaned[truth].mean() > 0.97
+    # The crease itself may stay with the object, the shadow beyond it may not.
+    beyond = cast & (away > 7) & (np.abs(columns - 150) < 35)
+    assert cleaned[beyond].mean() < 0.3
+    # Without a crease nothing is taken away.
+    assert (drop_ground_shadow(paint([(truth, (40, 80, 190))]), truth) == truth).all()
+
+
+def test_outline_settles_where_the_colours_mix_half_and_half():
+    truth = disc(150, 120, 45)
+    photo = paint([(truth, (40, 80, 190))])
+    wide = ndimage.binary_dilation(truth, iterations=2)
+    assert overlap(wide, truth) < 0.93
+    assert overlap(settle_outline(photo, wide), truth) > 0.98
+
+
+def test_largest_component_of_nothing_is_nothing():
+    assert not largest_component(np.zeros((20, 20), bool)).any()
+
+
+def test_what_colour_cannot_tell_falls_back_with_a_warning():
+    told = []
+    photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    mask = segment(photo, (100, 80, 200, 180), "ghost", warn=told.append)
+    assert told
+    assert 0.6 < mask.sum() / 1e4 < 0.9
+
+
+def test_a_box_that_cuts_the_object_is_told():
+    photo = paint([(disc(150, 120, 45), (40, 80, 190))])
+    told = []
+    segment(photo, (80, 100, 220, 200), "ball", warn=told.append)
+    assert len(told) == 1
+    assert "top" in told[0]
+    told.clear()
+    segment(photo, (80, 60, 220, 200), "ball", warn=told.append)
+    assert not told
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ((500, 10, 600, 60), "outside the photo"),
+        ((-90, -90, -10, -10), "outside the photo"),
+        ((50, 50, 50, 90), "no area"),
+        ((90, 50, 50, 90), "no area"),
+        ((50, 50, 52, 90), "too thin"),
+    ],
+)
+def test_impossible_boxes(box, message):
+    with pytest.raises(InputError, match=message):
+        pixel_box(box, 1.0, WIDTH, HEIGHT, "thing")
+
+
+def test_boxes_are_in_pixels_of_the_original():
+    assert pixel_box((100, 200, 300, 400), 0.5, WIDTH, HEIGHT, "thing") == (50, 100, 150, 200)
+
+
+def test_a_box_over_everything_is_refused():
+    with pytest.raises(InputError, match="whole photo"):
+        segment(paint([]), (0, 0, WIDTH, HEIGHT), "everything")
+
+
+def test_the_same_object_twice_is_refused_and_neighbours_are_not():
+    first, second = disc(100, 120, 40), disc(104, 122, 38)
+    with pytest.raises(InputError, match="same object"):
+        check_distinct([first, second], ["a", "b"])
+    # A thing on another one lies within its outline.
+    check_distinct([first, disc(100, 120, 10)], ["a", "b"])
+    check_distinct([first, disc(170, 120, 38)], ["a", "b"])
+
+
+@pytest.mark.parametrize("by_row", [False, True])
+@pytest.mark.parametrize("limit", [2_800_000, 10_000])
+def test_background_equals_the_photo_outside_the_hole(by_row, limit):
+    mask = disc(150, 110, 35)
+    photo = paint([(mask, (200, 30, 40))])
+    hole = disc(150, 110, 45)
+    options = FillOptions(by_row=by_row, limit=limit)
+    result = inpaint(photo, hole, mask, options)
+    assert (result[~hole] == photo[~hole]).all()
+    # Nothing red is left, and the filling is as bright as the ground around it.
+    assert (result[mask][:, 0].astype(int) - result[mask][:, 1]).max() < 90
+    beside = disc(150, 110, 60) & ~hole
+    assert np.abs(result[mask].mean(axis=0) - photo[beside].mean(axis=0)).max() < 15
+    assert (inpaint(photo, hole, mask, options) == result).all()
+
+
+def test_a_large_hole_keeps_the_grain():
+    whole = np.kron(ground(3), np.ones((3, 3, 1)))
+    whole = np.clip(whole + np.random.default_rng(5).normal(scale=8, size=whole.shape), 0, 255).astype(np.uint8)
+    hole = np.zeros(whole.shape[:2], bool)
+    hole[200:560, 300:700] = True
+    result = inpaint(whole, hole, hole, FillOptions())
+
+    def grain(pixels):
+        grey = pixels.astype(float).mean(axis=2)
+        return (grey - ndimage.gaussian_filter(grey, 1.5)).std()
+
+    assert grain(result[220:540, 320:680]) > 0.6 * grain(whole[600:, 300:700])
+
+
+def test_no_hole_and_no_background():
+    photo = paint([])
+    empty = np.zeros((HEIGHT, WIDTH), bool)
+    assert (inpaint(photo, empty, empty) == photo).all()
+    with pytest.raises(InputError, match="no background"):
+        inpaint(photo, ~empty, ~empty)
+
+
+def test_object_behind_another_keeps_both_its_parts_and_nothing_of_the_other():
+    bar = disc(150, 120, 60) & (np.abs(np.arange(WIDTH) - 150) < 14)
+    truth = disc(150, 120, 60) & ~bar
+    photo = paint([(truth, (40, 80, 190)), (bar, (200, 60, 50))])
+    mask = segment(photo, (75, 45, 225, 195), "ball", others=bar)
+    assert not (mask & bar).any()
+    assert overlap(mask, truth) > 0.95
+
+
+def test_other_objects_that_fill_the_box_are_refused():
+    with pytest.raises(InputError, match="fill its whole box"):
+        segment(paint([]), (75, 45, 225, 195), "ball", others=np.ones((HEIGHT, WIDTH), bool))
+
+
+def test_two_things_in_a_box_are_told_and_one_is_not():
+    told = []
+    first, second = disc(100, 120, 32), disc(200, 125, 28)
+    photo = paint([(first, (40, 80, 190)), (second, (50, 90, 180))])
+    mask = segment(photo, (55, 75, 245, 170), "balls", warn=told.append)
+    assert any("two separate objects" in message for message in told)
+    assert overlap(mask, first) > 0.9
+    told.clear()
+    segment(photo, (55, 75, 145, 170), "ball", warn=told.append)
+    assert not told
+
+
+def test_an_object_cut_by_the_photo_is_told():
+    told = []
+    mask = segment(paint([(disc(300, 120, 45), (40, 80, 190))]), (240, 60, 320, 180), "ball", warn=told.append)
+    assert mask[:, -1].any()
+    assert any("right edge of the photo" in message for message in told)
+    assert not any("its box" in message for message in told)
+
+
+def test_glass_is_told():
+    truth = disc(150, 120, 45)
+    photo = ground(4)
+    rim = truth & ~disc(150, 120, 42)
+    photo[rim] = 60.0
+    photo = np.clip(ndimage.gaussian_filter(photo, (0.5, 0.5, 0)), 0, 255).astype(np.uint8)
+    told = []
+    segment(photo, (95, 65, 205, 175), "glass", warn=told.append)
+    assert any("much like its surroundings" in message or "colour does not separate" in message for message in told)
+    told.clear()
+    segment(paint([(truth, (40, 80, 190))], seed=4), (95, 65, 205, 175), "ball", warn=told.append)
+    assert not told
+
+
+def test_contact_shadow_stays_on_the_ground():
+    truth = disc(150, 110, 40)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    shadow = (((columns - 170) / 50) ** 2 + ((rows - 148) / 12) ** 2 < 1) & ~truth
+    mask = segment(paint([(truth, (200, 60, 50))], [shadow]), (85, 55, 240, 175), "ball")
+    assert overlap(mask, truth) > 0.93
+    assert (mask & shadow).sum() < 0.15 * shadow.sum()
