@@ -44,14 +44,8 @@ from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
 from .bake_quality import Quality, load_quality
-from .world_setup_checks import (
-    collider_warnings,
-    overlap_warnings,
-    require_above_ground,
-    resolve,
-    surface_warnings,
-    vertices_at,
-)
+from .world_separation import separate
+from .world_setup_checks import require_above_ground, resolve, surface_warnings, vertices_at
 
 
 def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:
@@ -217,8 +211,9 @@ def prepare_world(
     quality: in place of the preset that ``options`` name. What depends on a mesh alone is worked out once for each of
     ``meshes``, as long as the caller keeps it.
 
-    Raises InputError for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that
-    stand in the ground or in each other, and for what no machine could compute.
+    Bodies that share space at the start are simulated without what they share; the warnings say so. Raises InputError
+    for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that stand in the ground,
+    and for what no machine could compute.
     """
     scene = folder.model
     moving = [i for i, item in enumerate(scene.objects) if item.role == "dynamic"]
@@ -237,16 +232,16 @@ def prepare_world(
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
     bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
-    warnings += overlap_warnings(bodies, spacing, cell)
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
-    warnings += collider_warnings(bodies, colliders, cell)
     warnings += [text for collider in colliders for text in _jump(collider)]
+    apart = separate(bodies, colliders, spacing=spacing, cell=cell)
+    warnings += apart.notices
     setup = WorldSetup(
-        bodies=bodies,
+        bodies=apart.bodies,
         ground=scene.ground,
         gravity=scene.gravity,
         gravity_track=_track(scene.gravity_track),
-        colliders=colliders,
+        colliders=apart.colliders,
         contacts=contact_table(scene),
     )
     setup = apply_effects(setup, scene.effects)

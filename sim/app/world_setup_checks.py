@@ -3,24 +3,20 @@
 
 How finely a scene is simulated: the cell size that its quality asks for.
 
-What a scene must hold at the start: bodies above the ground and beside one another, on sound meshes."""
+What a scene must hold at the start: bodies above the ground, on sound meshes."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import InputError
-from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import SAMPLING_BYTES, available_memory, require_memory
 from ..mpm.geometry.mesh_checks import check_surface
-from ..mpm.geometry.signed_distance import overlap, signed_distance
 from ..mpm.solver_options import SolverOptions, centred
 from ..scene.meshes import ObjectMesh
 from ..scene.model import Ground
@@ -121,35 +117,10 @@ Array = NDArray[np.float64]
 DEEPEST_CELLS = 1.0
 """Cells that a body may stand in the ground, or two in each other, at the start: contact pushes them out gently."""
 
-TOUCHING = 0.05
-"""Share of the particle spacing below which two bodies touch and do not overlap."""
-
 
 def surface_warnings(surface: Surface, name: str, cell: float) -> list[str]:
     """What is unusual about the mesh of object ``name``. Raises InputError for one that cannot be used."""
     return [str(warning) for warning in check_surface(surface, name=f"object {name}", cell_size=cell)]
-
-
-def collider_warnings(bodies: Sequence[BodyParticles], colliders: Sequence[Collider], cell: float) -> list[str]:
-    """What stands a little in a collider. Raises InputError for a body more than a cell deep in one."""
-    warnings: list[str] = []
-    for body, collider in itertools.product(bodies, colliders):
-        surface = collider.surface.vertices
-        low, high = body.positions.min(axis=0) - cell, body.positions.max(axis=0) + cell
-        # One that comes in later meets the collider wherever that has got to by then.
-        if body.start_time > 0 or (surface.max(axis=0) < low).any() or (surface.min(axis=0) > high).any():
-            continue
-        # No finer than the lattice of a large collider bears; bodies and colliders are then judged more coarsely.
-        spacing = max(cell, float(np.ptp(surface, axis=0).max()) / 200)
-        depth = overlap(body.positions, signed_distance(collider.surface, spacing, margin=0.0))
-        if depth > DEEPEST_CELLS * spacing:
-            raise InputError(
-                f"object {body.name}: is {depth:.2g} m deep in object {collider.name} at the start: move them apart "
-                "(world_from_mesh), or let it come in later (start_time)"
-            )
-        if depth > TOUCHING * spacing:
-            warnings.append(f"{body.name} stands {depth * 1000:.2g} mm in {collider.name} and will be pushed out")
-    return warnings
 
 
 def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:
@@ -160,52 +131,3 @@ def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float
             f"object {name}: its lowest vertex is {depth:.3g} m below the ground: lift it by that much "
             "(world_from_mesh), lower ground.point, or make it a collider"
         )
-
-
-def overlap_warnings(bodies: Sequence[BodyParticles], spacing: float, cell: float) -> list[str]:
-    """What overlaps a little at the start. Raises InputError for bodies that are more than a cell inside each other.
-
-    A ball of the contact radius around a particle lies inside its body; where two of them meet, the bodies do. Bodies
-    that come in at different times do not count.
-    """
-    warnings = []
-    for a, b in itertools.combinations(bodies, 2):
-        if a.start_time != b.start_time:
-            continue
-        depth = _overlap(a, b, spacing)
-        if depth > DEEPEST_CELLS * cell:
-            raise InputError(
-                f"object {a.name} and object {b.name}: they overlap at the start, {depth:.2g} m deep or more: move "
-                "them apart (world_from_mesh), let one come in later (start_time), or make one a collider"
-            )
-        if depth > 0:
-            warnings.append(
-                f"{a.name} and {b.name} overlap a little at the start ({depth * 1000:.2g} mm) and will be pushed apart"
-            )
-    return warnings
-
-
-def _overlap(a: BodyParticles, b: BodyParticles, spacing: float) -> float:
-    """About how deep in m two bodies are in each other, 0 when they are not."""
-    assert a.contact_radii is not None and b.contact_radii is not None
-    boxes = [(body.positions.min(axis=0) - spacing, body.positions.max(axis=0) + spacing) for body in (a, b)]
-    if (boxes[0][1] < boxes[1][0]).any() or (boxes[1][1] < boxes[0][0]).any():
-        return 0.0
-    distance, nearest = cKDTree(b.positions).query(a.positions, distance_upper_bound=spacing)
-    near = np.isfinite(distance)
-    touching = np.zeros(a.count)
-    touching[near] = a.contact_radii[near] + b.contact_radii[nearest[near]] - distance[near]
-    inside_a = touching > TOUCHING * spacing
-    if not inside_a.any():
-        return 0.0
-    back = cKDTree(a.positions[inside_a]).query(b.positions, distance_upper_bound=spacing)[0]
-    layers = min(_thickness(a.positions, inside_a), _thickness(b.positions, np.isfinite(back)))
-    # One layer of particles reaches the other body's first layer only: no deeper than their balls do.
-    return float(touching.max()) if layers <= 1.5 * spacing else layers
-
-
-def _thickness(positions: Array, marked: NDArray[np.bool_]) -> float:
-    """How far the marked particle that is deepest among the marked is from the others."""
-    if marked.all():
-        return float(np.ptp(positions, axis=0).max())
-    return float(cKDTree(positions[~marked]).query(positions[marked])[0].max())
