@@ -32,6 +32,7 @@ from .inflated_mesh import WORTH_SAYING, BodyMesh, inflated_mesh, shadow_mesh, s
 from .primitive_choice import KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import rasterize
+from .separation import PlacedBody, separate
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -336,7 +337,8 @@ def make_bodies(
             )
         surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"])
         bodies.append(Body(surface, str(made["shape"])))
-    return _on_supports(view, layers.seen, bodies, objects, steps.notice)
+    bodies = _on_supports(view, layers.seen, bodies, objects, steps.notice)
+    return _separated(view, layers.front_to_back, bodies, objects, steps.notice)
 
 
 def _content(path: Path) -> NDArray[np.uint8]:
@@ -408,6 +410,24 @@ def _on_supports(
         placed[found.upper] = replace(placed[found.upper], surface=replace(surface, vertices=vertices))
         notice(f"{objects[found.upper].name} stands on {objects[found.lower].name}; it is placed there")
     return placed
+
+
+def _separated(
+    view: Camera, front_to_back: Sequence[int], bodies: Sequence[Body], objects: Sequence[ObjectRequest], notice: Notice
+) -> list[Body]:
+    """``bodies``, none of which reaches into another; what the photo shows of them stays."""
+    placed = [PlacedBody(body.surface.vertices, body.surface.faces, body.shape == "inflated") for body in bodies]
+    vertices, found = separate(view, placed, front_to_back)
+    for item in found:
+        name, other = objects[item.yielding].name, objects[item.other].name
+        notice(
+            f"{name} and {other} would share space: {name} gives way by up to {item.share:.0%} of its size, on the "
+            "side that the photo does not show"
+        )
+    return [
+        replace(body, surface=replace(body.surface, vertices=places))
+        for body, places in zip(bodies, vertices, strict=True)
+    ]
 
 
 def shadow_casters(view: Camera, full: Sequence[Mask], bodies: Sequence[Body]) -> list[TriangleMesh]:
