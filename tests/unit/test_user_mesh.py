@@ -100,6 +100,47 @@ def test_an_open_mesh_becomes_a_closed_volume_and_this_is_said():
     assert "not closed" in said[0]
 
 
+def with_texture(mesh, uv, picture):
+    image = None if picture is None else Image.fromarray(picture)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=PBRMaterial(baseColorTexture=image))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)
+
+
+def colours_at(uv, picture):
+    """Colours (n, 3) of ``picture``, repeated without end, at ``uv`` (n, 2)."""
+    height, width = picture.shape[:2]
+    x, y = np.floor(uv[:, 0] * width).astype(int) % width, np.floor((1 - uv[:, 1]) * height).astype(int) % height
+    return picture[y, x].astype(int)
+
+
+@pytest.mark.parametrize("repeats", [0.9, 1.7, 2.0])
+def test_a_texture_that_repeats_looks_as_it_did(repeats):
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:] = np.add.outer(np.arange(64), 2 * np.arange(64))[..., None] * np.array([1, 0.5, 0.2])
+    mesh = trimesh.creation.icosphere(2)
+    uv = np.asarray(mesh.vertices)[:, :2] * repeats + (0.3, -7.4)
+    said = []
+    mended = repair_mesh(with_texture(mesh, uv, picture), "ball", said.append)
+    assert not said and trimesh.Trimesh(mended.vertices, mended.faces).is_watertight
+    assert mended.uv.min() >= 0.0 and mended.uv.max() <= 1.0
+    middles = mended.uv[mended.faces].mean(axis=1)
+    before = uv[np.asarray(mesh.faces)].mean(axis=1)
+    # A place on the border between two pixels may round to either.
+    assert np.mean(np.abs(colours_at(middles, mended.picture) - colours_at(before, picture)).max(axis=1) > 3) < 0.02
+
+
+def test_a_mesh_without_usable_coordinates_or_with_too_many_repetitions_says_so():
+    mesh, picture = trimesh.creation.icosphere(2), np.full((16, 16, 3), 90, np.uint8)
+    said = []
+    bare = repair_mesh(with_texture(mesh, np.full((len(mesh.vertices), 2), np.nan), picture), "ball", said.append)
+    assert bare.uv is None and bare.colours is None and "no usable texture coordinates" in said[0]
+    many = repair_mesh(with_texture(mesh, 500 * np.asarray(mesh.vertices)[:, :2], picture), "ball", said.append)
+    assert many.uv is None and (many.colours == 90).all() and "repeats many times" in said[1]
+    # Faces that share one place of the picture are no trouble: the photo has a part of the picture of its own.
+    shared = repair_mesh(with_texture(mesh, np.full((len(mesh.vertices), 2), 0.5), picture), "ball", said.append)
+    assert (shared.uv == 0.5).all() and len(said) == 2
+
+
 @pytest.mark.parametrize("vertices", [np.zeros((3, 3)), [[0, 0, 0], [1, 0, 0], [2, 0, 0]]])
 def test_a_mesh_without_extent_or_area_is_refused(vertices):
     with pytest.raises(InputError, match="export it again"):

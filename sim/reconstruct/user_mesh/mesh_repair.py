@@ -31,6 +31,10 @@ GAP = 0.03
 VOXELS = 110
 """Voxels along the largest extent of a mesh that is closed as a volume."""
 MOST_FACES = 2_000_000
+MOST_TILES = 16
+"""Repetitions of a mesh's own picture across a single face above which vertex colours are used instead."""
+MOST_TILED = 4096
+"""Largest side in pixels of a picture with its repetitions."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,15 @@ def repair_mesh(mesh: trimesh.Trimesh, name: str, notice: Callable[[str], None])
     size = float(np.ptp(vertices, axis=0).max())
     if not size > 1e-12:
         raise InputError(f"{name}: the mesh has no extent; export it again")
-    uv, picture, colours = _appearance(mesh)
+    uv, picture, colours = _appearance(mesh, name, notice)
+    if uv is not None and picture is not None:
+        tiled = _tiled(uv, picture, faces)
+        if tiled is None:
+            notice(f"{name}: its texture repeats many times within a face; the colours at its vertices are used")
+            uv = picture = None
+        else:
+            uv, picture, faces, source = tiled
+            vertices, colours = vertices[source], None if colours is None else colours[source]
     welded = _welded(vertices, faces)
     kept = _kept_faces(vertices, faces, welded, size, name, notice)
     used, renumbered = np.unique(faces[kept], return_inverse=True)
@@ -76,9 +88,9 @@ def repair_mesh(mesh: trimesh.Trimesh, name: str, notice: Callable[[str], None])
 
 
 def _appearance(
-    mesh: trimesh.Trimesh,
+    mesh: trimesh.Trimesh, name: str, notice: Callable[[str], None]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None, NDArray[np.float64] | None]:
-    """UV, picture and vertex colours, if the file has them."""
+    """UV as in the file, picture and vertex colours, if the file has them."""
     uv = getattr(mesh.visual, "uv", None)
     material = getattr(mesh.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
@@ -89,10 +101,38 @@ def _appearance(
         wrapped[coordinates == 1.0] = 1.0
         columns = np.minimum((wrapped[:, 0] * picture.shape[1]).astype(int), picture.shape[1] - 1)
         rows = np.minimum(((1 - wrapped[:, 1]) * picture.shape[0]).astype(int), picture.shape[0] - 1)
-        return wrapped, picture, picture[rows, columns].astype(np.float64)
+        return coordinates, picture, picture[rows, columns].astype(np.float64)
+    if image is not None:
+        notice(
+            f"{name}: the mesh has a picture but no usable texture coordinates; the photo's colours are used instead"
+        )
     if getattr(mesh.visual, "kind", None) == "vertex":
         return None, None, np.asarray(getattr(mesh.visual, "vertex_colors"), dtype=np.float64)[:, :3]  # noqa: B009
     return None, None, None
+
+
+def _tiled(
+    uv: NDArray[np.float64], picture: NDArray[np.uint8], faces: Faces
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], Faces, NDArray[np.int64]] | None:
+    """UV (W, 2) from 0 to 1, picture, faces (T, 3) and the vertex that each of the W vertices was; None for too many
+    repetitions.
+
+    Coordinates beyond 0 to 1 repeat the picture. Wrapping each vertex by itself would draw the whole picture backwards
+    across every face that crosses a border, so faces are wrapped as a whole, and the picture is repeated for those.
+    """
+    corners = uv[faces]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    within = (low >= -1e-6) & (high <= 1.0 + 1e-6)
+    tile = np.where(within, 0.0, np.floor(low + 1e-6))
+    columns, rows = (max(1, int(np.ceil(n - 1e-6))) for n in (high - tile).max(axis=0))
+    largest = max(columns * picture.shape[1], rows * picture.shape[0])
+    if columns * rows > 1 and (columns * rows > MOST_TILES or largest > MOST_TILED):
+        return None
+    keys = np.concatenate([np.repeat(tile, 3, axis=0), faces.reshape(-1, 1)], axis=1)
+    used, renumbered = np.unique(keys, axis=0, return_inverse=True)
+    source = used[:, 2].astype(np.int64)
+    wrapped = np.clip((uv[source] - used[:, :2]) / (columns, rows), 0.0, 1.0)
+    return wrapped, np.tile(picture, (rows, columns, 1)), renumbered.reshape(-1, 3), source
 
 
 def _welded(vertices: Points, faces: Faces) -> NDArray[np.int64]:
