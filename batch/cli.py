@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
@@ -17,7 +15,7 @@ from ..sim.version import VERSION
 from . import stages
 from .commands import compose_commands, diagnosis_commands, doctor, photo_commands, render_commands, scene_commands
 from .farm import batch_command as farm_command
-from .terminal import Terminal
+from .terminal import Terminal, stop_signals
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
 
@@ -109,14 +107,12 @@ def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``physgen``; returns the exit code (docs/cli.md)."""
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     expected = stages.expected_seconds(options.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
+    run: Command = options.run
     try:
-        run: Command = options.run
-        return run(options, terminal, lambda: stop.is_set() or terminal.reader_gone)
+        with stop_signals() as stopped:
+            return run(options, terminal, lambda: stopped() or terminal.reader_gone)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code

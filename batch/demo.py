@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
 import time
 import tomllib
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.model import Vector
 from ..sim.validation import parse
 from . import stages
-from .terminal import Terminal
+from .terminal import Terminal, stop_signals
 
 CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml"
 
@@ -84,15 +82,13 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("demo_out"))
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     started = time.monotonic()
     config = load_config()
     terminal = Terminal(as_json=options.json, expected_s=stages.expected_seconds(config.frames))
     terminal.line(config.description)
     try:
-        video = stages.photo_to_video(request(config, options.out), terminal, stop.is_set)
+        with stop_signals() as stopped:
+            video = stages.photo_to_video(request(config, options.out), terminal, stopped)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code

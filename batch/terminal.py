@@ -1,15 +1,36 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress as text on a terminal, or as JSON lines."""
+"""A command's terminal: progress as text or as JSON lines, and requests to stop."""
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TextIO
 
-from ..sim.events import Event
+from ..sim.events import Event, IsCancelled
+
+
+@contextmanager
+def stop_signals() -> Iterator[IsCancelled]:
+    """Yield a function that returns whether SIGINT or SIGTERM arrived since; the former handlers return at the end.
+
+    For the main thread: only there Python allows handlers.
+    """
+    stop = threading.Event()
+    former = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop.is_set
+    finally:
+        for number, handler in former.items():
+            # None: installed by C code, which Python can't put back.
+            if handler is not None:
+                signal.signal(number, handler)
 
 
 class Terminal:

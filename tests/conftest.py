@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import signal
 
 # Workers share the cores: threads of OpenBLAS that wait for one another took 40 % of a reconstruction's time. Children
 # inherit it. It has to be set before NumPy is there.
@@ -58,15 +57,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
-
-
-@pytest.fixture(autouse=True)
-def own_signals():
-    """The command listens to these for as long as its process lives; here that is the process of the tests."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -10,16 +10,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-import signal
 import socket
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import IsCancelled, OnEvent
-from ..terminal import Terminal
+from ..terminal import Terminal, stop_signals
 from .planning.plan import RETRIES, Outcome, Plan, Task, find_task, is_worth_retrying, load_plan
 from .task_execution import execute_task
 
@@ -41,14 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=0, help="CPU threads per render, 0 for all")
     parser.add_argument("--json", action="store_true", help="events as JSON lines")
     options = parser.parse_args(arguments)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     terminal = Terminal(as_json=options.json)
     try:
         plan = load_plan(options.plan)
         task = find_task(plan, options.task if options.list is None else listed_task(options.list, options.task))
-        outcome = run_with_retries(plan, task, terminal, stop.is_set, retries=options.retries, threads=options.threads)
+        with stop_signals() as stopped:
+            outcome = run_with_retries(plan, task, terminal, stopped, retries=options.retries, threads=options.threads)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code

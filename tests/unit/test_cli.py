@@ -2,6 +2,7 @@
 """The command line as a user types it: arguments, exit codes, what is on the disk afterwards."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from physgen.batch.cli import build_parser, main
+from physgen.batch.terminal import stop_signals
 from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.app.bake_worker import BakeJob, job_to_json
 from physgen.sim.cache.bake_folder import disk_usage, load_manifest
@@ -199,6 +201,20 @@ def test_stages_one_by_one(tmp_path, photo, physgen):
     assert physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview")[0] == 0
     code, events, _ = physgen("bake", scene, "--out", bake, "--frames", "4", "--quality", "preview", "--json")
     assert code == 0 and any("up to date" in e.get("message", "") for e in events)
+
+
+def test_the_callers_signal_handlers_return(capsys):
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    assert main(["effects", "wind"]) == 0 and main(["effects", "gremlins"]) == 3
+    assert [signal.getsignal(number) for number in numbers] == before
+
+
+def test_a_signal_is_a_request_to_stop():
+    with stop_signals() as stopped:
+        assert not stopped()
+        signal.raise_signal(signal.SIGTERM)
+        assert stopped()
 
 
 def test_doctor_finds_this_environment_fit():
