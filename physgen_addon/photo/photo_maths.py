@@ -9,11 +9,13 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.reconstruct.reconstruct_options import ReconstructOptions
 from ...sim.scene.model import Camera
+from ...sim.validation import range_of
 
-LOWEST, HIGHEST = 0.95, -10.0
+HIGHEST, LOWEST = range_of(ReconstructOptions, "horizon_y")
 """Range of the command; the horizon of a camera that looks straight down is infinitely high."""
-MOST_ROLL = math.radians(45)
+MOST_ROLL = math.radians(range_of(ReconstructOptions, "roll_deg")[1])
 USUAL_PITCH, USUAL_FOV = math.radians(20), math.radians(50)
 
 

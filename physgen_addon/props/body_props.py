@@ -7,7 +7,6 @@ from bpy.props import (
     CollectionProperty,
     EnumProperty,
     FloatProperty,
-    FloatVectorProperty,
     IntProperty,
     PointerProperty,
     StringProperty,
@@ -139,9 +138,11 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         update=_show_splats,
     )
 
-    velocity: FloatVectorProperty(
-        name="Velocity",
-        description="Initial velocity. Drag the arrow in the viewport to change it",
+    velocity: from_field(
+        SceneObject,
+        "velocity",
+        "Velocity",
+        "Initial velocity. Drag the arrow in the viewport to change it",
         subtype="VELOCITY",
         unit="VELOCITY",
         soft_min=-10.0,
@@ -157,9 +158,11 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         get=_get_speed,
         set=_set_speed,
     )
-    spin: FloatVectorProperty(
-        name="Spin",
-        description="Initial angular velocity in radians a second about the centre of mass; one turn a second is 6.28",
+    spin: from_field(
+        SceneObject,
+        "spin",
+        "Spin",
+        "Initial angular velocity in radians a second about the centre of mass; one turn a second is 6.28",
         subtype="XYZ",
         soft_min=-50.0,
         soft_max=50.0,

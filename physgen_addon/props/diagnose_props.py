@@ -16,11 +16,13 @@ from bpy.props import (
     StringProperty,
 )
 
+from ...sim.app.bake_options import BakeOptions
 from ..paths import RELATIVE
 from ..playback import capture_view
 from ..playback import capture_view as overlay
 from ..playback.capture_scene import LAYERS
 from ..text import readable
+from .generated_properties import from_field
 
 NOT_KNOWN = -1.0
 """Stands for a missing number; Blender's properties have no null."""
@@ -202,17 +204,22 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options=RELATIVE,
     )
-    frames: IntProperty(name="Frames", description="Number of frames to bake", default=48, min=1, soft_max=500)
-    fps: FloatProperty(name="Frame Rate", description="Frames a second of the bake", default=24, min=1, soft_max=120)
-    quality: EnumProperty(
-        name="Quality",
-        description="Resolution of the simulation",
+    frames: IntProperty(
+        name="Frames", description="Number of frames to bake", default=BakeOptions.frames, min=1, soft_max=500
+    )
+    fps: FloatProperty(
+        name="Frame Rate", description="Frames a second of the bake", default=BakeOptions.fps, min=1, soft_max=120
+    )
+    quality: from_field(
+        BakeOptions,
+        "quality",
+        "Quality",
+        "Resolution of the simulation",
         items=[
             ("preview", "Preview", "Coarse and quick"),
             ("standard", "Standard", "What most scenes need"),
             ("fine", "Fine", "Slow"),
         ],
-        default="standard",
     )
     before_root: PointerProperty(type=bpy.types.Collection)
     after_root: PointerProperty(type=bpy.types.Collection)

@@ -5,6 +5,7 @@ import dataclasses
 import math
 import types
 import typing
+from collections.abc import Callable
 from typing import Any
 
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty
@@ -12,9 +13,10 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 UNITS = {
     "metres": {"unit": "LENGTH"},
     "radians": {"subtype": "ANGLE"},
+    "degrees": {"subtype": "ANGLE"},
     "seconds": {"unit": "TIME_ABSOLUTE"},
 }
-"""Unit of a field → arguments of its property. Blender has no units for the others."""
+"""Unit of a field → arguments of its property. Blender has no units for the others, and stores angles in radians."""
 
 TYPES = {bool: BoolProperty, float: FloatProperty, int: IntProperty, str: EnumProperty, tuple: FloatVectorProperty}
 
@@ -29,10 +31,15 @@ def from_field(kind: type, field: str, name: str, description: str = "", **argum
     low, high = spec.metadata.get("range", (-math.inf, math.inf))
     own: dict[str, Any] = {"name": name, "description": description or help_text(kind, field)}
     own |= UNITS.get(spec.metadata.get("unit", ""), {})
-    own |= {key: limit for key, limit in (("min", low), ("max", high)) if math.isfinite(limit)}
+    scale: Callable[[Any], Any] = math.radians if spec.metadata.get("unit") == "degrees" else _unscaled
+    own |= {key: scale(limit) for key, limit in (("min", low), ("max", high)) if math.isfinite(limit)}
     if spec.default is not None:
-        own["default"] = spec.default
+        own["default"] = scale(spec.default)
     return TYPES[_type(kind, field)](**(own | arguments))
+
+
+def _unscaled(value: Any) -> Any:
+    return value
 
 
 def help_text(kind: type, field: str) -> str:

@@ -4,8 +4,6 @@
 Blender reads the classes' annotations as properties, so they must not be postponed to strings.
 """
 
-import math
-
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -17,10 +15,12 @@ from bpy.props import (
     StringProperty,
 )
 
+from ...sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from ..context import redraw
 from ..paths import RELATIVE
 from ..photo.photo_consent import agree, forget, is_agreed
-from ..photo.photo_maths import HIGHEST, LOWEST, MOST_ROLL
+from ..photo.photo_maths import USUAL_FOV, USUAL_PITCH
+from .generated_properties import from_field
 
 UP_ITEMS = [
     ("auto", "Automatic", "By file format and fit"),
@@ -48,16 +48,14 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
     y0: IntProperty(name="Top", description="Upper border in pixels", min=0, subtype="PIXEL", update=_on_box)
     x1: IntProperty(name="Right", description="Right border in pixels", min=0, subtype="PIXEL", update=_on_box)
     y1: IntProperty(name="Bottom", description="Lower border in pixels", min=0, subtype="PIXEL", update=_on_box)
-    size_m: FloatProperty(
-        name="Size",
-        description=(
-            "Largest extent of the object. One known size sets the scale of the scene; 0: estimated from the photo"
-        ),
+    size_m: from_field(
+        ObjectRequest,
+        "size_m",
+        "Size",
+        "Largest extent of the object. One known size sets the scale of the scene; 0: estimated from the photo",
         min=0.0,
-        max=1e3,
         soft_max=2.0,
         precision=3,
-        unit="LENGTH",
     )
     kind: StringProperty(
         name="What It Is",
@@ -76,9 +74,11 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         type=bpy.types.Image,
         update=_on_box,
     )
-    shape: EnumProperty(
-        name="Shape",
-        description="Shape of the object's body",
+    shape: from_field(
+        ObjectRequest,
+        "shape",
+        "Shape",
+        "Shape of the object's body",
         items=[
             ("auto", "Automatic", "Estimated from mask and kind"),
             ("inflated", "Inflated", "The silhouette, inflated"),
@@ -87,20 +87,23 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
             ("sphere", "Sphere", "An orange, a ball"),
         ],
     )
-    back: EnumProperty(
-        name="Back",
-        description="Hidden side of an inflated body",
+    back: from_field(
+        ObjectRequest,
+        "back",
+        "Back",
+        "Hidden side of an inflated body",
         items=[
             ("auto", "Automatic", "Estimated from mask and kind"),
             ("symmetric", "Symmetric", "Symmetric: as deep behind the silhouette as in front"),
             ("flat", "Flat", "Flat, as for objects that lean on a wall"),
         ],
     )
-    thickness: FloatProperty(
-        name="Thickness",
-        description="Depth of the body over its width, 0.02 to 3; 1 makes a ball of a disc. 0: judged by what it is",
+    thickness: from_field(
+        ObjectRequest,
+        "thickness",
+        "Thickness",
+        "Depth of the body over its width, 0.02 to 3; 1 makes a ball of a disc. 0: judged by what it is",
         min=0.0,
-        max=3.0,
         precision=2,
         step=5,
     )
@@ -110,11 +113,7 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=RELATIVE,
     )
-    mesh_up: EnumProperty(
-        name="Up",
-        description="Which axis of the mesh file points up",
-        items=UP_ITEMS,
-    )
+    mesh_up: from_field(ObjectRequest, "mesh_up", "Up", "Which axis of the mesh file points up", items=UP_ITEMS)
 
 
 class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
@@ -138,44 +137,41 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
         ],
         update=_on_box,
     )
-    pitch: FloatProperty(
-        name="Pitch",
-        description="Angle of the view below the horizontal: 20° for objects on a table, 50° for a steep view",
-        default=math.radians(20),
-        min=math.radians(-20),
-        max=math.radians(85),
-        subtype="ANGLE",
+    pitch: from_field(
+        ReconstructOptions,
+        "pitch_deg",
+        "Pitch",
+        "Angle of the view below the horizontal: 20° for objects on a table, 50° for a steep view",
+        default=USUAL_PITCH,
     )
-    horizon: FloatProperty(
-        name="Horizon",
-        description=(
+    horizon: from_field(
+        ReconstructOptions,
+        "horizon_y",
+        "Horizon",
+        (
             "Height of the horizon in the middle of the photo: 0 is the upper border, 1 the lower one. In a steep "
             "view it lies above the photo, below 0"
         ),
         default=-0.1,
-        min=HIGHEST,
-        max=LOWEST,
         soft_min=-2.0,
         precision=3,
         step=1,
         update=_on_box,
     )
-    roll: FloatProperty(
-        name="Roll",
-        description="Roll of the camera; positive if the horizon falls to the right",
-        min=-MOST_ROLL,
-        max=MOST_ROLL,
-        subtype="ANGLE",
+    roll: from_field(
+        ReconstructOptions,
+        "roll_deg",
+        "Roll",
+        "Roll of the camera; positive if the horizon falls to the right",
         update=_on_box,
     )
     use_fov: BoolProperty(name="Field of View", description="Set the field of view; off: from EXIF or vanishing points")
-    fov: FloatProperty(
-        name="Field of View",
-        description="Angle of view along the photo's longer side: about 65° for a phone, 40° for a portrait",
-        default=math.radians(50),
-        min=math.radians(5),
-        max=math.radians(150),
-        subtype="ANGLE",
+    fov: from_field(
+        ReconstructOptions,
+        "fov_deg",
+        "Field of View",
+        "Angle of view along the photo's longer side: about 65° for a phone, 40° for a portrait",
+        default=USUAL_FOV,
     )
     depth: StringProperty(
         name="Depth Map",

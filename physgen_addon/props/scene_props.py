@@ -16,11 +16,13 @@ from bpy.props import (
     StringProperty,
 )
 
+from ...sim.app.bake_options import BakeOptions
 from ...sim.effects.registry import Effect, Parameter, effect, effects
 from ...sim.gaussians.compose.compose_options import ComposeOptions
 from ..paths import RELATIVE
 from ..text import decimal, readable
 from .body_props import Surface, is_body
+from .generated_properties import from_field
 from .render_props import PHYSGEN_PG_rendering
 
 EFFECT_ITEMS = [
@@ -141,24 +143,27 @@ class PHYSGEN_PG_world(Surface, bpy.types.PropertyGroup):
 class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
     """Settings of the simulation, and the shown bake."""
 
-    quality: EnumProperty(
-        name="Quality",
-        description="Resolution of the simulation",
+    quality: from_field(
+        BakeOptions,
+        "quality",
+        "Quality",
+        "Resolution of the simulation",
         items=[
             ("preview", "Preview", "Takes seconds: to judge a motion"),
             ("standard", "Standard", "For most scenes on a laptop"),
             ("fine", "Fine", "Thin parts and wrinkles; several times as slow"),
             ("papers", "Papers", "256 cells along a box four times the extent of all dynamic objects"),
         ],
-        default="standard",
     )
     frame_start: IntProperty(
         name="Start", description="Frame that shows the scene at rest", default=1, min=0, soft_max=250
     )
     frame_end: IntProperty(name="End", description="Last simulated frame", default=48, min=0, soft_max=500)
-    device: EnumProperty(
-        name="Device",
-        description="Device of the simulation; falls back to the CPU",
+    device: from_field(
+        BakeOptions,
+        "arch",
+        "Device",
+        "Device of the simulation; falls back to the CPU",
         items=[
             ("cpu", "CPU", "CPU"),
             ("cuda", "CUDA", "An NVIDIA graphics card"),
@@ -166,7 +171,7 @@ class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
             ("metal", "Metal", "Apple's graphics"),
         ],
     )
-    seed: IntProperty(name="Seed", description="Random seed of the particle positions", min=0)
+    seed: from_field(BakeOptions, "seed", "Seed", "Random seed of the particle positions")
     cache: StringProperty(
         name="Cache",
         description="Folder of the bakes; // is beside the .blend",
@@ -231,9 +236,6 @@ def unregister_scene_properties() -> None:
     del bpy.types.Scene.physgen
 
 
-COMPOSE_DEFAULTS = ComposeOptions()
-
-
 class PHYSGEN_PG_composed_pair(bpy.types.PropertyGroup):
     """Penetration of two objects, before and after; ``name`` is the pair."""
 
@@ -251,9 +253,11 @@ class PHYSGEN_PG_composed_pair(bpy.types.PropertyGroup):
 class PHYSGEN_PG_compose(bpy.types.PropertyGroup):
     """Settings and last result of Compose Objects; ``Scene.physgen_together``."""
 
-    method: EnumProperty(
-        name="Method",
-        description="What moves the objects",
+    method: from_field(
+        ComposeOptions,
+        "method",
+        "Method",
+        "What moves the objects",
         items=[
             ("pse-sds", "Picture and Physics", "Match the photo under physical constraints: PhyCAGE"),
             ("ppps", "Physics", "Resolve penetration only. Needs no photo"),
@@ -261,20 +265,12 @@ class PHYSGEN_PG_compose(bpy.types.PropertyGroup):
             ("ppps+sds", "In Turns", "Alternate steps of photo and physics. For comparison"),
         ],
     )
-    steps: IntProperty(
-        name="Steps",
-        description="Number of optimisation steps; fewer are faster",
-        default=COMPOSE_DEFAULTS.steps,
-        min=1,
-        max=100_000,
-        soft_max=1000,
-    )
-    keep_strain: FloatProperty(
-        name="Keep Shape",
-        description="Shape memory of the yielding objects: 1 like rubber, 0 like dough",
-        default=COMPOSE_DEFAULTS.keep_strain,
-        min=0.0,
-        max=1.0,
+    steps: from_field(ComposeOptions, "steps", "Steps", "Number of optimisation steps; fewer are faster", soft_max=1000)
+    keep_strain: from_field(
+        ComposeOptions,
+        "keep_strain",
+        "Keep Shape",
+        "Shape memory of the yielding objects: 1 like rubber, 0 like dough",
         subtype="FACTOR",
     )
     keep_original: BoolProperty(

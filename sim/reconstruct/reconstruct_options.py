@@ -10,16 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..scene.equirectangular import FRAMES
 from ..scene.model import Vector
-
-
-def _check(condition: bool, name: str, value: object, remedy: str) -> None:
-    if not condition:
-        raise InputError(f"{name} is {value!r}: {remedy}")
-
-
-def _inside(value: float | None, low: float, high: float) -> bool:
-    return value is None or (math.isfinite(value) and low <= value <= high)
-
+from ..validation import quantity, require, require_quantities
 
 SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
 BACKS = ("auto", "symmetric", "flat")
@@ -52,34 +43,33 @@ class ObjectRequest:
     mask: Path | None = None
     name: str | None = None
     kind: str | None = None
-    size_m: float | None = None
+    size_m: float | None = quantity(None, 1e-4, 1e3, "metres")
     preset: str | None = None
     velocity: Vector = (0.0, 0.0, 0.0)
     spin: Vector = (0.0, 0.0, 0.0)
     shape: str = "auto"
     back: str = "auto"
-    thickness: float | None = None
+    thickness: float | None = quantity(None, 0.02, 3.0, "a ratio")
     mesh: Path | None = None
     mesh_up: str = "auto"
     mesh_points: tuple[tuple[Vector, Pixel], ...] = ()
 
     def __post_init__(self) -> None:
         if self.box is None:
-            _check(self.mask is not None, "box", None, "give x0,y0,x1,y1 around the object, or a mask")
+            require(self.mask is not None, "box", None, "give x0,y0,x1,y1 around the object, or a mask")
         else:
-            _check(
+            require(
                 len(self.box) == 4 and all(math.isfinite(v) for v in self.box),
                 "box",
                 self.box,
                 "give x0,y0,x1,y1 as four finite numbers of pixels",
             )
-        _check(_inside(self.size_m, 1e-4, 1e3), "size_m", self.size_m, "give metres from 0.0001 to 1000")
-        _check(_inside(self.thickness, 0.02, 3.0), "thickness", self.thickness, "give a ratio from 0.02 to 3")
+        require_quantities(self, "")
         for name, choices in (("shape", SHAPES), ("back", BACKS), ("mesh_up", UP_AXES)):
-            _check(getattr(self, name) in choices, name, getattr(self, name), f"choose {', '.join(choices)}")
+            require(getattr(self, name) in choices, name, getattr(self, name), f"choose {', '.join(choices)}")
         for place, pixel in self.mesh_points:
             good = len(place) == 3 and len(pixel) == 2 and all(math.isfinite(v) for v in (*place, *pixel))
-            _check(good, "mesh_points", (place, pixel), "give x,y,z on the mesh and x,y in the photo")
+            require(good, "mesh_points", (place, pixel), "give x,y,z on the mesh and x,y in the photo")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,52 +105,35 @@ class ReconstructOptions:
     report: also write ``report.html``, a page of pictures of every stage.
     """
 
-    max_size: int = 1920
-    fov_deg: float | None = None
-    horizon_y: float | None = None
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
+    max_size: int = quantity(1920, 64, 8192, "pixels")
+    fov_deg: float | None = quantity(None, 5, 150, "degrees")
+    horizon_y: float | None = quantity(None, -10, 0.95, "a fraction of the photo's height")
+    pitch_deg: float | None = quantity(None, -20, 85, "degrees")
+    roll_deg: float | None = quantity(None, -45, 45, "degrees")
     depth: Path | None = None
     order: tuple[str, ...] = ()
-    default_size_m: float = 0.15
-    grabcut_iterations: int = 6
-    shadow_threshold: float | None = None
-    hole_dilation: float = 50.0
-    patch_radius: int = 4
-    inpaint_pixels: int = 2_800_000
-    seed: int = 0
+    default_size_m: float = quantity(0.15, 1e-4, 1e3, "metres")
+    grabcut_iterations: int = quantity(6, 1, 20, "rounds")
+    shadow_threshold: float | None = quantity(None, 0, 255, "a grey value")
+    hole_dilation: float = quantity(50.0, 0, 300, "pixels")
+    patch_radius: int = quantity(4, 1, 10, "pixels")
+    inpaint_pixels: int = quantity(2_800_000, 1e4, 1e8, "pixels")
+    seed: int = quantity(0, 0, 2**32 - 1, "a whole number")
     inpainter: str | None = None
     segmenter: str | None = None
     depth_estimator: str | None = None
     mesher: str | None = None
-    mesh_vertices: int = 12_000
-    friction: float | None = None
+    mesh_vertices: int = quantity(12_000, 500, 200_000, "vertices")
+    friction: float | None = quantity(None, 0, 10, "a coefficient")
     environment: Path | None = None
     environment_frame: str = "ahead"
     sun: bool = True
     report: bool = False
 
     def __post_init__(self) -> None:
-        limits: tuple[tuple[str, float | None, float, float, str], ...] = (
-            ("max_size", self.max_size, 64, 8192, "pixels"),
-            ("fov_deg", self.fov_deg, 5, 150, "degrees"),
-            ("horizon_y", self.horizon_y, -10, 0.95, "a fraction of the photo's height"),
-            ("pitch_deg", self.pitch_deg, -20, 85, "degrees"),
-            ("roll_deg", self.roll_deg, -45, 45, "degrees"),
-            ("default_size_m", self.default_size_m, 1e-4, 1e3, "metres"),
-            ("grabcut_iterations", self.grabcut_iterations, 1, 20, "rounds"),
-            ("shadow_threshold", self.shadow_threshold, 0, 255, "a grey value"),
-            ("hole_dilation", self.hole_dilation, 0, 300, "pixels"),
-            ("patch_radius", self.patch_radius, 1, 10, "pixels"),
-            ("inpaint_pixels", self.inpaint_pixels, 1e4, 1e8, "pixels"),
-            ("seed", self.seed, 0, 2**32 - 1, "a whole number"),
-            ("mesh_vertices", self.mesh_vertices, 500, 200_000, "vertices"),
-            ("friction", self.friction, 0, 10, "a coefficient"),
-        )
-        for name, value, low, high, unit in limits:
-            _check(_inside(value, low, high), name, value, f"give {unit} from {low:g} to {high:g}")
+        require_quantities(self, "")
         frames = f"choose {', '.join(FRAMES)}"
-        _check(self.environment_frame in FRAMES, "environment_frame", self.environment_frame, frames)
+        require(self.environment_frame in FRAMES, "environment_frame", self.environment_frame, frames)
         if self.horizon_y is not None and self.pitch_deg is not None:
             raise InputError(
                 f"horizon_y is {self.horizon_y!r} and pitch_deg is {self.pitch_deg!r}: give one of them, not both"

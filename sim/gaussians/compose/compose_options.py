@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from ...errors import InputError
+from ...validation import quantity
 
 METHODS = ("pse-sds", "sds", "ppps", "ppps+sds")
 """Algorithm 1 of PhyCAGE and its ablations (§5.4): images only; physics only; the two alternating."""
@@ -22,45 +23,45 @@ class ComposeOptions:
     method: str = "pse-sds"
     """One of ``METHODS``."""
 
-    steps: int = 500
+    steps: int = quantity(500, 1, 100_000)
     """K of Algorithm 1: optimisation steps, 1 to 100,000."""
 
-    substeps: int = 20
+    substeps: int = quantity(20, 1, 1000)
     """N of Algorithm 1: MPM substeps a step, 1 to 1000."""
 
-    cells: int = 32
+    cells: int = quantity(32, 8, 256)
     """Grid cells along the longest side of the deformable part, 8 to 256."""
 
-    ssim_share: float = 0.2
+    ssim_share: float = quantity(0.2, 0, 1)
     """λ1 of eq. 18, 0 to 1."""
 
-    guidance_weight: float = 1e-5
+    guidance_weight: float = quantity(1e-5, 0, 1)
     """λ3 of eq. 19 for images of 256² pixels, 0 to 1; scaled for others. No effect without a guidance."""
 
-    first_timestep: int = 100
+    first_timestep: int = quantity(100, 1, 999)
     """Timestep of the guidance's noise at the first step, 1 to 999."""
 
-    last_timestep: int = 20
+    last_timestep: int = quantity(20, 1, 999)
     """The same at the last step."""
 
-    first_move: float = 1.0
+    first_move: float = quantity(1.0, 0.01, 4)
     """Displacement in grid cells of the fastest hundredth of the points in the first step, without interaction, 0.01 to
     4. It fixes the factor between gradient and velocity (which decays by ``last_rate``)."""
 
-    last_rate: float = 0.3
+    last_rate: float = quantity(0.3, 0.001, 1)
     """Decay of that factor until the last step, 0.001 to 1: the gradient of an L1 loss does not vanish by itself."""
 
-    first_stretch: float = 0.01
+    first_stretch: float = quantity(0.01, 0, 0.1)
     """Change of log scale of the fastest hundredth of the splats in the first step; 0 (frozen) to 0.1."""
 
-    first_turn: float = 0.01
+    first_turn: float = quantity(0.01, 0, 0.1)
     """Rotation in radians of the fastest hundredth of the splats in the first step; 0 (frozen) to 0.1."""
 
-    keep_strain: float = 0.5
+    keep_strain: float = quantity(0.5, 0, 1)
     """Fraction of the strain carried over from step to step, 0 to 1. 0: every step starts undeformed, as Algorithm 1
     passes on positions and velocities only. 1: an elastic body that returns to its initial shape."""
 
-    size: int = 256
+    size: int = quantity(256, 32, 1024)
     """Longer side in pixels of the images compared, 32 to 1024; larger ones are scaled down."""
 
     seed: int = 0
@@ -69,25 +70,11 @@ class ComposeOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"compose option method is {self.method!r}: choose one of {', '.join(METHODS)}")
-        ranges: dict[str, tuple[float, float]] = {
-            "steps": (1, 100_000),
-            "substeps": (1, 1000),
-            "cells": (8, 256),
-            "ssim_share": (0, 1),
-            "guidance_weight": (0, 1),
-            "first_timestep": (1, 999),
-            "last_timestep": (1, 999),
-            "first_move": (0.01, 4),
-            "last_rate": (0.001, 1),
-            "first_stretch": (0, 0.1),
-            "first_turn": (0, 0.1),
-            "keep_strain": (0, 1),
-            "size": (32, 1024),
-        }
-        for name, (least, most) in ranges.items():
-            value = getattr(self, name)
-            if not (math.isfinite(value) and least <= value <= most):
-                raise InputError(f"compose option {name} is {value!r}: give {least:g} to {most:g}")
+        for spec in fields(self):
+            if "range" in spec.metadata:
+                (least, most), value = spec.metadata["range"], getattr(self, spec.name)
+                if not (math.isfinite(value) and least <= value <= most):
+                    raise InputError(f"compose option {spec.name} is {value!r}: give {least:g} to {most:g}")
 
     @property
     def uses_images(self) -> bool:
