@@ -217,9 +217,9 @@ def simulate_soft(
     interval = float(times[1] - times[0])
     steps = int(np.ceil(interval / stable_step(solid, world)))
     dt = interval / steps
-    frames, takes = len(times), len(position)
-    nodes = np.zeros((takes, frames, len(solid.nodes), 3))
-    energy, loss = np.zeros((takes, frames)), np.zeros((takes, frames))
+    frames, trials = len(times), len(position)
+    nodes = np.zeros((trials, frames, len(solid.nodes), 3))
+    energy, loss = np.zeros((trials, frames)), np.zeros((trials, frames))
     nodes[:, 0] = position
     stepper.start(dt)
     for frame in range(1, frames):
@@ -238,7 +238,7 @@ class _Stepper:
     """Leapfrog stepper. x, v: (3, N, S). Element fields are (3 i, 3 j, M, S): derivative of x_i along rest axis j."""
 
     def __init__(self, solid: Solid, world: SoftWorld, position: Array, velocity: Array) -> None:
-        self._solid, self._world, self._takes = solid, world, len(position)
+        self._solid, self._world, self._trials = solid, world, len(position)
         self.x: Single = np.ascontiguousarray(position.transpose(2, 1, 0), dtype=np.float32)
         self._v: Single = np.ascontiguousarray(velocity.transpose(2, 1, 0), dtype=np.float32)
         self._count = len(solid.volume)
@@ -250,11 +250,11 @@ class _Stepper:
         self._gradient = solid.gradient.astype(np.float32)
         self._adjoint = (solid.gradient.T.tocsr() * np.tile(solid.volume, 3)[None, :]).tocsr().astype(np.float32)
         self._penalty = _penalty(solid, world).astype(np.float32)
-        self.flow: Single = np.zeros((self._count, self._takes), dtype=np.float32)
-        self._loss = np.zeros(self._takes)
+        self.flow: Single = np.zeros((self._count, self._trials), dtype=np.float32)
+        self._loss = np.zeros(self._trials)
         self._yielded: Single | None = None
         if world.yield_stress is not None:
-            self._yielded = np.zeros((3, 3, self._count, self._takes), dtype=np.float32)
+            self._yielded = np.zeros((3, 3, self._count, self._trials), dtype=np.float32)
             self._yielded[np.arange(3), np.arange(3)] = 1.0
 
     def start(self, dt: float) -> None:
@@ -269,7 +269,7 @@ class _Stepper:
         stress = self._stress(time)
         accel: Single = np.empty_like(self.x)
         for i in range(3):
-            accel[i] = self._adjoint @ stress[i].reshape(3 * self._count, self._takes)
+            accel[i] = self._adjoint @ stress[i].reshape(3 * self._count, self._trials)
         accel /= -self._mass
         accel[2] -= np.float32(GRAVITY)
         if self._world.force is not None:
@@ -278,22 +278,22 @@ class _Stepper:
         return accel
 
     def _contact(self, accel: Single, dt: float) -> None:
-        rows, takes = np.nonzero(self.x[2] < 0)
+        rows, trials = np.nonzero(self.x[2] < 0)
         if len(rows) == 0:
             return
-        press = self._penalty[rows] * -self.x[2, rows, takes] / self._mass[rows, 0]
-        accel[2, rows, takes] += press
+        press = self._penalty[rows] * -self.x[2, rows, trials] / self._mass[rows, 0]
+        accel[2, rows, trials] += press
         # Coulomb: enough to stop slip within the step, at most mu times the pressure.
-        slip = self._v[:2, rows, takes] + np.float32(dt) * accel[:2, rows, takes]
+        slip = self._v[:2, rows, trials] + np.float32(dt) * accel[:2, rows, trials]
         size = np.sqrt((slip**2).sum(axis=0))
         most = np.minimum(self._world.friction * press, size / dt)
-        accel[:2, rows, takes] -= (most / np.maximum(size, 1e-12)) * slip
+        accel[:2, rows, trials] -= (most / np.maximum(size, 1e-12)) * slip
 
     def _along(self, of_nodes: Single) -> Single:
         """Return the gradient (3, 3, M, S) of a nodal field (3, N, S)."""
-        out: Single = np.empty((3, 3, self._count, self._takes), dtype=np.float32)
+        out: Single = np.empty((3, 3, self._count, self._trials), dtype=np.float32)
         for i in range(3):
-            out[i] = (self._gradient @ of_nodes[i]).reshape(3, self._count, self._takes)
+            out[i] = (self._gradient @ of_nodes[i]).reshape(3, self._count, self._trials)
         return out
 
     def _stress(self, time: float) -> Single:

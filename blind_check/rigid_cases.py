@@ -53,7 +53,7 @@ _ROUND_ONLY = ("rolling_resistance", "magnus", "adhesion")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Take:
+class _Throw:
     name: str
     style: str
     state: State
@@ -66,7 +66,7 @@ class _Stage:
     """Everything of a case except its causes."""
 
     world: RigidWorld
-    takes: tuple[_Take, ...]
+    trials: tuple[_Throw, ...]
     times: Array
     noise: float
     camera: Camera | None
@@ -150,18 +150,18 @@ def _draw_stage(world: RigidWorld, names: Sequence[str], causes: Sequence[Cause]
         styles = ["slide" if s == "roll" else s for s in styles]
     withheld = int(rng.integers(2, 4))
     count = withheld + int(rng.integers(3, 6))
-    takes = []
+    trials = []
     for index in range(count):
         style = styles[index % len(styles)] if index < len(styles) else str(rng.choice(styles))
         state = draw_state(body, style, duration, rng, close=filmed)
         shown = round(float(rng.uniform(0.125, 0.2)) * rate) if index >= count - withheld else None
         start = round(float(rng.uniform(0, 0.4)), 3)
-        takes.append(_Take(name=f"take{index + 1:02d}", style=style, state=state, start=start, shown=shown))
+        trials.append(_Throw(name=f"take{index + 1:02d}", style=style, state=state, start=start, shown=shown))
     target = np.array([0.0, 0.0, float(rng.uniform(0.15, 0.35))])
     rest, normals = surface_points(body, int(rng.integers(18, 49)), rng)
     return _Stage(
         world=world,
-        takes=tuple(takes),
+        trials=tuple(trials),
         times=np.arange(round(duration * rate)) / rate,
         noise=0.5 if filmed else float(rng.uniform(3e-4, 1e-3)),
         camera=draw_camera(target, float(rng.uniform(1.9, 2.6)), rng) if filmed else None,
@@ -195,8 +195,8 @@ def _observe(stage: _Stage, hidden: Sequence[_Hidden], states: Sequence[State] |
         if cause.lens is not None:
             lens = cause.lens(strength)
     seen = []
-    for index, take in enumerate(stage.takes):
-        motion = simulate_rigid(world, take.state if states is None else states[index], times)
+    for index, trial in enumerate(stage.trials):
+        motion = simulate_rigid(world, trial.state if states is None else states[index], times)
         points = motion.points(stage.rest)
         pixels = None if camera is None else project(points, camera, lens)
         normals = np.einsum("tij,kj->tki", motion.rotation, stage.normals)
@@ -209,7 +209,7 @@ def _scaled(
 ) -> tuple[float, float]:
     """Return the strength at which the effect is about ``wanted`` times the noise, within its limits, and its size."""
     strength = math.sqrt(cause.low * cause.high)
-    some = dataclasses.replace(stage, takes=stage.takes[:3])
+    some = dataclasses.replace(stage, trials=stage.trials[:3])
     size = 0.0
     for _ in range(5):
         size, left = _size(some, _observe(some, [_Hidden(cause=cause, strength=strength)]), nominal)
@@ -255,9 +255,9 @@ def _assembled(
     effect = hidden[0].cause.effect if hidden else NONE
     share = float(rng.uniform(0.02, 0.11))
     trials, truths = [], {}
-    for take, view in zip(stage.takes, seen, strict=True):
-        trials.append(_trial(stage, take, view, share, rng))
-        truths[take.name] = _trial_truth(stage, take, view, hidden)
+    for trial, view in zip(stage.trials, seen, strict=True):
+        trials.append(_trial(stage, trial, view, share, rng))
+        truths[trial.name] = _trial_truth(stage, trial, view, hidden)
     body = stage.world.body
     vertices, faces = rigid_mesh(body)
     density = round(body.density, 3)
@@ -289,13 +289,13 @@ def _assembled(
 
 def _notes(stage: _Stage, seen: Sequence[_Seen], nominal: Sequence[_Seen]) -> Mapping[str, Any]:
     world = stage.world
-    takes: dict[str, Any] = {}
+    trials: dict[str, Any] = {}
     withheld = []
-    for take, view, plain in zip(stage.takes, seen, nominal, strict=True):
+    for trial, view, plain in zip(stage.trials, seen, nominal, strict=True):
         gap = np.sum((view.points - plain.points) ** 2, axis=2)
-        s = take.state
-        takes[take.name] = {
-            "style": take.style,
+        s = trial.state
+        trials[trial.name] = {
+            "style": trial.style,
             "effect_rms_m": float(np.sqrt(gap.mean())),
             "initial": {
                 "pos": s.position.tolist(),
@@ -304,8 +304,8 @@ def _notes(stage: _Stage, seen: Sequence[_Seen], nominal: Sequence[_Seen]) -> Ma
                 "omega": s.spin.tolist(),
             },
         }
-        if take.shown is not None:
-            withheld.append(gap[take.shown :].mean())
+        if trial.shown is not None:
+            withheld.append(gap[trial.shown :].mean())
     return {
         "shape": world.body.shape,
         "observation": "points" if stage.camera is None else "pixels",
@@ -316,11 +316,11 @@ def _notes(stage: _Stage, seen: Sequence[_Seen], nominal: Sequence[_Seen]) -> Ma
             "restitution": stage.believed_bounce,
             "density": world.body.density,
         },
-        "trials": takes,
+        "trials": trials,
     }
 
 
-def _trial(stage: _Stage, take: _Take, view: _Seen, share: float, rng: np.random.Generator) -> Trial:
+def _trial(stage: _Stage, trial: _Throw, view: _Seen, share: float, rng: np.random.Generator) -> Trial:
     clean = view.points if view.pixels is None else view.pixels
     frames, count = clean.shape[:2]
     gone = np.asarray(drop_points(frames, count, share, rng), dtype=bool)
@@ -329,28 +329,28 @@ def _trial(stage: _Stage, take: _Take, view: _Seen, share: float, rng: np.random
         gone |= cosine < rng.normal(0.12, 0.03, size=cosine.shape)
     observed = clean + rng.normal(scale=stage.noise, size=clean.shape)
     observed[gone] = np.nan
-    shown = frames if take.shown is None else take.shown
+    shown = frames if trial.shown is None else trial.shown
     kept = observed[:shown].astype(np.float32).astype(np.float64)
-    times = take.start + stage.times
+    times = trial.start + stage.times
     return Trial(
-        name=take.name,
-        role="fit" if take.shown is None else "predict",
+        name=trial.name,
+        role="fit" if trial.shown is None else "predict",
         times=times[:shown],
         points=kept if stage.camera is None else None,
         pixels=None if stage.camera is None else kept,
         object_index=np.zeros(count, dtype=np.int64),
         rest_points=stage.rest,
-        predict_times=None if take.shown is None else times[shown:],
+        predict_times=None if trial.shown is None else times[shown:],
     )
 
 
-def _trial_truth(stage: _Stage, take: _Take, view: _Seen, hidden: Sequence[_Hidden]) -> TrialTruth:
+def _trial_truth(stage: _Stage, trial: _Throw, view: _Seen, hidden: Sequence[_Hidden]) -> TrialTruth:
     active = np.zeros(len(stage.times), dtype=bool)
     for item in hidden:
         active |= _active(item.cause, view.motion, stage.times)
-    if take.shown is None:
+    if trial.shown is None:
         return TrialTruth(points=view.points, active=active)
-    shown = take.shown
+    shown = trial.shown
     return TrialTruth(
         points=view.points[:shown],
         active=active[:shown],
@@ -386,16 +386,16 @@ def _oracle(stage: _Stage, hidden: Sequence[_Hidden], seen: Sequence[_Seen], rng
     """Return the error on withheld frames caused by the uncertainty of the state from the shown ones."""
     body, count = stage.world.body, max(4, len(stage.rest))
     noise = stage.noise if stage.camera is None else stage.noise * 2.3 / stage.camera.fx
-    some = [i for i, take in enumerate(stage.takes) if take.shown is not None]
+    some = [i for i, trial in enumerate(stage.trials) if trial.shown is not None]
     errors = []
     for _ in range(2):
         states = []
-        for take in stage.takes:
-            shown = take.shown or 30
+        for trial in stage.trials:
+            shown = trial.shown or 30
             span = stage.times[shown]
             place = 2 * noise / math.sqrt(count * shown)
             speed = noise * math.sqrt(12 / (count * shown)) / span
-            s = take.state
+            s = trial.state
             spin = rng.normal(scale=speed / (0.7 * body.size), size=3)
             states.append(
                 dataclasses.replace(
@@ -405,9 +405,9 @@ def _oracle(stage: _Stage, hidden: Sequence[_Hidden], seen: Sequence[_Seen], rng
                     spin=s.spin + spin,
                 )
             )
-        part = dataclasses.replace(stage, takes=tuple(stage.takes[i] for i in some))
+        part = dataclasses.replace(stage, trials=tuple(stage.trials[i] for i in some))
         for i, view in zip(some, _observe(part, hidden, [states[j] for j in some]), strict=True):
-            shown = stage.takes[i].shown or 0
+            shown = stage.trials[i].shown or 0
             errors.append(np.mean(np.sum((view.points - seen[i].points)[shown:] ** 2, axis=2)))
     return float(np.sqrt(np.mean(errors)))
 

@@ -199,23 +199,23 @@ def _mean(values: Iterable[Any]) -> float | None:
     return float(np.mean(found)) if found else None
 
 
-def _takes(truth: Arrays) -> list[str]:
+def _trial_names(truth: Arrays) -> list[str]:
     return sorted({key.split(".")[0] for key in truth})
 
 
 def _where(where: Arrays, truth: Arrays) -> tuple[float | None, float | None]:
     """Return the mean AUC over complete trials of frame scores, and of point scores where the cause is local."""
     frames, points = [], []
-    for take in _takes(truth):
-        if f"{take}.points_predict" in truth:
+    for trial in _trial_names(truth):
+        if f"{trial}.points_predict" in truth:
             continue
-        active = truth[f"{take}.effect_active"]
-        frames.append(rank_auc(_same(where[f"{take}.frame_score"], active.shape), active))
-        if f"{take}.point_mask" in truth and active.any():
-            shown = _same(where[f"{take}.point_score"], truth[f"{take}.points"].shape[:2])[active]
+        active = truth[f"{trial}.effect_active"]
+        frames.append(rank_auc(_same(where[f"{trial}.frame_score"], active.shape), active))
+        if f"{trial}.point_mask" in truth and active.any():
+            shown = _same(where[f"{trial}.point_score"], truth[f"{trial}.points"].shape[:2])[active]
             seen = np.isfinite(shown)
             mean = np.where(seen, shown, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-            points.append(rank_auc(mean, truth[f"{take}.point_mask"]))
+            points.append(rank_auc(mean, truth[f"{trial}.point_mask"]))
     return _mean(f for f in frames if f is not None), _mean(p for p in points if p is not None)
 
 
@@ -226,7 +226,7 @@ def _same(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _closure(prediction: Arrays, truth: Arrays, label: Mapping[str, Any]) -> tuple[float, float]:
-    names = [t for t in _takes(truth) if f"{t}.points_predict" in truth]
+    names = [t for t in _trial_names(truth) if f"{t}.points_predict" in truth]
     wanted = [truth[f"{t}.points_predict"].astype(float) for t in names]
     rms = {}
     for which in ("before", "after"):

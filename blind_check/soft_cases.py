@@ -414,25 +414,25 @@ def _marks(solid: Solid, count: int, rng: np.random.Generator) -> tuple[NDArray[
     return solid.faces[chosen], np.column_stack([1 - u, u * (1 - v), u * v])
 
 
-def _active(cause: SoftCause | None, motion: SoftMotion, take: int) -> NDArray[np.bool_]:
+def _active(cause: SoftCause | None, motion: SoftMotion, trial: int) -> NDArray[np.bool_]:
     frames = motion.energy.shape[1]
     if cause is None:
         return np.zeros(frames, dtype=bool)
     if cause.active == "always":
         return np.ones(frames, dtype=bool)
-    size = motion.loss[take] if cause.active == "losing" else motion.energy[take]
+    size = motion.loss[trial] if cause.active == "losing" else motion.energy[trial]
     return np.asarray(size > 0.15 * max(float(size.max()), 1e-12))
 
 
 def _mask(
-    solid: Solid, cause: SoftCause | None, motion: SoftMotion, take: int, rest: Array
+    solid: Solid, cause: SoftCause | None, motion: SoftMotion, trial: int, rest: Array
 ) -> NDArray[np.bool_] | None:
     """Return a mask (K,) of points whose nearest element is affected; None if all are."""
     if cause is None:
         return None
     where = cause.where
     if cause.effect == "plastic_yield":
-        where = motion.flow[take] > 0.2 * max(float(motion.flow[take].max()), 1e-9)
+        where = motion.flow[trial] > 0.2 * max(float(motion.flow[trial].max()), 1e-9)
     if where is None:
         return None
     _, nearest = cKDTree(solid.centres).query(rest)

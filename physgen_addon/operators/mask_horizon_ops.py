@@ -259,7 +259,8 @@ def unregister_mask_drawing() -> None:
 
 
 Colour = tuple[float, float, float, float]
-TOLD, FOUND = (0.2, 0.9, 1.0, 1.0), (1.0, 1.0, 1.0, 0.8)
+USER_COLOUR, ESTIMATE_COLOUR = (0.2, 0.9, 1.0, 1.0), (1.0, 1.0, 1.0, 0.8)
+"""Of the horizon that the user sets, and of the estimated one."""
 HORIZON_HELP = (
     "Drag the horizon: the middle third moves it, the outer thirds rotate it    Enter, Esc, right click: done    "
     "It may lie outside the photo"
@@ -374,7 +375,7 @@ def draw_horizon(
         shader.uniform_float("color", tone)
         batch_for_shader(shader, "LINES", {"pos": [(*points[0], 0.0), (*points[-1], 0.0)]}).draw(shader)
         size = (3 + width) * scale
-        for x, y in points[1:-1] if colour == TOLD else ():
+        for x, y in points[1:-1] if colour == USER_COLOUR else ():
             square = [(x - size, y - size, 0.0), (x + size, y - size, 0.0), (x + size, y + size, 0.0)]
             square.append((x - size, y + size, 0.0))
             batch_for_shader(shader, "TRI_FAN", {"pos": square}).draw(shader)
@@ -392,11 +393,11 @@ def draw_horizon(
 def horizon_shown(state: bpy.types.PropertyGroup) -> tuple[tuple[float, float], Colour, str] | None:
     """Return heights at the edges, colour and label of the horizon: the user's, else the estimate."""
     if state.camera == "HORIZON":
-        return photo_maths.ends(state.horizon, state.roll, aspect(state)), TOLD, f"horizon {state.horizon:.2f}"
+        return photo_maths.ends(state.horizon, state.roll, aspect(state)), USER_COLOUR, f"horizon {state.horizon:.2f}"
     if not state.has_found:
         return None
     label = f"horizon as found {state.found_horizon:.2f}"
-    return photo_maths.ends(state.found_horizon, state.found_roll, aspect(state)), FOUND, label
+    return photo_maths.ends(state.found_horizon, state.found_roll, aspect(state)), ESTIMATE_COLOUR, label
 
 
 def _draw_horizon() -> None:

@@ -53,7 +53,7 @@ def clock(times: Array) -> Clock:
     rate = 1.0 / float(np.median(np.diff(times)))
     count = round(float(times[-1] - times[0]) * rate) + 1
     if count > MAX_FRAMES:
-        raise InputError(f"times: last {times[-1] - times[0]:g} s at {rate:g} frames a second; shorten the take")
+        raise InputError(f"times: last {times[-1] - times[0]:g} s at {rate:g} frames a second; shorten the trial")
     wanted = times[0] + np.arange(count) / rate
     right = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     nearest = np.where(wanted - times[right - 1] <= times[right] - wanted, right - 1, right)

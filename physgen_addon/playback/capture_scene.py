@@ -153,17 +153,17 @@ def prepare(capture: Capture, diagnosed: Diagnosed) -> list[BuiltTrial]:
     return [_trial(capture, trial, diagnosed) for trial in capture.trials]
 
 
-def build(scene: bpy.types.Scene, capture: Capture, takes: list[BuiltTrial]) -> bpy.types.Collection:
+def build(scene: bpy.types.Scene, capture: Capture, built_trials: list[BuiltTrial]) -> bpy.types.Collection:
     """Add ``capture`` to ``scene``; return the collection."""
     root = bpy.data.collections.new("PhysGen capture")
     scene.collection.children.link(root)
     size = _extent(capture)
-    _add_ground(root, capture, takes)
+    _add_ground(root, capture, built_trials)
     if capture.camera is not None:
         _add_camera(scene, root, capture.camera)
     shapes = [_refined(item) for item in capture.objects]
-    for take in takes:
-        _add_trial(root, capture, take, shapes, size)
+    for built in built_trials:
+        _add_trial(root, capture, built, shapes, size)
     bpy.data.batch_remove(shapes)
     return root
 
@@ -228,8 +228,8 @@ def _extent(capture: Capture) -> float:
     return float(max(np.ptp(item.vertices, axis=0).max() for item in capture.objects))
 
 
-def _add_ground(root: bpy.types.Collection, capture: Capture, takes: list[BuiltTrial]) -> None:
-    points = np.concatenate([v[np.isfinite(v).all(axis=2)] for take in takes for v in take.layers.values()])
+def _add_ground(root: bpy.types.Collection, capture: Capture, built_trials: list[BuiltTrial]) -> None:
+    points = np.concatenate([v[np.isfinite(v).all(axis=2)] for built in built_trials for v in built.layers.values()])
     normal, origin = capture.ground.unit_normal, np.asarray(capture.ground.point, dtype=float)
     first, second = plane_axes(normal)
     low, high = np.percentile(points, [2, 98], axis=0)
@@ -296,15 +296,15 @@ def _refined(item: CaptureObject) -> bpy.types.Mesh:
 
 
 def _add_trial(
-    root: bpy.types.Collection, capture: Capture, take: BuiltTrial, shapes: list[bpy.types.Mesh], size: float
+    root: bpy.types.Collection, capture: Capture, built: BuiltTrial, shapes: list[bpy.types.Mesh], size: float
 ) -> None:
-    trial = take.trial
+    trial = built.trial
     collection = bpy.data.collections.new(trial.name)
     root.children.link(collection)
-    collection[TRIAL], collection[FRAMES], collection[RATE] = trial.name, take.clock.frames, take.clock.rate
-    samples = _add_samples(collection, take)
-    shift = {name: np.zeros_like(values) for name, values in take.layers.items()}
-    known = {name: np.zeros(values.shape[:2], dtype=bool) for name, values in take.layers.items()}
+    collection[TRIAL], collection[FRAMES], collection[RATE] = trial.name, built.clock.frames, built.clock.rate
+    samples = _add_samples(collection, built)
+    shift = {name: np.zeros_like(values) for name, values in built.layers.items()}
+    known = {name: np.zeros(values.shape[:2], dtype=bool) for name, values in built.layers.items()}
     for index, (item, shape) in enumerate(zip(capture.objects, shapes, strict=True)):
         mine = np.flatnonzero(trial.object_index == index)
         if not len(mine):
@@ -312,7 +312,7 @@ def _add_trial(
         mesh = shape.copy()
         mesh.name = f"{item.name} {trial.name}"
         _set_carriers(mesh, mine, trial.rest_points)
-        for name, values in take.layers.items():
+        for name, values in built.layers.items():
             poses = fit_poses(trial.rest_points[mine], values[:, mine])
             known[name][:, mine] = poses.known[:, None]
             if not item.belief.rigid:
@@ -326,7 +326,7 @@ def _add_trial(
             modifier.node_group = nodes.body_group()
             inputs = {
                 "Samples": samples,
-                "Frames": take.clock.frames,
+                "Frames": built.clock.frames,
                 "Points": len(trial.object_index),
                 "First": int(mine[0]),
                 "Shift": f"shift_{name}",
@@ -337,20 +337,20 @@ def _add_trial(
             }
             for key, value in inputs.items():
                 nodes.set_input(modifier, key, value)
-    for name, values in take.layers.items():
+    for name, values in built.layers.items():
         _set_attribute(samples.data, f"shift_{name}", "FLOAT_VECTOR", "vector", shift[name])
         _set_attribute(samples.data, f"known_{name}", "BOOLEAN", "value", known[name])
         _add_points(collection, trial, name, values, size)
 
 
-def _add_samples(collection: bpy.types.Collection, take: BuiltTrial) -> bpy.types.Object:
+def _add_samples(collection: bpy.types.Collection, built: BuiltTrial) -> bpy.types.Object:
     """Add one vertex per frame and point, frame by frame, with its attributes; never visible itself."""
-    frames, count = next(iter(take.layers.values())).shape[:2]
-    mesh = bpy.data.meshes.new(f"samples {take.trial.name}")
+    frames, count = next(iter(built.layers.values())).shape[:2]
+    mesh = bpy.data.meshes.new(f"samples {built.trial.name}")
     mesh.vertices.add(frames * count)
-    if take.score is not None:
-        _set_attribute(mesh, nodes.SCORE, "FLOAT", "value", np.nan_to_num(take.score))
-    item = bpy.data.objects.new(f"samples {take.trial.name}", mesh)
+    if built.score is not None:
+        _set_attribute(mesh, nodes.SCORE, "FLOAT", "value", np.nan_to_num(built.score))
+    item = bpy.data.objects.new(f"samples {built.trial.name}", mesh)
     item[ROLE] = SAMPLES
     item.hide_viewport = item.hide_render = True
     collection.objects.link(item)

@@ -63,8 +63,8 @@ class ClipTrial:
     predict_from: float | None = None
 
 
-def capture_from_clips(takes: Sequence[ClipTrial], folder: Scene, *, objects: Sequence[str] = ()) -> Capture:
-    """Return the tracks of ``takes`` on the objects of the scene ``folder``, as a capture of pixels.
+def capture_from_clips(clips: Sequence[ClipTrial], folder: Scene, *, objects: Sequence[str] = ()) -> Capture:
+    """Return the tracks of ``clips`` on the objects of the scene ``folder``, as a capture of pixels.
 
     Each clip's first frame with a marker shows the scene as in ``folder``. Tracks seen there are projected onto the
     mesh; later ones onto the mesh at the pose that the earlier tracks give. Points are unobserved in frames without a
@@ -72,20 +72,20 @@ def capture_from_clips(takes: Sequence[ClipTrial], folder: Scene, *, objects: Se
     objects: names to use; empty: all that move. Raises InputError for a clip without usable tracks, with another aspect
     than the photo, or with unknown frame rate.
     """
-    if not takes:
+    if not clips:
         raise InputError("no clip: load a movie clip and track points on it")
     chosen = selected_objects(folder.model, objects)
     everything = scene_bodies(folder)
     warnings = belief_warnings(folder.model, chosen)
     trials, sigmas, cameras = [], [], []
-    for take in takes:
-        camera = _camera(folder, take.clip)
+    for entry in clips:
+        camera = _camera(folder, entry.clip)
         cameras.append(camera)
-        read = _read(take, camera)
+        read = _read(entry, camera)
         warnings += read.warnings
         trial, sigma = _lifted(read, everything, chosen, camera, warnings)
         sigmas.append(sigma)
-        trials.append(trial if take.predict_from is None else withhold(trial, take.predict_from)[0])
+        trials.append(trial if entry.predict_from is None else withhold(trial, entry.predict_from)[0])
     if any(camera != cameras[0] for camera in cameras):
         raise InputError("the clips have different sizes: a capture has one camera; import them apart")
     known = [sigma for sigma in sigmas if sigma is not None]
@@ -122,19 +122,19 @@ def _camera(folder: Scene, clip: bpy.types.MovieClip) -> Camera:
     return video_camera(folder.model, int(width), int(height), f"clip {clip.name!r}")
 
 
-def _fps(take: ClipTrial) -> float:
-    fps = take.fps
+def _fps(entry: ClipTrial) -> float:
+    fps = entry.fps
     if fps is None:
-        fps = float(take.clip.fps)
+        fps = float(entry.clip.fps)
         if fps <= 0 and bpy.context.scene is not None:
             fps = bpy.context.scene.render.fps / bpy.context.scene.render.fps_base
     if not (np.isfinite(fps) and 0 < fps <= 1e5):
-        raise InputError(f"clip {take.clip.name!r}: its frame rate is {fps!r}: give a frame rate up to 100000")
+        raise InputError(f"clip {entry.clip.name!r}: its frame rate is {fps!r}: give a frame rate up to 100000")
     return fps
 
 
-def _read(take: ClipTrial, camera: Camera) -> _Tracks:
-    clip = take.clip
+def _read(entry: ClipTrial, camera: Camera) -> _Tracks:
+    clip = entry.clip
     tracks = [track for item in clip.tracking.objects for track in item.tracks]
     seen = {
         index: {m.frame: np.add(m.co, track.offset) for m in track.markers if not m.mute}
@@ -153,9 +153,9 @@ def _read(take: ClipTrial, camera: Camera) -> _Tracks:
             pixels[frame - frames[0], index] = x * camera.width, (1.0 - y) * camera.height
     warnings: list[str] = []
     return _Tracks(
-        name="".join(c if c.isalnum() or c in "_- " else "_" for c in take.name or clip.name).strip() or "clip",
+        name="".join(c if c.isalnum() or c in "_- " else "_" for c in entry.name or clip.name).strip() or "clip",
         names=[track.name for track in tracks],
-        times=np.arange(count) / _fps(take),
+        times=np.arange(count) / _fps(entry),
         pixels=_undistorted(clip, pixels, camera, warnings),
         warnings=warnings,
     )

@@ -114,7 +114,7 @@ def negative_controls(
     last_residual_rms_m: the nominal model with its last residual carried forward.
     nominal: (T, K, 3) m by trial, simulated from its first frames.
     """
-    freedom = sum(len(p) for p in found.parameters.values())
+    parameter_count = sum(len(p) for p in found.parameters.values())
     wrong = [
         fit
         for fit in fits.candidates
@@ -123,10 +123,10 @@ def negative_controls(
         and math.isfinite(fit.heldout_rms_m)
     ]
     if weighed.verdict.effect in (NONE, UNKNOWN):
-        freedom = 1
+        parameter_count = 1
 
     def unlike(fit: CandidateFit) -> tuple[int, float]:
-        return abs(sum(len(p) for p in fit.parameters.values()) - freedom), fit.log_evidence
+        return abs(sum(len(p) for p in fit.parameters.values()) - parameter_count), fit.log_evidence
 
     chosen = min(wrong, key=unlike).heldout_rms_m if wrong else math.nan
     return {"wrong_effect_rms_m": chosen, "last_residual_rms_m": carried_residual(capture, nominal)}

@@ -321,7 +321,13 @@ sys.stdout.flush()
 import numpy as np
 from mathutils import Matrix
 from physgen.physgen_addon.photo.photo_maths import Painting, ellipse
-from physgen.physgen_addon.operators.mask_horizon_ops import TOLD, draw_brush, draw_horizon, draw_tint, tint_texture
+from physgen.physgen_addon.operators.mask_horizon_ops import (
+    USER_COLOUR,
+    draw_brush,
+    draw_horizon,
+    draw_tint,
+    tint_texture,
+)
 wide, high = 320, 240
 screen = gpu.types.GPUOffScreen(wide, high)
 with screen.bind():
@@ -334,7 +340,7 @@ with screen.bind():
         place = lambda u, v: (u * wide, (1 - v) * high)
         draw_tint(place, tint_texture(Painting(ellipse(640, 480, (100, 40, 300, 200)))))
         draw_brush((260.0, 40.0), 20.0)
-        draw_horizon(place, (0.6, 0.7), TOLD, "horizon", high, 1.0)
+        draw_horizon(place, (0.6, 0.7), USER_COLOUR, "horizon", high, 1.0)
     pixels = buffer.read_color(0, 0, wide, high, 4, 0, "UBYTE")
     pixels.dimensions = wide * high * 4
 np.save(sys.argv[2], np.array(pixels, dtype=np.uint8).reshape(high, wide, 4)[::-1])

@@ -30,7 +30,7 @@ from physgen.sim.diagnose.track.pose_estimation import (
     project,
     silhouette,
 )
-from physgen.sim.diagnose.track.track_command import add_arguments, parse_takes, run_command, track
+from physgen.sim.diagnose.track.track_command import add_arguments, parse_trials, run_command, track
 from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial
 from physgen.sim.diagnose.track.track_videos import track_video, track_videos, withhold
 from physgen.sim.errors import Cancelled, InputError
@@ -416,8 +416,8 @@ def test_several_takes_and_one_to_predict(cube, tossed, tmp_path):
     path, tracked = tossed
     second = tmp_path / "later.avi"
     second.write_bytes(path.read_bytes())
-    takes = parse_takes([path, second], predict_from=["later=0.25"], end_frames=[24])
-    capture = track(folder, takes, out=tmp_path / "capture", withheld=tmp_path / "withheld")
+    trials = parse_trials([path, second], predict_from=["later=0.25"], end_frames=[24])
+    capture = track(folder, trials, out=tmp_path / "capture", withheld=tmp_path / "withheld")
     loaded = load_capture(tmp_path / "capture")
     assert [(t.name, t.role) for t in loaded.trials] == [("toss", "fit"), ("later", "predict")]
     shown = loaded.predict_trials[0]
@@ -614,7 +614,7 @@ def test_options_out_of_range(changes, message):
 )
 def test_wrong_arguments(changes, message):
     with pytest.raises(InputError, match=message):
-        parse_takes([Path("a.mp4"), Path("b.mp4")], **changes)
+        parse_trials([Path("a.mp4"), Path("b.mp4")], **changes)
 
 
 def test_wrong_objects(cube, tossed):

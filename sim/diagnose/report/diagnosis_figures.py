@@ -95,7 +95,7 @@ class Growth:
     times: Array
     nominal: Array
     found: Array
-    takes: int
+    trials: int
     unit: str
     noise: float
 
@@ -116,7 +116,7 @@ def growth(diagnosis: Diagnosis, capture: Capture) -> Growth:
         times=times,
         nominal=means["nominal"],
         found=means["found"],
-        takes=len(chosen),
+        trials=len(chosen),
         unit="px" if in_pixels else "m",
         noise=capture.noise_sigma * math.sqrt(2 if in_pixels else 3),
     )
@@ -202,7 +202,7 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
         width=WIDTH,
         height=bottom + 42,
         title="Error over time since the start of a trial",
-        description=f"Mean of {data.takes} trials. {'; '.join(said) or 'No error available'}.",
+        description=f"Mean of {data.trials} trials. {'; '.join(said) or 'No error available'}.",
         body=join(parts),
     )
 

@@ -195,7 +195,7 @@ _PLACES = 160
 """Vertices of a path; more are not visible at this size."""
 
 
-def shown_takes(diagnosis: Diagnosis, capture: Capture) -> list[TrialTracks]:
+def shown_trials(diagnosis: Diagnosis, capture: Capture) -> list[TrialTracks]:
     """Return the trials with a picture, in the capture's order."""
     both = [(t, diagnosis.trials[t.name]) for t in capture.trials if t.name in diagnosis.trials]
     return [trial_tracks(trial, arrays, capture) for trial, arrays in both[:MAX_TAKES]]
@@ -204,7 +204,7 @@ def shown_takes(diagnosis: Diagnosis, capture: Capture) -> list[TrialTracks]:
 def tracks_pictures(diagnosis: Diagnosis, capture: Capture) -> list[Picture]:
     """Return a picture of each trial."""
     with_found = bool(found_effects(diagnosis.verdict))
-    return [_picture(take, with_found, found_label(diagnosis.verdict)) for take in shown_takes(diagnosis, capture)]
+    return [_picture(trial, with_found, found_label(diagnosis.verdict)) for trial in shown_trials(diagnosis, capture)]
 
 
 def tracks_legend(diagnosis: Diagnosis) -> Picture:
@@ -233,34 +233,34 @@ def tracks_legend(diagnosis: Diagnosis) -> Picture:
     )
 
 
-def _picture(take: TrialTracks, with_found: bool, found: str) -> Picture:
-    place = _Placement(take, with_found)
+def _picture(trial: TrialTracks, with_found: bool, found: str) -> Picture:
+    place = _Placement(trial, with_found)
     parts: list[Markup | None] = [
         element("rect", x=0, y=_TOP, width=WIDTH, height=HEIGHT - _TOP, rx=6, class_="panel"),
-        label(shortened(take.name, 24), 0, 15, class_="ink strong"),
-        label("prediction" if take.role == "predict" else "", WIDTH, 15, class_="quiet", anchor="end"),
+        label(shortened(trial.name, 24), 0, 15, class_="ink strong"),
+        label("prediction" if trial.role == "predict" else "", WIDTH, 15, class_="quiet", anchor="end"),
     ]
-    if take.ground is not None:
-        parts.append(element("path", d=place.curve(take.ground), class_="line tick", stroke_width=1))
-    parts += [_way(place, path, "nominal", "6 3") for path in (*take.nominal, *take.before)]
+    if trial.ground is not None:
+        parts.append(element("path", d=place.curve(trial.ground), class_="line tick", stroke_width=1))
+    parts += [_way(place, path, "nominal", "6 3") for path in (*trial.nominal, *trial.before)]
     if with_found:
-        parts += [_way(place, path, "found", None) for path in (*take.found, *take.after)]
-    for centres in take.observed:
+        parts += [_way(place, path, "found", None) for path in (*trial.found, *trial.after)]
+    for centres in trial.observed:
         parts += [
             element("circle", cx=x, cy=y, r=2.3, class_="panel observed-line", stroke_width=1.1)
             for x, y in spaced(place.places(centres))
         ]
     parts += [
-        element("circle", cx=x, cy=y, r=1.1, class_="observed-fill dot") for x, y in place.places(take.dots[:200])
+        element("circle", cx=x, cy=y, r=1.1, class_="observed-fill dot") for x, y in place.places(trial.dots[:200])
     ]
-    parts.append(_scale_bar(place, take.unit))
-    seen = "as the camera saw it" if take.unit == "px" else "from the side"
+    parts.append(_scale_bar(place, trial.unit))
+    seen = "as the camera saw it" if trial.unit == "px" else "from the side"
     lines = f"observed, nominal model{f', and {found}' if with_found else ''}"
     return Picture(
         width=WIDTH,
         height=HEIGHT,
-        title=f"{shortened(take.name, 40)}, {seen}",
-        description=f"Paths of the objects' centres: {lines}.{_parting(take, with_found, found)}",
+        title=f"{shortened(trial.name, 40)}, {seen}",
+        description=f"Paths of the objects' centres: {lines}.{_parting(trial, with_found, found)}",
         body=join(parts),
     )
 
@@ -274,21 +274,21 @@ def spaced(places: Array) -> list[tuple[float, float]]:
     return shown
 
 
-def _parting(take: TrialTracks, with_found: bool, found: str) -> str:
+def _parting(trial: TrialTracks, with_found: bool, found: str) -> str:
     """Return how far the simulated paths end from the observed one, or from each other where it is withheld."""
     said = []
-    if take.role == "predict":
-        for before, after in zip(take.before, take.after, strict=False):
+    if trial.role == "predict":
+        for before, after in zip(trial.before, trial.after, strict=False):
             if with_found and len(before.centres) and np.isfinite(before.centres[-1] + after.centres[-1]).all():
                 apart = float(np.linalg.norm(before.centres[-1] - after.centres[-1]))
-                said.append(f"At the end of the prediction the two are {quantity_text(apart, take.unit)} apart.")
+                said.append(f"At the end of the prediction the two are {quantity_text(apart, trial.unit)} apart.")
         return "".join(f" {s}" for s in said)
-    for observed, nominal, better in zip(take.observed, take.nominal, take.found, strict=True):
+    for observed, nominal, better in zip(trial.observed, trial.nominal, trial.found, strict=True):
         for path, words in ((nominal, "the nominal model"), (better, found if with_found else "")):
             both = np.isfinite(observed + path.centres).all(axis=1)
             if words and both.any():
                 apart = float(np.linalg.norm((observed - path.centres)[both][-1]))
-                said.append(f"At the end {words} is {quantity_text(apart, take.unit)} off.")
+                said.append(f"At the end {words} is {quantity_text(apart, trial.unit)} off.")
     return "".join(f" {s}" for s in said)
 
 
@@ -332,9 +332,9 @@ def _scale_bar(place: _Placement, unit: str) -> Markup | None:
 class _Placement:
     """Maps the plane of a trial to its picture: one scale for both axes, everything inside."""
 
-    def __init__(self, take: TrialTracks, with_found: bool) -> None:
-        paths = (*take.nominal, *take.before, *(take.found + take.after if with_found else ()))
-        shown = [take.dots, *take.observed, *(p.centres for p in paths), *(o for p in paths for o in p.outlines)]
+    def __init__(self, trial: TrialTracks, with_found: bool) -> None:
+        paths = (*trial.nominal, *trial.before, *(trial.found + trial.after if with_found else ()))
+        shown = [trial.dots, *trial.observed, *(p.centres for p in paths), *(o for p in paths for o in p.outlines)]
         places = np.concatenate([s.reshape(-1, 2) for s in shown]) if shown else np.empty((0, 2))
         places = places[np.isfinite(places).all(axis=1)]
         # A diverged path must not shrink the rest to a dot.
@@ -348,7 +348,7 @@ class _Placement:
         room = np.array([WIDTH - 2 * _MARGIN, HEIGHT - _TOP - 2 * _MARGIN - 16])
         self.scale = float((room / extent).min())
         self.offset = (room - extent * self.scale) / 2 + (_MARGIN, _MARGIN)
-        self.extent, self.down = extent, take.unit == "px"
+        self.extent, self.down = extent, trial.unit == "px"
         wanted = 70 / self.scale
         power = 10.0 ** np.floor(np.log10(wanted))
         self.bar = float(max(f * power for f in (1, 2, 5) if f * power <= wanted)) if len(places) > 1 else None

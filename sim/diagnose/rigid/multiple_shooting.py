@@ -70,26 +70,26 @@ class SegmentedTrial:
 class Model:
     """The nominal model's own parameters plus added effects."""
 
-    freedoms: tuple[CandidateEffect, ...]
+    candidates: tuple[CandidateEffect, ...]
 
     @property
     def size(self) -> int:
         """Return the number of free numbers."""
-        return BELIEFS.size + sum(f.size for f in self.freedoms)
+        return BELIEFS.size + sum(f.size for f in self.candidates)
 
     @property
     def steps(self) -> Array:
         """Return the finite-difference steps (P,)."""
-        parts = [np.full(BELIEFS.size, BELIEFS.step), *(np.full(f.size, f.step) for f in self.freedoms)]
+        parts = [np.full(BELIEFS.size, BELIEFS.step), *(np.full(f.size, f.step) for f in self.candidates)]
         return np.concatenate(parts)
 
     def setting(self, scene: BodyScene, z: Array) -> WorldSettings:
         """Return the world settings of the numbers ``z`` (P,)."""
         setting = BELIEFS.change(scene, scene.base, z[: BELIEFS.size])
         at = BELIEFS.size
-        for freedom in self.freedoms:
-            setting = freedom.change(scene, setting, z[at : at + freedom.size])
-            at += freedom.size
+        for candidate in self.candidates:
+            setting = candidate.change(scene, setting, z[at : at + candidate.size])
+            at += candidate.size
         return setting
 
 
@@ -100,7 +100,7 @@ class Segment:
     turn: (F, 6, 12 + B), come: (12, 12 + B): Jacobians of poses and arrival with respect to start and beliefs.
     """
 
-    take: int
+    trial: int
     index: int
     frames: NDArray[np.int64]
     record: Array
@@ -135,7 +135,7 @@ class Problem:
 
     scene: BodyScene
     simulator: RigidWorlds
-    takes: list[SegmentedTrial]
+    trials: list[SegmentedTrial]
 
     def state_steps(self) -> Array:
         """Return the finite-difference steps (12,) of a state."""
@@ -165,12 +165,12 @@ class Problem:
         tables = [scene.numbers(m[1]) for m in many]
         rows = tables if len(many) > 1 else tables * len(states)
         owner = np.concatenate([np.zeros(variants - len(settings) + 1), np.arange(1, len(settings))]).astype(int)
-        spans = [(i, j, a, b) for i, take in enumerate(self.takes) for j, (a, b) in enumerate(take.spans)]
+        spans = [(i, j, a, b) for i, trial in enumerate(self.trials) for j, (a, b) in enumerate(trial.spans)]
         starts, times = [], []
         for i, j, a, b in spans:
-            take = self.takes[i]
-            last = b if b < take.end else b - 1
-            clock = take.observations.times[a : last + 1] - take.observations.times[a]
+            trial = self.trials[i]
+            last = b if b < trial.end else b - 1
+            clock = trial.observations.times[a : last + 1] - trial.observations.times[a]
             starts.append(perturbed(np.repeat(states[i][j][None], variants, axis=0), changes))
             times += [clock * around[i][o].rate for o in owner]
         numbers = np.concatenate([rows[i][owner] for i, _, _, _ in spans])
@@ -185,15 +185,15 @@ class Problem:
             for s in states
         ]
         for number, ((i, j, a, b), world) in enumerate(zip(spans, out, strict=True)):
-            take = self.takes[i]
+            trial = self.trials[i]
             old = held.segments[number] if held is not None else None
             turn = come = None
             part = linear[i]
             frames = np.arange(a, b)
             count = len(frames)
             pose = self.seen_poses(world[:, :count], [around[i][o] for o in owner])
-            chi2, slope, info = take.observations.information(pose[0, :, :3], pose[0, :, 3:7], frames)
-            weight = take.weights[j] if j < len(take.weights) else np.ones(count)
+            chi2, slope, info = trial.observations.information(pose[0, :, :3], pose[0, :, 3:7], frames)
+            weight = trial.weights[j] if j < len(trial.weights) else np.ones(count)
             chi2 = chi2 * weight
             part.cost += float(chi2.sum())
             defect = None
@@ -206,10 +206,10 @@ class Problem:
                 info, slope = info * weight[:, None, None], slope * weight[:, None]
                 part.hessian[np.ix_(where, where)] += np.einsum("fav,fab,fbw->vw", turn, info, turn, optimize=True)
                 part.slope[where] += np.einsum("fav,fa->v", turn, slope)
-            if b < take.end:
+            if b < trial.end:
                 arrival = world[:, count]
                 defect = state_difference(arrival[0, :13], states[i][j + 1])
-                scale = np.linalg.inv(take.covers[j]) if j < len(take.covers) else np.eye(12)
+                scale = np.linalg.inv(trial.covers[j]) if j < len(trial.covers) else np.eye(12)
                 square = float(defect @ scale @ defect)
                 nu = CONTACT_DEGREES_OF_FREEDOM
                 part.cost += (nu + 12) * np.log1p(square / nu)
@@ -226,7 +226,7 @@ class Problem:
                     spot = np.r_[where, 12 * (j + 1) : 12 * (j + 2)]
                     part.hessian[np.ix_(spot, spot)] += both.T @ scale @ both
                     part.slope[spot] += both.T @ scale @ defect
-            if take.observations.camera is not None:
+            if trial.observations.camera is not None:
                 # Pixels leave the depth open, but it cannot be below the ground.
                 gap, rise = height(scene, states[i][j])
                 sunk = min(gap, 0.0) / SUNK
@@ -236,17 +236,17 @@ class Problem:
                     part.hessian[low, low] += np.outer(rise, rise) / SUNK**2
                     part.slope[low] -= rise * sunk / SUNK
             if j == 0:
-                off = state_difference(states[i][0], take.guess) / take.prior
+                off = state_difference(states[i][0], trial.guess) / trial.prior
                 part.cost += float(off @ off)
-                part.hessian[own, own] += np.diag(take.prior**-2.0)
-                part.slope[own] += off / take.prior
+                part.hessian[own, own] += np.diag(trial.prior**-2.0)
+                part.slope[own] += off / trial.prior
             segments.append(
                 Segment(
-                    take=i,
+                    trial=i,
                     index=j,
                     frames=frames,
                     record=world[0, :count],
-                    arrival=world[0, count] if b < take.end else world[0, count - 1],
+                    arrival=world[0, count] if b < trial.end else world[0, count - 1],
                     chi2=chi2,
                     defect=defect,
                     turn=None if turn is None else turn[..., : 12 + BELIEFS.size],
@@ -403,14 +403,14 @@ def _volumes(problem: Problem, evaluation: Evaluation, size: int) -> float:
     nu = CONTACT_DEGREES_OF_FREEDOM
     # Student's distribution relative to the normal one, in 12 dimensions.
     student = gammaln((nu + 12) / 2) - gammaln(nu / 2) - 6 * np.log(nu / 2)
-    for take, part in zip(problem.takes, evaluation.linear, strict=True):
+    for trial, part in zip(problem.trials, evaluation.linear, strict=True):
         n = len(part.slope) - size
         hessian = part.hessian[:n, :n]
         band = np.zeros((24, n))
         for k in range(min(24, n)):
             band[k, : n - k] = np.diagonal(hessian, -k)
         total -= float(np.sum(np.log(np.abs(cholesky_banded(band + 0.0, lower=True, check_finite=False)[0]))))
-        total -= float(np.sum(np.log(take.prior)))
-        for cover in take.covers[: len(take.nodes) - 1]:
+        total -= float(np.sum(np.log(trial.prior)))
+        for cover in trial.covers[: len(trial.nodes) - 1]:
             total += float(student) - 0.5 * float(np.sum(np.log(np.diag(cover))))
     return total

@@ -139,12 +139,12 @@ def fit_rigid(
     for body in bodies:
         fit_nominal(body)
         tick("nominal")
-        for freedom in wanted:
+        for candidate in wanted:
             if time.monotonic() - started < budget_s:
-                begin_search(body, (freedom,))
-                if freedom.name == "camera_pose":
+                begin_search(body, (candidate,))
+                if candidate.name == "camera_pose":
                     fit_camera_pose(body)
-            tick(freedom.name)
+            tick(candidate.name)
         finish_best(body, started + budget_s)
         refit_beliefs(body)
         tick("refitted")
@@ -255,8 +255,8 @@ def _candidate(
             )
     evidence = sum(b.fits[key].evidence for b in bodies)
     for name in key:
-        freedom = CANDIDATE_EFFECTS[name]
-        if freedom.positive and _amount(fit, name) < 0:
+        candidate = CANDIDATE_EFFECTS[name]
+        if candidate.positive and _amount(fit, name) < 0:
             # A negative amount: the nominal model with an extra parameter.
             evidence = min(evidence, sum(b.fits[()].evidence for b in bodies) - 3.0)
     ratios = [misfit(b.fits[key]) for b in bodies]
@@ -274,10 +274,10 @@ def _candidate(
 
 def _amount(fit: Fit, name: str) -> float:
     at = BELIEFS.size
-    for freedom in fit.model.freedoms:
-        if freedom.name == name:
+    for candidate in fit.model.candidates:
+        if candidate.name == name:
             return float(fit.z[at])
-        at += freedom.size
+        at += candidate.size
     return 0.0
 
 
@@ -286,10 +286,10 @@ def _estimates(scene: BodyScene, fit: Fit, name: str, draws: Array) -> dict[str,
 
     def values(z: Array) -> dict[str, float]:
         at, setting = BELIEFS.size, None
-        for freedom in fit.model.freedoms:
-            if freedom.name == name:
-                setting = freedom.values(scene, fit.model.setting(scene, z), z[at : at + freedom.size])
-            at += freedom.size
+        for candidate in fit.model.candidates:
+            if candidate.name == name:
+                setting = candidate.values(scene, fit.model.setting(scene, z), z[at : at + candidate.size])
+            at += candidate.size
         assert setting is not None
         return {k: float(np.clip(v, schema[k].low, schema[k].high)) for k, v in setting.items()}
 

@@ -35,18 +35,18 @@ def localise_discrepancies(capture: Capture, bodies: list[tuple[Fit, Fit | None]
         phases: list[str] = ["rest"] * len(trial.times)
         velocity = np.zeros((len(trial.times), 3))
         for nominal, fit in bodies:
-            for i, take in enumerate(nominal.problem.takes):
-                if take.observations.trial is not trial:
+            for i, fitted in enumerate(nominal.problem.trials):
+                if fitted.observations.trial is not trial:
                     continue
                 lack, body_phases, speed = _lack(nominal, fit, i)
-                points[:, take.observations.columns] = np.linalg.norm(lack, axis=1)[:, None]
+                points[:, fitted.observations.columns] = np.linalg.norm(lack, axis=1)[:, None]
                 strongest = np.linalg.norm(lack, axis=1) > np.linalg.norm(force, axis=1)
                 force = np.where(strongest[:, None], lack, force)
                 phases, velocity = body_phases, speed
                 modelled = _nominal_points(nominal, i)
                 if capture.camera is not None and trial.pixels is not None:
                     modelled = project(capture.camera, modelled)
-                residual[:, take.observations.columns] = take.observations.seen - modelled
+                residual[:, fitted.observations.columns] = fitted.observations.seen - modelled
         found[trial.name] = Discrepancy(
             frame_score=points.max(axis=1) if points.shape[1] else np.zeros(size[0]),
             point_score=points,
@@ -59,21 +59,21 @@ def localise_discrepancies(capture: Capture, bodies: list[tuple[Fit, Fit | None]
 
 def _nominal_points(nominal: Fit, index: int) -> Array:
     problem = nominal.problem
-    take = problem.takes[index]
+    trial = problem.trials[index]
     state = nominal.states[index][0]
-    times = take.observations.times
+    times = trial.observations.times
     setting = nominal.model.setting(problem.scene, nominal.z)
     record = problem.simulator.run(state[None], problem.scene.numbers([setting]), [times - times[0]])[0]
-    return world_points(take, record[: len(times)])
+    return world_points(trial, record[: len(times)])
 
 
 def _fine(fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
     """Return recorded times (M,), records (M, 17) and nearest frames (M,) of a trial, sampled between frames."""
     problem = fit.problem
-    take, setting = problem.takes[index], fit.model.setting(problem.scene, fit.z)
-    times = take.observations.times
+    trial, setting = problem.trials[index], fit.model.setting(problem.scene, fit.z)
+    times = trial.observations.times
     rows, clocks = [], []
-    spans = [*take.spans[:-1], (take.nodes[-1], len(times))]
+    spans = [*trial.spans[:-1], (trial.nodes[-1], len(times))]
     for a, b in spans:
         last = b if b < len(times) else b - 1
         edges = times[a : last + 1]
@@ -94,8 +94,8 @@ def _fine(fit: Fit, index: int) -> tuple[Array, Array, NDArray[np.int64]]:
 def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], Array]:
     """Return missing force per mass (T, 3), phase of every frame and velocity (T, 3)."""
     used = nominal if fit is None else fit
-    take, scene = used.problem.takes[index], used.problem.scene
-    frames = len(take.observations.times)
+    trial, scene = used.problem.trials[index], used.problem.scene
+    frames = len(trial.observations.times)
     clock, record, nearest = _fine(used, index)
     normal = scene.capture.ground.unit_normal
     gains = np.maximum(np.diff(record[:, 13:17], axis=0, append=record[-1:, 13:17]), 0.0)
@@ -105,7 +105,7 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     pushed = _summed(gains[:, 0], nearest, frames)
     touched = _summed(gains[:, 2], nearest, frames)
     slid = _summed(gains[:, 3], nearest, frames)
-    spacing = np.gradient(take.observations.times)
+    spacing = np.gradient(trial.observations.times)
     weight = float(np.linalg.norm(scene.capture.gravity))
     speed = np.linalg.norm(velocity, axis=1) + np.linalg.norm(spin, axis=1) * scene.body.bound
     blow = pushed - weight * touched
@@ -121,7 +121,7 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
 
     if fit is None:
         return measured_force(nominal, index), phases, velocity
-    base = Model(freedoms=()).setting(scene, fit.z[: BELIEFS.size])
+    base = Model(candidates=()).setting(scene, fit.z[: BELIEFS.size])
     setting = fit.model.setting(scene, fit.z)
     lack += _by_frame(_force_difference(base, setting, record), nearest, frames)
     rate = pushed / spacing
@@ -178,18 +178,18 @@ def measured_force(fit: Fit, index: int) -> Array:
     The expected contribution of noise is subtracted.
     """
     problem = fit.problem
-    take = problem.takes[index]
-    times = take.observations.times
+    trial = problem.trials[index]
+    times = trial.observations.times
     lack = np.zeros((len(times), 3))
     setting = fit.model.setting(problem.scene, fit.z)
     for segment in fit.evaluation.segments:
-        if segment.take != index:
+        if segment.trial != index:
             continue
         free = np.flatnonzero(segment.record[:, 15] <= 0)
         if len(free) >= 6:
-            lack[segment.frames[free]] = _curvature(problem, take, segment, free, setting)
+            lack[segment.frames[free]] = _curvature(problem, trial, segment, free, setting)
         if segment.defect is not None:
-            deviation = np.sqrt(np.diag(take.covers[segment.index])[6:9])
+            deviation = np.sqrt(np.diag(trial.covers[segment.index])[6:9])
             jump = segment.defect[6:9]
             size = float(np.linalg.norm(jump / deviation))
             jump = -jump * max(0.0, 1 - 2.5 / max(size, 1e-9))
@@ -201,12 +201,12 @@ def measured_force(fit: Fit, index: int) -> Array:
 
 
 def _curvature(
-    problem: Problem, take: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
+    problem: Problem, trial: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
 ) -> Array:
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
-    _, slope, info = take.observations.information(pose[:, :3], pose[:, 3:7], frames)
-    t = take.observations.times[frames]
+    _, slope, info = trial.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    t = trial.observations.times[frames]
     found = np.zeros((len(frames), 3))
     for k in range(len(frames)):
         half = 0.03

@@ -27,7 +27,7 @@ SHOWN = 0.16
 
 def believed_fit(nominal: Fit) -> Fit:
     """Return the nominal model with its given parameters and fitted states."""
-    model, z = Model(freedoms=()), np.zeros(BELIEFS.size)
+    model, z = Model(candidates=()), np.zeros(BELIEFS.size)
     states = fit_states(nominal.problem, model, z, nominal.states, 3)
     return dataclasses.replace(nominal, model=model, z=z, states=states)
 
@@ -39,66 +39,66 @@ def extrapolate(fit: Fit, z: Array, state: Array, times: Array) -> Array:
     return fit.problem.simulator.run(state[None], scene.numbers([setting]), [times * setting.rate])[0, : len(times)]
 
 
-def world_points(take: SegmentedTrial, record: Array) -> Array:
+def world_points(trial: SegmentedTrial, record: Array) -> Array:
     """Return world points (M, K, 3) of ``record``."""
     return np.asarray(
-        record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), take.observations.places)
+        record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), trial.observations.places)
     )
 
 
 def predict_points(fit: Fit) -> Points:
     """Return by predict trial: columns and points (P, K, 3) at its ``predict_times``."""
     found: Points = {}
-    for take, states in zip(fit.problem.takes, fit.states, strict=True):
-        wanted = take.observations.trial.predict_times
+    for trial, states in zip(fit.problem.trials, fit.states, strict=True):
+        wanted = trial.observations.trial.predict_times
         if wanted is None:
             continue
-        begin = take.observations.times[take.nodes[-1]]
+        begin = trial.observations.times[trial.nodes[-1]]
         record = extrapolate(fit, fit.z, states[-1], wanted - begin)
-        found[take.observations.trial.name] = take.observations.columns, world_points(take, record)
+        found[trial.observations.trial.name] = trial.observations.columns, world_points(trial, record)
     return found
 
 
-def shown_frames(fit: Fit, take: SegmentedTrial) -> int:
-    """Return how many first frames of ``take`` to use: as many as in predict trials, or ``SHOWN`` seconds."""
+def shown_frames(fit: Fit, trial: SegmentedTrial) -> int:
+    """Return how many first frames of ``trial`` to use: as many as in predict trials, or ``SHOWN`` seconds."""
     spans = [
         t.observations.times[-1] - t.observations.times[0]
-        for t in fit.problem.takes
+        for t in fit.problem.trials
         if t.observations.trial.predict_times is not None
     ]
-    times = take.observations.times - take.observations.times[0]
+    times = trial.observations.times - trial.observations.times[0]
     count = int(np.searchsorted(times, float(np.median(spans)) if spans else SHOWN, side="right"))
-    return int(np.clip(count, min(4, take.end), take.end))
+    return int(np.clip(count, min(4, trial.end), trial.end))
 
 
 def _shortened(fit: Fit) -> tuple[Problem, list[Array]]:
     """Return ``fit``'s problem truncated to the first frames of every trial, and the states there."""
     short, states = [], []
-    for take, whole in zip(fit.problem.takes, fit.states, strict=True):
-        end = shown_frames(fit, take)
-        nodes = [n for n in take.nodes if n < end - 2] or [0]
-        end = min([end, *take.nodes[len(nodes) : len(nodes) + 1]])
+    for trial, whole in zip(fit.problem.trials, fit.states, strict=True):
+        end = shown_frames(fit, trial)
+        nodes = [n for n in trial.nodes if n < end - 2] or [0]
+        end = min([end, *trial.nodes[len(nodes) : len(nodes) + 1]])
         cut = end - nodes[-1]
-        weights = [*take.weights[: len(nodes) - 1], take.weights[len(nodes) - 1][:cut]]
+        weights = [*trial.weights[: len(nodes) - 1], trial.weights[len(nodes) - 1][:cut]]
         short.append(
             dataclasses.replace(
-                take,
+                trial,
                 nodes=nodes,
                 end=end,
                 states=whole[: len(nodes)],
-                covers=take.covers[: len(nodes) - 1],
+                covers=trial.covers[: len(nodes) - 1],
                 weights=weights,
             )
         )
         states.append(whole[: len(nodes)])
-    return dataclasses.replace(fit.problem, takes=short), states
+    return dataclasses.replace(fit.problem, trials=short), states
 
 
 def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
     """Return (frame, state (13,)) of all trials, estimated from their first frames only. z: (P,) or (trials, P)."""
     short, states = _shortened(fit)
     found = fit_states(short, fit.model, z, states, 3)
-    return [(t.nodes[-1], s[-1]) for t, s in zip(short.takes, found, strict=True)]
+    return [(t.nodes[-1], s[-1]) for t, s in zip(short.trials, found, strict=True)]
 
 
 def noise_spread(fit: Fit) -> float:
@@ -107,17 +107,17 @@ def noise_spread(fit: Fit) -> float:
     states = fit_states(short, fit.model, fit.z, states, 3)
     look = short.evaluate(fit.model, fit.z, states, fixed=True)
     rng, squares = np.random.default_rng(0), []
-    for take, part, state in zip(short.takes, look.linear, states, strict=True):
-        times = take.observations.times[shown_frames(fit, take) :]
-        if take.observations.trial.role != "fit" or not len(times):
+    for trial, part, state in zip(short.trials, look.linear, states, strict=True):
+        times = trial.observations.times[shown_frames(fit, trial) :]
+        if trial.observations.trial.role != "fit" or not len(times):
             continue
         cover = np.linalg.pinv(part.hessian, hermitian=True)[-12:, -12:]
         values, vectors = np.linalg.eigh(0.5 * (cover + cover.T))
         draws = rng.normal(size=(NOISE_DRAWS, 12)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
-        clock = times - take.observations.times[take.nodes[-1]]
-        middle = world_points(take, extrapolate(fit, fit.z, state[-1], clock))
+        clock = times - trial.observations.times[trial.nodes[-1]]
+        middle = world_points(trial, extrapolate(fit, fit.z, state[-1], clock))
         for draw in draws:
-            other = world_points(take, extrapolate(fit, fit.z, perturbed(state[-1], draw), clock))
+            other = world_points(trial, extrapolate(fit, fit.z, perturbed(state[-1], draw), clock))
             squares.append(np.sum((other - middle) ** 2, axis=-1).ravel())
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
@@ -125,13 +125,13 @@ def noise_spread(fit: Fit) -> float:
 def simulate_points(fit: Fit) -> Points:
     """Return by trial: columns and points (T, K, 3) at its frames, simulated from its first frames."""
     found: Points = {}
-    for i, (take, (begin, state)) in enumerate(zip(fit.problem.takes, first_states(fit, fit.z), strict=True)):
-        times = take.observations.times
+    for i, (trial, (begin, state)) in enumerate(zip(fit.problem.trials, first_states(fit, fit.z), strict=True)):
+        times = trial.observations.times
         record = extrapolate(fit, fit.z, state, times[begin:] - times[begin])
-        earlier = [s.record[s.frames < begin] for s in fit.evaluation.segments if s.take == i]
-        found[take.observations.trial.name] = (
-            take.observations.columns,
-            world_points(take, np.concatenate([*earlier, record])),
+        earlier = [s.record[s.frames < begin] for s in fit.evaluation.segments if s.trial == i]
+        found[trial.observations.trial.name] = (
+            trial.observations.columns,
+            world_points(trial, np.concatenate([*earlier, record])),
         )
     return found
 
@@ -145,10 +145,10 @@ def step_size_error(fit: Fit) -> float:
     half = row.copy()
     half[:, SLOTS["step"]] *= 0.5
     off = []
-    for take, states in zip(problem.takes, fit.states, strict=True):
-        clock = [(take.observations.times - take.observations.times[0]) * setting.rate]
-        coarse = world_points(take, problem.simulator.run(states[:1], row, clock)[0])
-        off.append(np.sum((world_points(take, fine.run(states[:1], half, clock)[0]) - coarse) ** 2, axis=-1).ravel())
+    for trial, states in zip(problem.trials, fit.states, strict=True):
+        clock = [(trial.observations.times - trial.observations.times[0]) * setting.rate]
+        coarse = world_points(trial, problem.simulator.run(states[:1], row, clock)[0])
+        off.append(np.sum((world_points(trial, fine.run(states[:1], half, clock)[0]) - coarse) ** 2, axis=-1).ravel())
     return float(np.sqrt(np.mean(np.concatenate(off))))
 
 
@@ -177,22 +177,24 @@ def score_held_out(fit: Fit) -> HeldOutScore:
     problem = fit.problem
     numbers = leave_one_out(fit)
     scores = []
-    for i, take in enumerate(problem.takes):
-        if take.observations.trial.role == "fit":
+    for i, trial in enumerate(problem.trials):
+        if trial.observations.trial.role == "fit":
             step = numbers[i] - fit.z
             cost = fit.evaluation.linear[i].cost - 2 * float(fit.pull[i] @ step) + float(step @ fit.schur[i] @ step)
             scores.append(-0.5 * cost)
     starts = first_states(fit, numbers)
     squares: list[Array] = []
-    for i, take in enumerate(problem.takes):
-        if take.observations.trial.role != "fit" or len(take.observations.times) < 5:
+    for i, trial in enumerate(problem.trials):
+        if trial.observations.trial.role != "fit" or len(trial.observations.times) < 5:
             continue
-        times = take.observations.times
+        times = trial.observations.times
         begin, state = starts[i]
         record = extrapolate(fit, numbers[i], state, times[begin:] - times[begin])
-        points = world_points(take, record)
-        off = (take.observations.seen if take.observations.camera is None else _tracked_points(fit, i))[begin:] - points
-        off = off[max(0, shown_frames(fit, take) - begin) :]
+        points = world_points(trial, record)
+        off = (trial.observations.seen if trial.observations.camera is None else _tracked_points(fit, i))[
+            begin:
+        ] - points
+        off = off[max(0, shown_frames(fit, trial) - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
     rms = float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("nan")
     return HeldOutScore(log_score=np.array(scores), rms_m=rms)
@@ -203,18 +205,18 @@ def noise_floor(fit: Fit) -> float:
 
     Pixels are compared with the fitted path, which has almost no noise.
     """
-    takes = [t for t in fit.problem.takes if t.observations.trial.role == "fit"]
-    own = [0.0 if t.observations.camera is not None else 3 * t.observations.sigma**2 for t in takes]
+    trials = [t for t in fit.problem.trials if t.observations.trial.role == "fit"]
+    own = [0.0 if t.observations.camera is not None else 3 * t.observations.sigma**2 for t in trials]
     return float(np.sqrt(np.mean(own) + noise_spread(fit) ** 2))
 
 
 def _tracked_points(fit: Fit, index: int) -> Array:
     """Return points (T, K, 3) of a trial along the fitted segments; NaN outside them."""
-    take = fit.problem.takes[index]
-    found = np.full((len(take.observations.times), len(take.observations.places), 3), np.nan)
+    trial = fit.problem.trials[index]
+    found = np.full((len(trial.observations.times), len(trial.observations.places), 3), np.nan)
     for segment in fit.evaluation.segments:
-        if segment.take == index:
-            found[segment.frames] = world_points(take, segment.record)
+        if segment.trial == index:
+            found[segment.frames] = world_points(trial, segment.record)
     return found
 
 
@@ -231,13 +233,13 @@ INERTIAS = (1.0, 1.1, 1.2, 1.3)
 def marginal_points(fit: Fit) -> Points:
     """Return by predict trial: columns and points (P, K, 3), averaged over plausible contact parameters of ``fit``."""
     found: Points = {}
-    for take, states in zip(fit.problem.takes, fit.states, strict=True):
-        wanted = take.observations.trial.predict_times
+    for trial, states in zip(fit.problem.trials, fit.states, strict=True):
+        wanted = trial.observations.trial.predict_times
         if wanted is not None:
-            begin = take.observations.times[take.nodes[-1]]
-            found[take.observations.trial.name] = (
-                take.observations.columns,
-                _expected(fit, take, states[-1], wanted - begin),
+            begin = trial.observations.times[trial.nodes[-1]]
+            found[trial.observations.trial.name] = (
+                trial.observations.columns,
+                _expected(fit, trial, states[-1], wanted - begin),
             )
     return found
 
@@ -245,22 +247,22 @@ def marginal_points(fit: Fit) -> Points:
 def marginal_rms(fit: Fit) -> float:
     """Return the RMS distance in m of ``marginal_points`` predictions to the 3D points of the fit trials."""
     squares: list[Array] = []
-    for take, (begin, state) in zip(fit.problem.takes, first_states(fit, fit.z), strict=True):
-        late = shown_frames(fit, take)
+    for trial, (begin, state) in zip(fit.problem.trials, first_states(fit, fit.z), strict=True):
+        late = shown_frames(fit, trial)
         if (
-            take.observations.trial.role != "fit"
-            or take.observations.camera is not None
-            or late >= len(take.observations.times)
+            trial.observations.trial.role != "fit"
+            or trial.observations.camera is not None
+            or late >= len(trial.observations.times)
         ):
             continue
-        clock = take.observations.times[late:] - take.observations.times[begin]
+        clock = trial.observations.times[late:] - trial.observations.times[begin]
         squares.append(
-            np.sum((take.observations.seen[late:] - _expected(fit, take, state, clock)) ** 2, axis=-1).ravel()
+            np.sum((trial.observations.seen[late:] - _expected(fit, trial, state, clock)) ** 2, axis=-1).ravel()
         )
     return float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("inf")
 
 
-def _expected(fit: Fit, take: SegmentedTrial, state: Array, clock: Array) -> Array:
+def _expected(fit: Fit, trial: SegmentedTrial, state: Array, clock: Array) -> Array:
     """Return points (M, K, 3) of the rigid body closest to the mean of all worlds, ``clock`` (M,) s after ``state``."""
     scene = fit.problem.scene
     base = fit.model.setting(scene, fit.z)
@@ -274,8 +276,8 @@ def _expected(fit: Fit, take: SegmentedTrial, state: Array, clock: Array) -> Arr
     rows[:, SLOTS["inertia"]] *= scale
     rows[:, SLOTS["mobility"]] /= scale
     records = fit.problem.simulator.run(np.repeat(state[None], len(rows), axis=0), rows, [clock] * len(rows))
-    mean = np.mean([world_points(take, record[: len(clock)]) for record in records], axis=0)
-    places = take.observations.places - take.observations.places.mean(axis=0)
+    mean = np.mean([world_points(trial, record[: len(clock)]) for record in records], axis=0)
+    places = trial.observations.places - trial.observations.places.mean(axis=0)
     middle = mean.mean(axis=1)
     turns = np.array([fit_rotation(places, frame - m) for frame, m in zip(mean, middle, strict=True)])
     return np.asarray(middle[:, None] + np.einsum("mij,kj->mki", turns, places))

@@ -51,26 +51,26 @@ def misfit(fit: Fit) -> Misfit:
     flights = contacts = 0
     setting = fit.model.setting(problem.scene, fit.z)
     for segment in fit.evaluation.segments:
-        take = problem.takes[segment.take]
+        trial = problem.trials[segment.trial]
         free = np.flatnonzero(segment.record[:, 15] <= 0)
         if len(free) >= LEAST_FRAMES:
-            gain, count = _remainder(problem, take, segment, free, setting)
+            gain, count = _remainder(problem, trial, segment, free, setting)
             flight, flights = flight + gain, flights + count
         if segment.defect is not None:
-            cover = take.covers[segment.index]
+            cover = trial.covers[segment.index]
             contact += float(segment.defect @ np.linalg.solve(cover, segment.defect))
             contacts += 12
     return Misfit(flight=flight, flight_count=flights, contact=contact, contact_count=contacts)
 
 
 def _remainder(
-    problem: Problem, take: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
+    problem: Problem, trial: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
 ) -> tuple[float, int]:
     """Return the chi² explained by a smooth change of the poses, and its degrees of freedom."""
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
-    _, slope, info = take.observations.information(pose[:, :3], pose[:, 3:7], frames)
-    t = take.observations.times[frames]
+    _, slope, info = trial.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    t = trial.observations.times[frames]
     span = max(t[-1] - t[0], 1e-9)
     degree = int(np.clip(2 + span / BEND_EVERY, 2, 9))
     degree = min(degree, len(frames) - 2)
@@ -151,19 +151,19 @@ def body_problem(capture: Capture, index: int) -> Problem:
                 places.append(pose[0])
     middle = np.median(places, axis=0) if places else np.zeros(3)
     scene = BodyScene(capture=capture, body=body, middle=middle)
-    return Problem(scene=scene, simulator=simulator, takes=track_states(scene, simulator, seen))
+    return Problem(scene=scene, simulator=simulator, trials=track_states(scene, simulator, seen))
 
 
 def fit_nominal(body: BodyFits) -> None:
     """Fit the nominal model and set the contact uncertainty."""
-    problem, model = body.problem, Model(freedoms=())
+    problem, model = body.problem, Model(candidates=())
     z = np.zeros(BELIEFS.size)
     for _ in range(2):
         weight_contacts(problem, model, z)
-        fit = solve(problem, model, z, [t.states for t in problem.takes], rounds=6)
+        fit = solve(problem, model, z, [t.states for t in problem.trials], rounds=6)
         z = fit.z
-        for take, states in zip(problem.takes, fit.states, strict=True):
-            take.states = states
+        for trial, states in zip(problem.trials, fit.states, strict=True):
+            trial.states = states
     body.fits[()] = fit
 
 
@@ -177,22 +177,22 @@ def reconsider_nominal(body: BodyFits, until: float) -> None:
     for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
         if time.monotonic() > until:
             return
-        again = solve(body.problem, Model(freedoms=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
+        again = solve(body.problem, Model(candidates=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
         if again.evidence > body.fits[()].evidence:
             body.fits[()] = again
 
 
-def begin_search(body: BodyFits, freedoms: tuple[CandidateEffect, ...], base: Fit | None = None) -> Fit:
+def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: Fit | None = None) -> Fit:
     """Return the first steps with ``freedoms`` from ``base`` (default: nominal), reusing its Jacobians."""
     problem, nominal = body.problem, body.fits[()]
     first = nominal if base is None else base
-    model = Model(freedoms=freedoms)
-    new = freedoms[len(first.model.freedoms) :]
+    model = Model(candidates=candidates)
+    new = candidates[len(first.model.candidates) :]
     slopes = nominal.evaluation if first.problem is problem else first.evaluation
     problem = first.problem
     starts: list[Array] = [first.z]
-    for freedom in new:
-        starts = [np.concatenate([z, s]) for z in starts for s in freedom.starts]
+    for candidate in new:
+        starts = [np.concatenate([z, s]) for z in starts for s in candidate.starts]
     if new[0].name not in CONTACTS:
         # Flight is nearly linear: contacts are added once the forces are about right.
         loose = _loosened(problem)
@@ -204,7 +204,7 @@ def begin_search(body: BodyFits, freedoms: tuple[CandidateEffect, ...], base: Fi
         fits = [(z, free), (z, first.states)]
     begun = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
     begun.sort(key=lambda f: -f.evidence)
-    key = tuple(f.name for f in freedoms)
+    key = tuple(f.name for f in candidates)
     body.begun[key] = [f for f in begun if f.evidence > begun[0].evidence - BEHIND]
     _keep(body, key, begun[0])
     return begun[0]
@@ -234,20 +234,20 @@ def _keep(body: BodyFits, key: tuple[str, ...], fit: Fit) -> None:
         body.fits[key] = fit
 
 
-def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: CandidateEffect) -> tuple[Array, list[Array]]:
+def _scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffect) -> tuple[Array, list[Array]]:
     """Return start numbers and states of a contact effect: states from flights alone, numbers from a grid.
 
     States of the nominal fit are biased by its wrong contacts.
     """
     problem = begin.problem
-    key = tuple(f.name for f in begin.model.freedoms)
+    key = tuple(f.name for f in begin.model.candidates)
     if key not in body.flown:
         body.flown[key] = solve(_loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
     flown = body.flown[key]
     spreads = _arrival_spreads(problem, flown)
     base = begin.z.copy()
     base[: BELIEFS.size] = 0.0
-    tried = [np.concatenate([base, s]) for s in freedom.grid]
+    tried = [np.concatenate([base, s]) for s in candidate.grid]
     costs = []
     for z in tried:
         look = problem.evaluate(model, z, flown.states, slopes=False)
@@ -266,7 +266,7 @@ def _scanned(body: BodyFits, begin: Fit, model: Model, freedom: CandidateEffect)
     states = [s.copy() for s in begin.states]
     for segment in flown.evaluation.segments:
         if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
-            states[segment.take][segment.index] = flown.states[segment.take][segment.index]
+            states[segment.trial][segment.index] = flown.states[segment.trial][segment.index]
     return tried[int(np.argmin(costs))], states
 
 
@@ -277,12 +277,12 @@ def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
         if segment.defect is None or segment.come is None:
             found.append(None)
             continue
-        hessian = flown.evaluation.linear[segment.take].hessian
+        hessian = flown.evaluation.linear[segment.trial].hessian
         first, second = 12 * segment.index, 12 * segment.index + 12
         here = np.linalg.pinv(hessian[first:second, first:second] + 1e-6 * np.eye(12))
         there = np.linalg.pinv(hessian[second : second + 12, second : second + 12] + 1e-6 * np.eye(12))
         come = segment.come[:, :12]
-        found.append(problem.takes[segment.take].covers[segment.index] + come @ here @ come.T + there)
+        found.append(problem.trials[segment.trial].covers[segment.index] + come @ here @ come.T + there)
     return found
 
 
@@ -291,8 +291,8 @@ def fit_camera_pose(body: BodyFits) -> None:
     problem, nominal = body.problem, body.fits[()]
     if misfit(nominal).ratio < MOVED_MISFIT:
         return
-    freedom = CANDIDATE_EFFECTS["camera_pose"]
-    model = Model(freedoms=(freedom,))
+    candidate = CANDIDATE_EFFECTS["camera_pose"]
+    model = Model(candidates=(candidate,))
     guess = initial_camera(problem)
     if float(np.abs(guess).max()) > MOVED_GUESS:
         _followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
@@ -301,20 +301,20 @@ def fit_camera_pose(body: BodyFits) -> None:
 def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
     """Return ``model`` fitted from ``z`` with nodes at its own contacts, if that is better."""
     problem = body.problem
-    takes = track_states(problem.scene, problem.simulator, [t.observations for t in problem.takes], model=model, z=z)
-    other = dataclasses.replace(problem, takes=takes)
+    trials = track_states(problem.scene, problem.simulator, [t.observations for t in problem.trials], model=model, z=z)
+    other = dataclasses.replace(problem, trials=trials)
     weight_contacts(other, model, z)
-    flown = solve(_loosened(other), model, z, [t.states for t in takes], rounds=3)
-    begin = flown.z if model.freedoms[-1].name not in CONTACTS else z
+    flown = solve(_loosened(other), model, z, [t.states for t in trials], rounds=3)
+    begin = flown.z if model.candidates[-1].name not in CONTACTS else z
     fit = solve(other, model, begin, flown.states, rounds=2)
     fit = solve(other, model, fit.z, fit.states, rounds=ROUNDS, held=fit.evaluation)
-    _keep(body, tuple(f.name for f in model.freedoms), fit)
+    _keep(body, tuple(f.name for f in model.candidates), fit)
     return fit
 
 
 def _loosened(problem: Problem) -> Problem:
-    takes = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.takes]
-    return dataclasses.replace(problem, takes=takes)
+    trials = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.trials]
+    return dataclasses.replace(problem, trials=trials)
 
 
 def refine_promising(body: BodyFits, until: float) -> None:
@@ -325,7 +325,7 @@ def refine_promising(body: BodyFits, until: float) -> None:
     for fit in sorted(far, key=lambda f: -f.evidence)[:3]:
         if time.monotonic() > until:
             return
-        key = tuple(f.name for f in fit.model.freedoms)
+        key = tuple(f.name for f in fit.model.candidates)
         new = solve(fit.problem, fit.model, fit.z, fit.states, rounds=4)
         if new.evidence > fit.evidence:
             body.fits[key] = new
@@ -364,15 +364,15 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect], until: float) ->
         return
     tried = []
     for name, fit in singles[:2]:
-        for freedom in wanted:
+        for candidate in wanted:
             if time.monotonic() > until:
                 break
-            if freedom.name == name or tuple(sorted((name, freedom.name))) in {tuple(sorted(k)) for k in body.fits}:
+            if candidate.name == name or tuple(sorted((name, candidate.name))) in {tuple(sorted(k)) for k in body.fits}:
                 continue
-            if {name, freedom.name} == {"air_drag", "wind"}:
+            if {name, candidate.name} == {"air_drag", "wind"}:
                 continue
-            begin_search(body, (CANDIDATE_EFFECTS[name], freedom), fit)
-            tried.append((name, freedom.name))
+            begin_search(body, (CANDIDATE_EFFECTS[name], candidate), fit)
+            tried.append((name, candidate.name))
     for key in sorted(tried, key=lambda k: -body.fits[k].evidence)[:PAIRS_FINISHED]:
         if time.monotonic() < until:
             finish(body, key)

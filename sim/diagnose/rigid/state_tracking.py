@@ -115,7 +115,7 @@ LOST = 40.0
 GUESS_HEIGHT = 0.01
 """Standard deviation in m of a height estimated from one frame's pixels."""
 
-NOMINAL = Model(freedoms=())
+NOMINAL = Model(candidates=())
 
 
 def first_state(scene: BodyScene, observations: ObservedBody, first: int = 0) -> tuple[Array, Array]:
@@ -205,10 +205,10 @@ def track_states(
 ) -> list[SegmentedTrial]:
     """Return the trials with nodes and initial states, found with the nominal model segment by segment."""
     numbers = np.zeros(model.size) if z is None else z
-    takes = []
+    trials = []
     for observations in seen:
         state, prior = first_state(scene, observations)
-        takes.append(
+        trials.append(
             SegmentedTrial(
                 observations=observations,
                 nodes=[0],
@@ -218,14 +218,14 @@ def track_states(
                 prior=prior,
             )
         )
-    _set_down(scene, simulator, takes, model, numbers)
-    here = [dataclasses.replace(t, states=t.states.copy(), nodes=[0]) for t in takes]
-    active = list(range(len(takes)))
+    _set_down(scene, simulator, trials, model, numbers)
+    here = [dataclasses.replace(t, states=t.states.copy(), nodes=[0]) for t in trials]
+    active = list(range(len(trials)))
     for _ in range(MOST_NODES):
         if not active:
             break
-        ends = [takes[i].end for i in active]
-        problem = Problem(scene=scene, simulator=simulator, takes=[here[i] for i in active])
+        ends = [trials[i].end for i in active]
+        problem = Problem(scene=scene, simulator=simulator, trials=[here[i] for i in active])
         for _ in range(2):
             for k, i in enumerate(active):
                 here[i].end = ends[k]
@@ -240,22 +240,22 @@ def track_states(
         look = problem.evaluate(model, numbers, [here[i].states for i in active], slopes=False)
         going = []
         for segment, i in zip(look.segments, active, strict=True):
-            take, node = takes[i], here[i].nodes[0]
-            if len(take.states) < len(take.nodes):
-                take.states = np.concatenate([take.states, here[i].states])
+            trial, node = trials[i], here[i].nodes[0]
+            if len(trial.states) < len(trial.nodes):
+                trial.states = np.concatenate([trial.states, here[i].states])
             else:
-                take.states = here[i].states.copy()
-            index = _next_node(take.observations.times[node : take.end], segment.record)
-            lost = _lost(take.observations, segment)
+                trial.states = here[i].states.copy()
+            index = _next_node(trial.observations.times[node : trial.end], segment.record)
+            lost = _lost(trial.observations, segment)
             if lost is not None and (index is None or lost < index):
                 # The model lost the body: restart where it is.
-                guess, prior = first_state(scene, take.observations, node + lost)
-                take.nodes.append(node + lost)
+                guess, prior = first_state(scene, trial.observations, node + lost)
+                trial.nodes.append(node + lost)
                 here[i] = SegmentedTrial(
-                    observations=take.observations,
+                    observations=trial.observations,
                     nodes=[node + lost],
                     states=guess[None],
-                    end=take.end,
+                    end=trial.end,
                     guess=guess,
                     prior=prior,
                 )
@@ -267,71 +267,73 @@ def track_states(
             blow = 0.2 * segment.record[index, 13] + 0.05
             size = scene.body.bound
             prior = np.repeat([0.01, 0.01 / size, blow, blow / size], 3)
-            if not take.observations.poses_alone:
+            if not trial.observations.poses_alone:
                 prior[3:6], prior[9:12] = 1e-3, 0.3
-            take.nodes.append(node + index)
+            trial.nodes.append(node + index)
             here[i] = SegmentedTrial(
-                observations=take.observations,
+                observations=trial.observations,
                 nodes=[node + index],
                 states=guess[None],
-                end=take.end,
+                end=trial.end,
                 guess=guess,
                 prior=prior,
             )
             going.append(i)
         active = going
-    for take in takes:
-        take.nodes = take.nodes[: len(take.states)]
-    return takes
+    for trial in trials:
+        trial.nodes = trial.nodes[: len(trial.states)]
+    return trials
 
 
-def _set_down(scene: BodyScene, simulator: RigidWorlds, takes: list[SegmentedTrial], model: Model, z: Array) -> None:
+def _set_down(scene: BodyScene, simulator: RigidWorlds, trials: list[SegmentedTrial], model: Model, z: Array) -> None:
     """Start on the ground where that explains the first frames better: pixels leave the initial height open."""
     near = []
-    for take in takes:
-        if take.observations.camera is None:
+    for trial in trials:
+        if trial.observations.camera is None:
             continue
-        lying = None if model.setting(scene, z).camera is not None else resting_state(scene, take.observations)
+        lying = None if model.setting(scene, z).camera is not None else resting_state(scene, trial.observations)
         if lying is None:
-            near.append(take)
+            near.append(trial)
         else:
-            take.states, take.guess, take.prior = lying[0][None], lying[0].copy(), lying[1]
+            trial.states, trial.guess, trial.prior = lying[0][None], lying[0].copy(), lying[1]
     if not near:
         return
     normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
     options = []
-    for take in near:
-        down = take.states.copy()
+    for trial in near:
+        down = trial.states.copy()
         corners = down[0, :3] + scene.body.corners @ as_matrix(down[0, 3:7]).T
         down[0, :3] -= ((corners - foot) @ normal - scene.body.radius).min() * normal
         down[0, 7:10] -= (down[0, 7:10] @ normal) * normal
         end = min(
-            take.end, int(np.searchsorted(take.observations.times - take.observations.times[0], PIXEL_WINDOW)) + 1
+            trial.end, int(np.searchsorted(trial.observations.times - trial.observations.times[0], PIXEL_WINDOW)) + 1
         )
-        options += [dataclasses.replace(take, end=end), dataclasses.replace(take, end=end, states=down)]
-    problem = Problem(scene=scene, simulator=simulator, takes=options)
+        options += [dataclasses.replace(trial, end=end), dataclasses.replace(trial, end=end, states=down)]
+    problem = Problem(scene=scene, simulator=simulator, trials=options)
     settled = fit_states(problem, model, z, [t.states for t in options], 6)
     costs = [part.cost for part in problem.evaluate(model, z, settled, slopes=False).linear]
-    for k, take in enumerate(near):
+    for k, trial in enumerate(near):
         best = 2 * k + int(costs[2 * k + 1] < costs[2 * k])
-        take.states = settled[best]
-        take.guess = settled[best][0].copy()
+        trial.states = settled[best]
+        trial.guess = settled[best][0].copy()
 
 
-def _window(take: SegmentedTrial, record: Array) -> int:
+def _window(trial: SegmentedTrial, record: Array) -> int:
     """Return the end (exclusive) of the frames to which the state at the node is fitted."""
-    node = take.nodes[0]
-    times = take.observations.times[node : take.end] - take.observations.times[node]
+    node = trial.nodes[0]
+    times = trial.observations.times[node : trial.end] - trial.observations.times[node]
     touched = record[:, 15] > 0
     first = int(np.argmax(touched)) if touched.any() else len(times)
-    flight = PIXEL_WINDOW if take.observations.camera is not None else FLIGHT_WINDOW
-    if not take.observations.poses_alone:
+    flight = PIXEL_WINDOW if trial.observations.camera is not None else FLIGHT_WINDOW
+    if not trial.observations.poses_alone:
         flight = 1e9
-    enough = 10 if take.observations.camera is not None else 4
+    enough = 10 if trial.observations.camera is not None else 4
     if first >= enough:
         return node + min(first, int(np.searchsorted(times, flight)) + 1)
-    short = max(int(np.searchsorted(times, (2 if take.observations.camera is not None else 1) * CONTACT_WINDOW)) + 1, 5)
-    return min(take.end, node + short)
+    short = max(
+        int(np.searchsorted(times, (2 if trial.observations.camera is not None else 1) * CONTACT_WINDOW)) + 1, 5
+    )
+    return min(trial.end, node + short)
 
 
 def _lost(observations: ObservedBody, segment: Segment) -> int | None:
@@ -372,19 +374,19 @@ def weight_contacts(problem: Problem, model: Model, z: Array) -> None:
     scene = problem.scene
     uncertainty = contact_uncertainty(scene.body)
     weight = float(np.linalg.norm(scene.capture.gravity))
-    states = [t.states for t in problem.takes]
+    states = [t.states for t in problem.trials]
     look = problem.evaluate(model, z, states, slopes=False)
-    for take in problem.takes:
-        take.covers, take.weights = [], []
+    for trial in problem.trials:
+        trial.covers, trial.weights = [], []
     for segment in look.segments:
-        take = problem.takes[segment.take]
-        a, b = take.spans[segment.index]
-        record = np.concatenate([segment.record, segment.arrival[None]]) if b < take.end else segment.record
-        times = take.observations.times[a : a + len(record)]
-        take.covers.append(segment_covariance(uncertainty, scene.body, record, times, weight))
-        _, _, info = take.observations.information(segment.record[:, :3], segment.record[:, 3:7], segment.frames)
+        trial = problem.trials[segment.trial]
+        a, b = trial.spans[segment.index]
+        record = np.concatenate([segment.record, segment.arrival[None]]) if b < trial.end else segment.record
+        times = trial.observations.times[a : a + len(record)]
+        trial.covers.append(segment_covariance(uncertainty, scene.body, record, times, weight))
+        _, _, info = trial.observations.information(segment.record[:, :3], segment.record[:, 3:7], segment.frames)
         count = len(segment.frames)
-        take.weights.append(frame_weights(uncertainty, scene.body, segment.record, times[:count], weight, info))
+        trial.weights.append(frame_weights(uncertainty, scene.body, segment.record, times[:count], weight, info))
 
 
 def initial_camera(problem: Problem) -> Array:
@@ -397,12 +399,12 @@ def initial_camera(problem: Problem) -> Array:
     assert camera is not None
     place, normal, foot = camera.matrix[:3, 3], ground.unit_normal, np.asarray(ground.point)
     rows, values = [], []
-    for take in problem.takes:
-        if take.observations.trial.predict_times is not None:
+    for trial in problem.trials:
+        if trial.observations.trial.predict_times is not None:
             continue
         heights, poses, guess = [], [], None
-        for frame in range(len(take.observations.times)):
-            found = frame_pose(take.observations, frame, guess)
+        for frame in range(len(trial.observations.times)):
+            found = frame_pose(trial.observations, frame, guess)
             if found is None:
                 continue
             guess = found

@@ -88,12 +88,12 @@ class Survey:
         belief = item.belief
         assert belief.youngs_modulus_pa is not None
         mesh = body_mesh(item.vertices, item.faces)
-        self.takes = [soft_trial(t, self.frame, mesh.nodes) for t in capture.trials]
+        self.trials = [soft_trial(t, self.frame, mesh.nodes) for t in capture.trials]
         rest = capture.trials[0].rest_points
         if any(t.rest_points.shape != rest.shape or np.abs(t.rest_points - rest).max() > 1e-9 for t in capture.trials):
             raise InputError("rest_points differ between trials: track the same points in all trials of a soft object")
         self.worlds = SoftWorlds(mesh, belief.density_kg_m3, rest)
-        self.flights = Flights(self.takes, self.worlds, capture.noise_sigma)
+        self.flights = Flights(self.trials, self.worlds, capture.noise_sigma)
         x, y, z = (float(c) for c in self.frame.direction(np.asarray(capture.gravity)))
         self.base = WorldParameters(
             modulus=belief.youngs_modulus_pa,
@@ -102,11 +102,11 @@ class Survey:
             gravity=(x, y, z),
         )
         self._size = float(np.ptp(mesh.nodes, axis=0).mean() / 2)
-        self.fit_takes = [i for i, t in enumerate(self.takes) if t.role == "fit"]
+        self.fit_trials = [i for i, t in enumerate(self.trials) if t.role == "fit"]
         self._check()
         coarse_mesh = coarser(mesh, item.vertices, item.faces, factor=COARSER)
-        self._coarse = Flights(self.takes, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma)
-        windows = [w for w in map(self._window, self.fit_takes) if w is not None]
+        self._coarse = Flights(self.trials, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma)
+        windows = [w for w in map(self._window, self.fit_trials) if w is not None]
         self.numerics_rms_m, model_error = self._measure_grain(windows)
         self.problem = ContactProblem(self.flights, windows, self.base, model_error=model_error, size=self._size)
         self._rough = ContactProblem(
@@ -116,7 +116,7 @@ class Survey:
     def run(self, names: Sequence[str]) -> None:
         """Search all candidates of ``names``."""
         base, problem = self.base, self.problem
-        middle = np.mean([np.nanmean(t.points[: t.flying], axis=(0, 1)) for t in self.takes], axis=0)
+        middle = np.mean([np.nanmean(t.points[: t.flying], axis=(0, 1)) for t in self.trials], axis=0)
         known = candidates(base, self._size, middle)
         neutral = CandidateSearch(problem, None)
         rough = CandidateSearch(self._rough, None)
@@ -127,12 +127,12 @@ class Survey:
         refitted = neutral.descend(min(self.believed, refitted, key=lambda f: f.cost), 2, self._stop)
         self.plain = FoundFit(search=neutral, fit=refitted)
         self._report(10, "nominal model")
-        self.flight_chi2 = np.array([self.flights.fit(i, base).chi2 for i in self.fit_takes])
-        self._flight_count = sum(self.flights.fit(i, base).count for i in self.fit_takes)
+        self.flight_chi2 = np.array([self.flights.fit(i, base).chi2 for i in self.fit_trials])
+        self._flight_count = sum(self.flights.fit(i, base).count for i in self.fit_trials)
         in_flight: list[tuple[Candidate, FlightEstimate]] = []
         for candidate in (c for name in IN_FLIGHT if name in names for c in known[name]):
             self._stop()
-            in_flight.append((candidate, fit_in_flight(self.flights, self.fit_takes, base, candidate)))
+            in_flight.append((candidate, fit_in_flight(self.flights, self.fit_trials, base, candidate)))
         self._report(25, "flights")
         tried = [c for n in names if n not in IN_FLIGHT for c in known[n]]
         self.found = self._contact_effects(problem, self._rough, tried)
@@ -252,21 +252,25 @@ class Survey:
     # Data
 
     def _window(self, index: int) -> Window | None:
-        take, start = self.takes[index], self.flights.start(index, self.base)
+        trial, start = self.trials[index], self.flights.start(index, self.base)
         if start is None:
             return None
-        chosen = (take.times > start.time) & (take.times <= start.time + HORIZON)
-        if not (take.seen[chosen].any()):
+        chosen = (trial.times > start.time) & (trial.times <= start.time + HORIZON)
+        if not (trial.seen[chosen].any()):
             return None
         return Window(
-            take=index, times=take.times[chosen], points=take.points[chosen], seen=take.seen[chosen], contact=start.time
+            trial=index,
+            times=trial.times[chosen],
+            points=trial.points[chosen],
+            seen=trial.seen[chosen],
+            contact=start.time,
         )
 
     def _measure_grain(self, windows: list[Window]) -> tuple[float, ModelError]:
         """Return the distance in m between the motions of both lattices, and the model error it implies."""
         if not windows:
             return 0.0, ModelError(drift=0.02, ringing=5e-4)
-        args = [w.take for w in windows], [self.base] * len(windows), [w.times for w in windows]
+        args = [w.trial for w in windows], [self.base] * len(windows), [w.times for w in windows]
         fine, coarse = self.flights.motion(*args), self._coarse.motion(*args)
         apart = np.concatenate([((a - b) ** 2).sum(axis=2).ravel() for a, b in zip(fine, coarse, strict=True)])
         apart = apart[np.isfinite(apart)]
@@ -274,12 +278,12 @@ class Survey:
         return rms, model_error_between(fine, coarse, [w.times - w.contact for w in windows], self._size)
 
     def _check(self) -> None:
-        if not self.fit_takes:
+        if not self.fit_trials:
             raise InputError('no trial has role "fit": mark the complete trials as such')
-        for take in self.takes:
-            if (take.seen[: take.flying].sum(axis=1) >= 3).sum() < 3:
+        for trial in self.trials:
+            if (trial.seen[: trial.flying].sum(axis=1) >= 3).sum() < 3:
                 raise InputError(
-                    f"trial {take.name!r}: fewer than 3 frames with 3 points each before the first contact; "
+                    f"trial {trial.name!r}: fewer than 3 frames with 3 points each before the first contact; "
                     "start the recording earlier"
                 )
 

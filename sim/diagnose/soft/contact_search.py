@@ -124,7 +124,7 @@ LOST = 1e12
 class Window:
     """Compared part of a trial: recorded times (T,) from first contact on, points (T, K, 3), visibility (T, K)."""
 
-    take: int
+    trial: int
     times: Array
     points: Array
     seen: NDArray[np.bool_]
@@ -167,9 +167,9 @@ class ContactProblem:
 
     def motions(self, world: Sequence[WorldParameters]) -> list[list[Array]]:
         """Return the simulated points of every window under each of ``world``."""
-        takes = [w.take for _ in world for w in self.windows]
+        trials = [w.trial for _ in world for w in self.windows]
         times = [w.times for _ in world for w in self.windows]
-        found = self.flights.motion(takes, [a for a in world for _ in self.windows], times)
+        found = self.flights.motion(trials, [a for a in world for _ in self.windows], times)
         self.simulated += len(found)
         n = len(self.windows)
         return [found[i * n : (i + 1) * n] for i in range(len(world))]

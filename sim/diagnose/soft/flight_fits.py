@@ -99,8 +99,8 @@ def soft_trial(trial: Trial, frame: GroundFrame, nodes: Array) -> SoftTrial:
 class Flights:
     """Cached flight fits of all trials by world parameters. sigma: noise of a coordinate in m."""
 
-    def __init__(self, takes: list[SoftTrial], worlds: SoftWorlds, sigma: float) -> None:
-        self.takes, self._worlds, self.sigma = takes, worlds, sigma
+    def __init__(self, trials: list[SoftTrial], worlds: SoftWorlds, sigma: float) -> None:
+        self.trials, self._worlds, self.sigma = trials, worlds, sigma
         self._fits: dict[tuple[object, ...], FlightFit] = {}
         self._flights: dict[int, FlightFrames] = {}
         self._starts: dict[tuple[object, ...], State | None] = {}
@@ -109,19 +109,19 @@ class Flights:
     def flight(self, index: int) -> FlightFrames:
         """Return the flying frames of trial ``index``."""
         if index not in self._flights:
-            take, n = self.takes[index], self.takes[index].flying
-            self._flights[index] = FlightFrames.of(take.times[:n], take.rest, take.points[:n], self.sigma)
+            trial, n = self.trials[index], self.trials[index].flying
+            self._flights[index] = FlightFrames.of(trial.times[:n], trial.rest, trial.points[:n], self.sigma)
         return self._flights[index]
 
     def fit(self, index: int, world: WorldParameters) -> FlightFit:
         """Return the flight fit of trial ``index``: state at its first frame, in true time from there."""
         key = (index, *world.flight)
         if key not in self._fits:
-            take, inertia = self.takes[index], self._worlds.inertia_of(world)
-            n = take.flying
+            trial, inertia = self.trials[index], self._worlds.inertia_of(world)
+            n = trial.flying
             known = self._last.get(index)
             if known is None:
-                state = first_guess(take.times[:n], take.rest, take.points[:n], inertia, np.asarray(world.gravity))
+                state = first_guess(trial.times[:n], trial.rest, trial.points[:n], inertia, np.asarray(world.gravity))
             else:
                 state = self.as_seen(known[0], known[1], inertia)
             found = fit_flight(state, inertia, world, self.flight(index))
@@ -145,16 +145,16 @@ class Flights:
 
     def true_times(self, index: int, world: WorldParameters, times: Array) -> Array:
         """Return true times for recorded ``times`` of trial ``index``, equal at its first frame."""
-        first = self.takes[index].times[0]
+        first = self.trials[index].times[0]
         return np.asarray(first + world.rate * (times - first))
 
     def start(self, index: int, world: WorldParameters) -> State | None:
         """Return the rigid state just before first contact, in true time; None without contact."""
         key = (index, *world.flight)
         if key not in self._starts:
-            take, inertia = self.takes[index], self._worlds.inertia_of(world)
+            trial, inertia = self.trials[index], self._worlds.inertia_of(world)
             first = self.fit(index, world).state
-            ends = self.true_times(index, world, take.asked[[max(0, take.flying - 3), -1]])
+            ends = self.true_times(index, world, trial.asked[[max(0, trial.flying - 3), -1]])
             grid = np.arange(max(ends[0], first.time), ends[1] + SEARCH, SEARCH)
             place, velocity, turn, spin = (a[0] for a in simulate_flight([first], [inertia], [world], grid[None]))
             rest = self._worlds.mesh.nodes - inertia.centre
@@ -176,7 +176,7 @@ class Flights:
         place, _, turn, _ = (
             a[0] for a in simulate_flight([first], [inertia], [world], self.true_times(index, world, times)[None])
         )
-        rest = self.takes[index].rest - inertia.centre
+        rest = self.trials[index].rest - inertia.centre
         return np.asarray(np.einsum("tij,kj->tki", turn, rest) + place[:, None])
 
     def job(self, index: int, world: WorldParameters, times: Array) -> SimulationJob | None:
@@ -195,7 +195,7 @@ class Flights:
         after = iter(found)
         out = []
         for i, a, t, job in zip(indices, world, times, jobs, strict=True):
-            tail = next(after) if job is not None else np.zeros((0, len(self.takes[i].rest), 3))
+            tail = next(after) if job is not None else np.zeros((0, len(self.trials[i].rest), 3))
             ahead = len(t) - len(tail)
             head = self.in_air(i, a, t[:ahead]) if ahead else tail[:0]
             out.append(np.concatenate([head, tail]))
@@ -246,14 +246,14 @@ class FlightEstimate:
         return np.asarray(self.chi2 - 2 * self.gradients @ d + np.einsum("i,kij,j->k", d, self.curvatures, d))
 
 
-def fit_in_flight(flights: Flights, takes: list[int], base: WorldParameters, candidate: Candidate) -> FlightEstimate:
+def fit_in_flight(flights: Flights, trials: list[int], base: WorldParameters, candidate: Candidate) -> FlightEstimate:
     """Return the best maximum a posteriori estimate of ``candidate``, by Gauss–Newton from every start."""
     best: tuple[float, FlightEstimate] | None = None
-    nominal = [flights.fit(index, base) for index in takes]
+    nominal = [flights.fit(index, base) for index in trials]
     count = sum(fit.count for fit in nominal)
     quiet = sum(fit.chi2 for fit in nominal) < count + QUIET * np.sqrt(2.0 * count)
     for start in candidate.starts[:1] if quiet else candidate.starts:
-        found = _descend(flights, takes, base, candidate, start)
+        found = _descend(flights, trials, base, candidate, start)
         z = (found.free - candidate.mean) / candidate.spread
         value = float(found.chi2.sum() + z @ z)
         if np.isfinite(value) and (best is None or value < best[0]):
@@ -263,10 +263,10 @@ def fit_in_flight(flights: Flights, takes: list[int], base: WorldParameters, can
 
 
 def _descend(
-    flights: Flights, takes: list[int], base: WorldParameters, candidate: Candidate, free: Array
+    flights: Flights, trials: list[int], base: WorldParameters, candidate: Candidate, free: Array
 ) -> FlightEstimate:
     weight = np.diag(candidate.spread**-2.0)
-    here = _look(flights, takes, base, candidate, free)
+    here = _look(flights, trials, base, candidate, free)
     damping = 1e-3
     for _ in range(ITERATIONS):
         curvature = here.curvatures.sum(axis=0) + weight
@@ -275,7 +275,7 @@ def _descend(
         free = np.clip(
             here.free + np.clip(step, -1.5 * candidate.spread, 1.5 * candidate.spread), candidate.low, candidate.high
         )
-        there = _look(flights, takes, base, candidate, free)
+        there = _look(flights, trials, base, candidate, free)
         if _cost(there, candidate) > _cost(here, candidate) or not np.isfinite(there.chi2).all():
             damping = max(10 * damping, 0.3)
             continue
@@ -292,13 +292,13 @@ def _cost(found: FlightEstimate, candidate: Candidate) -> float:
 
 
 def _look(
-    flights: Flights, takes: list[int], base: WorldParameters, candidate: Candidate, free: Array
+    flights: Flights, trials: list[int], base: WorldParameters, candidate: Candidate, free: Array
 ) -> FlightEstimate:
     """Return the state fits at ``free`` and the jacobians of their residuals with respect to ``free``."""
     world = candidate.world(base, free)
     varied = [candidate.world(base, free + d) for d in np.diag(candidate.step)]
     chi2, gradients, curvatures = [], [], []
-    for index in takes:
+    for index in trials:
         fit = flights.fit(index, world)
         inertia = [flights.inertia(a) for a in (world, *varied)]
         # A different centre of mass changes position and velocity of the same motion.

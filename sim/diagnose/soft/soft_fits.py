@@ -38,14 +38,14 @@ def discrepancy_of(
 ) -> dict[str, Discrepancy]:
     """Return by trial the internal and external forces that ``world`` have beyond ``base``, at their own states."""
     out = {}
-    for index, take in enumerate(flights.takes):
-        frames, count = len(take.times), len(take.rest)
+    for index, trial in enumerate(flights.trials):
+        frames, count = len(trial.times), len(trial.rest)
         forces = np.zeros((frames, count, 3))
-        air = flights.in_air(index, world, take.times)
+        air = flights.in_air(index, world, trial.times)
         whole = air.copy()
         low = np.full(frames, np.inf)
         start, history = flights.start(index, world), None
-        true = flights.true_times(index, world, take.times)
+        true = flights.true_times(index, world, trial.times)
         if start is not None and true[-1] > start.time:
             after = true > start.time + 1e-9
             times = np.append(true[after], true[-1] + 1e-4)
@@ -58,34 +58,34 @@ def discrepancy_of(
             forces[after] = np.einsum("kj,tkji->tki", worlds.weights, lacking[:, worlds.holders])
             whole[after] = points[0][:-1]
             low[after] = places[:, :, 2].min(axis=1)
-        forces += _outside(take, whole, low, world, base)[:, None]
-        out[take.name] = _discrepancy(take, forces, whole, nominal[take.name], low)
+        forces += _outside(trial, whole, low, world, base)[:, None]
+        out[trial.name] = _discrepancy(trial, forces, whole, nominal[trial.name], low)
     return out
 
 
 def raw_discrepancy(
-    take: SoftTrial, nominal: Array, flights: Flights, index: int, base: WorldParameters
+    trial: SoftTrial, nominal: Array, flights: Flights, index: int, base: WorldParameters
 ) -> Discrepancy:
     """Return the discrepancy from the tracks alone: second differences of the residual, less the noise contribution."""
-    residual = take.points - nominal
-    frames = len(take.times)
+    residual = trial.points - nominal
+    frames = len(trial.times)
     forces = np.full(residual.shape, np.nan)
     half = 2 if frames >= 5 else 1
     if frames >= 2 * half + 1:
-        step = np.median(np.diff(take.times)) * half
+        step = np.median(np.diff(trial.times)) * half
         second = (residual[2 * half :] - 2 * residual[half:-half] + residual[: -2 * half]) / step**2
         forces[half:-half] = second
         noise = np.sqrt(6) * flights.sigma / step**2
         size = np.linalg.norm(second, axis=2, keepdims=True)
         forces[half:-half] *= np.sqrt(np.maximum(0.0, 1 - 3 * noise**2 / np.maximum(size, 1e-12) ** 2))
-    turn_low = np.where(take.seen, np.nan_to_num(take.points[:, :, 2], nan=np.inf), np.inf).min(axis=1)
-    return _discrepancy(take, np.nan_to_num(forces), nominal, nominal, turn_low)
+    turn_low = np.where(trial.seen, np.nan_to_num(trial.points[:, :, 2], nan=np.inf), np.inf).min(axis=1)
+    return _discrepancy(trial, np.nan_to_num(forces), nominal, nominal, turn_low)
 
 
-def _outside(take: SoftTrial, whole: Array, low: Array, world: WorldParameters, base: WorldParameters) -> Array:
+def _outside(trial: SoftTrial, whole: Array, low: Array, world: WorldParameters, base: WorldParameters) -> Array:
     """Return (T, 3) m/s² on the whole body that ``world`` have beyond ``base``."""
     centre = whole.mean(axis=1)
-    velocity = np.gradient(centre, take.times, axis=0) if len(take.times) > 2 else np.zeros_like(centre)
+    velocity = np.gradient(centre, trial.times, axis=0) if len(trial.times) > 2 else np.zeros_like(centre)
     force = np.tile(np.asarray(world.gravity) - np.asarray(base.gravity), (len(centre), 1))
     past = velocity - np.asarray(world.wind)
     force -= world.drag * np.linalg.norm(past, axis=1, keepdims=True) * past
@@ -95,35 +95,37 @@ def _outside(take: SoftTrial, whole: Array, low: Array, world: WorldParameters, 
         pull = world.tether_stiffness * (length - world.tether_length)
         force += (np.maximum(pull, 0.0) if world.tether_string else pull) * away / np.maximum(length, 1e-9)
     if world.lift:
-        force += world.lift * np.cross(_spin(take, whole), past)
+        force += world.lift * np.cross(_spin(trial, whole), past)
     if world.adhesion:
         force[low < world.reach, 2] -= world.adhesion
     if world.rate != 1:
         force += (world.rate**2 - 1) * np.asarray(base.gravity)
     if world.fraction:
         arm = world.fraction * float(np.linalg.norm(world.offset))
-        force[:, 2] += arm * (_spin(take, whole) ** 2).sum(axis=1)
+        force[:, 2] += arm * (_spin(trial, whole) ** 2).sum(axis=1)
     return force
 
 
-def _spin(take: SoftTrial, whole: Array) -> Array:
+def _spin(trial: SoftTrial, whole: Array) -> Array:
     """Return the spin (T, 3) rad/s of the points as a whole."""
     r = whole - whole.mean(axis=1, keepdims=True)
-    v = np.gradient(r, take.times, axis=0) if len(take.times) > 2 else np.zeros_like(r)
+    v = np.gradient(r, trial.times, axis=0) if len(trial.times) > 2 else np.zeros_like(r)
     momentum = np.cross(r, v).sum(axis=1)
     inertia = np.einsum("tki,tki->t", r, r)[:, None, None] * np.eye(3) - np.einsum("tki,tkj->tij", r, r)
     return np.asarray(np.linalg.solve(inertia, momentum[:, :, None])[:, :, 0])
 
 
-def _discrepancy(take: SoftTrial, forces: Array, motion: Array, nominal: Array, low: Array) -> Discrepancy:
+def _discrepancy(trial: SoftTrial, forces: Array, motion: Array, nominal: Array, low: Array) -> Discrepancy:
     point = np.linalg.norm(forces, axis=2)
     frame = np.sqrt((point**2).mean(axis=1))
-    velocity = np.gradient(motion.mean(axis=1), take.times, axis=0) if len(take.times) > 2 else np.zeros((len(low), 3))
+    velocity = (
+        np.gradient(motion.mean(axis=1), trial.times, axis=0) if len(trial.times) > 2 else np.zeros((len(low), 3))
+    )
     return Discrepancy(
         frame_score=frame,
         point_score=point,
-        residual=take.points - nominal,
-        intervals=_intervals(take.times, low < TOUCHING, np.linalg.norm(velocity, axis=1)),
+        residual=trial.points - nominal,
+        intervals=_intervals(trial.times, low < TOUCHING, np.linalg.norm(velocity, axis=1)),
         directions=_directions(forces, velocity),
     )
 
@@ -175,7 +177,7 @@ class SoftFits:
 
     def __init__(self, survey: Survey) -> None:
         self._survey = survey
-        self._takes, self._fit_takes, self._flights = survey.takes, survey.fit_takes, survey.flights
+        self._trials, self._fit_trials, self._flights = survey.trials, survey.fit_trials, survey.flights
         self._laws: dict[int, WorldParameters] = {}
         self._found: dict[int, FoundFit] = {}
         self.numerics_rms_m = survey.numerics_rms_m
@@ -188,16 +190,16 @@ class SoftFits:
         chosen: dict[tuple[str, ...], FoundFit] = {}
         for entry in ranked:
             chosen.setdefault(entry.effects, entry)
-        takes = [self._takes[i] for i in self._fit_takes]
-        whole = self._whole_takes([believed.world, plain.fit.world, *(f.fit.world for f in list(chosen.values())[:2])])
+        trials = [self._trials[i] for i in self._fit_trials]
+        whole = self._whole_trials([believed.world, plain.fit.world, *(f.fit.world for f in list(chosen.values())[:2])])
         self._windows_nominal = self._window_rms(plain.search.judge(believed.free, believed.motions).residuals)
-        self._whole_nominal = self._rms(takes, whole[0])
+        self._whole_nominal = self._rms(trials, whole[0])
         nominal = FoundFit(search=plain.search, fit=dataclasses.replace(believed, jacobians=None), in_flight=None)
         self.nominal = self._candidate_fit(nominal, self._whole_nominal, believed=True)
-        self.refitted = self._candidate_fit(plain, self._rms(takes, whole[1]))
+        self.refitted = self._candidate_fit(plain, self._rms(trials, whole[1]))
         fits = []
         for i, entry in enumerate(chosen.values()):
-            rms = self._rms(takes, whole[2 + i]) if i < 2 and len(whole) > 2 + i else None
+            rms = self._rms(trials, whole[2 + i]) if i < 2 and len(whole) > 2 + i else None
             fits.append(self._candidate_fit(entry, rms))
         self.candidates = tuple(fits)
         self.floor_rms_m = math.sqrt(3) * self._flights.sigma
@@ -206,9 +208,9 @@ class SoftFits:
         search, fit = found.search, found.fit
         scores, residuals = search.held_out(fit)
         flights = self._survey.flight_part(found)
-        by_take = -0.5 * flights
+        by_trial = -0.5 * flights
         for window, score in zip(self._survey.problem.windows, scores, strict=True):
-            by_take[self._fit_takes.index(window.take)] += score
+            by_trial[self._fit_trials.index(window.trial)] += score
         covariance = search.covariance(fit)
         draws = np.random.default_rng(0).multivariate_normal(fit.free, covariance, size=DRAWS, method="eigh")
         parameters = {name: _estimates(name, [values], values) for name, values, _ in found.before}
@@ -224,8 +226,8 @@ class SoftFits:
                 value=f, unit="1", low=f * math.exp(-1.96 * spread), high=f * math.exp(1.96 * spread)
             )
         if rms is None and fit.cost >= LOST:
-            takes = [self._takes[i] for i in self._fit_takes]
-            rms = self._rms(takes, self._whole_takes([fit.world])[0])
+            trials = [self._trials[i] for i in self._fit_trials]
+            rms = self._rms(trials, self._whole_trials([fit.world])[0])
         if rms is None:
             rms = self._whole_nominal * self._window_rms(residuals) / max(self._windows_nominal, 1e-12)
         result = CandidateFit(
@@ -233,7 +235,7 @@ class SoftFits:
             parameters=parameters,
             beliefs=beliefs,
             log_evidence=self._survey.evidence(found),
-            heldout_log_score=by_take,
+            heldout_log_score=by_trial,
             heldout_rms_m=rms,
             misfit=max(self._survey.contact_misfit(found), self._survey.flight_misfit(found)),
         )
@@ -242,11 +244,11 @@ class SoftFits:
 
     def simulate(self, fit: CandidateFit) -> dict[str, Array]:
         """See ``Fits``."""
-        return self._motion(self.world(fit), [t.times for t in self._takes])
+        return self._motion(self.world(fit), [t.times for t in self._trials])
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """See ``Fits``."""
-        asked = [t.predict_times for t in self._takes]
+        asked = [t.predict_times for t in self._trials]
         return self._motion(self.world(fit), asked)
 
     def world(self, fit: CandidateFit) -> WorldParameters:
@@ -255,11 +257,11 @@ class SoftFits:
 
     def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
         """See ``Fits``."""
-        nominal = {t.name: p for t, p in zip(self._takes, self._in_ground(self._survey.base), strict=True)}
+        nominal = {t.name: p for t, p in zip(self._trials, self._in_ground(self._survey.base), strict=True)}
         if fit is None or not fit.effects:
             return {
                 t.name: raw_discrepancy(t, nominal[t.name], self._flights, i, self._survey.base)
-                for i, t in enumerate(self._takes)
+                for i, t in enumerate(self._trials)
             }
         world = self.world(fit)
         return discrepancy_of(self._flights, self._survey.worlds, world, self._survey.base, nominal)
@@ -267,29 +269,29 @@ class SoftFits:
     def _motion(self, world: WorldParameters, times: Sequence[Array | None]) -> dict[str, Array]:
         wanted = [(i, t) for i, t in enumerate(times) if t is not None and len(t)]
         found = self._flights.lasting_motion([i for i, _ in wanted], [world] * len(wanted), [t for _, t in wanted])
-        return {self._takes[i].name: self._survey.frame.back(p) for (i, _), p in zip(wanted, found, strict=True)}
+        return {self._trials[i].name: self._survey.frame.back(p) for (i, _), p in zip(wanted, found, strict=True)}
 
     def _in_ground(self, world: WorldParameters) -> list[Array]:
-        n = len(self._takes)
-        return self._flights.lasting_motion(list(range(n)), [world] * n, [t.times for t in self._takes])
+        n = len(self._trials)
+        return self._flights.lasting_motion(list(range(n)), [world] * n, [t.times for t in self._trials])
 
-    def _whole_takes(self, world: list[WorldParameters]) -> list[list[Array]]:
-        n = len(self._fit_takes)
-        pairs = list(itertools.product(world, self._fit_takes))
+    def _whole_trials(self, world: list[WorldParameters]) -> list[list[Array]]:
+        n = len(self._fit_trials)
+        pairs = list(itertools.product(world, self._fit_trials))
         found = self._flights.lasting_motion(
-            [i for _, i in pairs], [a for a, _ in pairs], [self._takes[i].times for _, i in pairs]
+            [i for _, i in pairs], [a for a, _ in pairs], [self._trials[i].times for _, i in pairs]
         )
         return [found[k * n : (k + 1) * n] for k in range(len(world))]
 
     # Scores
 
     @staticmethod
-    def _rms(takes: list[SoftTrial], motions: list[Array]) -> float:
+    def _rms(trials: list[SoftTrial], motions: list[Array]) -> float:
         """Return the RMS distance in m from first contact on, predicted from the flight alone."""
         squares = []
-        for take, motion in zip(takes, motions, strict=True):
-            d = (take.points - motion)[take.flying :]
-            squares.append((d[take.seen[take.flying :]] ** 2).sum(axis=1))
+        for trial, motion in zip(trials, motions, strict=True):
+            d = (trial.points - motion)[trial.flying :]
+            squares.append((d[trial.seen[trial.flying :]] ** 2).sum(axis=1))
         found = np.concatenate(squares) if squares else np.zeros(1)
         return float(np.sqrt(found.mean())) if len(found) else 0.0
 

@@ -24,7 +24,7 @@ from .track_videos import track_videos
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``physgen track``."""
     defaults = TrackOptions()
-    parser.add_argument("videos", type=Path, nargs="+", metavar="VIDEO", help="a take each: MP4, MOV, AVI …")
+    parser.add_argument("videos", type=Path, nargs="+", metavar="VIDEO", help="one trial each: MP4, MOV, AVI …")
     parser.add_argument("--scene", type=Path, required=True, metavar="SCENE", help="scene folder that the videos show")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="new capture folder")
     objects = "names of the objects to track (default: all that move)"
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCancelled) -> Event:
     """Run the command with parsed ``options``; return the ``done`` event, whose ``summary`` is human-readable."""
-    takes = parse_takes(
+    trials = parse_trials(
         options.videos,
         start_frames=options.start_frame,
         end_frames=options.end_frame,
@@ -63,7 +63,7 @@ def run_command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCan
     )
     capture = track(
         load_scene(options.scene),
-        takes,
+        trials,
         out=options.out,
         objects=options.objects,
         options=TrackOptions(density=options.density, min_contrast=options.min_contrast, min_score=options.min_score),
@@ -74,7 +74,7 @@ def run_command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCan
     return {"event": "done", "stage": "track", "capture": str(options.out), "summary": summary(capture)}
 
 
-def parse_takes(
+def parse_trials(
     videos: Sequence[Path],
     *,
     start_frames: Sequence[int] = (),

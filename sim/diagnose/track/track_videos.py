@@ -171,7 +171,7 @@ class TrackedVideos:
 
 
 def track_videos(
-    takes: Sequence[VideoTrial],
+    videos: Sequence[VideoTrial],
     folder: Scene,
     *,
     objects: Sequence[str] = (),
@@ -179,38 +179,38 @@ def track_videos(
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> TrackedVideos:
-    """Return the capture of the videos ``takes`` of the scene ``folder``.
+    """Return the capture of ``videos`` of the scene ``folder``.
 
     objects: names of those to track; empty: all that move. Raises InputError as ``track_video``, and when no trial is
     left to fit to or the videos differ in size; Cancelled on request.
     """
-    takes = _named_apart(takes)
-    if not takes:
+    videos = _named_apart(videos)
+    if not videos:
         raise InputError("no video: give at least one")
-    if all(take.predict_from is not None for take in takes):
+    if all(trial.predict_from is not None for trial in videos):
         raise InputError("predict_from is given for every video: leave at least one complete, to fit to")
     tracked = [
-        track_video(take, folder, objects=objects, options=options, on_event=on_event, cancelled=cancelled)
-        for take in takes
+        track_video(trial, folder, objects=objects, options=options, on_event=on_event, cancelled=cancelled)
+        for trial in videos
     ]
     camera = tracked[0].camera
-    for take, item in zip(takes, tracked, strict=True):
+    for trial, item in zip(videos, tracked, strict=True):
         if item.camera != camera:
             raise InputError(
-                f"{take.path}: has {item.camera.width}x{item.camera.height} pixels and {takes[0].path} "
+                f"{trial.path}: has {item.camera.width}x{item.camera.height} pixels and {videos[0].path} "
                 f"{camera.width}x{camera.height}: a capture has one camera; track them separately"
             )
     trials, withheld = [], {}
-    for take, item in zip(takes, tracked, strict=True):
-        if take.predict_from is None:
+    for trial, item in zip(videos, tracked, strict=True):
+        if trial.predict_from is None:
             trials.append(item.trial)
         else:
-            shown, rest = withhold(item.trial, take.predict_from)
+            shown, rest = withhold(item.trial, trial.predict_from)
             trials.append(shown)
             withheld[shown.name] = rest
     scene, chosen = folder.model, selected_objects(folder.model, objects)
     bodies = [body for i, body in enumerate(scene_bodies(folder)) if i in chosen]
-    fit = [item.noise_sigma for take, item in zip(takes, tracked, strict=True) if take.predict_from is None]
+    fit = [item.noise_sigma for trial, item in zip(videos, tracked, strict=True) if trial.predict_from is None]
     capture = Capture(
         gravity=scene.gravity,
         ground=believed_ground(scene, [body.source for body in bodies]),
@@ -227,16 +227,16 @@ def track_videos(
     )
 
 
-def _named_apart(takes: Sequence[VideoTrial]) -> list[VideoTrial]:
+def _named_apart(videos: Sequence[VideoTrial]) -> list[VideoTrial]:
     """Return the videos with unique names that are valid file names."""
     named: list[VideoTrial] = []
-    for take in takes:
-        clean = "".join(c if c.isalnum() or c in "_- " else "_" for c in take.trial_name).strip() or "take"
+    for trial in videos:
+        clean = "".join(c if c.isalnum() or c in "_- " else "_" for c in trial.trial_name).strip() or "take"
         name, count = clean, 1
         while name in {t.name for t in named}:
             count += 1
             name = f"{clean}_{count}"
-        named.append(dataclasses.replace(take, name=name))
+        named.append(dataclasses.replace(trial, name=name))
     return named
 
 
@@ -271,7 +271,7 @@ def withhold(trial: Trial, seconds: float) -> tuple[Trial, Trial]:
 
 
 def track_video(
-    take: VideoTrial,
+    trial: VideoTrial,
     folder: Scene,
     *,
     objects: Sequence[str] = (),
@@ -288,19 +288,19 @@ def track_video(
     options = options or TrackOptions()
     chosen = selected_objects(folder.model, objects)
     everything = scene_bodies(folder)
-    with Video(take.path) as video:
-        camera = video_camera(folder.model, video.info.width, video.info.height, str(take.path))
-        run = _Run(take, folder, everything, chosen, camera, options)
-        last = video.info.frames - 1 if take.end_frame is None else take.end_frame
-        progress = StageProgress(on_event, STAGE, max(1, last - take.start_frame + 1))
-        for frame in video.frames(take.start_frame, take.end_frame):
+    with Video(trial.path) as video:
+        camera = video_camera(folder.model, video.info.width, video.info.height, str(trial.path))
+        run = _Run(trial, folder, everything, chosen, camera, options)
+        last = video.info.frames - 1 if trial.end_frame is None else trial.end_frame
+        progress = StageProgress(on_event, STAGE, max(1, last - trial.start_frame + 1))
+        for frame in video.frames(trial.start_frame, trial.end_frame):
             if cancelled():
                 raise Cancelled("tracking was cancelled; nothing was written")
             run.take_in(frame)
-            progress.report(min(len(run.stamps), max(1, last - take.start_frame + 1)), take.path.name)
+            progress.report(min(len(run.stamps), max(1, last - trial.start_frame + 1)), trial.path.name)
         tracked = run.finish(video)
     for warning in tracked.warnings:
-        progress.notice(f"{take.path.name}: {warning}")
+        progress.notice(f"{trial.path.name}: {warning}")
     return tracked
 
 
@@ -309,7 +309,7 @@ class _Run:
 
     def __init__(
         self,
-        take: VideoTrial,
+        trial: VideoTrial,
         folder: Scene,
         everything: Sequence[SceneBody],
         chosen: Sequence[int],
@@ -317,7 +317,7 @@ class _Run:
         options: TrackOptions,
     ) -> None:
         self.stamps: list[float] = []
-        self._take, self._folder, self._camera, self._options = take, folder, camera, options
+        self._trial, self._folder, self._camera, self._options = trial, folder, camera, options
         self._bodies = [everything[i] for i in chosen]
         self._still: list[tuple[Surface, Pose]] = [
             (body.surface, body.pose(camera))
@@ -352,7 +352,7 @@ class _Run:
         ]
 
     def _begin(self, frame: Frame, view: View) -> None:
-        where = f"{self._take.path}, frame {frame.index}"
+        where = f"{self._trial.path}, frame {frame.index}"
         photo = load_scene_photo(self._folder, self._camera, self._bodies)
         starts: list[InitialPose] = []
         for i, body in enumerate(self._bodies):
@@ -377,19 +377,19 @@ class _Run:
 
     def finish(self, video: Video) -> TrackedVideo:
         """Return the trial of all frames tracked."""
-        take, count = self._take, len(self.stamps)
+        trial, count = self._trial, len(self.stamps)
         if count < 3:
-            found = f"{count} frames could be read from frame {take.start_frame} on" if count else "no frame could be"
+            read = f"{count} frames" if count else "no frame"
             raise InputError(
-                f"{take.path}: {found}{'' if count else f' read from frame {take.start_frame} on'}; a motion needs 3: "
+                f"{trial.path}: {read} could be read from frame {trial.start_frame} on; a motion needs 3: "
                 "check --start-frame and --end-frame, or convert the video to MP4 (H.264)"
             )
-        expected = video.info.frames if take.end_frame is None else take.end_frame + 1
-        if expected and take.start_frame + count < expected - 1:
+        expected = video.info.frames if trial.end_frame is None else trial.end_frame + 1
+        if expected and trial.start_frame + count < expected - 1:
             self._warnings.append(
-                f"{take.start_frame + count} of {expected} frames could be read; the rest is missing or damaged"
+                f"{trial.start_frame + count} of {expected} frames could be read; the rest is missing or damaged"
             )
-        times, warning = frame_times(take.path, self.stamps, video.info, take.fps_override)
+        times, warning = frame_times(trial.path, self.stamps, video.info, trial.fps_override)
         if warning is not None:
             self._warnings.append(warning)
         if self._watch is not None and self._watch.warning is not None:
@@ -407,7 +407,7 @@ class _Run:
             sigmas.append(self._sigma(tracker, residual))
         return TrackedVideo(
             trial=Trial(
-                name=take.trial_name,
+                name=trial.trial_name,
                 role="fit",
                 times=times,
                 points=None,
@@ -426,7 +426,7 @@ class _Run:
         seen = np.isfinite(places).all(axis=2).any(axis=1)
         if seen.sum() < min(LEAST_FRAMES, count):
             raise InputError(
-                f"{self._take.path}: object {name!r} is lost after {int(seen.sum())} frames: it moves too far "
+                f"{self._trial.path}: object {name!r} is lost after {int(seen.sum())} frames: it moves too far "
                 "from frame to frame, is blurred or hidden, or shows too little texture; film at a higher "
                 "frame rate with a shorter exposure, or put a pattern on it"
             )
@@ -434,7 +434,7 @@ class _Run:
             gone = np.flatnonzero(~seen)
             self._warnings.append(
                 f"object {name!r} is not seen in {len(gone)} of {count} frames, first in frame "
-                f"{self._take.start_frame + int(gone[0])}"
+                f"{self._trial.start_frame + int(gone[0])}"
             )
 
     def _sigma(self, tracker: BodyTracker, residual: Array) -> float:

@@ -164,7 +164,7 @@ GUESSED = 1.0
 """Gain in decibels over a plain colour below which the inpainting is a guess."""
 GOOD = 32.0
 """Score in decibels above which the inpainting is right, as on a plain wall, where a plain colour does no worse."""
-TOLD = 0.01
+NOTICED = 0.01
 """Share of the photo above which a guess gives a notice."""
 PHOTO_WAYS = ("by rows", "by rows without light", "as a surface")
 GROUND_WAYS = ("as ground",)
@@ -247,7 +247,7 @@ def _fill_part(
             choose_method(task, ways) if target.sum() > SMALL * target.size else MethodChoice(PHOTO_WAYS[0], {}, np.inf)
         )
         reliable = choice.certain >= GUESSED or choice.scores.get(choice.way, 0.0) >= GOOD
-        if not reliable and target.sum() > TOLD * target.size:
+        if not reliable and target.sum() > NOTICED * target.size:
             rows, columns = box(target, 0)
             notice(
                 f"the background behind columns {columns.start} to {columns.stop}, rows {rows.start} to {rows.stop} "
