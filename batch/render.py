@@ -39,29 +39,37 @@ def build_parser() -> argparse.ArgumentParser:
 
 def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[dict[str, Any], str]:
     """Render; return the ``done`` event, and the same in words."""
+    from ..sim.cache.bake_folder import load_bake
     from ..sim.scene.folder import load_scene
     from .commands.render_commands import render_options
 
     started = time.monotonic()
-    folder, settings = load_scene(options.scene), render_options(options)
+    scene, bake, settings = load_scene(options.scene), load_bake(options.bake), render_options(options)
     frames = import_module("..physgen_addon.render.render_frames", __package__)
     paths = frames.render_frames(
-        folder, options.bake, options.out, settings, on_event, cancelled, frames=options.frames
+        scene,
+        bake,
+        out=options.out,
+        options=settings,
+        frames=options.frames,
+        on_event=on_event,
+        cancelled=cancelled,
     )
     done: dict[str, Any] = {"event": "done", "frames": len(paths), "out": str(options.out)}
+    done["files"] = [path.name for path in paths]
     if options.video is not None:
-        _encode(paths, options, on_event, cancelled)
+        _encode(paths, bake.manifest.fps, options, on_event, cancelled)
         done["video"] = str(options.video)
     done["seconds"] = round(time.monotonic() - started, 1)
     return done, f"{done['frames']} frames in {done['out']}, {done['seconds']:.0f} s"
 
 
-def _encode(paths: Sequence[Path], options: argparse.Namespace, on_event: Any, cancelled: Any) -> None:
+def _encode(
+    paths: Sequence[Path], baked_fps: float, options: argparse.Namespace, on_event: Any, cancelled: Any
+) -> None:
     """Encode the frames at ``paths``, unless the video is up to date."""
     from ..physgen_addon.frames.frame_index import FrameIndex, own_fps
-    from ..sim.cache.bake_folder import load_manifest
 
-    baked_fps = load_manifest(options.bake).fps
     index = FrameIndex(options.out, suffix=paths[0].suffix, fps=baked_fps)
     fps = own_fps([int(path.stem) for path in paths], baked_fps)
     if index.has_video(options.video, paths, fps):

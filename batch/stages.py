@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..physgen_addon.frames.frame_index import frame_name, parse_frame_range
 from ..physgen_addon.render.render_options import RenderOptions, render_arguments, require_video_name
 from ..sim.app import bake_worker
 from ..sim.app.bake_options import BakeOptions, inputs_hash
@@ -71,9 +70,8 @@ def render(
     Blender fails; Cancelled when cancelled: complete frames are kept then.
     """
     options, out = options or RenderOptions(), Path(out)
-    run_render(scene, bake, out, options, frames=frames, video=video, on_event=on_event, cancelled=cancelled)
-    numbers = parse_frame_range(frames, bake.first_frame, bake.last_frame)
-    return tuple(out / frame_name(number, options.frame_format.suffix) for number in numbers)
+    done = run_render(scene, bake, out, options, frames=frames, video=video, on_event=on_event, cancelled=cancelled)
+    return tuple(out / name for name in done["files"])
 
 
 def run_render(

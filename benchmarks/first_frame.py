@@ -21,6 +21,7 @@ from physgen.benchmarks.common import benchmark_parser, blender_output_to_stderr
 from physgen.physgen_addon.render.render_frames import render_frames
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import read_mask, read_rgb
 from physgen.sim.errors import PhysGenError
@@ -46,7 +47,9 @@ def measure(photo: Path, boxes: Sequence[Box], samples: int) -> dict[str, object
         scene = reconstruct(photo, [ObjectRequest(box=box) for box in boxes], out=root / "scene")
         reconstructed = time.monotonic()
         bake = rest_bake(scene, root / "bake")
-        frame = read_rgb(render_frames(scene, bake, root / "frames", RenderOptions(samples=samples))[0])
+        frame = read_rgb(
+            render_frames(scene, load_bake(bake), out=root / "frames", options=RenderOptions(samples=samples))[0]
+        )
         original = read_rgb(scene.file(scene.model.photo))
         masks = {o.name: read_mask(scene.file(o.mask)) for o in scene.model.objects if o.mask is not None}
     inside = {name: round(psnr(frame, original, mask), 2) for name, mask in masks.items()}

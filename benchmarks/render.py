@@ -29,6 +29,7 @@ from physgen.physgen_addon.playback.point_caches import open_bake
 from physgen.physgen_addon.render import lighting, render_engines
 from physgen.physgen_addon.render.render_options import ENGINES, RenderOptions
 from physgen.physgen_addon.render.renderer import Renderer
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import PhysGenError
 from physgen.sim.scene.folder import Scene, save_scene
@@ -103,7 +104,7 @@ def run(
     spent: dict[str, float] = {}
     began = time.process_time()
     with timed(opening):
-        renderer = Renderer(folder, open_bake(bake, folder.model), options)
+        renderer = Renderer(folder, open_bake(load_bake(bake), folder), options)
     try:
         ready = time.process_time()
         with timed(spent):

@@ -138,7 +138,7 @@ def run_fit_splats(options: argparse.Namespace, terminal: Terminal, cancelled: I
         reference=options.reference,
         seed=options.seed,
     )
-    folder = fit_splats_scene(options.views, options.out, request, terminal, cancelled)
+    folder = fit_splats_scene(options.views, out=options.out, request=request, on_event=terminal, cancelled=cancelled)
     found = [item.name for item in folder.model.objects]
     terminal({"event": "done", "scene": str(options.out), "objects": found})
     terminal.line(f"scene: {options.out} ({', '.join(found)})")

@@ -147,9 +147,10 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
 
 def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen correct``; the exit code."""
-    stamp = require_stamp(options.scene)
+    scene = load_scene(options.scene)
+    stamp = require_stamp(scene)
     requests, settings = corrected_requests(options, stamp.objects), reconstruct_options(options, stamp.options)
-    correct(load_scene(options.scene), objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
+    correct(scene, objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
     terminal({"event": "done", "scene": str(options.scene)})
     terminal.line(f"scene: {options.scene}")
     return 0
@@ -159,7 +160,7 @@ def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
     """Run ``physgen import``; the exit code."""
     import_folder(
         options.folder,
-        options.out,
+        out=options.out,
         size_m=options.size,
         settings=options.settings,
         up=options.up,

@@ -23,7 +23,6 @@ from pathlib import Path, PurePosixPath
 from queue import Empty, Queue
 from types import TracebackType
 
-from ...sim.app.bake_options import file_hash
 from ...sim.app.stage_process import (
     CANCEL_GRACE_S,
     MOST_LINE_BYTES,
@@ -37,7 +36,7 @@ from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
 from ...sim.cache.folder_lock import LOCK_FILE, is_locked
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
-from ...sim.scene.folder import inside
+from ...sim.scene.folder import file_hash, inside
 from ...sim.validation import parse, read_json, to_json
 from ...sim.version import VERSION
 from .planning.plan import Outcome, Task

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...sim.app.bake_options import file_hash
 from ...sim.atomic import write_json
 from ...sim.errors import InputError
+from ...sim.scene.folder import file_hash
 from ...sim.validation import read_json
 
 

@@ -10,11 +10,12 @@ import bpy
 
 from ...sim.app.add_effect import AddRequest, add_and_bake, found_effects, with_effects
 from ...sim.app.stage_process import run_stage
+from ...sim.cache.bake_folder import load_bake
 from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
 from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
-from ...sim.scene.folder import load_scene
+from ...sim.scene.folder import Scene, load_scene
 from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
 from ..context import look_through_camera, turn_to, viewports
@@ -57,11 +58,11 @@ def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
     if diagnosis is not None:
         report, where, prediction = read_diagnosis(diagnosis)
         arrays = capture_scene.Diagnosed(where=where, prediction=prediction)
-    takes = capture_scene.prepare(capture, arrays)
+    built_trials = capture_scene.prepare(capture, arrays)
     fresh, trial, had_motion = state.root is None, state.trial if state.trials else "", state.has_motion
     if state.root is not None:
         capture_scene.remove(state.root)
-    root = state.root = capture_scene.build(scene, capture, takes)
+    root = state.root = capture_scene.build(scene, capture, built_trials)
     _fill_trials(state, capture)
     state.has_scores = any(arrays.score(t) is not None for t in capture.trials)
     state.has_motion = any(arrays.layer(t, NOMINAL) is not None for t in capture.trials)
@@ -273,28 +274,28 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
     def request(self, context: bpy.types.Context) -> Work:
         """Add the effect to the scene; return one or two bakes as child processes."""
         state = context.scene.physgen_diagnose
-        scene_root = require_folder(state.scene_folder, "Scene")
+        folder = load_scene(require_folder(state.scene_folder, "Scene"))
         found = found_effects(read_json(report_folder(state) / REPORT_FILE))
-        with_effects(load_scene(scene_root).model, found)
+        with_effects(folder.model, found)
         bake_before = not state.before.strip()
         # A bake from an earlier run is reused while the scene is unchanged.
-        beside = folder_beside(scene_root, "bake_before")
-        before = beside if bake_before else require_folder(state.before, "Bake Before")
+        beside = folder_beside(folder.root, "bake_before")
         request = AddRequest(
-            scene=scene_root,
             found=found,
-            before=before,
-            after=bake_folder(folder_beside(scene_root, "bake_after")),
+            before=beside if bake_before else require_folder(state.before, "Bake Before"),
+            after=bake_folder(folder_beside(folder.root, "bake_after")),
             bake_before=bake_before,
         )
         settings = ("--frames", str(state.frames), "--fps", repr(state.fps), "--quality", state.quality)
         preferred = python(context)
 
-        def run_bake(scene: Path, out: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
-            command = cli_command(find_python(preferred), "bake", str(scene), "--out", str(out), *settings)
+        def run_bake(scene: Scene, out: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "bake", str(scene.root), "--out", str(out), *settings)
             return run_stage(command, on_event, cancelled)
 
-        return lambda on_event, cancelled: add_and_bake(request, run_bake, on_event, cancelled)
+        return lambda on_event, cancelled: add_and_bake(
+            folder, request=request, run_bake=run_bake, on_event=on_event, cancelled=cancelled
+        )
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show both bakes."""
@@ -323,10 +324,10 @@ class PHYSGEN_OT_show_overlay(bpy.types.Operator):
 def show_overlay(scene: bpy.types.Scene) -> None:
     """Show both bakes of the scene folder in ``scene`` and hide the capture. Raises InputError."""
     state = scene.physgen_diagnose
-    folder = require_folder(state.scene_folder, "Scene")
+    folder = load_scene(require_folder(state.scene_folder, "Scene"))
     bakes = {
-        overlay.BEFORE: require_folder(state.before, "Bake Before"),
-        overlay.AFTER: require_folder(state.after, "Bake After"),
+        overlay.BEFORE: load_bake(require_folder(state.before, "Bake Before")),
+        overlay.AFTER: load_bake(require_folder(state.after, "Bake After")),
     }
     first, last, rate = overlay.overlay_frame_range(folder, bakes[overlay.AFTER])
     built: list[bpy.types.Collection] = []

@@ -14,7 +14,7 @@ import bpy
 
 from ...sim.app.bake_transfer import transfer_bake
 from ...sim.app.stage_process import run_stage
-from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
+from ...sim.cache.bake_folder import MANIFEST_FILE, load_bake, load_manifest
 from ...sim.errors import InputError, PhysGenError, RenderError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.camera_path import CameraPath, save_camera_path
@@ -123,7 +123,14 @@ class _Render(JobOperator):
                 rendered = bake
                 if (baked_scene / SCENE_FILE).is_file():
                     rendered = Path(scratch) / "bake"
-                    transfer_bake(photo, baked_scene, bake, rendered, names, on_event)
+                    transfer_bake(
+                        load_scene(photo),
+                        load_scene(baked_scene),
+                        load_bake(bake),
+                        out=rendered,
+                        names=names,
+                        on_event=on_event,
+                    )
                 command = [*start, str(photo), "--bake", str(rendered), *arguments]
                 if path is not None:
                     save_camera_path(Path(scratch) / "camera.json", path)

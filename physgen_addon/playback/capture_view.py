@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Vector
 
-from ...sim.scene.folder import Scene, load_scene
+from ...sim.cache.bake_folder import Bake
+from ...sim.scene.folder import Scene
 from ...sim.scene.meshes import load_object_mesh
 from . import capture_scene as materials
 from . import geometry_nodes as nodes
@@ -24,13 +24,12 @@ OVERLAID_BAKES = "physgen_bake"
 OVERLAY_COLOURS = {BEFORE: materials.COLOURS[NOMINAL], AFTER: materials.COLOURS[FOUND]}
 
 
-def build_overlay(scene: bpy.types.Scene, scene_root: Path, bake: Path, which: str) -> bpy.types.Collection:
-    """Add the objects of the scene folder, animated by ``bake``, to ``scene``; on failure nothing is left behind.
+def build_overlay(scene: bpy.types.Scene, folder: Scene, bake: Bake, which: str) -> bpy.types.Collection:
+    """Return a collection in ``scene`` with the objects of ``folder``, animated by ``bake``; on failure none is left.
 
-    Raises InputError for a scene, mesh or bake that cannot be used, or that do not belong together.
+    which: ``BEFORE`` or ``AFTER``. Raises InputError for a mesh or bake that cannot be used, or that do not match.
     """
-    folder = load_scene(scene_root)
-    opened = point_caches.open_bake(bake, folder.model)
+    opened = point_caches.open_bake(bake, folder)
     point_caches.require_world(opened)
     point_caches.require_scene(opened, folder)
     root = bpy.data.collections.new(f"PhysGen {which}")
@@ -60,9 +59,9 @@ def overlay_bounds(root: bpy.types.Collection) -> tuple[Vector, Vector]:
     return Vector(corners.min(axis=0).tolist()), Vector(corners.max(axis=0).tolist())
 
 
-def overlay_frame_range(scene_root: Path, bake: Path) -> tuple[int, int, float]:
-    """Return first and last frame and frame rate of ``bake``."""
-    opened = point_caches.open_bake(bake, load_scene(scene_root).model)
+def overlay_frame_range(folder: Scene, bake: Bake) -> tuple[int, int, float]:
+    """Return first and last frame and frame rate of ``bake``, whose caches hold the objects of ``folder``."""
+    opened = point_caches.open_bake(bake, folder)
     return opened.first_frame, opened.last_frame, opened.manifest.fps
 
 

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import bpy
 
-from ...sim.app.bake_options import geometry_hash
-from ...sim.cache.bake_folder import SURFACE, WORLD_SPACE, BakeManifest, load_manifest
+from ...sim.cache.bake_folder import SURFACE, WORLD_SPACE, Bake, BakeManifest
 from ...sim.cache.folder_lock import is_locked
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
 from ...sim.scene.folder import Scene
-from ...sim.scene.model import SceneModel
 
 MODIFIER = "PhysGen cache"
 
@@ -37,7 +35,7 @@ class Flow:
 
 
 @dataclass(frozen=True)
-class Bake:
+class OpenedBake:
     """A bake that matches a scene: caches in the order of its objects, and particles (None: without)."""
 
     folder: Path
@@ -73,12 +71,12 @@ class Bake:
         )
 
 
-def open_bake(folder: Path, scene: SceneModel) -> Bake:
-    """Open the bake in ``folder`` for ``scene``.
+def open_bake(bake: Bake, scene: Scene) -> OpenedBake:
+    """Return ``bake`` with its caches open, in the order of the objects of ``scene``.
 
-    Raises InputError if there is none, an object of the scene has no cache in it, or a cache is damaged or empty.
+    Raises InputError if an object of the scene has no cache in it, or a cache is damaged or empty.
     """
-    manifest = load_manifest(folder)
+    folder, manifest = bake.root, bake.manifest
     files = {item.name: item for item in manifest.objects}
     caches: list[Pc2Reader] = []
     flows: list[Flow | None] = []
@@ -89,23 +87,23 @@ def open_bake(folder: Path, scene: SceneModel) -> Bake:
         caches.append(Pc2Reader(folder / baked.file))
         particles = None if baked.points_file is None else Pc2Reader(folder / baked.points_file)
         flows.append(None if particles is None else Flow(cache=particles, surface=baked.points_as == SURFACE))
-    bake = Bake(folder=folder, manifest=manifest, caches=tuple(caches), flows=tuple(flows))
-    for cache in bake.every:
+    opened = OpenedBake(folder=folder, manifest=manifest, caches=tuple(caches), flows=tuple(flows))
+    for cache in opened.every:
         if cache.sample_count < 1:
             raise InputError(f"{cache.path}: holds no sample yet; let the bake run on")
-    return bake
+    return opened
 
 
-def require_scene(bake: Bake, folder: Scene) -> None:
+def require_scene(bake: OpenedBake, folder: Scene) -> None:
     """Raise InputError if ``bake`` was made from other meshes or poses."""
     known = bake.manifest.geometry_hash
-    if known and known != geometry_hash(folder):
+    if known and known != folder.geometry_hash():
         raise InputError(
             f"{bake.folder}: was baked from other meshes or poses than {folder.root} has now; bake the scene again"
         )
 
 
-def require_world(bake: Bake) -> None:
+def require_world(bake: OpenedBake) -> None:
     """Raise InputError unless the samples of ``bake`` are in world metres."""
     other = next((item for item in bake.manifest.objects if item.space != WORLD_SPACE), None)
     if other is not None:

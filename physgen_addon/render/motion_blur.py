@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...sim.scene.model import Camera
 
 if TYPE_CHECKING:
-    from ..playback.point_caches import Bake
+    from ..playback.point_caches import OpenedBake
 
 STILL_PX = 0.02
 """Motion below this on the image is invisible."""
@@ -61,7 +61,7 @@ class Pose:
         return self.flowing == other.flowing and all(float(np.abs(a - b).max()) <= within for a, b in pairs)
 
 
-def pose(bake: Bake, sample: int) -> Pose:
+def pose(bake: OpenedBake, sample: int) -> Pose:
     """Return the positions in ``sample`` of ``bake``."""
     return Pose(
         skins=[cache.sample(sample) for cache in bake.caches],

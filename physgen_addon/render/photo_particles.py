@@ -46,7 +46,7 @@ texture starts and ends to give way to the mean of its colours.
 """
 
 
-def find_tears(bake: point_caches.Bake, folder: Scene) -> point_caches.Bake:
+def find_tears(bake: point_caches.OpenedBake, folder: Scene) -> point_caches.OpenedBake:
     """Return ``bake`` with the first samples at which particles are shown."""
 
     def samples(cache: Pc2Reader) -> Iterator[NDArray[np.float32]]:

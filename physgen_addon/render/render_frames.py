@@ -15,13 +15,13 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...sim.app.bake_options import file_hash
 from ...sim.atomic import replacing
+from ...sim.cache.bake_folder import Bake
 from ...sim.cache.folder_lock import folder_lock
 from ...sim.composite.compositing import FrameLayers
 from ...sim.errors import Cancelled, RenderError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
-from ...sim.scene.folder import Scene, require_photo
+from ...sim.scene.folder import Scene, file_hash, require_photo
 from ...sim.scene.meshes import load_object_mesh
 from ...sim.scene.model import Camera
 from ...sim.validation import to_json
@@ -30,7 +30,7 @@ from .. import compat
 from ..frames.frame_files import write_frame
 from ..frames.frame_index import FrameIndex, parse_frame_range
 from ..playback import point_caches
-from ..playback.point_caches import Bake
+from ..playback.point_caches import OpenedBake
 from . import motion_blur, photo_particles, render_engines
 from .clean_plate import CameraMotion, make_camera_motion
 from .motion_blur import Pose
@@ -61,7 +61,7 @@ class Frame:
 
 def plan_frames(
     folder: Scene,
-    bake: Bake,
+    bake: OpenedBake,
     numbers: Sequence[int],
     *,
     options: RenderOptions,
@@ -93,7 +93,7 @@ def plan_frames(
 
 
 def _shown(
-    folder: Scene, bake: Bake, count: int, *, base: str, options: RenderOptions, shot: CameraMotion
+    folder: Scene, bake: OpenedBake, count: int, *, base: str, options: RenderOptions, shot: CameraMotion
 ) -> list[tuple[int, str]]:
     """Return for each of the first ``count`` samples the earliest one that looks the same, or itself, and its hash.
 
@@ -172,7 +172,7 @@ class OpenRenderer:
     def __init__(
         self,
         scene: Scene,
-        bake: point_caches.Bake,
+        bake: point_caches.OpenedBake,
         options: RenderOptions,
         shot: CameraMotion,
         notice: Callable[[str], None],
@@ -225,13 +225,13 @@ class OpenRenderer:
 
 def render_frames(
     scene: Scene,
-    bake: Path,
+    bake: Bake,
+    *,
     out: Path,
     options: RenderOptions | None = None,
+    frames: str | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
-    *,
-    frames: str | None = None,
 ) -> list[Path]:
     """Render ``frames`` (a range such as ``1-48x2``, None for all baked ones) to ``out``; return their paths in order.
 
@@ -242,12 +242,12 @@ def render_frames(
     """
     options = options or RenderOptions()
     require_photo(scene)
-    opened = point_caches.open_bake(bake, scene.model)
+    opened = point_caches.open_bake(bake, scene)
     point_caches.require_world(opened)
     point_caches.require_scene(opened, scene)
     for source, cache in zip(scene.model.objects, opened.caches, strict=True):
         point_caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
-    remedy = opened.unfinished or f"bake more in {bake}, or ask for fewer"
+    remedy = opened.unfinished or f"bake more in {bake.root}, or ask for fewer"
     numbers = parse_frame_range(frames, opened.first_frame, opened.last_frame, there=f"baked; {remedy}")
     traces = options.engine == "cycles"
     denoised = traces and options.denoise and compat.denoiser_available()
@@ -274,7 +274,7 @@ def render_frames(
 
 def _make(
     scene: Scene,
-    bake: point_caches.Bake,
+    bake: point_caches.OpenedBake,
     planned: list[Frame],
     frame_index: FrameIndex,
     options: RenderOptions,

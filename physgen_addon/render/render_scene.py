@@ -351,7 +351,7 @@ def _size(scene: bpy.types.Scene) -> tuple[int, int]:
     return scene.render.resolution_x, scene.render.resolution_y
 
 
-def build(folder: Scene, bake: point_caches.Bake | None, options: RenderOptions) -> BlenderScene:
+def build(folder: Scene, bake: point_caches.OpenedBake | None, options: RenderOptions) -> BlenderScene:
     """Build ``folder`` beside the .blend's other contents; with ``bake`` its objects follow their caches.
 
     Raises InputError for a scene without a photo or ground, and for an unusable mesh, texture, light or cache; nothing
@@ -382,7 +382,7 @@ def remove(built: BlenderScene) -> None:
     built.own = []
 
 
-def _build(folder: Scene, bake: point_caches.Bake | None, options: RenderOptions) -> BlenderScene:
+def _build(folder: Scene, bake: point_caches.OpenedBake | None, options: RenderOptions) -> BlenderScene:
     scene = folder.model
     colour_scene, light_scene, shadow_scene = scenes = [
         bpy.data.scenes.new(f"PhysGen {name}") for name in ("colours", "light", "shadows")

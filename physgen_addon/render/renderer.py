@@ -19,7 +19,7 @@ from ...sim.composite.backdrop import Backdrop
 from ...sim.scene.folder import Scene
 from ...sim.scene.model import Camera, SceneModel
 from .. import compat
-from ..playback.point_caches import Bake
+from ..playback.point_caches import OpenedBake
 from ..scene_io.photo_view import render_size, with_sun_angle
 from . import lighting, motion_blur, photo_particles, render_engines
 from .clean_plate import CameraMotion, CleanPlate, PlateView, make_relief
@@ -171,7 +171,9 @@ def _set_vectors(mesh: bpy.types.Mesh, pair: tuple[Vectors, Vectors]) -> None:
 class Renderer:
     """Renders samples of one bake into the photo. Opening it measures the reference lighting; close it after use."""
 
-    def __init__(self, scene: Scene, bake: Bake, options: RenderOptions, shot: CameraMotion | None = None) -> None:
+    def __init__(
+        self, scene: Scene, bake: OpenedBake, options: RenderOptions, shot: CameraMotion | None = None
+    ) -> None:
         """``shot``: camera motion; None keeps the photo's camera.
 
         Raises InputError for unusable images, meshes or light, RenderError if Blender fails.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a diagnosis found, put into a scene: its effects into ``scene.json``, and the scene baked before and after."""
+"""Adds the effects that a diagnosis found to a scene, and bakes the scene before and after."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Any
 
 from ..effects.registry import effect
 from ..errors import Cancelled, InputError, PhysGenError
-from ..events import Event, IsCancelled, OnEvent
-from ..scene.folder import Scene, load_scene, save_scene
+from ..events import Event, IsCancelled, OnEvent, ignore, never
+from ..scene.folder import Scene, save_scene
 from ..scene.model import Effect, SceneModel
 
 FoundEffects = Mapping[str, Mapping[str, float]]
 """Effect → parameter → value, in the order in which the diagnosis found them."""
 
-RunBake = Callable[[Path, Path, OnEvent, IsCancelled], Event]
-"""Bakes a scene folder into a bake folder, in a process of its own, and gives its final event."""
+RunBake = Callable[[Scene, Path, OnEvent, IsCancelled], Event]
+"""Bakes a scene into a folder, in a process of its own, and returns the final event."""
 
 
 def found_effects(report: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """The verdict's effects with their parameters, from the content of ``report.json``.
+    """Return the verdict's effects with their parameters, from the content of ``report.json``.
 
     Raises InputError where the verdict is ``none`` or ``unknown``, or its parameters are missing or no numbers.
     """
@@ -53,7 +53,7 @@ def _number(name: str, key: str, entry: Any) -> float:
 
 
 def with_effects(scene: SceneModel, found: FoundEffects) -> SceneModel:
-    """``scene`` with the ``found`` effects; one of the same name is replaced in its place and keeps its objects.
+    """Return ``scene`` with the ``found`` effects; one of the same name is replaced in its place and keeps its objects.
 
     Raises InputError for an unknown effect, a parameter out of its range, and where all that was found concerns the
     recording (its clock, its camera) and would leave the scene's motion as it is.
@@ -80,7 +80,7 @@ def with_effects(scene: SceneModel, found: FoundEffects) -> SceneModel:
 
 
 def without_effects(scene: SceneModel, names: Collection[str]) -> SceneModel:
-    """``scene`` without the effects called ``names``."""
+    """Return ``scene`` without the effects called ``names``."""
     return dataclasses.replace(scene, effects=tuple(item for item in scene.effects if item.name not in names))
 
 
@@ -94,45 +94,50 @@ def add_effects(scene: Scene, found: FoundEffects) -> Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class AddRequest:
-    """What is added where. scene: its folder; after: the new bake folder; before: the bake without the effects.
+    """Effects to add, and folders of the bakes without and with them.
 
-    bake_before: whether ``before`` is baked first; otherwise it is there already.
+    bake_before: whether ``before`` is baked first; otherwise it exists already.
     """
 
-    scene: Path
     found: FoundEffects
     before: Path
     after: Path
     bake_before: bool
 
 
-def add_and_bake(request: AddRequest, run_bake: RunBake, on_event: OnEvent, cancelled: IsCancelled) -> Event:
-    """Bake the scene without the found effects if asked to, add them, and bake it with them.
+def add_and_bake(
+    scene: Scene,
+    *,
+    request: AddRequest,
+    run_bake: RunBake,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Event:
+    """Bake ``scene`` without the found effects if requested, add them, and bake it with them.
 
-    A bake that fails leaves ``scene.json`` as it was before; one that is cancelled in the second bake leaves the
-    effects in, so that the same call goes on from there. Returns ``{"event": "done", "scene", "before", "after"}``.
+    Returns ``{"event": "done", "scene", "before", "after"}``. A bake that fails leaves ``scene.json`` as it was before;
+    cancelling the second bake leaves the effects in, so that the same call resumes there.
     """
-    original = load_scene(request.scene).model
-    changed = with_effects(original, request.found)
+    changed = scene.with_model(with_effects(scene.model, request.found))
     try:
         if request.bake_before:
-            save_scene(request.scene, without_effects(original, request.found))
-            run_bake(request.scene, request.before, _named(on_event, "before"), cancelled)
+            bare = scene.with_model(without_effects(scene.model, request.found)).save()
+            run_bake(bare, request.before, _named(on_event, "before"), cancelled)
     except BaseException:
-        save_scene(request.scene, original)
+        scene.save()
         raise
-    save_scene(request.scene, changed)
+    changed.save()
     try:
-        run_bake(request.scene, request.after, _named(on_event, "after"), cancelled)
+        run_bake(changed, request.after, _named(on_event, "after"), cancelled)
     except Cancelled:
         raise
     except PhysGenError:
-        save_scene(request.scene, original)
+        scene.save()
         raise
-    folders = {"scene": request.scene, "before": request.before, "after": request.after}
+    folders = {"scene": scene.root, "before": request.before, "after": request.after}
     return {"event": "done", **{name: str(path) for name, path in folders.items()}}
 
 
 def _named(on_event: OnEvent, which: str) -> OnEvent:
-    """Events say which of the two bakes they are of."""
+    """Return ``on_event`` with the stage of each event naming one of the two bakes."""
     return lambda event: on_event({**event, "stage": f"bake {which}"} if "stage" in event else event)

@@ -35,7 +35,7 @@ from ..scene.meshes import load_object_mesh
 from ..version import VERSION
 from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
 from .bake_estimate import disk_bytes, require_disk_space
-from .bake_options import BakeOptions, geometry_hash, inputs_hash
+from .bake_options import BakeOptions, inputs_hash
 from .bake_samples import ObjectSampler, baked_objects, load_object_splats
 from .world_setup import prepare_world
 
@@ -159,7 +159,7 @@ def _bake_locked(
         engine=simulation.engine_name,
         version=VERSION,
         particles=simulation.particle_count,
-        geometry_hash=geometry_hash(folder),
+        geometry_hash=folder.geometry_hash(),
         objects=objects,
     )
     samplers = [

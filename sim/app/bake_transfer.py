@@ -14,46 +14,44 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cache.bake_folder import MESH_SPACE, WORLD_SPACE, BakedObject, BakeManifest, load_manifest, save_manifest
+from ..cache.bake_folder import MESH_SPACE, WORLD_SPACE, Bake, BakedObject, save_manifest
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import InputError
 from ..events import OnEvent, ignore
-from ..scene.folder import Scene, load_scene
+from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import SceneObject
-from .bake_options import geometry_hash
 
 MOVED_SHARE = 0.01
 """Fraction of an object's size; farther from its position in the photo it counts as moved."""
 
 
 def transfer_bake(
-    photo: Path, baked_scene: Path, bake: Path, out: Path, names: Mapping[str, str], on_event: OnEvent = ignore
-) -> BakeManifest:
-    """Write ``bake`` of the scene folder ``baked_scene`` into ``out`` as a bake of the scene folder ``photo``.
+    photo: Scene, baked_scene: Scene, bake: Bake, *, out: Path, names: Mapping[str, str], on_event: OnEvent = ignore
+) -> Bake:
+    """Return ``bake`` of ``baked_scene`` as a bake of ``photo``, in the new folder ``out``.
 
     names: name in ``photo`` → name in ``baked_scene``; objects left out stay where the photo shows them.
-    out: a folder that does not exist yet. Returns its manifest.
 
     Raises InputError when ``baked_scene`` has changed since the bake, an object is missing from it, or an object's
     vertices differ from the photo's scene.
     """
-    target, source, manifest = load_scene(photo), load_scene(baked_scene), load_manifest(bake)
-    if manifest.geometry_hash and manifest.geometry_hash != geometry_hash(source):
-        raise InputError(f"{bake}: was baked from other meshes or positions; bake the scene again")
+    manifest = bake.manifest
+    if manifest.geometry_hash and manifest.geometry_hash != baked_scene.geometry_hash():
+        raise InputError(f"{bake.root}: was baked from other meshes or positions; bake the scene again")
     files = {item.name: item for item in manifest.objects}
-    bodies = {item.name: item for item in source.model.objects}
+    bodies = {item.name: item for item in baked_scene.objects}
     out.mkdir(parents=True)
     placed = []
-    for item in target.model.objects:
+    for item in photo.objects:
         name = names.get(item.name)
         if name is not None and (name not in files or name not in bodies):
-            raise InputError(f"{bake}: has no cache of object {name!r}; bake the scene again")
-        cache = None if name is None else (Pc2Reader(bake / files[name].file), files[name], bodies[name])
-        placed.append(_transfer_object(target, item, cache, manifest.frames_done, out, on_event))
-    result = dataclasses.replace(manifest, objects=tuple(placed), geometry_hash=geometry_hash(target))
+            raise InputError(f"{bake.root}: has no cache of object {name!r}; bake the scene again")
+        cache = None if name is None else (Pc2Reader(bake.root / files[name].file), files[name], bodies[name])
+        placed.append(_transfer_object(photo, item, cache, manifest.frames_done, out, on_event))
+    result = dataclasses.replace(manifest, objects=tuple(placed), geometry_hash=photo.geometry_hash())
     save_manifest(out, result)
-    return result
+    return Bake(root=out, manifest=result)
 
 
 def _transfer_object(

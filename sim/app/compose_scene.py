@@ -105,7 +105,9 @@ def write_composition(
             item = _write_moved(source, target, item, moved[item.name], taken)
         objects.append(item)
     scene = dataclasses.replace(source.model, objects=tuple(objects))
-    names = set(referenced_files(scene)) | set(_unnamed_files(source.root))
+    unmoved = tuple(item for item in scene.objects if item.name not in moved)
+    beside = source.with_model(dataclasses.replace(scene, objects=unmoved)).files()
+    names = {*referenced_files(scene), *beside, *_unnamed_files(source.root)}
     for name in sorted(names):
         place = inside(target, name)
         if not place.exists():

@@ -81,6 +81,7 @@ class _FittedObject:
 
 def fit_splats_scene(
     source: Path,
+    *,
     out: Path,
     request: FitRequest | None = None,
     on_event: OnEvent = ignore,

@@ -46,8 +46,8 @@ def mask_requests(
 
 def import_folder(
     root: Path,
-    out: Path,
     *,
+    out: Path,
     size_m: float | None = None,
     settings: Path | None = None,
     up: str | None = None,
@@ -63,15 +63,15 @@ def import_folder(
     if root.is_file():
         if settings is not None:
             raise InputError(f"--settings {settings}: {root} is a splat file, which has none; omit the flag")
-        return import_splats(root, out, size_m=size_m, up=up or DEFAULT_UP_AXIS, on_event=on_event)
+        return import_splats(root, out=out, size_m=size_m, up=up or DEFAULT_UP_AXIS, on_event=on_event)
     if up is not None:
         raise InputError(f"--up {up}: {root} is not a splat file; omit the flag")
     if (root / TRANSFORM_FILE).is_file():
-        return import_physgen3d(root, out, size_m=size_m, settings=settings, on_event=on_event)
+        return import_physgen3d(root, out=out, size_m=size_m, settings=settings, on_event=on_event)
     if (root / SETTINGS).is_file() and (root / MASKS).is_file():
         if settings is not None:
             raise InputError(f"--settings {settings}: PhysGen's settings are {root / SETTINGS}; omit the flag")
-        return import_physgen(root, out, size_m=size_m, on_event=on_event, cancelled=cancelled)
+        return import_physgen(root, out=out, size_m=size_m, on_event=on_event, cancelled=cancelled)
     raise InputError(
         f"{root}: contains neither {TRANSFORM_FILE} of PhysGen3D's perception nor {SETTINGS} and {MASKS} of PhysGen; "
         "choose such a folder, or a PLY file of splats"

@@ -260,10 +260,10 @@ class PreviewRunner:
         after each, ``done``. Raises InputError, SimulationError, or Cancelled as soon as ``cancelled()``.
         """
         folder = load_scene(Path(request.scene))
-        folder = Scene(root=folder.root, model=apply_overrides(folder.model, request.overrides))
+        folder = folder.with_model(apply_overrides(folder.model, request.overrides))
         pairs = [self._mesh(folder, item) for item in folder.model.objects]
         scene, left, gone = without_tiny(folder.model, [mesh for mesh, _ in pairs], request.particles)
-        folder, pairs = Scene(root=folder.root, model=scene), [pairs[i] for i in left]
+        folder, pairs = folder.with_model(scene), [pairs[i] for i in left]
         prepared, notices = prepare_preview(
             folder, [mesh for mesh, _ in pairs], frames=request.frames, fps=request.fps, particles=request.particles
         )

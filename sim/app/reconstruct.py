@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Photo → scene folder, once: the same photo, boxes and options are not reconstructed twice.
+"""Photo → scene folder; the same photo, boxes and options are not reconstructed twice.
 
-A correction of a scene that was reconstructed: the same photo again, with something told that was guessed wrong.
-
-What the correction does not touch is not computed again (``sim/reconstruct/stage_store``). What has been changed in the
-scene since, matter, motion, effects, light, stays."""
+``correct`` repeats it with values that the user overrides. Stages whose inputs have not changed are not computed again
+(``sim/reconstruct/stage_cache``); materials, motion, effects and light that were edited since are kept.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +26,11 @@ from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.reasoning.chat_client import ChatRequest
 from ..reconstruct.scene_output import PHYSICS_FILE
 from ..scene.environment import read_environment
-from ..scene.folder import Scene, load_scene, parse_scene, save_scene, scene_to_json
+from ..scene.folder import Scene, file_hash, load_scene, parse_scene, save_scene, scene_to_json
 from ..scene.material import load_preset
 from ..scene.model import Ground, SceneModel, Vector
 from ..scene.overrides import PHYSICS_FIELDS, apply_overrides, without_physics
 from ..validation import parse, read_json, to_json
-from .bake_options import file_hash
 
 T = TypeVar("T")
 
@@ -43,10 +41,10 @@ RECONSTRUCT_REVISION = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Stamp:
-    """What a scene folder was reconstructed from (``reconstruct.json``).
+    """Record of what a scene folder was reconstructed from (``reconstruct.json``).
 
     inputs_hash: of all that the scene depends on. photo, objects, options: the request, paths absolute.
-    scene: ``scene.json`` as it was then, before anybody changed its physics or light.
+    scene: ``scene.json`` as reconstructed, before physics or light were edited.
     """
 
     inputs_hash: str
@@ -117,7 +115,7 @@ def _reconstruct_cached(
     ask: ChatRequest | None = None,
     answered: str | None = None,
 ) -> Scene:
-    """The scene folder ``out``, reconstructed unless it is there already; its physics may be of an earlier request."""
+    """Return the scene folder ``out``, reconstructed unless cached; its physics may be of an earlier request."""
     if not photo.is_file():
         raise InputError(f"{photo}: there is no such photo; check its name")
     if options.environment is not None:
@@ -151,7 +149,7 @@ def _reconstruct_cached(
 
 
 def read_stamp(root: Path) -> Stamp | None:
-    """What the folder ``root`` was reconstructed from; None when it does not say, or in a way that is not known."""
+    """Return the record of what the folder ``root`` was reconstructed from; None without one, or of another version."""
     try:
         return parse(Stamp, read_json(root / STAMP_FILE), STAMP_FILE)
     except InputError:
@@ -159,7 +157,7 @@ def read_stamp(root: Path) -> Stamp | None:
 
 
 def _resolved(value: T, names: Sequence[str]) -> T:
-    """The dataclass ``value`` with the paths in its fields ``names`` absolute."""
+    """Return the dataclass ``value`` with the paths in its fields ``names`` absolute."""
     paths = {name: path.resolve() for name in names if (path := getattr(value, name)) is not None}
     return dataclasses.replace(value, **paths)  # type: ignore[type-var]
 
@@ -194,7 +192,7 @@ def _inputs_hash(
 
 
 def _file_hashes(value: object, names: Sequence[str]) -> dict[str, str]:
-    """Hashes of the files that the fields ``names`` of ``value`` name. Raises InputError when one is not there."""
+    """Return hashes of the files in the fields ``names`` of ``value``. Raises InputError when one is missing."""
     found = {}
     for name in names:
         path = getattr(value, name)
@@ -270,16 +268,15 @@ def with_physics(scene: SceneModel, physics: Physics) -> SceneModel:
 
 
 MATTER_FIELDS = ("material", "fill", "roughness")
-"""What follows from what a thing is."""
+"""Fields that follow from an object's kind."""
 
 
-def require_stamp(root: Path) -> Stamp:
-    """What the scene folder ``root`` was reconstructed from. Raises InputError when it does not say."""
-    load_scene(root)
-    stamp = read_stamp(root)
+def require_stamp(scene: Scene) -> Stamp:
+    """Return the record of what ``scene`` was reconstructed from. Raises InputError when it has none."""
+    stamp = read_stamp(scene.root)
     if stamp is None:
         raise InputError(
-            f"{root}: does not say what it was reconstructed from ({STAMP_FILE} is missing or of another version); "
+            f"{scene.root}: has no record of its reconstruction ({STAMP_FILE} is missing or of another version); "
             "reconstruct it from the photo again"
         )
     return stamp
@@ -298,13 +295,13 @@ def correct(
     Objects keep their physics by name. Raises what ``reconstruct`` raises, and InputError when the photo has moved.
     """
     root = scene.root
-    stamp = require_stamp(root)
+    stamp = require_stamp(scene)
     if not stamp.photo.is_file():
         raise InputError(f"{stamp.photo}: the photo of this scene is no longer there; put it back, or reconstruct anew")
     before, first = scene.model, parse_scene(stamp.scene, STAMP_FILE)
     lights = ("environment", "environment_frame", "sun")
-    told_light = any(getattr(options, name) != getattr(stamp.options, name) for name in lights)
-    keeps_light = before.light != first.light and not told_light
+    light_changed = any(getattr(options, name) != getattr(stamp.options, name) for name in lights)
+    keeps_light = before.light != first.light and not light_changed
     with TemporaryDirectory(dir=root.resolve().parent, prefix=f".{root.name}.light-") as place:
         light = None
         if keeps_light and before.light.environment is not None:
@@ -315,8 +312,8 @@ def correct(
             target = folder.file(before.light.environment)
             target.parent.mkdir(exist_ok=True)
             shutil.copyfile(light, target)
-    told = {item.name: (item.kind, item.preset) for item in stamp.objects}
-    changed = {item.name for item in objects if told.get(item.name) != (item.kind, item.preset)}
+    previous = {item.name: (item.kind, item.preset) for item in stamp.objects}
+    changed = {item.name for item in objects if previous.get(item.name) != (item.kind, item.preset)}
     model = _as_before(folder.model, before, changed)
     if keeps_light:
         model = dataclasses.replace(model, light=before.light)
@@ -324,7 +321,7 @@ def correct(
 
 
 def _answered(root: Path) -> str | None:
-    """What a model once answered about the scene; it is not asked again for a correction."""
+    """Return the earlier reply of a chat model about the scene; a correction does not query it again."""
     try:
         record = read_json(root / PHYSICS_FILE)
     except InputError:
@@ -335,7 +332,7 @@ def _answered(root: Path) -> str | None:
 
 
 def _as_before(scene: SceneModel, before: SceneModel, changed: Collection[str | None]) -> SceneModel:
-    """``scene`` with the physics of ``before``, but the matter of the objects ``changed``, which are something else."""
+    """Return ``scene`` with the physics of ``before``, but the new material of the objects ``changed``."""
     known = {item.name: item for item in before.objects}
     names = {item.name for item in scene.objects}
     return dataclasses.replace(

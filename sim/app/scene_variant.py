@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..scene.folder import (
     SCENE_FILE,
     Scene,
+    file_hash,
     inside,
     load_scene,
     parse_scene,
@@ -23,7 +24,6 @@ from ..scene.folder import (
     scene_to_json,
 )
 from ..scene.model import SceneModel
-from .bake_options import file_hash
 from .reconstruct import Physics, with_physics
 
 
@@ -54,7 +54,7 @@ def make_variant(
         if any(p.name not in leftovers for p in out.iterdir() if not p.name.startswith(".")):
             raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
     with folder_lock(out):
-        for name in referenced_files(scene):
+        for name in source.with_model(scene).files():
             _link_or_copy(source.file(name), inside(out, name))
         try:
             if load_scene(out).model == scene:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..atomic import replacing
 from ..errors import InputError
-from ..scene.folder import Scene, save_scene
+from ..scene.folder import Scene, inside, load_scene, save_scene, side_files
 from ..scene.material import load_preset
 from ..scene.meshes import read_mesh
 from ..scene.model import Camera, SceneModel, SceneObject, Vector
@@ -29,14 +30,16 @@ def scene_from_meshes(
 ) -> Scene:
     """Return a scene of mesh files as the new folder ``out``: world metres, Z up, ground at z = 0, no photo.
 
-    meshes: name → OBJ, GLB, PLY or STL file, in world coordinates. presets: material presets in the order of
+    meshes: name → OBJ, glTF, GLB, PLY or STL file, in world coordinates; materials, textures and buffers in the same
+    folder or below are copied with it. presets: material presets in the order of
     ``meshes``; a single one goes to all. velocities: m/s, at rest where the list ends. colliders: names of those that
     stay in place.
 
     >>> import physgen
     >>> scene = physgen.scene_from_meshes({"ball": "ball.obj"}, out="scene", presets=["rubber"])  # doctest: +SKIP
 
-    Raises InputError for unreadable meshes, unknown presets or names, and a folder that is not empty.
+    Raises InputError for unreadable meshes, unknown presets or names, and a folder that is not empty; nothing is
+    written then.
     """
     out = Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -53,7 +56,7 @@ def scene_from_meshes(
         objects.append(
             SceneObject(
                 name=name,
-                mesh=f"meshes/{name}{Path(source).suffix.lower()}",
+                mesh=_mesh_name(name, Path(source)),
                 size_m=size,
                 role="collider" if name in colliders else "dynamic",
                 material=load_preset(presets[index if len(presets) > 1 else 0]),
@@ -61,10 +64,31 @@ def scene_from_meshes(
             )
         )
     scene = SceneModel(camera=_camera(extent), objects=tuple(objects), photo=None, background=None)
-    (out / "meshes").mkdir(parents=True)
-    for item, source in zip(objects, meshes.values(), strict=True):
-        shutil.copyfile(source, out / item.mesh)
-    return save_scene(out, scene)
+    with replacing(out) as folder:
+        folder.mkdir()
+        for item, source in zip(objects, map(Path, meshes.values()), strict=True):
+            _copy_mesh(source, inside(folder, item.mesh))
+        save_scene(folder, scene)
+        if out.is_dir():
+            # Empty, as checked above; Windows does not rename onto a folder.
+            out.rmdir()
+    return load_scene(out)
+
+
+def _copy_mesh(source: Path, target: Path) -> None:
+    """Copy a mesh file with the materials, textures and buffers that it names (``side_files``)."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+    for name in side_files(source):
+        beside = target.parent / name
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source.parent / name, beside)
+
+
+def _mesh_name(name: str, source: Path) -> str:
+    """Return the mesh's file name in the scene; a folder of its own keeps apart materials that share a name."""
+    folder = f"meshes/{name}" if side_files(source) else "meshes"
+    return f"{folder}/{name}{source.suffix.lower()}"
 
 
 def _camera(extent: float) -> Camera:

@@ -190,8 +190,8 @@ Notice = Callable[[str], None]
 
 def import_physgen(
     root: Path,
-    out: Path,
     *,
+    out: Path,
     size_m: float | None = None,
     options: ReconstructOptions | None = None,
     on_event: OnEvent = ignore,

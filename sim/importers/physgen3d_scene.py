@@ -238,8 +238,8 @@ class _World:
 
 def import_physgen3d(
     root: Path,
-    out: Path,
     *,
+    out: Path,
     size_m: float | None = None,
     settings: Path | None = None,
     on_event: OnEvent = ignore,

@@ -233,7 +233,7 @@ FIELD_OF_VIEW_DEG = 40.0
 
 
 def import_splats(
-    file: Path, out: Path, *, size_m: float | None = None, up: str = DEFAULT_UP_AXIS, on_event: OnEvent = ignore
+    file: Path, *, out: Path, size_m: float | None = None, up: str = DEFAULT_UP_AXIS, on_event: OnEvent = ignore
 ) -> Scene:
     """Return the scene folder ``out`` made of the splats in the PLY ``file``: one object on the ground, no photo.
 

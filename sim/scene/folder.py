@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Scene folders on disk: load, check, save (format: docs/file-formats.md)."""
+"""Scene folders on disk: load, check, hash, save (format: docs/file-formats.md)."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import unquote
 
 from ..atomic import write_json
 from ..errors import InputError
@@ -41,6 +46,65 @@ class Scene:
         """Return the path of the scene's file ``name``; InputError when it would lie outside the folder."""
         return inside(self.root, name)
 
+    def files(self) -> list[str]:
+        """Return the names of all files that the scene needs besides ``scene.json``: those that it names itself, then
+        materials, textures and buffers that its meshes name (``side_files``).
+        """
+        named = referenced_files(self.model)
+        beside = []
+        for item in self.objects:
+            folder = PurePosixPath(item.mesh).parent
+            beside += [(folder / name).as_posix() for name in side_files(self.file(item.mesh))]
+        return list(dict.fromkeys((*named, *beside)))
+
+    def hash(self) -> str:
+        """Return the SHA-256 of all that the scene's motion depends on (``motion_inputs``), as 64 hex digits.
+
+        Files count by content, not by name; photo, camera and light do not count. A bake's ``inputs_hash`` is over the
+        same and the bake's options. Computed anew at every call, because files may have changed. Raises InputError
+        when a file cannot be read.
+        """
+        return hashlib.sha256(json.dumps(self.motion_inputs(), sort_keys=True).encode()).hexdigest()
+
+    def motion_inputs(self) -> dict[str, Any]:
+        """Return what ``hash`` is taken over, as JSON: objects, ground, gravity, contacts and effects."""
+        scene = self.model
+        objects = []
+        for item in scene.objects:
+            fields: dict[str, Any] = to_json(item)
+            for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
+                del fields[irrelevant]
+            fields["material"].pop("preset")
+            fields["mesh"] = file_hash(self.file(item.mesh))
+            if item.splats is None:
+                # Older scenes have no such field, and their bakes stay valid.
+                del fields["splats"]
+            else:
+                fields["splats"] = file_hash(self.file(item.splats))
+            if item.motion is not None and item.motion.vertices_file is not None:
+                fields["motion"]["vertices_file"] = file_hash(self.file(item.motion.vertices_file))
+            objects.append(fields)
+        ground: dict[str, Any] | None = None
+        if scene.ground is not None:
+            ground = to_json(scene.ground)
+            for visible_only in ("reflectivity", "reflection_roughness"):
+                del ground[visible_only]
+        return {
+            "objects": objects,
+            "ground": ground,
+            "gravity": scene.gravity,
+            "gravity_track": to_json(scene.gravity_track),
+            "contacts": to_json(scene.contacts),
+            "effects": to_json(scene.effects),
+        }
+
+    def geometry_hash(self) -> str:
+        """Return the SHA-256 of the objects' names, meshes and rest poses, which a bake must share with the scene that
+        it is shown in. Raises InputError when a mesh cannot be read.
+        """
+        content = [[o.name, file_hash(self.file(o.mesh)), o.world_from_mesh] for o in self.objects]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
     def with_model(self, model: SceneModel) -> Scene:
         """Return this folder with another content, not saved yet."""
         return Scene(root=self.root, model=model)
@@ -67,6 +131,15 @@ def inside(root: Path, name: str) -> Path:
     if not inside_root:
         raise InputError(f"file name {name!r}: leads out of {root}")
     return path
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes as 64 hex digits; InputError when it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
 
 
 def load_scene(root: str | Path) -> Scene:
@@ -161,3 +234,54 @@ def referenced_files(scene: SceneModel) -> list[str]:
         names += [name for name in (item.mesh, item.mask, item.shadow, track, item.splats) if name is not None]
     names += [name for name in (scene.light.environment, scene.depth) if name is not None]
     return names
+
+
+_MTL_TEXTURE = re.compile(r"(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+)", re.IGNORECASE)
+
+
+def side_files(mesh: Path) -> list[str]:
+    """Return the files that a mesh file refers to, relative to its folder: an OBJ's material libraries and their
+    textures, a glTF's buffers and images. Other formats are self-contained.
+
+    Files that are missing or lie outside the mesh's folder are left out; the mesh is read without them.
+    """
+    found: list[str] = []
+    for name in _named_beside(mesh):
+        try:
+            inner = inside(mesh.parent, name.replace("\\", "/"))
+        except InputError:
+            continue
+        relative = inner.relative_to(mesh.parent).as_posix()
+        if relative not in found and inner.is_file():
+            found.append(relative)
+            if inner.suffix.lower() == ".mtl":
+                parent = PurePosixPath(relative).parent
+                found += [(parent / texture).as_posix() for texture in side_files(inner)]
+    return list(dict.fromkeys(found))
+
+
+def _named_beside(path: Path) -> Iterator[str]:
+    """Yield the file names in an OBJ, MTL or glTF file, as they are written there; none if it cannot be read."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".gltf":
+            yield from _named_in_gltf(json.loads(path.read_bytes()))
+        elif suffix in (".obj", ".mtl"):
+            with path.open(encoding="utf-8", errors="replace") as file:
+                for line in map(str.strip, file):
+                    # Several names may follow, and one name may hold spaces; options may come before a texture's.
+                    if suffix == ".obj" and line.startswith("mtllib "):
+                        yield from (line.removeprefix("mtllib ").strip(), *line.split()[1:])
+                    elif suffix == ".mtl" and (texture := _MTL_TEXTURE.match(line)):
+                        yield from (texture[1], texture[1].split()[-1])
+    except (OSError, ValueError, RecursionError):
+        return
+
+
+def _named_in_gltf(document: Any) -> Iterator[str]:
+    for kind in ("buffers", "images"):
+        listed = document.get(kind) if isinstance(document, dict) else None
+        for entry in listed if isinstance(listed, list) else []:
+            uri = entry.get("uri") if isinstance(entry, dict) else None
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                yield unquote(uri)

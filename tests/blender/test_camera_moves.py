@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
@@ -33,8 +34,8 @@ def test_the_moved_camera_sees_what_is_there(world, bake, truth, tmp_path):
     folder, plain = bake([REST, REST, REST]), tmp_path / "plain"
     path = camera_file(tmp_path, {"frame": 1}, {"frame": 3, **OFFSET})
     options = RenderOptions(samples=16, camera=path)
-    first, second, third = render_frames(world.folder, folder, tmp_path / "moved", options)
-    (still,) = render_frames(world.folder, folder, plain, RenderOptions(samples=16), frames="1")
+    first, second, third = render_frames(world.folder, load_bake(folder), out=tmp_path / "moved", options=options)
+    (still,) = render_frames(world.folder, load_bake(folder), out=plain, options=RenderOptions(samples=16), frames="1")
     # The photo's own camera sees what it saw without a path, and nothing here moves but the camera.
     assert first.read_bytes() == still.read_bytes()
     assert second.read_bytes() != third.read_bytes()
@@ -57,9 +58,11 @@ def test_a_camera_that_goes_too_far_is_refused_before_anything_is_rendered(world
     folder, out = bake([REST, REST]), tmp_path / "out"
     path = camera_file(tmp_path, {"frame": 1}, {"frame": 2, "pan_deg": 29})
     with pytest.raises(InputError, match=r"frame 2: the camera sees .* beyond the photo's right border"):
-        render_frames(world.folder, folder, out, RenderOptions(samples=1, camera=path))
+        render_frames(world.folder, load_bake(folder), out=out, options=RenderOptions(samples=1, camera=path))
     with pytest.raises(InputError, match="give a camera file, or a simple move"):
-        render_frames(world.folder, folder, out, RenderOptions(samples=1, camera=path, orbit=5.0))
+        render_frames(
+            world.folder, load_bake(folder), out=out, options=RenderOptions(samples=1, camera=path, orbit=5.0)
+        )
     assert not out.exists()
 
 

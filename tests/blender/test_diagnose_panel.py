@@ -459,7 +459,6 @@ def interpreter(tmp_path, monkeypatch):
                 print(json.dumps({{"event": "done", "out": out}}), flush=True)
                 sys.exit(0)
             from pathlib import Path
-            from physgen.sim.app.bake_options import geometry_hash
             from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
             from physgen.sim.cache.pc2 import Pc2Writer
             from physgen.sim.scene.folder import load_scene
@@ -472,7 +471,7 @@ def interpreter(tmp_path, monkeypatch):
                     writer.append(mesh + [0, 0, frame * (2.0 if folder.model.effects else 1.0)])
             save_manifest(out, BakeManifest(
                 inputs_hash="0", fps=30.0, frame_start=1, frames=3, frames_done=3, state="complete", engine="test",
-                version="0", particles=1, geometry_hash=geometry_hash(folder),
+                version="0", particles=1, geometry_hash=folder.geometry_hash(),
                 objects=(BakedObject(name="ball", file="ball.pc2", vertices=len(mesh)),),
             ))
             print(json.dumps({{"event": "done", "bake": str(out)}}), flush=True)

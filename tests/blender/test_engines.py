@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import linear_to_bytes, read_mask
 from physgen.sim.errors import InputError, RenderError
@@ -29,7 +30,7 @@ def drawing():
 
 
 def test_eevee_makes_the_same_pictures(drawing, world, bake):
-    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)
     made = {}
     for engine, samples in (("cycles", 16), ("eevee", 4)):
         renderer = Renderer(world.folder, opened, RenderOptions(engine=engine, samples=samples, motion_blur=0.0))
@@ -68,12 +69,14 @@ def test_what_is_not_there_falls_back_to_the_cpu(world, bake, tmp_path):
     events = []
     settings = RenderOptions(samples=2, device="metal" if os.uname().sysname != "Darwin" else "cuda")
     baked = bake([(0, 0, 0)])
-    first = render_frames(world.folder, baked, tmp_path / "out", settings, events.append)
+    first = render_frames(
+        world.folder, load_bake(baked), out=tmp_path / "out", options=settings, on_event=events.append
+    )
     said = [event["message"] for event in events if event["event"] == "notice"]
     assert f"{settings.device} is not available here; renders on the CPU" in said
     # The picture is the same, so the frames are kept.
     made = first[0].stat().st_mtime_ns
-    again = render_frames(world.folder, baked, tmp_path / "out", RenderOptions(samples=2))
+    again = render_frames(world.folder, load_bake(baked), out=tmp_path / "out", options=RenderOptions(samples=2))
     assert again[0].stat().st_mtime_ns == made
     with pytest.raises(InputError, match="device is 'gpu'"):
         RenderOptions(device="gpu")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.srgb import bytes_to_linear, read_rgb
 from physgen.sim.errors import Cancelled, InputError
 
@@ -41,22 +42,22 @@ def rendered(monkeypatch):
 
 def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered):
     folder, out = bake(SHIFTS), tmp_path / "out"
-    paths = render_frames(world.folder, folder, out, QUICK)
+    paths = render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert [p.name for p in paths] == ["0001.png", "0002.png", "0003.png", "0004.png"]
     assert rendered == [0, 1, 3]
     assert paths[1].read_bytes() == paths[2].read_bytes()
 
     rendered.clear()
-    render_frames(world.folder, folder, out, QUICK)
+    render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == []
 
     paths[3].unlink()
-    render_frames(world.folder, folder, out, QUICK)
+    render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == [3]
 
     paths[0].write_bytes(paths[0].read_bytes()[:200])
     rendered.clear()
-    render_frames(world.folder, folder, out, QUICK)
+    render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == [0]
     assert read_rgb(paths[0]).shape == (60, 80, 3)
 
@@ -64,7 +65,7 @@ def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered):
 def test_cancelling_keeps_complete_frames(world, bake, tmp_path, rendered):
     folder, out = bake(SHIFTS), tmp_path / "out"
     with pytest.raises(Cancelled, match="1 of 4"):
-        render_frames(world.folder, folder, out, QUICK, cancelled=lambda: len(rendered) >= 1)
+        render_frames(world.folder, load_bake(folder), out=out, options=QUICK, cancelled=lambda: len(rendered) >= 1)
     assert sorted(p.name for p in out.iterdir()) == ["0001.png", "frames.json"]
     assert read_rgb(out / "0001.png").shape == (60, 80, 3)
 
@@ -72,21 +73,21 @@ def test_cancelling_keeps_complete_frames(world, bake, tmp_path, rendered):
 def test_unusable_input_is_named(world, bake, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(InputError, match="no bake there"):
-        render_frames(world.folder, tmp_path / "none", out, QUICK)
+        render_frames(world.folder, load_bake(tmp_path / "none"), out=out, options=QUICK)
     with pytest.raises(InputError, match="has 7 vertices, the mesh of 'ball' has"):
-        render_frames(world.folder, bake(SHIFTS, "other", np.zeros((7, 3))), out, QUICK)
+        render_frames(world.folder, load_bake(bake(SHIFTS, "other", np.zeros((7, 3)))), out=out, options=QUICK)
     folder = bake(SHIFTS)
     with pytest.raises(InputError, match="frames 1 to 4 are baked"):
-        render_frames(world.folder, folder, out, QUICK, frames="1-9")
+        render_frames(world.folder, load_bake(folder), out=out, options=QUICK, frames="1-9")
     cache = folder / "ball.pc2"
     cache.write_bytes(cache.read_bytes()[:-5])
     with pytest.raises(InputError, match="cut off"):
-        render_frames(world.folder, folder, out, QUICK)
+        render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert not out.exists()
     foreign = tmp_path / "holiday"
     write_png(foreign / "0001.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match="choose an empty or new folder"):
-        render_frames(world.folder, bake(SHIFTS, "again"), foreign, QUICK)
+        render_frames(world.folder, load_bake(bake(SHIFTS, "again")), out=foreign, options=QUICK)
 
 
 @pytest.mark.parametrize(

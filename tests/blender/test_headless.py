@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physgen.sim.cache.bake_folder import MANIFEST_FILE
+from physgen.sim.cache.bake_folder import MANIFEST_FILE, load_bake
 from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
@@ -146,7 +146,7 @@ def test_what_a_bake_lacks_comes_with_the_way_out(world, bake, tmp_path):
     def refusal(asked=None, **changes):
         path.write_text(json.dumps({**whole, **changes}))
         with pytest.raises(InputError) as raised:
-            render_frames(world.folder, folder, tmp_path / "out", options, frames=asked)
+            render_frames(world.folder, load_bake(folder), out=tmp_path / "out", options=options, frames=asked)
         return str(raised.value)
 
     assert "frames 1 to 6 are baked; bake more" in refusal("1-48")
@@ -176,6 +176,11 @@ def test_an_environment_that_cannot_be_used_is_named(world, bake, tmp_path, cont
     scene["light"]["environment"] = "sky.exr"
     (root / "scene.json").write_text(json.dumps(scene))
     with pytest.raises(InputError, match=r"sky\.exr: .*; (restore|make|give)") as raised:
-        render_frames(load_scene(root), bake(SHIFTS), tmp_path / "out", RenderOptions(samples=1, scale=0.25))
+        render_frames(
+            load_scene(root),
+            load_bake(bake(SHIFTS)),
+            out=tmp_path / "out",
+            options=RenderOptions(samples=1, scale=0.25),
+        )
     assert "\n" not in str(raised.value)
     assert list((tmp_path / "out").iterdir()) == []

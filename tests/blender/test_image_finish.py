@@ -6,6 +6,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.scene.folder import Scene
 
 bpy = pytest.importorskip("bpy")
@@ -34,7 +35,7 @@ def frames(folder, opened, options, samples):
 
 def test_everything_on_changes_nothing_at_rest_and_each_changes_what_moves(world, bake):
     glossy = with_ground(world.folder, reflectivity=0.3)
-    opened = open_bake(bake([(0, 0, 0), (0, -0.05, LIFT)]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), (0, -0.05, LIFT)])), world.folder)
     everything = dataclasses.replace(
         OFF, motion_blur=0.5, grain=True, match_sharpness=True, reflections=True, f_number=1
     )
@@ -51,11 +52,11 @@ def test_motion_blur_is_the_mean_over_the_shutter(world, bake):
     mean = np.mean(
         [
             f.objects.alpha
-            for f in frames(world.folder, open_bake(bake(fine, "fine"), world.folder.model), OFF, range(1, 13))
+            for f in frames(world.folder, open_bake(load_bake(bake(fine, "fine")), world.folder), OFF, range(1, 13))
         ],
         axis=0,
     )
-    opened = open_bake(bake([(0, 0, 0), way]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), way])), world.folder)
     blurred = frames(world.folder, opened, dataclasses.replace(OFF, motion_blur=0.5), [1])[0]
     assert np.abs(blurred.objects.alpha - mean).max() < 0.15
     assert np.abs(blurred.objects.alpha - mean).mean() < 0.004
@@ -63,7 +64,7 @@ def test_motion_blur_is_the_mean_over_the_shutter(world, bake):
 
 def test_a_glossy_floor_shows_the_ball_upside_down(world, bake):
     glossy = with_ground(world.folder, reflectivity=0.5, reflection_roughness=0.0)
-    opened = open_bake(bake([(0, 0, 0), (0, 0, LIFT)]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), (0, 0, LIFT)])), world.folder)
     options = dataclasses.replace(OFF, reflections=True)
     shown = frames(glossy, opened, options, [1])[0]
     matte = frames(world.folder, opened, options, [1])[0]
@@ -83,7 +84,7 @@ def test_a_glossy_floor_shows_the_ball_upside_down(world, bake):
 
 
 def test_hard_sun_hard_shadow(world, bake):
-    opened = open_bake(bake([(0, 0, 0), (0, 0, 0.1)]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), (0, 0, 0.1)])), world.folder)
 
     def steepest(angle: float) -> float:
         shadow = frames(world.folder, opened, dataclasses.replace(OFF, sun_angle=angle, light_scale=1.0), [1])[0].shadow
@@ -96,7 +97,7 @@ def test_blurred_frames_depend_on_the_frame_before(world, bake):
     options = RenderOptions()
 
     def hashes(shifts, name):
-        opened = open_bake(bake(shifts, name), world.folder.model)
+        opened = open_bake(load_bake(bake(shifts, name)), world.folder)
         numbers = range(1, len(shifts) + 1)
         rest = [cache.sample(0) for cache in opened.caches]
         shot = make_camera_motion(world.folder, rest, options, first_frame=1, count=len(shifts), fps=24.0)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 
@@ -20,7 +21,9 @@ LIFTED = (0.0, 0.0, 0.004)
 @pytest.fixture
 def frames(world, bake, tmp_path):
     shifts = [(0, 0, 0), (1e-4, 0, 0), SHIFT]
-    paths = render_frames(world.folder, bake(shifts), tmp_path / "out", RenderOptions(samples=32, motion_blur=0))
+    paths = render_frames(
+        world.folder, load_bake(bake(shifts)), out=tmp_path / "out", options=RenderOptions(samples=32, motion_blur=0)
+    )
     return [read_rgb(path) for path in paths]
 
 
@@ -50,7 +53,7 @@ def test_rest_is_the_photo_and_motion_is_the_truth(world, frames):
 
 
 def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
-    opened = open_bake(bake([(0, 0, 0), SHIFT]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)
     pictures = []
     for crop in (True, False):
         renderer = Renderer(world.folder, opened, RenderOptions(samples=64, crop=crop))
@@ -62,7 +65,7 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
 
 
 def test_out_of_view_is_the_background_alone(world, bake):
-    opened = open_bake(bake([(0, 0, 0), (50.0, 0, 0)]), world.folder.model)
+    opened = open_bake(load_bake(bake([(0, 0, 0), (50.0, 0, 0)])), world.folder)
     renderer = Renderer(world.folder, opened, RenderOptions(samples=4, grain=False))
     gone = linear_to_bytes(renderer.frame(1).beauty)
     renderer.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from physgen.sim.cache.bake_folder import load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.composite.srgb import linear_to_bytes, read_rgb
 from physgen.sim.scene.meshes import load_object_mesh
@@ -37,7 +37,9 @@ def stack(channels, name, letters):
 def test_layers_hold_the_frame_and_where_everything_goes(world, bake, tmp_path):
     folder = bake(SHIFTS)
     quick = {"samples": 1, "scale": 0.5, "grain": False, "motion_blur": 0.0}
-    layered = render_frames(world.folder, folder, tmp_path / "exr", RenderOptions(format="exr-layers", **quick))
+    layered = render_frames(
+        world.folder, load_bake(folder), out=tmp_path / "exr", options=RenderOptions(format="exr-layers", **quick)
+    )
     assert [path.name for path in layered] == ["0001.exr", "0002.exr", "0003.exr", "0004.exr"]
     # The third looks like the second, but moves on.
     assert layered[1].read_bytes() != layered[2].read_bytes()
@@ -51,7 +53,9 @@ def test_layers_hold_the_frame_and_where_everything_goes(world, bake, tmp_path):
     beauty, objects = stack(channels, "", "RGB"), stack(channels, "objects.", "RGBA")
     ground = stack(channels, "ground.", "RGB")
     assert np.abs(objects[..., :3] + (1 - objects[..., 3:]) * ground - beauty).max() < 2e-3
-    png = render_frames(world.folder, folder, tmp_path / "png", RenderOptions(**quick), frames="2")
+    png = render_frames(
+        world.folder, load_bake(folder), out=tmp_path / "png", options=RenderOptions(**quick), frames="2"
+    )
     assert np.abs(linear_to_bytes(beauty).astype(int) - read_rgb(png[0])).max() <= 1
 
     # The ball is where a ray through the pixel's centre meets the sphere, at that depth.
@@ -109,7 +113,7 @@ def test_particles_have_the_id_of_their_object_and_flow(world, bake, tmp_path, l
     flowing = dataclasses.replace(manifest.objects[0], points_file="ball.points.pc2", points=len(rest), points_as=look)
     save_manifest(folder, dataclasses.replace(manifest, objects=(flowing,)))
     options = RenderOptions(samples=1, format="exr-layers", scale=0.5)
-    (path,) = render_frames(world.folder, folder, tmp_path / "out", options, frames="2")
+    (path,) = render_frames(world.folder, load_bake(folder), out=tmp_path / "out", options=options, frames="2")
     channels = read_layers(path)
     seen = channels["object_id.X"] == 1
     camera = world.folder.model.camera

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from physgen.sim.cache.bake_folder import load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import read_mask, read_rgb
@@ -53,12 +53,14 @@ def test_it_is_the_photo_until_it_falls_apart_and_wears_its_colours_then(world, 
     flowing = dataclasses.replace(manifest.objects[0], points_file="ball.points.pc2", points=len(rest), points_as=look)
     save_manifest(folder, dataclasses.replace(manifest, frames=3, frames_done=3, objects=(flowing,)))
     before = set(bpy.data.node_groups)
-    paths = render_frames(world.folder, folder, tmp_path / "out", RenderOptions(samples=8))
+    paths = render_frames(world.folder, load_bake(folder), out=tmp_path / "out", options=RenderOptions(samples=8))
     first, whole, apart = (read_rgb(path) for path in paths)
     assert psnr(first, world.photo) > 38
     # In the air it is still one ball: the same as without particles, but for the noise of light in another crop.
     save_manifest(folder, dataclasses.replace(manifest, frames=3, frames_done=3))
-    skin = render_frames(world.folder, folder, tmp_path / "skin", RenderOptions(samples=8), frames="2-3")
+    skin = render_frames(
+        world.folder, load_bake(folder), out=tmp_path / "skin", options=RenderOptions(samples=8), frames="2-3"
+    )
     assert psnr(whole, read_rgb(skin[0])) > 50
     assert psnr(apart, read_rgb(skin[1])) < 35
     # The heap is where its particles are, in the ball's colour and not the floor's, whatever the light.

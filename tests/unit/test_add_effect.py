@@ -18,7 +18,7 @@ from physgen.sim.app.add_effect import (
 )
 from physgen.sim.effects.registry import effects
 from physgen.sim.errors import Cancelled, InputError, SimulationError
-from physgen.sim.events import ignore, never
+from physgen.sim.events import ignore
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.model import Camera, Effect, SceneModel, SceneObject
 
@@ -133,7 +133,7 @@ class Bakes:
         self.seen = []
 
     def __call__(self, scene, out, on_event, cancelled):
-        self.seen.append((out.name, [e.name for e in load_scene(scene).model.effects]))
+        self.seen.append((out.name, [e.name for e in load_scene(scene.root).model.effects]))
         error = self.errors.pop(0) if self.errors else None
         if error is not None:
             raise error
@@ -142,14 +142,14 @@ class Bakes:
 
 
 def a_request(folder, **changes):
-    request = {"scene": folder, "found": DRAG, "before": folder.parent / "a", "after": folder.parent / "b"}
+    request = {"found": DRAG, "before": folder.parent / "a", "after": folder.parent / "b"}
     return AddRequest(**{**request, "bake_before": True, **changes})
 
 
 def test_before_is_baked_without_and_after_with_the_effect(folder):
     save_scene(folder, a_scene(Effect(name="air_drag", parameters=(("drag_per_mass", 9.0),))))
     bakes, events = Bakes(), []
-    done = add_and_bake(a_request(folder), bakes, events.append, never)
+    done = add_and_bake(load_scene(folder), request=a_request(folder), run_bake=bakes, on_event=events.append)
     assert bakes.seen == [("a", []), ("b", ["air_drag"])]
     folders = {"scene": folder, "before": folder.parent / "a", "after": folder.parent / "b"}
     assert done == {"event": "done", **{name: str(path) for name, path in folders.items()}}
@@ -160,7 +160,7 @@ def test_before_is_baked_without_and_after_with_the_effect(folder):
 
 def test_a_bake_that_is_there_is_not_made_again(folder):
     bakes = Bakes()
-    add_and_bake(a_request(folder, bake_before=False), bakes, ignore, never)
+    add_and_bake(load_scene(folder), request=a_request(folder, bake_before=False), run_bake=bakes, on_event=ignore)
     assert bakes.seen == [("b", ["air_drag"])]
 
 
@@ -168,11 +168,13 @@ def test_a_bake_that_is_there_is_not_made_again(folder):
 def test_a_failure_leaves_the_scene_as_it_was(folder, errors):
     before = load_scene(folder).model
     with pytest.raises((SimulationError, Cancelled)):
-        add_and_bake(a_request(folder), Bakes(*errors), ignore, never)
+        add_and_bake(load_scene(folder), request=a_request(folder), run_bake=Bakes(*errors), on_event=ignore)
     assert load_scene(folder).model == before
 
 
 def test_cancelling_the_second_bake_keeps_the_effect_so_that_it_can_go_on(folder):
     with pytest.raises(Cancelled):
-        add_and_bake(a_request(folder), Bakes(None, Cancelled("no")), ignore, never)
+        add_and_bake(
+            load_scene(folder), request=a_request(folder), run_bake=Bakes(None, Cancelled("no")), on_event=ignore
+        )
     assert [e.name for e in load_scene(folder).model.effects] == ["air_drag"]

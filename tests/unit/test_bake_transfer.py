@@ -6,9 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.bake_options import geometry_hash
 from physgen.sim.app.bake_transfer import transfer_bake
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import save_scene
@@ -60,7 +59,7 @@ def made(tmp_path):
         engine="test",
         version="0",
         particles=1,
-        geometry_hash=geometry_hash(scene),
+        geometry_hash=scene.geometry_hash(),
         objects=(BakedObject(name="Mug", file="Mug.pc2", vertices=8, space="mesh"),),
     )
     save_manifest(bake, manifest)
@@ -70,9 +69,9 @@ def made(tmp_path):
 def test_it_is_in_world_metres_under_the_photos_names(made, tmp_path):
     photo, scene, bake = made
     events = []
-    transfer_bake(photo.root, scene.root, bake, tmp_path / "out", {"cup": "Mug"}, events.append)
+    transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"}, on_event=events.append)
     manifest = load_manifest(tmp_path / "out")
-    assert manifest.geometry_hash == geometry_hash(photo) and manifest.fps == 30 and manifest.frames_done == 3
+    assert manifest.geometry_hash == photo.geometry_hash() and manifest.fps == 30 and manifest.frames_done == 3
     assert [(item.name, item.space) for item in manifest.objects] == [("cup", "world"), ("spoon", "world")]
     rest = [load_object_mesh(photo, item).vertices for item in photo.model.objects]
     cup, spoon = (Pc2Reader(tmp_path / "out" / item.file) for item in manifest.objects)
@@ -88,21 +87,21 @@ def test_what_was_moved_in_blender_is_said(made, tmp_path):
     moved = SceneObject(name="Mug", mesh="Mug.ply", size_m=0.1, world_from_mesh=tuple(map(tuple, matrix.tolist())))
     changed = save_scene(scene.root, SceneModel(camera=CAMERA, objects=(moved,), photo=None, background=None))
     with pytest.raises(InputError, match="bake the scene again"):
-        transfer_bake(photo.root, scene.root, bake, tmp_path / "out", {"cup": "Mug"})
-    save_manifest(bake, dataclasses.replace(load_manifest(bake), geometry_hash=geometry_hash(changed)))
+        transfer_bake(photo, changed, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"})
+    save_manifest(bake, dataclasses.replace(load_manifest(bake), geometry_hash=changed.geometry_hash()))
     events = []
-    transfer_bake(photo.root, scene.root, bake, tmp_path / "out", {"cup": "Mug"}, events.append)
+    transfer_bake(photo, changed, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"}, on_event=events.append)
     assert [event["message"][:3] for event in events] == ["cup"]
 
 
 def test_another_mesh_or_name_is_refused(made, tmp_path):
     photo, scene, bake = made
     with pytest.raises(InputError, match="no cache of object 'Pot'"):
-        transfer_bake(photo.root, scene.root, bake, tmp_path / "a", {"cup": "Pot"})
+        transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "a", names={"cup": "Pot"})
     fine = trimesh.creation.icosphere(subdivisions=1)
     fine.export(photo.root / "cup.ply")
     with pytest.raises(InputError, match="8 vertices and had 42"):
-        transfer_bake(photo.root, scene.root, bake, tmp_path / "b", {"cup": "Mug"})
+        transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "b", names={"cup": "Mug"})
 
 
 def test_particles_come_along(made, tmp_path):
@@ -115,7 +114,7 @@ def test_particles_come_along(made, tmp_path):
     manifest = load_manifest(bake)
     flowing = dataclasses.replace(manifest.objects[0], points_file="Mug.points.pc2", points=5, points_as="surface")
     save_manifest(bake, dataclasses.replace(manifest, objects=(flowing,)))
-    transfer_bake(photo.root, scene.root, bake, tmp_path / "out", {"cup": "Mug"})
+    transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"})
     cup = load_manifest(tmp_path / "out").objects[0]
     assert (cup.points_file, cup.points, cup.points_as) == ("cup.points.pc2", 5, "surface")
     centre = np.asarray(scene.model.objects[0].world_from_mesh)[:3, 3]

@@ -49,7 +49,7 @@ def scene(reconstructed, tmp_path):
     """A scene that came from the photo beside it."""
     shutil.copytree(reconstructed, tmp_path, dirs_exist_ok=True)
     stamp = tmp_path / "scene" / STAMP_FILE
-    assert require_stamp(tmp_path / "scene").photo == reconstructed / "photo.png"
+    assert require_stamp(load_scene(tmp_path / "scene")).photo == reconstructed / "photo.png"
     stamp.write_text(json.dumps(json.loads(stamp.read_text()) | {"photo": str(tmp_path / "photo.png")}))
     return tmp_path / "scene"
 
@@ -69,7 +69,7 @@ def changed(scene, before):
 
 def corrected(scene, **changes):
     """Correct fields of the object ``left``; the stages that were computed again."""
-    before, stamp = stages(scene), require_stamp(scene)
+    before, stamp = stages(scene), require_stamp(load_scene(scene))
     first = dataclasses.replace(stamp.objects[0], **changes)
     correct(load_scene(scene), objects=[first, *stamp.objects[1:]], options=stamp.options)
     return changed(scene, before)
@@ -86,7 +86,7 @@ def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_
     again = corrected(scene, mask=tmp_path / "mask.png")
     assert {"background", "mesh", "shadows"} <= again
     assert (np.asarray(Image.open(scene / "masks" / "left.png")) > 0).sum() == mask.sum()
-    before, stamp = stages(scene), require_stamp(scene)
+    before, stamp = stages(scene), require_stamp(load_scene(scene))
     correct(
         load_scene(scene),
         objects=stamp.objects,
@@ -125,10 +125,10 @@ def test_on_the_command_line(scene, capsys):
 
 def test_a_scene_that_cannot_say_where_it_comes_from_is_refused(scene, tmp_path):
     (tmp_path / "photo.png").rename(tmp_path / "gone.png")
-    stamp = require_stamp(scene)
+    stamp = require_stamp(load_scene(scene))
     with pytest.raises(InputError, match="no longer there"):
         correct(load_scene(scene), objects=stamp.objects, options=stamp.options)
     for garbage in ("{}", "[1]", "nonsense", json.dumps({"inputs_hash": "x", "photo": 3})):
         (scene / STAMP_FILE).write_text(garbage, encoding="utf-8")
         with pytest.raises(InputError, match=STAMP_FILE):
-            require_stamp(scene)
+            require_stamp(load_scene(scene))

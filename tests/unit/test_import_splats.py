@@ -117,7 +117,7 @@ def test_it_stands_upright_on_the_ground(tmp_path, up):
     matrix = turn.copy()
     matrix[:3, 3] = 7.0
     write_splats(tmp_path / "pole.ply", transform_splats(pole.changed(colours=red), matrix))
-    folder = import_splats(tmp_path / "pole.ply", tmp_path / "scene", size_m=0.4, up=up)
+    folder = import_splats(tmp_path / "pole.ply", out=tmp_path / "scene", size_m=0.4, up=up)
     (item,) = folder.model.objects
     mesh = load_object_mesh(folder, item)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0).max(), 0.4, rtol=1e-6)

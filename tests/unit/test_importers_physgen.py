@@ -156,7 +156,9 @@ def test_without_gravity_it_is_seen_from_above(root, tmp_path):
 def test_the_whole_way(root, tmp_path, capsys):
     out = tmp_path / "scene"
     events = []
-    folder = import_physgen(root, out, options=ReconstructOptions(mesh_vertices=500, sun=False), on_event=events.append)
+    folder = import_physgen(
+        root, out=out, options=ReconstructOptions(mesh_vertices=500, sun=False), on_event=events.append
+    )
     assert isinstance(folder, Scene) and [o.name for o in folder.model.objects] == ["ball", "toy box"]
     notices = " ".join(e["message"] for e in events if e["event"] == "notice")
     for words in ("1 walls (edge_list)", "not used: animation_frames", "ratios are kept"):
@@ -196,10 +198,10 @@ def test_mistakes_are_named(root, what):
 def test_missing_and_damaged_files_are_named(root, tmp_path, name):
     (root / name).write_bytes(b"\x00garbage")
     with pytest.raises(InputError, match=name):
-        import_physgen(root, tmp_path / "scene")
+        import_physgen(root, out=tmp_path / "scene")
     (root / name).unlink()
     with pytest.raises(InputError, match=name):
-        import_physgen(root, tmp_path / "scene")
+        import_physgen(root, out=tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 
 

@@ -121,7 +121,7 @@ def rewrite(root, **changes):
 
 
 def test_the_picture_stays_and_the_world_is_ours(output, tmp_path):
-    folder = import_physgen3d(output, tmp_path / "scene", size_m=0.3)
+    folder = import_physgen3d(output, out=tmp_path / "scene", size_m=0.3)
     scene = folder.model
     assert [o.name for o in scene.objects] == list(MESHES)
     for item in scene.objects:
@@ -145,7 +145,7 @@ def test_the_picture_stays_and_the_world_is_ours(output, tmp_path):
 
 
 def test_textures_masks_and_background_come_along(output, tmp_path):
-    folder = import_physgen3d(output, tmp_path / "scene")
+    folder = import_physgen3d(output, out=tmp_path / "scene")
     teddy, box = folder.model.objects
     mesh = read_textured_mesh(folder.file(teddy.mesh))
     assert mesh.picture is not None and mesh.uv is not None
@@ -173,7 +173,7 @@ def test_the_better_of_two_poses_is_taken(output, tmp_path):
         changes = {} if matrices is None else {"matrices": matrices, "matrices_optimized": optimized}
         rewrite(output, **changes)
         events = []
-        folder = import_physgen3d(output, tmp_path / "scene", on_event=events.append)
+        folder = import_physgen3d(output, out=tmp_path / "scene", on_event=events.append)
         for item in folder.model.objects:
             matrix = MATRICES[item.name]
             expected = seen(MESHES[item.name].vertices @ matrix[:3, :3].T + matrix[:3, 3])
@@ -189,7 +189,7 @@ def test_an_improved_pose_without_a_mask_is_taken_if_it_is_near(output, tmp_path
     near, far = shifted("box1", (0.02, 0, 0)), shifted("box1", (0.5, 0, 0))
     for improved, expected in ((near, near), (far, MATRICES["box1"]), (np.eye(4), MATRICES["box1"])):
         rewrite(output, matrices_optimized=[MATRICES["teddy1"].tolist(), improved.tolist()])
-        folder = import_physgen3d(output, tmp_path / "scene")
+        folder = import_physgen3d(output, out=tmp_path / "scene")
         box = folder.model.objects[1]
         truth = seen(MESHES["box1"].vertices @ expected[:3, :3].T + expected[:3, 3])
         pixels = folder.model.camera.project(points_of(folder, box))[:, :2]
@@ -202,12 +202,12 @@ def test_all_four_borders_of_the_view_count(output, tmp_path):
     # The photo is cut from a larger one: its middle is not on the camera's axis. Square pixels, f = 150.
     left, top, right, bottom = -0.5, -0.3, 0.3, -0.3 + 0.8 * HEIGHT / WIDTH
     rewrite(output, fov=[left, top, right, bottom])
-    camera = import_physgen3d(output, tmp_path / "scene").model.camera
+    camera = import_physgen3d(output, out=tmp_path / "scene").model.camera
     assert (camera.fx, camera.fy) == (pytest.approx(150), pytest.approx(150))
     assert (camera.cx, camera.cy) == (pytest.approx(75), pytest.approx(45))
     # DUSt3R crops the height about the middle to what 16 divides: pixels stay square, and the middle stays.
     rewrite(output, fov=[left, top + 0.02, right, bottom - 0.02])
-    camera = import_physgen3d(output, tmp_path / "scene").model.camera
+    camera = import_physgen3d(output, out=tmp_path / "scene").model.camera
     assert (camera.fx, camera.fy) == (pytest.approx(150), pytest.approx(150))
     assert (camera.cx, camera.cy) == (pytest.approx(75), pytest.approx(45))
 
@@ -241,7 +241,7 @@ def theirs(velocity):
 def test_the_settings_of_its_simulation(output, tmp_path):
     (output / "sim.yaml").write_text(SIMULATION)
     events = []
-    scene = import_physgen3d(output, tmp_path / "scene", on_event=events.append).model
+    scene = import_physgen3d(output, out=tmp_path / "scene", on_event=events.append).model
     for item, told in zip(scene.objects, ([0.5, 0.25, 1.0], [0, 0, -2.0]), strict=True):
         # Its unit is the metre: gravity is 9.8 of them.
         assert item.velocity == pytest.approx(world_axes(scene).T @ theirs(told), abs=1e-9)
@@ -268,9 +268,11 @@ def points_of_mesh(name):
 
 def test_another_size_keeps_the_motion_in_the_picture(output, tmp_path):
     (output / "sim.yaml").write_text(SIMULATION)
-    small = import_physgen3d(output, tmp_path / "a").model
+    small = import_physgen3d(output, out=tmp_path / "a").model
     events = []
-    large = import_physgen3d(output, tmp_path / "b", size_m=small.objects[0].size_m * 3, on_event=events.append).model
+    large = import_physgen3d(
+        output, out=tmp_path / "b", size_m=small.objects[0].size_m * 3, on_event=events.append
+    ).model
     for a, b in zip(small.objects, large.objects, strict=True):
         assert np.asarray(b.velocity) == pytest.approx(3 * np.asarray(a.velocity), abs=1e-9)
     assert "simulated with a gravity of 29.4 m/s²" in messages(events)
@@ -280,7 +282,7 @@ def test_settings_lie_where_the_program_has_them_or_are_named(output, tmp_path, 
     usual = tmp_path / "data" / "sim"
     usual.mkdir(parents=True)
     (usual / "teddy.yaml").write_text(SIMULATION)
-    assert import_physgen3d(output, tmp_path / "a").model.ground.friction == 0.3
+    assert import_physgen3d(output, out=tmp_path / "a").model.ground.friction == 0.3
     (tmp_path / "mine.yaml").write_text("velocities: [0, 0, 1]\nfriction: 0.9\ninput_path: outputs/panda\n")
     arguments = ["import", str(output), "--out", str(tmp_path / "b"), "--settings", str(tmp_path / "mine.yaml")]
     assert main(arguments) == 0
@@ -292,7 +294,7 @@ def test_settings_lie_where_the_program_has_them_or_are_named(output, tmp_path, 
     (output / "a.yaml").write_text(SIMULATION)
     (output / "b.yaml").write_text(SIMULATION)
     with pytest.raises(InputError, match=r"both a\.yaml and b\.yaml"):
-        import_physgen3d(output, tmp_path / "c")
+        import_physgen3d(output, out=tmp_path / "c")
 
 
 def test_objects_that_its_simulation_leaves_in_the_air_stay_there(output, tmp_path):
@@ -300,7 +302,7 @@ def test_objects_that_its_simulation_leaves_in_the_air_stay_there(output, tmp_pa
     lifted[:3, 3] -= 0.03 * DOWN
     rewrite(output, matrices=[lifted.tolist(), MATRICES["box1"].tolist()], matrices_optimized=None)
     (output / "sim.yaml").write_text(SIMULATION.replace("pull_to_ground: true", "pull_to_ground: false"))
-    folder = import_physgen3d(output, tmp_path / "scene")
+    folder = import_physgen3d(output, out=tmp_path / "scene")
     assert points_of(folder, folder.model.objects[0])[:, 2].min() == pytest.approx(0.03, rel=1e-6)
 
 
@@ -308,7 +310,7 @@ def test_what_inverse_rendering_adds(output, tmp_path):
     Image.new("RGB", (32, 32), (10, 200, 10)).save(output / "meshes" / "teddy1_albedo.png")
     Image.new("L", (32, 32), 51).save(output / "meshes" / "teddy1_roughness.png")
     Image.new("L", (32, 32), 204).save(output / "meshes" / "teddy1_metallic.png")
-    folder = import_physgen3d(output, tmp_path / "scene")
+    folder = import_physgen3d(output, out=tmp_path / "scene")
     mesh = trimesh.load(folder.file(folder.model.objects[0].mesh), force="mesh")
     material = mesh.visual.material
     assert (material.roughnessFactor, material.metallicFactor) == (pytest.approx(0.2), pytest.approx(0.8))
@@ -340,7 +342,7 @@ def test_mistakes_in_the_settings_are_named(output, tmp_path, what):
     text, words = SETTINGS_BAD[what]
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(InputError, match=rf"bad\.yaml: {words}"):
-        import_physgen3d(output, tmp_path / "scene", settings=tmp_path / "bad.yaml")
+        import_physgen3d(output, out=tmp_path / "scene", settings=tmp_path / "bad.yaml")
     assert not (tmp_path / "scene").exists()
 
 
@@ -351,7 +353,7 @@ def test_an_object_near_the_ground_is_put_on_it_without_moving_in_the_picture(ou
     far[:3, 3] -= 0.3 * DOWN
     rewrite(output, matrices=[lifted.tolist(), far.tolist()], matrices_optimized=None)
     events = []
-    folder = import_physgen3d(output, tmp_path / "scene", on_event=events.append)
+    folder = import_physgen3d(output, out=tmp_path / "scene", on_event=events.append)
     near, high = (load_object_mesh(folder, item).vertices for item in folder.model.objects)
     assert near[:, 2].min() == pytest.approx(0, abs=1e-6) and high[:, 2].min() > 0.05
     truth = MESHES["teddy1"].vertices @ lifted[:3, :3].T + lifted[:3, 3]
@@ -362,7 +364,7 @@ def test_an_object_near_the_ground_is_put_on_it_without_moving_in_the_picture(ou
 
 def test_matter_that_the_folder_names(output, tmp_path):
     rewrite(output, E=[5e4, 2e6], density=[300, 900])
-    materials = [item.material for item in import_physgen3d(output, tmp_path / "scene").model.objects]
+    materials = [item.material for item in import_physgen3d(output, out=tmp_path / "scene").model.objects]
     assert [m.youngs_modulus for m in materials] == [5e4, 2e6] and [m.density for m in materials] == [300, 900]
 
 
@@ -370,7 +372,7 @@ def test_names_become_names_of_scenes(output, tmp_path):
     for suffix in ("obj", "png", "mtl"):
         (output / "meshes" / f"teddy1.{suffix}").rename(output / "meshes" / f"teddy.bär(1).{suffix}")
     rewrite(output, object_names=["teddy.bär(1)", "box1"])
-    assert import_physgen3d(output, tmp_path / "scene").model.objects[0].name == "teddy_bär_1_"
+    assert import_physgen3d(output, out=tmp_path / "scene").model.objects[0].name == "teddy_bär_1_"
 
 
 def test_the_command(output, tmp_path, capsys):
@@ -409,7 +411,7 @@ def test_mistakes_are_named_and_nothing_is_written(output, tmp_path, what):
     changes, words = MISTAKES[what]
     rewrite(output, **changes)
     with pytest.raises(InputError, match=words):
-        import_physgen3d(output, tmp_path / "scene")
+        import_physgen3d(output, out=tmp_path / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
 
 
@@ -417,10 +419,10 @@ def test_mistakes_are_named_and_nothing_is_written(output, tmp_path, what):
 def test_missing_and_damaged_files_are_named(output, tmp_path, name):
     (output / name).write_bytes(b"\x00garbage")
     with pytest.raises(InputError, match=name.split("/")[-1]):
-        import_physgen3d(output, tmp_path / "scene")
+        import_physgen3d(output, out=tmp_path / "scene")
     (output / name).unlink()
     with pytest.raises(InputError, match=name.split("/")[-1]):
-        import_physgen3d(output, tmp_path / "scene")
+        import_physgen3d(output, out=tmp_path / "scene")
 
 
 json_values = st.recursive(
@@ -507,7 +509,7 @@ def test_a_known_scene_comes_back(tmp_path, unit):
     (root / TRANSFORM_FILE).write_text(json.dumps(data))
     # With gravity as it is in its unit of length, the settings alone give the scale.
     (root / "sim.yaml").write_text(json.dumps({"velocities": velocities, "scale": 1 / unit, "friction": 0.25}))
-    folder = import_physgen3d(root, tmp_path / "scene")
+    folder = import_physgen3d(root, out=tmp_path / "scene")
     scene = folder.model
     camera = np.asarray(scene.camera.world_from_camera)
     assert np.allclose(camera, pose, atol=1e-7)

@@ -12,7 +12,7 @@ from ....physgen_addon.render.render_options import render_arguments
 from ....sim.app.bake_options import BakeOptions
 from ....sim.errors import InputError
 from ....sim.reconstruct.reconstruct_pipeline import object_names
-from ....sim.scene.folder import SCENE_FILE, referenced_files
+from ....sim.scene.folder import SCENE_FILE
 from ....sim.scene.model import Vector
 from ....sim.version import VERSION
 from .job_file import Job, JobScene
@@ -89,7 +89,7 @@ class _Builder:
         else:
             self._names = tuple(item.name for item in scene.folder.model.objects)
             self._source = scene.folder.root.relative_to(job.root).as_posix()
-            self._files = (SCENE_FILE, *dict.fromkeys(referenced_files(scene.folder.model)))
+            self._files = (SCENE_FILE, *scene.folder.files())
             self.once = []
 
     def _task(
