@@ -11,6 +11,9 @@ from physgen.physgen_addon import compat
 
 from .cases import Case, Item
 
+PAINT = "paint"
+"""Attribute of vertices with their albedo, where a body has its own colours."""
+
 
 class _Nodes:
     """Nodes of one material with the wires between them."""
@@ -189,7 +192,10 @@ def skin(item: Item, which: int) -> bpy.types.Material:
     relief: object | None = None
     colour: object = first
     style = item.print
-    if style == "stripes":
+    if item.body.colours is not None:
+        colour = nodes.made("Attribute", {}, "Color", attribute_name=PAINT)
+        relief = fine if item.roughness > 0.6 else None
+    elif style == "stripes":
         band = nodes.made("TexWave", {"Vector": place, "Scale": 1.6}, 1, bands_direction="Z")
         colour = nodes.mixed(nodes.stepped(band, 0.47, 0.53), first, second)
     elif style == "dots":

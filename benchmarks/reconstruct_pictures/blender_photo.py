@@ -30,7 +30,8 @@ from physgen.sim.composite.srgb import linear_to_bytes
 from PIL import Image
 
 from . import blender_materials, scoring
-from .cases import Case, Item, Lamp, draw, loose_box
+from .cases import Case, Item, Lamp, loose_box
+from .picture_sets import draw
 
 FINER = 3
 """Masks are counted on so many times as many pixels along a side."""
@@ -106,6 +107,10 @@ class Studio:
         for which in (0, 1):
             data.materials.append(blender_materials.skin(item, which))
         data.polygons.foreach_set("material_index", item.body.paints.astype(np.int32))
+        if item.body.colours is not None:
+            painted = data.color_attributes.new(blender_materials.PAINT, "FLOAT_COLOR", "POINT")
+            opaque = np.concatenate([item.body.colours, np.ones((len(item.body.colours), 1))], axis=1)
+            painted.data.foreach_set("color", opaque.astype(np.float32).ravel())
         if item.body.smooth:
             data.shade_smooth()
             data.set_sharp_from_angle(angle=math.radians(35.0))

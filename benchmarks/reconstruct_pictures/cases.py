@@ -144,17 +144,17 @@ def draw(set_name: str, number: int) -> Case:
     for _ in range(MOST_ARRANGEMENTS):
         placed = _arrange(relation, k, rng)
         pitch = math.radians(rng.uniform(24.0, 55.0) if _flat(placed) else rng.uniform(9.0, 48.0))
-        camera = _aim(placed, (width, height), fov, pitch, roll, rng)
+        camera = aim(placed, (width, height), fov, pitch, roll, rng)
         if camera is not None and _as_wanted(camera, placed, relation):
             break
     else:
         raise ValueError(f"{set_name} {number}: no arrangement found")
     reach = max(float(np.abs(item.vertices).max()) for item in placed)
-    ground_paint = _ground_paint(ground, rng)
+    ground_paint = paint_of_ground(ground, rng)
     items = tuple(_painted(item, ground_paint, hard if i == 0 else None, rng) for i, item in enumerate(placed))
     lowest = pitch - math.atan(math.tan(fov / 2) * (1.0 if height > width else height / width)) - abs(roll)
     walled = lowest < math.radians(5.0) or rng.random() < 0.25
-    lamps, sky = _lights(light, walled, reach, rng)
+    lamps, sky = lights(light, walled, reach, rng)
     back = max(float(item.vertices[:, 1].max()) for item in items)
     return Case(
         name=f"case_{number:02}",
@@ -240,9 +240,10 @@ def _flat(items: list[Item]) -> bool:
     return any(item.kind in ("book", "bowl") for item in items)
 
 
-def _aim(
+def aim(
     items: list[Item], size: tuple[int, int], fov: float, pitch: float, roll: float, rng: np.random.Generator
 ) -> Camera | None:
+    """A camera that sees all ``items``, ``pitch`` below the horizontal and rolled, radians; None if none was found."""
     width, height = size
     focal = max(size) / 2 / math.tan(fov / 2)
     points = np.concatenate([item.vertices for item in items])
@@ -317,7 +318,7 @@ def _colour(rng: np.random.Generator, low: float, high: float, chroma: float) ->
     return np.clip(np.exp(rng.uniform(math.log(low), math.log(high))) * (1.0 + chroma * tint), 0.015, 0.85)
 
 
-def _ground_paint(ground: str, rng: np.random.Generator) -> NDArray[np.float64]:
+def paint_of_ground(ground: str, rng: np.random.Generator) -> NDArray[np.float64]:
     """Bright, dark and third colour (3, 3) of the pattern."""
     if ground == "boards":
         bright = np.array([0.48, 0.29, 0.15]) * rng.uniform(0.5, 1.3) * (1 + rng.uniform(-0.12, 0.12, 3))
@@ -353,7 +354,7 @@ def _towards(azimuth: float, elevation: float) -> tuple[float, float, float]:
     return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
 
 
-def _lights(
+def lights(
     kind: str, walled: bool, reach: float, rng: np.random.Generator
 ) -> tuple[tuple[Lamp, ...], tuple[float, float, float]]:
     """The lamps, and the colour of the sky. A wall stands ahead, azimuth 90: nothing shines through it."""

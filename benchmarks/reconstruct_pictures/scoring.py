@@ -382,5 +382,6 @@ WANTED: tuple[tuple[str, str, float], ...] = (
     ("fov_error_exif", "<=", 0.1),
     ("fov_error_vanishing_points", "<=", 0.1),
     ("normal_deg_lines", "<=", 3.0),
+    ("marks_behind", "<=", 0.0),
 )
-"""Requirements on the medians."""
+"""Requirements on the medians, and on the sum of marks."""

@@ -20,12 +20,14 @@ class Body:
     """A thing that stands on the origin, Z up, metres.
 
     parts: closed meshes and the paint that each wears (0 or 1). volume: cubic metres, None for what is hollow or has
-    parts that overlap. smooth: whether its surface is shaded round.
+    parts that overlap. smooth: whether its surface is shaded round. colours: (V, 3) linear albedo of the vertices of
+    ``mesh``, instead of paints.
     """
 
     parts: tuple[tuple[Trimesh, int], ...]
     volume: float | None
     smooth: bool
+    colours: NDArray[np.float64] | None = None
 
     @property
     def mesh(self) -> Trimesh:
@@ -58,15 +60,18 @@ def make(kind: str, size: float, rng: np.random.Generator) -> Body:
 Parts = list[tuple[Trimesh, int]]
 
 
-def _block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Trimesh:
+def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Trimesh:
+    """An upright box between two corners."""
     return trimesh.creation.box(bounds=np.array([low, high]))
 
 
-def _turned(profile: list[tuple[float, float]]) -> Trimesh:
-    return trimesh.creation.revolve(np.array(profile), sections=96)
+def revolved(profile: list[tuple[float, float]], sections: int = 96) -> Trimesh:
+    """A profile of radius and height turned around the z axis."""
+    return trimesh.creation.revolve(np.array(profile), sections=sections)
 
 
-def _ellipsoid(centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Trimesh:
+def ellipsoid(centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Trimesh:
+    """An upright ellipsoid."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
     ball.apply_scale(radii)
     ball.apply_translation(centre)
@@ -75,17 +80,17 @@ def _ellipsoid(centre: tuple[float, float, float], radii: tuple[float, float, fl
 
 def _box(rng: np.random.Generator) -> Parts:
     x, y, z = rng.uniform(0.5, 1.0, 3)
-    return [(_block((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)), 0)]
+    return [(block((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)), 0)]
 
 
 def _book(rng: np.random.Generator) -> Parts:
     x, y, z = rng.uniform(0.64, 0.78), 1.0, rng.uniform(0.1, 0.2)
-    return [(_block((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)), 0)]
+    return [(block((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)), 0)]
 
 
 def _cylinder(rng: np.random.Generator) -> Parts:
     height, radius = 1.0, rng.uniform(0.25, 0.6)
-    return [(_turned([(0, 0), (radius, 0), (radius, height), (0, height)]), 0)]
+    return [(revolved([(0, 0), (radius, 0), (radius, height), (0, height)]), 0)]
 
 
 def _sphere(rng: np.random.Generator) -> Parts:
@@ -95,22 +100,22 @@ def _sphere(rng: np.random.Generator) -> Parts:
 def _cone(rng: np.random.Generator) -> Parts:
     base, top = rng.uniform(0.35, 0.55), rng.choice([0.0, 0.15])
     profile = [(0.0, 0.0), (base, 0.0), (top, 1.0), (0.0, 1.0)] if top else [(0.0, 0.0), (base, 0.0), (0.0, 1.0)]
-    return [(_turned(profile), 0)]
+    return [(revolved(profile), 0)]
 
 
 def _mug(rng: np.random.Generator) -> Parts:
     radius, wall, height = rng.uniform(0.36, 0.46), 0.035, 1.0
     foot = rng.uniform(0.8, 1.0) * radius
     profile = [(0, 0), (foot, 0), (radius, height), (radius - wall, height), (foot - wall, wall), (0, wall)]
-    handle = _handle(0.22, 0.3, 0.055)
+    handle = half_ring(0.22, 0.3, 0.055)
     # Its ends lie within the wall, which may lean.
     lean = (radius - foot) / height
     handle.vertices[:, 0] += foot - wall / 2 + lean * (handle.vertices[:, 2] + 0.52)
     handle.vertices[:, 2] += 0.52
-    return [(_turned(profile), 0), (handle, 1 if rng.random() < 0.3 else 0)]
+    return [(revolved(profile), 0), (handle, 1 if rng.random() < 0.3 else 0)]
 
 
-def _handle(reach: float, rise: float, thick: float) -> Trimesh:
+def half_ring(reach: float, rise: float, thick: float) -> Trimesh:
     """Half an elliptic ring in the plane y = 0, x from 0 to ``reach``, its ends closed."""
     rings, around = 32, 16
     turn = np.linspace(-np.pi / 2, np.pi / 2, rings)[:, None]
@@ -142,8 +147,8 @@ def _bottle(rng: np.random.Generator) -> Parts:
     bend = np.linspace(0.0, np.pi / 2, 9)
     curve = [(neck + (body - neck) * float(np.cos(a)), shoulder + 0.16 * float(np.sin(a))) for a in bend]
     profile = [(0.0, 0.0), (body * 0.92, 0.0), (body, 0.02), *curve, (neck, 0.9), (0.0, 0.9)]
-    cap = _turned([(0, 0.9), (neck * 1.15, 0.9), (neck * 1.15, 1.0), (0, 1.0)])
-    return [(_turned([(float(r), float(z)) for r, z in profile]), 0), (cap, 1)]
+    cap = revolved([(0, 0.9), (neck * 1.15, 0.9), (neck * 1.15, 1.0), (0, 1.0)])
+    return [(revolved([(float(r), float(z)) for r, z in profile]), 0), (cap, 1)]
 
 
 def _bowl(rng: np.random.Generator) -> Parts:
@@ -153,23 +158,23 @@ def _bowl(rng: np.random.Generator) -> Parts:
     inner = [(r - wall, z + wall * 0.6) for r, z in outer[::-1]]
     rim = outer[-1][1]
     inner = [(r, min(z, rim)) for r, z in inner]
-    return [(_turned([(0.0, outer[0][1]), *outer, *inner, (0.0, inner[-1][1])]), 0)]
+    return [(revolved([(0.0, outer[0][1]), *outer, *inner, (0.0, inner[-1][1])]), 0)]
 
 
 def _toy(rng: np.random.Generator) -> Parts:
     head = rng.uniform(0.2, 0.25)
     top = 0.52 + head * 0.75
     parts: Parts = [
-        (_ellipsoid((0, 0, 0.3), (0.25, 0.21, 0.3)), 0),
-        (_ellipsoid((0, -0.06, 0.28), (0.18, 0.17, 0.2)), 1),
-        (_ellipsoid((0, -0.02, top), (head, head * 0.92, head * 0.92)), 0),
-        (_ellipsoid((0, -0.02 - head * 0.75, top - 0.06), (0.09, 0.09, 0.07)), 1),
+        (ellipsoid((0, 0, 0.3), (0.25, 0.21, 0.3)), 0),
+        (ellipsoid((0, -0.06, 0.28), (0.18, 0.17, 0.2)), 1),
+        (ellipsoid((0, -0.02, top), (head, head * 0.92, head * 0.92)), 0),
+        (ellipsoid((0, -0.02 - head * 0.75, top - 0.06), (0.09, 0.09, 0.07)), 1),
     ]
     for side in (-1.0, 1.0):
-        parts.append((_ellipsoid((side * head * 0.8, 0.0, top + head * 0.72), (0.085, 0.05, 0.085)), 0))
-        parts.append((_ellipsoid((side * 0.29, -0.08, 0.36), (0.085, 0.09, 0.17)), 0))
-        parts.append((_ellipsoid((side * 0.17, -0.24, 0.085), (0.095, 0.17, 0.085)), 0))
-        parts.append((_ellipsoid((side * 0.17, -0.4, 0.1), (0.07, 0.03, 0.07)), 1))
+        parts.append((ellipsoid((side * head * 0.8, 0.0, top + head * 0.72), (0.085, 0.05, 0.085)), 0))
+        parts.append((ellipsoid((side * 0.29, -0.08, 0.36), (0.085, 0.09, 0.17)), 0))
+        parts.append((ellipsoid((side * 0.17, -0.24, 0.085), (0.095, 0.17, 0.085)), 0))
+        parts.append((ellipsoid((side * 0.17, -0.4, 0.1), (0.07, 0.03, 0.07)), 1))
     return parts
 
 
@@ -177,14 +182,14 @@ def _chair(rng: np.random.Generator) -> Parts:
     width, depth, seat, leg = 0.48, 0.46, rng.uniform(0.44, 0.5), 0.05
     slats = int(rng.integers(2, 5))
     x, y = width / 2, depth / 2
-    parts: Parts = [(_block((-x, -y, seat - 0.045), (x, y, seat)), 0)]
+    parts: Parts = [(block((-x, -y, seat - 0.045), (x, y, seat)), 0)]
     for side in (-1.0, 1.0):
         inner, outer = sorted((side * x, side * (x - leg)))
-        parts.append((_block((inner, -y, 0.0), (outer, -y + leg, seat - 0.045)), 0))
-        parts.append((_block((inner, y - leg, 0.0), (outer, y, 1.0)), 0))
+        parts.append((block((inner, -y, 0.0), (outer, -y + leg, seat - 0.045)), 0))
+        parts.append((block((inner, y - leg, 0.0), (outer, y, 1.0)), 0))
     for row in range(slats):
         z = seat + 0.14 + (0.9 - seat - 0.14) * row / max(1, slats - 1)
-        parts.append((_block((-x + leg, y - leg * 0.8, z), (x - leg, y - leg * 0.2, z + 0.09)), 1))
+        parts.append((block((-x + leg, y - leg * 0.8, z), (x - leg, y - leg * 0.2, z + 0.09)), 1))
     return parts
 
 

@@ -24,11 +24,12 @@ from ..version import VERSION
 from . import report_pictures
 from .lighting.light_estimate import describe_sun
 from .photo_layers import Layers
-from .report_pictures import turntable
+from .turntable import sheet, turned
 
 REPORT_FILE = "report.html"
 WIDTH = 900
 """Width in pixels of a full-width picture."""
+TURNTABLE_WIDTH = 1800
 QUALITY = 88
 _TEMPLATE = Path(__file__).with_name("reconstruction_report.html")
 _EXTRA = """
@@ -185,16 +186,20 @@ def _camera(folder: Scene, data: ReportData) -> Section:
 
 def _shapes(folder: Scene, data: ReportData) -> Section:
     figures = []
+    ground = folder.model.ground
+    up = np.array([0.0, 0.0, 1.0]) if ground is None else ground.unit_normal
+    viewer = folder.model.camera.position
     for item, shape in zip(folder.model.objects, data.shapes, strict=True):
         mesh = read_mesh(folder.file(item.mesh))
         mesh.apply_transform(np.asarray(item.world_from_mesh))
         extent = np.ptp(np.asarray(mesh.vertices), axis=0) * 100
         size = " × ".join(f"{value:.3g}" for value in extent)
         text = f"{item.name}: {shape}, {size} cm, {len(mesh.vertices)} vertices"
-        figures.append(_figure(turntable(mesh), f"{text}. From the front, the right, behind, and above.", 880))
+        figures.append(_figure(sheet(turned(mesh, viewer, up=up)), f"{text}.", TURNTABLE_WIDTH))
     return Section(
         title="Shape and texture",
-        text="Unseen surfaces are a guess: kind, shape, thickness and back can be set.",
+        text="Each body from eight sides, without light: at 0° as photographed, then around it to the right; the dark "
+        "patch is where it stands. Unseen surfaces are a guess: kind, shape, thickness and back can be set.",
         figures=figures,
     )
 
