@@ -361,6 +361,7 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split.active = False
             split.label(text=f"{turns:.2g} turns/s")
         column.prop(body, "start_frame")
+        column.prop(body, "asleep")
         row = layout.row(align=True)
         draw_arrows(row, context)
         cleared = row.row(align=True)

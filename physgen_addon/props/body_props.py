@@ -174,6 +174,12 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         min=0,
         soft_max=250,
     )
+    asleep: from_field(
+        SceneObject,
+        "asleep",
+        "Asleep until Touched",
+        "Keeps its pose until something touches it, if it stands and nothing but gravity acts on it",
+    )
     pins: CollectionProperty(type=PHYSGEN_PG_pin)
     pin_index: IntProperty(name="Pin", description="Active pin")
     goal_stiffness: from_field(

@@ -98,6 +98,7 @@ def fill_body(
     _fill_material(body.material, source.material)
     body.fill, body.shell_thickness = source.fill, source.shell_thickness or 0.0
     body.velocity, body.spin = source.velocity, source.spin
+    body.asleep = source.asleep
     body.start_frame = first + round(source.start_time * rate) if source.start_time > 0 else 0
     body.goal_stiffness, body.goal_damping = source.goal_stiffness, source.goal_damping
     _fill_surface(body, source, ground)
@@ -236,6 +237,7 @@ OF_BODY = (
     ("own_surface", "contact_mode", *_SURFACE),
     ("velocity",),
     ("spin",),
+    ("asleep",),
     ("start_frame",),
     ("goal_stiffness", "goal_damping"),
     ("splats_as",),

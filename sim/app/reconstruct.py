@@ -35,7 +35,7 @@ from ..validation import parse, read_json, to_json
 T = TypeVar("T")
 
 STAMP_FILE = "reconstruct.json"
-RECONSTRUCT_REVISION = 4
+RECONSTRUCT_REVISION = 5
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 
@@ -145,6 +145,11 @@ def _reconstruct_cached(
         scene=scene_to_json(folder.model),
     )
     write_json(out / STAMP_FILE, to_json(stamp))
+    # Imported here, because planning a farm's jobs must not pay for the engine's geometry.
+    from .rest_check import rest_notices
+
+    for text in rest_notices(folder):
+        on_event({"event": "notice", "stage": "reconstruct", "message": text})
     return folder
 
 

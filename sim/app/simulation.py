@@ -80,6 +80,11 @@ def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> 
     prepared.require_affordable()
     progress.notice(cost_text(prepared))
     simulation = start_world(prepared)
+    asleep = [body.name for i, body in enumerate(simulation.world.bodies) if simulation.world.asleep(i)]
+    if asleep:
+        progress.notice(
+            f"at rest until something touches them: {', '.join(asleep)} (--set {asleep[0]}.asleep=false lets it go)"
+        )
     found = simulation.world.arch
     if found != arch:
         prepared = prepared.on(found)

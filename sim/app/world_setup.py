@@ -296,6 +296,7 @@ def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed
         velocity=item.velocity,
         spin=item.spin,
         start_time=item.start_time,
+        asleep=item.asleep,
         acceleration=_track(item.acceleration),
         velocity_keys=_track(item.velocity_keys),
         pins=_pins(item, sample),

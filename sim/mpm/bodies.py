@@ -158,6 +158,10 @@ class BodyParticles:
     start_time: float = 0.0
     """Time in s at which the body enters the simulation. Until then it stays in place and touches nothing."""
 
+    asleep: bool = False
+    """Whether the body keeps its pose until something moving reaches it, if it stands at the start and nothing but
+    gravity acts on it; see ``sleeping``."""
+
     def __post_init__(self) -> None:
         positions = np.ascontiguousarray(self.positions, dtype=np.float64)
         volumes = np.ascontiguousarray(self.volumes, dtype=np.float64)

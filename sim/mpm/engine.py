@@ -245,10 +245,15 @@ class Engine:
         row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
         self._put_control(control)
 
-    def _download(self) -> State:
-        """The particles in engine order, with the block key of each under "keys"."""
+    def places(self) -> tuple[NDArray[np.int32], Array]:
+        """Numbers (n,) of the particles as the caller counts, and their positions (n, 3) in cells."""
+        state = self._download(("ids", "x"))
+        return np.asarray(state["ids"], dtype=np.int32), _positions(state["keys"].astype(np.int64), state["x"])
+
+    def _download(self, names: Sequence[str] | None = None) -> State:
+        """The particles in engine order, all or those arrays, with the block key of each under "keys"."""
         n = self.count
-        state: State = {name: self._particles[0][name].to_numpy()[:n] for name in self._names}
+        state: State = {name: self._particles[0][name].to_numpy()[:n] for name in names or self._names}
         cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64)
         fields = self._p_field.to_numpy()[: self._p_blocks].astype(np.int64)
         starts = self._starts.to_numpy()[: self._p_blocks + 1]
@@ -272,9 +277,7 @@ class Engine:
     def state(self) -> State:
         """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells."""
         state = self._download()
-        keys = state["keys"].astype(np.int64)
-        cells = np.stack([(keys >> shift & 0xFFFF) - sorting.BIAS for shift in (32, 16, 0)], axis=1)
-        state["position"] = 4 * cells - 1 + state["x"].astype(np.float64) / FIXED_ONE
+        state["position"] = _positions(state["keys"].astype(np.int64), state["x"])
         state["control"] = self.control()
         state["means"] = self._means.to_numpy()
         return state
@@ -516,6 +519,12 @@ def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64])
     """Keys (n,) of the blocks (n, 3) of the fields, as ``sorting.block_key`` packs them."""
     x, y, z = (blocks + sorting.BIAS).T
     return np.asarray(((fields << 16 | x) << 16 | y) << 16 | z)
+
+
+def _positions(keys: NDArray[np.int64], x: NDArray[np.generic]) -> Array:
+    """Positions (n, 3) in cells of particles at ``x`` (n, 3) in the blocks of these keys."""
+    cells = np.stack([(keys >> shift & 0xFFFF) - sorting.BIAS for shift in (32, 16, 0)], axis=1)
+    return np.asarray(4 * cells - 1 + x.astype(np.float64) / FIXED_ONE)
 
 
 def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArray[np.int64]]:

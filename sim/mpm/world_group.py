@@ -19,6 +19,7 @@ from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks
 from .kernels import layout, runtime
 from .kernels.time_stepping import SOLID_LOST
 from .rigid.rigid_bodies import RigidBodies, RigidPose
+from .sleeping import Sleepers
 from .solver_options import SolverOptions
 from .world_setup import WorldSetup, check_start
 
@@ -32,6 +33,9 @@ SOLIDS = "solids."
 
 ROUNDING = 1e-12
 """Rounding error of sums of times, s."""
+
+LEAST_WATCH = 1e-4
+"""Seconds that pass at least between two looks at what may touch a sleeper."""
 
 
 class WorldGroup:
@@ -63,6 +67,14 @@ class WorldGroup:
         self._first_body = np.concatenate([[0], np.cumsum([len(setup.bodies) for setup in self.setups])])
         self._offsets = np.concatenate([[0], np.cumsum(counts)])
         self._started = np.zeros(len(counts), dtype=bool)
+        cell = 1.0 / self.cells.scale
+        self._sleepers = [
+            Sleepers(setup, cell) if any(body.asleep for body in setup.bodies) else None for setup in self.setups
+        ]
+        self._asleep = np.zeros(len(counts), dtype=bool)
+        for world, sleepers in enumerate(self._sleepers):
+            if sleepers is not None:
+                self._asleep[self._first_body[world] : self._first_body[world + 1]] = sleepers.asleep
         self._times = np.zeros(len(self.setups))
         self._between = False
         self._solids = self._new_solids()
@@ -75,7 +87,12 @@ class WorldGroup:
     def _new_solids(self) -> RigidBodies:
         origin = self.cells.points_to_world(np.zeros((1, 3)))[0]
         place = (float(origin[0]), float(origin[1]), float(origin[2]))
-        return RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
+        solids = RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
+        for world, setup in enumerate(self.setups):
+            first = int(self._first_body[world])
+            rigid = [i for i, body in enumerate(setup.bodies) if body.rigid and self._asleep[first + i]]
+            solids.asleep |= {(world, setup.bodies[i].name) for i in rigid}
+        return solids
 
     def _new_engine(self) -> Engine:
         soft = [not body.rigid for setup in self.setups for body in setup.bodies]
@@ -126,7 +143,8 @@ class WorldGroup:
         self._check_whole()
         end = self._times[0] + duration
         while (self._times < end - ROUNDING).any():
-            stops = np.array([self._next_stop(place, end) for place in self._places])
+            watch = self._wake_touched()
+            stops = np.array([min(self._next_stop(place, end), watch[place.world]) for place in self._places])
             self._engine.set_rows(
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
@@ -168,6 +186,68 @@ class WorldGroup:
         knots += [t for track in tracks if track is not None for t in track.knots(now + SAME_TIME, end - SAME_TIME)]
         return min([end, *knots])
 
+    def _wake_touched(self) -> Array:
+        """Wake the bodies that moving ones have come to touch; for each world (W,) the time until which none else is.
+
+        What wakes is in the engine from the present time on, as if it had started now.
+        """
+        until = np.full(len(self), math.inf)
+        fresh = []
+        control = None
+        for place in self._places:
+            world, sleepers = place.world, self._sleepers[place.world]
+            first, end = int(self._first_body[world]), int(self._first_body[world + 1])
+            asleep = self._asleep[first:end]
+            if sleepers is None or not asleep.any() or not self._started[first:end].any():
+                continue
+            control = self._engine.control() if control is None else control
+            now = float(self._times[world])
+            while True:
+                moving, speed = self._moving_matter(place, float(control[world, layout.SPEED]))
+                woken, rest = sleepers.touched(moving, asleep, now, speed)
+                if not woken:
+                    break
+                for i in sleepers.with_neighbours(woken, asleep):
+                    self._asleep[first + i], self._started[first + i] = False, True
+                    if place.setup.bodies[i].rigid:
+                        self._solids.asleep.discard((world, place.setup.bodies[i].name))
+                    else:
+                        choice = self._material_choice(place, i, now + SAME_TIME)
+                        fresh.append(packing.particles(place, i, int(self._offsets[first + i]), choice))
+            until[world] = now + max(rest, LEAST_WATCH)
+        if fresh:
+            self._engine.add(fresh)
+            self._host = None
+        return until
+
+    def _moving_matter(self, place: packing.WorldSlot, speed: float) -> tuple[dict[int, Array], float]:
+        """Particles (N, 3) in world metres of the world's bodies that have started, by index, and the speed in m/s of
+        the fastest of all; ``speed``: of the fastest particle of those that deform, cells/s."""
+        first = int(self._first_body[place.world])
+        fastest = speed / place.cells.scale
+        ids, cells = self._engine.places()
+        order = np.argsort(ids)
+        ids, cells = ids[order], cells[order]
+        found = {}
+        for i, body in enumerate(place.setup.bodies):
+            number = first + i
+            if not self._started[number]:
+                continue
+            if body.rigid:
+                pose = self.pose(place.world, body.name)
+                found[i] = body.positions @ pose.rotation.T + pose.translation
+                arm = float(np.linalg.norm(found[i] - pose.center, axis=1).max())
+                fastest = max(fastest, float(np.linalg.norm(pose.velocity) + np.linalg.norm(pose.spin) * arm))
+                continue
+            low, high = np.searchsorted(ids, (self._offsets[number], self._offsets[number + 1]))
+            # What has just woken is not in the engine yet, and at rest.
+            found[i] = place.cells.points_to_world(cells[low:high]) if high > low else body.positions
+        return found, fastest
+
+    def asleep(self, number: int) -> bool:
+        """Whether body ``number`` of all sleeps."""
+        return bool(self._asleep[number])
+
     def _reach_times(self, before: Array) -> None:
         """Apply what starts at the worlds' present times, after ``before`` (W,): bodies, velocities, materials."""
         fresh = []
@@ -176,7 +256,7 @@ class WorldGroup:
             now = float(self._times[place.world]) + SAME_TIME
             for i, body in enumerate(place.setup.bodies):
                 number = int(self._first_body[place.world]) + i
-                if not self._started[number] and body.start_time <= now:
+                if not self._started[number] and not self._asleep[number] and body.start_time <= now:
                     self._started[number] = True
                     if not body.rigid:
                         choice = self._material_choice(place, i, now)
@@ -362,6 +442,8 @@ class WorldGroup:
         state["format"] = np.array(CHECKPOINT_FORMAT)
         state["times"] = self._times.copy()
         state["started"] = self._started.copy()
+        if any(sleepers is not None for sleepers in self._sleepers):
+            state["asleep"] = self._asleep.copy()
         state["offsets"] = self._offsets.astype(np.int64)
         state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
         state["grid"] = np.array(self.options.grid)
@@ -388,6 +470,7 @@ class WorldGroup:
             raise InputError("checkpoint is of another scene: bodies, similarity and grid must be the same")
         self._times = np.array(checkpoint["times"], dtype=np.float64)
         self._started = np.array(checkpoint["started"], dtype=bool)
+        self._asleep = np.array(checkpoint.get("asleep", np.zeros(len(self._started))), dtype=bool)
         self._solids = self._new_solids()
         if self._solids.count:
             solids = {name.removeprefix(SOLIDS): checkpoint[name] for name in checkpoint if name.startswith(SOLIDS)}

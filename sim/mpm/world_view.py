@@ -65,6 +65,10 @@ class WorldView:
     def _scale(self) -> float:
         return self.group.cells.scale
 
+    def asleep(self, index: int) -> bool:
+        """Whether body ``index`` sleeps: it is at rest until something touches it."""
+        return self.group.asleep(self._number(index))
+
     def positions(self, index: int) -> Array:
         """Particle positions (N, 3) of body ``index``, world metres, in the order in which they were given."""
         number, body = self._number(index), self.bodies[index]

@@ -113,6 +113,7 @@ def write_scene(
                 roughness=physics[i].roughness,
                 velocity=objects[i].velocity,
                 spin=objects[i].spin,
+                asleep=True,
                 occlusion_order=layers.front_to_back.index(i),
                 mask=f"masks/{name}.png",
                 shadow=f"shadows/{name}.png",

@@ -75,6 +75,9 @@ class Scene:
             for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
                 del fields[irrelevant]
             fields["material"].pop("preset")
+            if not item.asleep:
+                # Older scenes have no such field either.
+                del fields["asleep"]
             fields["mesh"] = file_hash(self.file(item.mesh))
             if item.splats is None:
                 # Older scenes have no such field, and their bakes stay valid.

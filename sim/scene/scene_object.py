@@ -163,6 +163,8 @@ class SceneObject:
         what is rendered; the mesh is filled with particles and collides, and the splats follow the particles.
 
     Of dynamic objects only:
+    asleep: whether the object keeps the pose it has at the start until something touches it, if it stands and nothing
+        but gravity acts on it; reconstructed objects do, since the photo shows them at rest.
     start_time: s at which the object enters the simulation; until then it stays in place and touches nothing.
     acceleration: keyframes of force over mass in m/s².
     velocity_keys: keyframes at which the object's mean velocity in m/s is set.
@@ -192,6 +194,7 @@ class SceneObject:
     contact_mode: str | None = None
     motion: Motion | None = None
     splats: str | None = None
+    asleep: bool = False
     start_time: float = quantity(0.0, 0.0, 1e6, "seconds")
     acceleration: Keys = ()
     velocity_keys: Keys = ()

@@ -72,6 +72,7 @@ class RigidBodies:
     """The rigid bodies (in the order of the setup), then the colliders of each world, and their contact pairs.
 
     scales: cells per metre of each world; origins: the world point of each that is cell (0, 0, 0).
+    asleep: world and name of bodies that stay in place and touch nothing, from the next segment on.
     Call ``set_segment`` before the first substep and wherever a track bends, gravity changes or a body starts.
     """
 
@@ -90,6 +91,7 @@ class RigidBodies:
         self._baked: dict[tuple[int, float], DistanceLattice] = {}
         self._segments: dict[int, tuple[float, float]] = {}
         self._keys_done = np.full(len(setups), -np.inf)
+        self.asleep: set[tuple[int, str]] = set()
         self.arrays: dict[str, ti.Ndarray] = {}
         spans = []
         for w, setup in enumerate(self.setups):
@@ -351,7 +353,7 @@ class RigidBodies:
     ) -> None:
         body, scale = solid.source, self.scales[solid.world]
         assert isinstance(body, BodyParticles)
-        starts = body.start_time <= start + SAME_TIME
+        starts = body.start_time <= start + SAME_TIME and (solid.world, solid.name) not in self.asleep
         kinds[at.KIND] = at.DYNAMIC if starts else at.WAITING
         if body.acceleration is not None:
             numbers[at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
