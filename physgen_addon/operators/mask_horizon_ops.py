@@ -14,6 +14,7 @@ import bpy
 from ..context import redraw, scene_with
 from ..photo import photo_maths
 from ..photo.photo_image import (
+    PhotoTool,
     drop_mask,
     first_mask,
     on_screen,
@@ -21,7 +22,6 @@ from ..photo.photo_image import (
     region_under,
     shows_photo,
     store_mask,
-    why_not_seen,
     widen,
     width_of_pixel,
 )
@@ -64,21 +64,21 @@ def chosen_box(context: bpy.types.Context) -> bpy.types.PropertyGroup | None:
     return state.boxes[state.box_index] if 0 <= state.box_index < len(state.boxes) else None
 
 
-class PHYSGEN_OT_paint_mask(bpy.types.Operator):
+class PHYSGEN_OT_paint_mask(PhotoTool, bpy.types.Operator):
     """Paint the mask of the active object over the photo, starting from the last estimated mask"""
 
     bl_idname = "physgen.paint_mask"
     bl_label = "Paint Mask"
     bl_options = {"UNDO"}  # noqa: RUF012
 
+    tool_cursor = "PAINT_CROSS"
+    tool_help = PAINT_HELP
+
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Enabled with an active box and a visible photo."""
-        why = "Choose a box first" if chosen_box(context) is None else why_not_seen(context)
-        why = why or ("A mask is being painted" if _sessions else "")
-        if why:
-            cls.poll_message_set(why)
-        return not why
+    def why_not(cls, context: bpy.types.Context) -> str:
+        """Return why no mask can be painted: no active box, no visible photo, or one is being painted."""
+        why = "Choose a box first" if chosen_box(context) is None else super().why_not(context)
+        return why or ("A mask is being painted" if _sessions else "")
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show the mask and wait for strokes."""
@@ -87,18 +87,14 @@ class PHYSGEN_OT_paint_mask(bpy.types.Operator):
         painting = Painting(first_mask(state, box, found or Path()))
         self._session = _Session(painting, context.scene.session_uid, state.box_index, _brush[0])
         _sessions[:] = [self._session]
-        context.window.cursor_modal_set("PAINT_CROSS")
-        context.workspace.status_text_set(PAINT_HELP)
-        context.window_manager.modal_handler_add(self)
-        redraw("IMAGE_EDITOR")
-        return {"RUNNING_MODAL"}
+        return self.begin(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Handle strokes until painting is finished."""
         session, scene = self._session, scene_with(self._session.scene)
         # The extension was disabled, or the box is gone.
         if session not in _sessions or scene is None or session.box >= len(scene.physgen_photo.boxes):
-            return self._end(context, "CANCELLED")
+            return self.end(context, "CANCELLED")
         state = scene.physgen_photo
         session.mouse = (event.mouse_x, event.mouse_y)
         if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
@@ -119,10 +115,6 @@ class PHYSGEN_OT_paint_mask(bpy.types.Operator):
             session.region = region_under(context, state.image, event)
         redraw("IMAGE_EDITOR", "WINDOW")
         return {"RUNNING_MODAL"}
-
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Called by Blender when another file is loaded or Blender quits."""
-        self._end(context, "CANCELLED")
 
     def _button(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> set[str]:
         session = self._session
@@ -148,18 +140,15 @@ class PHYSGEN_OT_paint_mask(bpy.types.Operator):
     def _done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
         painting, box = self._session.painting, state.boxes[self._session.box]
         if not painting.changed:
-            return self._end(context, "CANCELLED")
+            return self.end(context, "CANCELLED")
         if store_mask(box, painting.mask) is None:
             self.report({"INFO"}, f"the mask of {box.name} is empty: the object is cut out of its box")
         widen(state, box, painting.mask)
-        return self._end(context, "FINISHED")
+        return self.end(context, "FINISHED")
 
-    def _end(self, context: bpy.types.Context, how: str) -> set[str]:
+    def forget(self) -> None:
+        """End the session."""
         _sessions.clear()
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        redraw("IMAGE_EDITOR")
-        return {how}
 
 
 def _size_change(event: bpy.types.Event) -> float:
@@ -289,44 +278,36 @@ def drag(state: bpy.types.PropertyGroup, start: tuple[float, float], at: float, 
     state.horizon, state.roll = photo_maths.of_ends(left, right, aspect(state))
 
 
-class PHYSGEN_OT_set_horizon(bpy.types.Operator):
+class PHYSGEN_OT_set_horizon(PhotoTool, bpy.types.Operator):
     """Drag the horizon over the photo, starting with the last estimate"""
 
     bl_idname = "physgen.set_horizon"
     bl_label = "Set Horizon"
     bl_options = {"UNDO"}  # noqa: RUF012
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Enabled if the photo is visible."""
-        why = why_not_seen(context)
-        if why:
-            cls.poll_message_set(why)
-        return not why
+    tool_cursor = "MOVE_Y"
+    tool_help = HORIZON_HELP
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show the horizon and wait for drags."""
         take_over(context.scene.physgen_photo)
         self._scene = context.scene.session_uid
         self._grip: tuple[bpy.types.Region, tuple[float, float], tuple[float, float]] | None = None
-        context.window.cursor_modal_set("MOVE_Y")
-        context.workspace.status_text_set(HORIZON_HELP)
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
+        return self.begin(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Handle drags until finished."""
         scene = scene_with(self._scene)
         if scene is None or scene.physgen_photo.image is None:
-            return self._end(context, "CANCELLED")
+            return self.end(context, "CANCELLED")
         state = scene.physgen_photo
         if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
-            return self._end(context, "FINISHED")
+            return self.end(context, "FINISHED")
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             region = region_under(context, state.image, event)
             if region is None:
                 # A click elsewhere ends the tool and is passed on.
-                return self._end(context, "FINISHED")
+                return self.end(context, "FINISHED")
             self._grip = (region, place_under(region, event), (state.horizon, state.roll))
         elif self._grip is None:
             # Zooming and panning stay available.
@@ -337,16 +318,6 @@ class PHYSGEN_OT_set_horizon(bpy.types.Operator):
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             self._grip = None
         return {"RUNNING_MODAL"}
-
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Called by Blender when another file is loaded or Blender quits."""
-        self._end(context, "CANCELLED")
-
-    def _end(self, context: bpy.types.Context, how: str) -> set[str]:
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        redraw("IMAGE_EDITOR")
-        return {how}
 
 
 def draw_horizon(

@@ -17,13 +17,13 @@ from ..context import TAB, show_beside
 from ..interpreter import cli_command, find_python
 from ..photo.photo_image import (
     SUFFIXES,
+    PhotoTool,
     drop_mask,
     load_photo_image,
     on_screen,
     place_under,
     region_under,
     shows_photo,
-    why_not_seen,
     write_masks,
 )
 from ..photo.photo_request import LEAST_PX, arguments, mask_files, photo_file, report_page, scene_folder, take_camera
@@ -172,40 +172,31 @@ def add_box(scene: bpy.types.Scene, corners: tuple[int, int, int, int], name: st
     return box
 
 
-class PHYSGEN_OT_draw_box(bpy.types.Operator):
+class PHYSGEN_OT_draw_box(PhotoTool, bpy.types.Operator):
     """Drag a box around an object of the photo in the image editor; it need not be tight"""
 
     bl_idname = "physgen.draw_box"
     bl_label = "Draw Box"
     bl_options = {"UNDO"}  # noqa: RUF012
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Enabled with a visible photo."""
-        why = why_not_seen(context)
-        if why:
-            cls.poll_message_set(why)
-        return not why
+    tool_help = "Drag a box around an object    Esc, right click: stop"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Wait for the drag."""
         self._start: tuple[int, int] | None = None
         self._region: bpy.types.Region | None = None
-        context.window.cursor_modal_set("CROSSHAIR")
-        context.workspace.status_text_set("Drag a box around an object    Esc, right click: stop")
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
+        return self.begin(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Handle events from press to release."""
         image = context.scene.physgen_photo.image
         if image is None or event.type in ("ESC", "RIGHTMOUSE"):
-            return self._end(context, "CANCELLED")
+            return self.end(context, "CANCELLED")
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             region = region_under(context, image, event)
             if region is None:
                 self.report({"INFO"}, "drag inside the image in the image editor")
-                return self._end(context, "CANCELLED")
+                return self.end(context, "CANCELLED")
             self._region, self._start = region, _pixel(context.scene, region, event)
         elif self._start is None or self._region is None:
             # Zooming and panning stay available.
@@ -216,22 +207,14 @@ class PHYSGEN_OT_draw_box(bpy.types.Operator):
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             corners = (*self._start, *_pixel(context.scene, self._region, event))
             if min(abs(corners[2] - corners[0]), abs(corners[3] - corners[1])) < LEAST_PX:
-                return self._end(context, "CANCELLED")
+                return self.end(context, "CANCELLED")
             add_box(context.scene, corners)
-            return self._end(context, "FINISHED")
+            return self.end(context, "FINISHED")
         return {"RUNNING_MODAL"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Called by Blender when another file is loaded or Blender quits."""
-        self._end(context, "CANCELLED")
-
-    def _end(self, context: bpy.types.Context, how: str) -> set[str]:
+    def forget(self) -> None:
+        """Drop the dragged rectangle."""
         _dragged.clear()
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        for area in context.window.screen.areas:
-            area.tag_redraw()
-        return {how}
 
 
 def _pixel(scene: bpy.types.Scene, region: bpy.types.Region, event: bpy.types.Event) -> tuple[int, int]:

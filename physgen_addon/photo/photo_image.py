@@ -14,6 +14,7 @@ import numpy as np
 from mathutils import Vector
 
 from ...sim.errors import InputError
+from ..context import redraw
 from .photo_maths import Mask, ellipse, extent, resized
 
 MAX_TURNED = 2048
@@ -293,3 +294,51 @@ def _pixels(image: bpy.types.Image) -> np.ndarray:
     pixels = np.empty(width * height * image.channels, dtype=np.float32)
     image.pixels.foreach_get(pixels)
     return pixels.reshape(height, width, image.channels)[::-1]
+
+
+class PhotoTool:
+    """Mixin of modal operators that work over the photo in the image editor: enabled while it is visible, with a cursor
+    and a line of help until it ends.
+
+    tool_cursor: one of Blender's cursors. tool_help: shown in the status bar.
+    """
+
+    tool_cursor = "CROSSHAIR"
+    tool_help = ""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled unless ``why_not`` gives a reason."""
+        why = cls.why_not(context)
+        if why:
+            cls.poll_message_set(why)  # type: ignore[attr-defined]
+        return not why
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        """Return why the tool cannot be used now; empty if it can."""
+        return why_not_seen(context)
+
+    def begin(self, context: bpy.types.Context) -> set[str]:
+        """Start to receive events; return the result of ``invoke``."""
+        context.window.cursor_modal_set(self.tool_cursor)
+        context.workspace.status_text_set(self.tool_help)
+        context.window_manager.modal_handler_add(self)
+        redraw("IMAGE_EDITOR")
+        return {"RUNNING_MODAL"}
+
+    def end(self, context: bpy.types.Context, how: str) -> set[str]:
+        """Give cursor and status bar back; return the result ``how``, FINISHED or CANCELLED, of ``modal``."""
+        self.forget()
+        context.window.cursor_modal_restore()
+        context.workspace.status_text_set(None)
+        for editor in ("IMAGE_EDITOR", "VIEW_3D"):
+            redraw(editor)
+        return {how}
+
+    def forget(self) -> None:
+        """Drop what the tool draws; called at its end."""
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Called by Blender when another file is loaded or Blender quits."""
+        self.end(context, "CANCELLED")

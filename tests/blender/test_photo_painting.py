@@ -21,6 +21,7 @@ from physgen.physgen_addon.operators.photo_ops import (
     set_photo,
 )
 from physgen.physgen_addon.photo.photo_image import (
+    PhotoTool,
     first_mask,
     mask_size,
     read_mask_image,
@@ -194,8 +195,8 @@ def window(photo):
 
 def operate(kind):
     """The operator's own methods, without Blender, which makes no operator outside an event."""
-    methods = {name: value for name, value in vars(kind).items() if callable(value)}
-    return type("Operator", (), {**methods, "report": lambda self, level, text: None})()
+    methods = {name: value for name, value in vars(kind).items() if callable(value) or name.startswith("tool_")}
+    return type("Operator", (PhotoTool,), {**methods, "report": lambda self, level, text: None})()
 
 
 def event(kind, u=0.0, v=0.0, value="PRESS", **held):
