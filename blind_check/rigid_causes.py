@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..sim.diagnose.capture import Camera
+from ..sim.diagnose.diagnosis import UNKNOWN
 from .case import Lens, moved_camera
 from .mujoco_world import GRAVITY, Array, Push, RigidWorld
 
@@ -36,15 +37,18 @@ def _no_parameters(strength: float) -> Mapping[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Cause:
-    """A cause. effect: name in the vocabulary, or ``unknown``. mechanism: in words. low, high: bounds of the strength.
+    """A cause.
+
+    effect: name in the vocabulary, or ``unknown``. mechanism: in words; by default the effect's name. low, high: bounds
+    of the strength.
 
     change: the world with it. clock: recorded times (T,) → true times. camera: (strength, assumed camera, the point it
     looks at) → true camera. lens: of the strength. active: see ``ACTIVE``. styles: of the trials that show it.
     window: s since the first frame, with ``active="window"``.
     """
 
-    effect: str
-    mechanism: str
+    effect: str = UNKNOWN
+    mechanism: str = ""
     low: float
     high: float
     styles: tuple[str, ...]
@@ -57,17 +61,31 @@ class Cause:
     ambiguous_with: Mapping[str, str] = field(default_factory=dict)
     window: tuple[float, float] = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        if not self.mechanism:
+            object.__setattr__(self, "mechanism", self.effect)
 
-def with_push(world: RigidWorld, push: Push) -> RigidWorld:
-    """Return ``world`` with ``push`` added."""
-    before = world.push
-    if before is None:
-        return dataclasses.replace(world, push=push)
 
-    def both(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
-        return before(t, p, v, w, turn) + push(t, p, v, w, turn)
+Maker = Callable[[RigidWorld, np.random.Generator], Cause]
+"""Draws the details of a cause in a world; its strength is chosen afterwards."""
 
-    return dataclasses.replace(world, push=both)
+
+def pushing(push_of: Callable[[float], Push]) -> Callable[[float, RigidWorld], RigidWorld]:
+    """Return the change that adds the force per mass ``push_of(strength)`` to a world's others."""
+
+    def change(strength: float, world: RigidWorld) -> RigidWorld:
+        before, push = world.push, push_of(strength)
+        if before is None:
+            return dataclasses.replace(world, push=push)
+        both: Push = lambda t, p, v, w, turn: before(t, p, v, w, turn) + push(t, p, v, w, turn)  # noqa: E731
+        return dataclasses.replace(world, push=both)
+
+    return change
+
+
+def either_sign(rng: np.random.Generator) -> float:
+    """Return -1 or 1."""
+    return float(rng.choice([-1, 1]))
 
 
 TOSSES = ("toss",)
@@ -82,17 +100,16 @@ def drag_per_mass(world: RigidWorld, coefficient: float) -> float:
 def air_drag(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Quadratic drag in still air; strength: c_d."""
 
-    def change(cd: float, world: RigidWorld) -> RigidWorld:
+    def push_of(cd: float) -> Push:
         k = drag_per_mass(world, cd)
-        return with_push(world, lambda t, p, v, w, turn: -k * math.sqrt(v @ v) * v)
+        return lambda t, p, v, w, turn: -k * math.sqrt(v @ v) * v
 
     return Cause(
         effect="air_drag",
-        mechanism="air_drag",
         low=0.1,
         high=1.5,
         styles=TOSSES,
-        change=change,
+        change=pushing(push_of),
         parameters=lambda cd: {"cd": cd, "drag_per_mass_1_per_m": drag_per_mass(world, cd)},
         ambiguous_with={"wind": "still air is wind of speed zero"},
     )
@@ -103,22 +120,21 @@ def wind(world: RigidWorld, rng: np.random.Generator) -> Cause:
     cd, azimuth, rise = float(rng.uniform(0.35, 0.8)), rng.uniform(-np.pi, np.pi), rng.uniform(-0.2, 0.2)
     direction = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
 
-    def change(speed: float, world: RigidWorld) -> RigidWorld:
+    def push_of(speed: float) -> Push:
         k, air = drag_per_mass(world, cd), speed * direction
 
         def push(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
             u = v - air
             return np.asarray(-k * math.sqrt(u @ u) * u)
 
-        return with_push(world, push)
+        return push
 
     return Cause(
         effect="wind",
-        mechanism="wind",
         low=0.5,
         high=5.0,
         styles=TOSSES,
-        change=change,
+        change=pushing(push_of),
         parameters=lambda s: {
             "cd": cd,
             "wind": (s * direction).tolist(),
@@ -134,31 +150,29 @@ def magnus(world: RigidWorld, rng: np.random.Generator) -> Cause:
     def lift(slope: float) -> float:
         return drag_per_mass(world, slope) * world.body.size
 
-    def change(slope: float, world: RigidWorld) -> RigidWorld:
+    def push_of(slope: float) -> Push:
         s = lift(slope)
 
         def push(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
             return s * np.array([w[1] * v[2] - w[2] * v[1], w[2] * v[0] - w[0] * v[2], w[0] * v[1] - w[1] * v[0]])
 
-        return with_push(world, push)
+        return push
 
     return Cause(
         effect="magnus",
-        mechanism="magnus",
         low=0.1,
         high=1.2,
         styles=("spun",),
-        change=change,
+        change=pushing(push_of),
         parameters=lambda slope: {"lift_per_mass": lift(slope), "lift_slope": slope},
     )
 
 
 def buoyancy(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Gravity times 1 - fraction; strength: the fraction's size."""
-    sign = float(rng.choice([-1, 1]))
+    sign = either_sign(rng)
     return Cause(
         effect="buoyancy",
-        mechanism="buoyancy",
         low=0.004,
         high=0.15,
         styles=("toss", "toss", "drop"),
@@ -181,7 +195,6 @@ def gravity_tilt(world: RigidWorld, rng: np.random.Generator) -> Cause:
 
     return Cause(
         effect="gravity_tilt",
-        mechanism="gravity_tilt",
         low=0.006,
         high=0.09,
         styles=("toss", "toss", "slide"),
@@ -196,31 +209,29 @@ def tether(world: RigidWorld, rng: np.random.Generator) -> Cause:
     azimuth, rest = rng.uniform(-np.pi, np.pi), float(rng.uniform(0.15, 0.4))
     anchor = np.array([0.45 * np.cos(azimuth), 0.45 * np.sin(azimuth), rng.uniform(0.6, 1.2)])
 
-    def change(k: float, world: RigidWorld) -> RigidWorld:
+    def push_of(k: float) -> Push:
         def push(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
             line = anchor - p
             length = math.sqrt(line @ line)
             return np.asarray(k * max(0.0, length - rest) / max(length, 1e-9) * line)
 
-        return with_push(world, push)
+        return push
 
     return Cause(
         effect="tether",
-        mechanism="tether",
         low=0.05,
         high=6.0,
         styles=("toss", "toss", "drop"),
-        change=change,
+        change=pushing(push_of),
         parameters=lambda k: {"stiffness_per_mass": k, "rest_length": rest, "anchor": anchor.tolist()},
     )
 
 
 def friction(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Another Coulomb coefficient; strength: log of the factor."""
-    sign = float(rng.choice([-1, 1]))
+    sign = either_sign(rng)
     return Cause(
         effect="friction",
-        mechanism="friction",
         low=0.04,
         high=0.9,
         styles=("slide", "slide", "slide", "toss"),
@@ -232,14 +243,13 @@ def friction(world: RigidWorld, rng: np.random.Generator) -> Cause:
 
 def restitution(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Another restitution; strength: the difference."""
-    sign = 1.0 if world.restitution < 0.35 else -1.0 if world.restitution > 0.6 else float(rng.choice([-1, 1]))
+    sign = 1.0 if world.restitution < 0.35 else -1.0 if world.restitution > 0.6 else either_sign(rng)
 
     def bounce(s: float) -> float:
         return min(max(world.restitution + sign * s, 0.16), 0.93)
 
     return Cause(
         effect="restitution",
-        mechanism="restitution",
         low=0.015,
         high=0.4,
         styles=("drop", "drop", "toss"),
@@ -253,7 +263,6 @@ def rolling_resistance(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Rolling resistance; strength: arm over the radius."""
     return Cause(
         effect="rolling_resistance",
-        mechanism="rolling_resistance",
         low=0.002,
         high=0.06,
         styles=("roll", "roll", "roll", "toss"),
@@ -268,7 +277,6 @@ def adhesion(world: RigidWorld, rng: np.random.Generator) -> Cause:
     reach = float(rng.uniform(0.002, 0.006))
     return Cause(
         effect="adhesion",
-        mechanism="adhesion",
         low=3.0,
         high=150.0,
         styles=("drop",),
@@ -286,7 +294,6 @@ def mass_offset(world: RigidWorld, rng: np.random.Generator) -> Cause:
     place = (at[0], at[1], at[2])
     return Cause(
         effect="mass_offset",
-        mechanism="mass_offset",
         low=0.02,
         high=0.8,
         styles=("spun", "toss"),
@@ -302,10 +309,9 @@ def mass_offset(world: RigidWorld, rng: np.random.Generator) -> Cause:
 
 def time_scale(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Wrong clock rate; strength: deviation from 1."""
-    sign = float(rng.choice([-1, 1]))
+    sign = either_sign(rng)
     return Cause(
         effect="time_scale",
-        mechanism="time_scale",
         low=0.003,
         high=0.07,
         styles=("toss", "toss", "drop"),
@@ -327,7 +333,6 @@ def camera_pose(world: RigidWorld, rng: np.random.Generator) -> Cause:
 
     return Cause(
         effect="camera_pose",
-        mechanism="camera_pose",
         low=0.004,
         high=0.08,
         styles=("toss", "drop", "toss"),
@@ -337,7 +342,7 @@ def camera_pose(world: RigidWorld, rng: np.random.Generator) -> Cause:
     )
 
 
-KNOWN_CAUSES: Mapping[str, Callable[[RigidWorld, np.random.Generator], Cause]] = {
+KNOWN_CAUSES: Mapping[str, Maker] = {
     "air_drag": air_drag,
     "wind": wind,
     "magnus": magnus,

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from .case import Lens
-from .mujoco_world import Array, RigidWorld
-from .rigid_causes import TOSSES, Cause, with_push
+from .mujoco_world import Array, Push, RigidWorld
+from .rigid_causes import TOSSES, Cause, Maker, either_sign, pushing
 
 
 def _level(rng: np.random.Generator) -> Array:
@@ -23,12 +23,11 @@ def periodic(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """A horizontal oscillating force; strength: amplitude in m/s²."""
     direction, rate = _level(rng), float(rng.uniform(8, 25))
     return Cause(
-        effect="unknown",
         mechanism="periodic",
         low=0.1,
         high=8.0,
         styles=TOSSES,
-        change=lambda s, w: with_push(w, lambda t, p, v, spin, turn: s * math.sin(rate * t) * direction),
+        change=pushing(lambda s: lambda t, p, v, w, turn: s * math.sin(rate * t) * direction),
         parameters=lambda s: {"amplitude": (s * direction).tolist(), "omega": rate},
     )
 
@@ -37,18 +36,17 @@ def kick(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """An impulse of 20 ms; strength: change of velocity in m/s."""
     direction, start, length = _level(rng), float(rng.uniform(0.3, 0.5)), 0.02
 
-    def push_of(s: float) -> Callable[[float, Array, Array, Array, Array], Array]:
+    def push_of(s: float) -> Push:
         return lambda t, p, v, w, turn: direction * (s / length if start <= t < start + length else 0.0)
 
     return Cause(
-        effect="unknown",
         mechanism="kick",
         low=0.02,
         high=0.8,
         styles=("drop", "toss"),
         active="window",
         window=(start, start + length),
-        change=lambda s, w: with_push(w, push_of(s)),
+        change=pushing(push_of),
         parameters=lambda s: {"velocity_change": (s * direction).tolist(), "time": start, "duration": length},
     )
 
@@ -57,21 +55,20 @@ def vortex(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """A force around a vertical line, strongest 0.25 m from it; strength: its largest in m/s²."""
     centre, core = np.array([*rng.uniform(-0.3, 0.3, 2), 0.0]), 0.25
 
-    def change(s: float, world: RigidWorld) -> RigidWorld:
+    def push_of(s: float) -> Push:
         def push(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
             x, y = (p[0] - centre[0]) / core, (p[1] - centre[1]) / core
             size = s * math.exp(0.5 * (1 - x * x - y * y))
             return np.array([-y * size, x * size, 0.0])
 
-        return with_push(world, push)
+        return push
 
     return Cause(
-        effect="unknown",
         mechanism="vortex",
         low=0.1,
         high=8.0,
         styles=TOSSES,
-        change=change,
+        change=pushing(push_of),
         parameters=lambda s: {"centre": centre.tolist(), "core": core, "strength": s},
     )
 
@@ -79,22 +76,21 @@ def vortex(world: RigidWorld, rng: np.random.Generator) -> Cause:
 def repeller(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """A smooth repulsive potential in the air, 0.2 m wide; strength: its largest force in m/s²."""
     centre, width = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(0.4, 0.9)]), 0.2
-    sign = float(rng.choice([-1, 1]))
+    sign = either_sign(rng)
 
-    def change(s: float, world: RigidWorld) -> RigidWorld:
+    def push_of(s: float) -> Push:
         def push(t: float, p: Array, v: Array, w: Array, turn: Array) -> Array:
             d = (p - centre) / width
             return np.asarray(sign * s * math.exp(0.5 * (1 - d @ d)) * d)
 
-        return with_push(world, push)
+        return push
 
     return Cause(
-        effect="unknown",
         mechanism="repeller" if sign > 0 else "attractor",
         low=0.2,
         high=12.0,
         styles=TOSSES,
-        change=change,
+        change=pushing(push_of),
         parameters=lambda s: {"centre": centre.tolist(), "width": width, "strength": sign * s},
     )
 
@@ -104,13 +100,12 @@ def thrust(world: RigidWorld, rng: np.random.Generator) -> Cause:
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     return Cause(
-        effect="unknown",
         mechanism="body_thrust",
         low=0.1,
         high=10.0,
         styles=("toss",),
         active="always",
-        change=lambda s, w: with_push(w, lambda t, p, v, spin, turn: np.asarray(s * (turn @ direction))),
+        change=pushing(lambda s: lambda t, p, v, w, turn: np.asarray(s * (turn @ direction))),
         parameters=lambda s: {"direction": direction.tolist(), "strength": s},
     )
 
@@ -123,7 +118,6 @@ def belt(world: RigidWorld, rng: np.random.Generator) -> Cause:
         return s / rate * math.sin(rate * t) * direction, s * math.cos(rate * t) * direction
 
     return Cause(
-        effect="unknown",
         mechanism="moving_ground",
         low=0.03,
         high=1.0,
@@ -143,7 +137,6 @@ def shaker(world: RigidWorld, rng: np.random.Generator) -> Cause:
         return s / rate * (math.sin(rate * t + phase)) * up, s * math.cos(rate * t + phase) * up
 
     return Cause(
-        effect="unknown",
         mechanism="shaking_ground",
         low=0.02,
         high=0.5,
@@ -158,7 +151,6 @@ def unsteady_clock(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Frame times that oscillate about the true ones; strength: amplitude in s."""
     rate = float(rng.uniform(8, 16))
     return Cause(
-        effect="unknown",
         mechanism="unsteady_clock",
         low=0.002,
         high=0.6 / rate,
@@ -173,7 +165,6 @@ def dropped_frames(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Frames lost unnoticed at one time; strength: seconds lost."""
     when = float(rng.uniform(0.3, 0.5))
     return Cause(
-        effect="unknown",
         mechanism="dropped_frames",
         low=0.004,
         high=0.08,
@@ -187,9 +178,8 @@ def dropped_frames(world: RigidWorld, rng: np.random.Generator) -> Cause:
 
 def lens_distortion(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Radial lens distortion; strength: k1."""
-    sign = float(rng.choice([-1, 1]))
+    sign = either_sign(rng)
     return Cause(
-        effect="unknown",
         mechanism="lens_distortion",
         low=0.03,
         high=1.2,
@@ -200,7 +190,7 @@ def lens_distortion(world: RigidWorld, rng: np.random.Generator) -> Cause:
     )
 
 
-UNKNOWN_CAUSES: Mapping[str, Callable[[RigidWorld, np.random.Generator], Cause]] = {
+UNKNOWN_CAUSES: Mapping[str, Maker] = {
     "periodic": periodic,
     "kick": kick,
     "vortex": vortex,
