@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
@@ -14,14 +15,14 @@ from ..context import redraw
 from ..interpreter import cli_command, find_python
 from ..props import preferences
 from ..props.body_props import bodies
-from .preview_session import Session
+from .preview_session import Clip, Session, shade_vertices
 
 STEP_S = 0.04
 JOIN_S = 0.5
 
 _sessions: list[Session] = []
 """The running session, at most one."""
-_drawings: list[object] = []
+_drawings: list[_Drawing] = []
 longest_step_s = [0.0]
 """Longest time in s that a step has blocked Blender since the preview was switched on."""
 
@@ -40,9 +41,7 @@ def start(scene: bpy.types.Scene, command: Callable[[Path], Sequence[str]]) -> S
     new.start()
     if not bpy.app.background:
         # Shaders need a window.
-        from .preview_drawing import Drawing
-
-        _drawings.append(Drawing(new))
+        _drawings.append(_Drawing(new))
         bpy.app.timers.register(_tick, first_interval=STEP_S, persistent=False)
     return new
 
@@ -50,7 +49,7 @@ def start(scene: bpy.types.Scene, command: Callable[[Path], Sequence[str]]) -> S
 def stop() -> None:
     """Stop the preview, if running."""
     while _drawings:
-        _drawings.pop().remove()  # type: ignore[attr-defined]
+        _drawings.pop().remove()
     while _sessions:
         old = _sessions.pop()
         old.stop()
@@ -122,3 +121,60 @@ class PHYSGEN_OT_toggle_preview(bpy.types.Operator):
         else:
             start(context.scene, worker_command(preferences.python(context)))
         return {"FINISHED"}
+
+
+class _Drawing:
+    """Draws the proxies of ``session`` in every 3D viewport of its scene until removed; part of no file or undo step."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._clip: Clip | None = None
+        self._batches: dict[int, list[Any]] = {}
+        self._handle: Any = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_VIEW")
+
+    def remove(self) -> None:
+        """Stop drawing."""
+        if self._handle is not None:
+            bpy.types.SpaceView3D.draw_handler_remove(self._handle, "WINDOW")
+            self._handle = None
+        self._batches = {}
+
+    def _draw(self) -> None:
+        session, clip = self._session, self._session.clip
+        if clip is None or clip.done == 0 or bpy.context.scene.session_uid != session.scene_uid:
+            return
+        if clip is not self._clip:
+            self._clip, self._batches = clip, {}
+        import gpu
+
+        shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+        if session.frame not in self._batches:
+            self._batches[session.frame] = _batches(clip, session.frame, shader)
+        depth, blend = gpu.state.depth_test_get(), gpu.state.blend_get()
+        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_mask_set(True)
+        gpu.state.face_culling_set("BACK")
+        gpu.state.blend_set("ALPHA")
+        with gpu.matrix.push_pop():
+            gpu.matrix.scale_uniform(1.0 / session.unit)
+            for batch in self._batches[session.frame]:
+                batch.draw(shader)
+        gpu.state.face_culling_set("NONE")
+        gpu.state.depth_mask_set(False)
+        gpu.state.depth_test_set(depth)
+        gpu.state.blend_set(blend)
+
+
+def _batches(clip: Clip, frame: int, shader: Any) -> list[Any]:
+    """Return the GPU batches of ``frame``, cached so that a loop costs nothing."""
+    from gpu_extras.batch import batch_for_shader
+
+    return [
+        batch_for_shader(
+            shader,
+            "TRIS",
+            {"pos": proxy.samples[frame], "color": shade_vertices(proxy.samples[frame], proxy.faces)},
+            indices=proxy.faces,
+        )
+        for proxy in clip.proxies
+    ]

@@ -7,10 +7,18 @@ from html.parser import HTMLParser
 
 import cv2
 import numpy as np
-from physgen.batch.farm.job_monitor import HEIGHT, Monitor, make_strip
+from physgen.batch.farm.job_monitor import (
+    HEIGHT,
+    MOST_ROWS,
+    STATES,
+    Monitor,
+    format_duration,
+    make_strip,
+    summarize,
+    summary_page,
+)
 from physgen.batch.farm.planning.plan import Outcome, Plan, Task
 from physgen.batch.farm.runners import ended_event, started_event
-from physgen.batch.farm.summary_page import MOST_ROWS, STATES, format_duration, summarize, summary_page
 from physgen.batch.farm.task_execution import log_path
 from physgen.physgen_addon.frames.frame_files import Part, write_exr
 from physgen.sim.version import VERSION

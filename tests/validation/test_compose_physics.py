@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.gaussians.compose.deformable_part import BoundMesh
+from physgen.sim.gaussians.compose.composition_parts import BoundMesh
 from physgen.sim.gaussians.compose.pair_stability import check_stability
 from physgen.sim.gaussians.compose.penetration import penetration_of_meshes
 from physgen.sim.gaussians.compose.physical_body import PhysicalBody, StepOptions

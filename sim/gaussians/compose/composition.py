@@ -33,8 +33,15 @@ from ..raster.rasteriser import Rasteriser, SplatGradients
 from ..splats import MAX_SCALE, MIN_SCALE, Splats, from_half_axes, half_axes, joined
 from ..views.posed_images import orbit_cameras
 from .compose_options import ComposeOptions
-from .composition_parts import Composition, CompositionPart, Reference, StepRecord, fraction_inside, part_distances
-from .deformable_part import DeformablePart
+from .composition_parts import (
+    Composition,
+    CompositionPart,
+    DeformablePart,
+    Reference,
+    StepRecord,
+    fraction_inside,
+    part_distances,
+)
 from .physical_body import StepOptions
 
 Array = NDArray[np.float64]

@@ -1,5 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Data of a composition: parts with splats and a closed surface, the reference image, and the result."""
+"""Parts of a composition: splats with a closed surface, the reference image and the result; and a part as a simulated
+body (Taichi): its splats, skin particles on its surface, and its mesh.
+
+Splats are fitted slightly under the surface that they show (``pair_fit.initial_splats``). If they alone met the
+boundary, the surface would penetrate by as much. So vertices of the surface are particles too. They are invisible and
+have no gradient: their velocity is the mean of the splats around them.
+
+The points of a body leave an obstacle to a hundredth of a grid cell. A mesh bound to them follows by interpolation,
+whose error is larger, and a flat face between two vertices may cut into a bulge. That is removed by projection: where
+a face is in the obstacle, its corners move along the gradient of the signed distance, by least squares for every
+sample of the face and smoothed over neighbours, until none is. The volume changes by no more than the layer that is
+lifted, as thin as the interpolation is good."""
 
 from __future__ import annotations
 
@@ -8,12 +19,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.spatial import cKDTree
 
 from ...errors import InputError
-from ...mpm.colliders import Surface
+from ...events import IsCancelled, never
+from ...mpm.colliders import Collider, Surface
 from ...mpm.geometry.signed_distance import DistanceLattice, signed_distance
 from ...scene.model import Camera
+from ...skinning import bind, deform
 from ..splats import Splats
+from .physical_body import PhysicalBody, StepOptions
 
 Pixels = NDArray[np.float64]
 
@@ -103,3 +119,183 @@ def fraction_inside(splats: Splats, lattices: Sequence[DistanceLattice]) -> floa
     for lattice in lattices:
         inside |= lattice.at(splats.centres)[0] < 0
     return float(inside.mean())
+
+
+Array = NDArray[np.float64]
+
+FACE_SUBDIVISIONS = 4
+"""Subdivisions of a triangle's side at whose points penetration is tested."""
+
+MAX_ITERATIONS = 60
+"""Iterations of the correction for each obstacle."""
+
+CLEARANCE = 0.02
+"""Lattice spacings that faces keep from the surface: of the order of the lattice's error."""
+
+SMOOTHING_RINGS = 3
+"""Rings of neighbours over which a correction is smoothed."""
+
+
+class BoundMesh:
+    """A mesh (vertices (V, 3), faces (T, 3), world metres) bound to a body in its rest state.
+
+    Raises InputError where the mesh exceeds the body by a tenth of its size, because it is of another object then.
+    """
+
+    def __init__(self, surface: Surface, body: PhysicalBody) -> None:
+        self._surface, self._body = surface, body
+        rest = body.rest
+        low, high = rest.min(axis=0), rest.max(axis=0)
+        reach = 0.1 * float((high - low).max())
+        if not ((surface.vertices > low - reach) & (surface.vertices < high + reach)).all():
+            raise InputError("bound mesh: it extends far beyond the body's points: give the mesh of the same object")
+        self._binding = bind(surface.vertices, rest)
+
+    def deformed(self) -> Surface:
+        """Return the mesh deformed with the body's particles."""
+        body = self._body
+        return Surface(
+            vertices=deform(self._binding, body.particles, body.particle_gradients), faces=self._surface.faces
+        )
+
+    def resolved(self) -> Surface:
+        """Return the same without residual penetration of the obstacles, which must be at rest."""
+        return resolve_penetration(self.deformed(), self._body.lattices)
+
+
+def resolve_penetration(surface: Surface, lattices: Sequence[DistanceLattice]) -> Surface:
+    """Return ``surface`` with its faces moved out of where ``lattices`` are negative.
+
+    Meant for the residual penetration of a simulation, a small fraction of a grid cell; deeper penetration is removed,
+    too, but distorts the mesh.
+    """
+    vertices = surface.vertices.copy()
+    i, j = (
+        n.ravel()
+        for n in np.meshgrid(np.arange(FACE_SUBDIVISIONS + 1), np.arange(FACE_SUBDIVISIONS + 1), indexing="ij")
+    )
+    held = i + j <= FACE_SUBDIVISIONS
+    shares = np.stack([FACE_SUBDIVISIONS - i - j, i, j], axis=1)[held] / FACE_SUBDIVISIONS
+    neighbours = _neighbour_means(len(vertices), surface.faces)
+    for lattice in lattices:
+        for _ in range(MAX_ITERATIONS):
+            moved = _face_corrections(vertices, surface.faces, shares, lattice)
+            if moved is None:
+                break
+            vertices = vertices + _smoothed(moved, neighbours)
+    return Surface(vertices=vertices, faces=surface.faces)
+
+
+def _face_corrections(
+    vertices: Array, faces: NDArray[np.int64], shares: Array, lattice: DistanceLattice
+) -> Array | None:
+    """Return displacements (V, 3), metres, that move the faces out of the lattice's inside; None where none is."""
+    corners = vertices[faces]
+    reach = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    near = np.flatnonzero(lattice.at(corners.mean(axis=1))[0] < reach + lattice.spacing)
+    places = np.einsum("sb,tbc->tsc", shares, corners[near])
+    distance, slope = lattice.at(places.reshape(-1, 3))
+    lack = CLEARANCE * lattice.spacing - distance
+    if not (lack > 0.5 * CLEARANCE * lattice.spacing).any():
+        return None
+    face, place = np.divmod(np.flatnonzero(lack > 0), len(shares))
+    weights = shares[place]
+    away = slope[lack > 0] / np.maximum(np.linalg.norm(slope[lack > 0], axis=1), 1e-9)[:, None]
+    # A single sample is moved by least squares over its three corners; several are averaged.
+    ways = (lack[lack > 0] / (weights**2).sum(axis=1))[:, None] * away
+    owner = faces[near[face]].ravel()
+    total = np.stack(
+        [np.bincount(owner, (weights**2 * ways[:, k, None]).ravel(), len(vertices)) for k in range(3)], axis=1
+    )
+    weight = np.bincount(owner, weights.ravel(), len(vertices))
+    return np.asarray(total / np.maximum(weight, 1e-12)[:, None])
+
+
+def _smoothed(ways: Array, neighbours: csr_matrix) -> Array:
+    """Return displacements (V, 3) smoothed over neighbours; vertices with their own keep it."""
+    own = np.linalg.norm(ways, axis=1) > 0
+    result = ways
+    for _ in range(SMOOTHING_RINGS):
+        result = np.where(own[:, None], ways, 0.5 * (neighbours @ result))
+    return result
+
+
+def _neighbour_means(count: int, faces: NDArray[np.int64]) -> csr_matrix:
+    """Return the matrix (V, V) that averages over the vertices that share an edge with each."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    both = np.concatenate([ends, ends[:, ::-1]])
+    linked = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+    linked.data[:] = 1.0
+    degree = np.maximum(np.asarray(linked.sum(axis=1)).ravel(), 1.0)
+    return csr_matrix(coo_matrix((1.0 / degree, (np.arange(count), np.arange(count)))).tocsr() @ linked)
+
+
+SKIN_NEIGHBOURS = 8
+"""Splats from which a skin particle takes its velocity."""
+
+MIN_SKIN = 2_000
+"""Least number of skin particles, if the surface has as many vertices; at most as many as splats beyond that."""
+
+
+class DeformablePart:
+    """``part`` as an elastic body beside obstacles. Raises what ``PhysicalBody`` raises."""
+
+    def __init__(
+        self, part: CompositionPart, obstacles: Sequence[Collider], options: StepOptions, *, seed: int = 0
+    ) -> None:
+        centres, vertices = part.splats.centres, part.surface.vertices
+        self._count = len(centres)
+        most = max(MIN_SKIN, self._count)
+        kept = np.arange(len(vertices))
+        if len(kept) > most:
+            kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
+        skin = vertices[kept]
+        self._follow = _skin_weights(centres, skin)
+        self._body = PhysicalBody(
+            points=np.concatenate([centres, skin]), surface=part.surface, obstacles=obstacles, options=options
+        )
+        self._mesh = BoundMesh(part.surface, self._body)
+
+    @property
+    def cell(self) -> float:
+        """Side of the grid's cells in metres."""
+        return self._body.cell
+
+    @property
+    def points(self) -> Array:
+        """Current centres of the splats, (N, 3) world metres."""
+        return self._body.points[: self._count]
+
+    @property
+    def gradients(self) -> Array:
+        """Deformation gradients (N, 3, 3) of the splats since the start."""
+        return self._body.gradients[: self._count]
+
+    def step(self, velocities: Array, stop: IsCancelled = never) -> None:
+        """Advance the simulator by one step from velocities (N, 3) of the splats, metres a step."""
+        self._body.step(self._with_skin(velocities), stop=stop)
+
+    def place(self, points: Array) -> None:
+        """Move the splats to (N, 3), world metres, without simulation; skin and filling follow."""
+        now = self._body.points
+        self._body.place(now + self._with_skin(points - now[: self._count]))
+
+    def surface(self) -> Surface:
+        """Return the part's surface deformed with its particles."""
+        return self._mesh.deformed()
+
+    def resolved_surface(self) -> Surface:
+        """Return the same with residual penetration of the obstacles removed."""
+        return self._mesh.resolved()
+
+    def _with_skin(self, values: Array) -> Array:
+        return np.concatenate([values, self._follow @ values])
+
+
+def _skin_weights(centres: Array, skin: Array) -> csr_matrix:
+    """Return the matrix (M, N) of each skin particle's mean over its nearest centres, weighted by 1 / distance²."""
+    distance, nearest = cKDTree(centres).query(skin, k=min(SKIN_NEIGHBOURS, len(centres)))
+    weights = 1.0 / np.maximum(distance, 1e-9 + 1e-3 * np.median(distance)) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(skin)), weights.shape[1])
+    return csr_matrix((weights.ravel(), (rows, nearest.ravel())), shape=(len(skin), len(centres)))
