@@ -124,7 +124,7 @@ class PHYSGEN_OT_toggle_preview(bpy.types.Operator):
 
 
 class _Drawing:
-    """Draws the proxies of ``session`` in every 3D viewport of its scene until removed; part of no file or undo step."""
+    """Draws the proxies of ``session`` in every 3D viewport of its scene until removed. Not stored or undone."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

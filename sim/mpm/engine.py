@@ -36,7 +36,7 @@ from .kernels.substep import substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
 from .rigid.rigid_bodies import RigidBodies
-from .rigid.rigid_motion import advance_solids
+from .rigid.rigid_motion import advance_bodies
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -428,7 +428,7 @@ class Engine:
     def _advance_solids(self) -> None:
         """All substeps of all worlds, none of which holds particles."""
         solids = self.solids
-        advance_solids(self._limits(), self._worlds(), solids.bodies, solids.shapes, solids.contacts)
+        advance_bodies(self._limits(), self._worlds(), solids.bodies, solids.shapes, solids.contacts)
 
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""

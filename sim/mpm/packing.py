@@ -120,15 +120,15 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
     pairs: list[tuple[float, ...]] = []
     world_integers = np.zeros((len(all_places), layout.WORLD_INTEGERS), dtype=np.int32)
     field_integers = np.zeros((len(bodies), layout.FIELD_INTEGERS), dtype=np.int32)
-    first_solid = 0
+    first_body = 0
     for place in all_places:
         setup, soft = place.setup, place.soft
         obstacles = collider_names(setup)
         row = world_integers[place.world]
-        row[layout.FIRST_SOLID], row[layout.SOLIDS] = first_solid, len(obstacles)
+        row[layout.FIRST_SOLID], row[layout.SOLIDS] = first_body, len(obstacles)
         row[layout.FIRST_FIELD], row[layout.FIELDS] = place.first_field, len(soft)
         row[layout.FIRST_PAIR] = len(pairs)
-        first_solid += len(obstacles)
+        first_body += len(obstacles)
         for i in soft:
             body = setup.bodies[i]
             integers = field_integers[place.field(i)]

@@ -6,7 +6,7 @@ before the next sort."""
 
 import taichi as ti
 
-from .collider_distance import solid_distance
+from .collider_distance import body_distance
 from .kernel_arrays import (
     BlockTable,
     GridBlocks,
@@ -73,7 +73,7 @@ def list_near_blocks(
         first = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
         for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + SOLIDS]):
             if not is_near:
-                phi, _, _ = solid_distance(i, centre, HALF_DIAGONAL + NEAR, bodies, shapes)
+                phi, _, _ = body_distance(i, centre, HALF_DIAGONAL + NEAR, bodies, shapes)
                 is_near = phi < HALF_DIAGONAL + NEAR
         near.slot[k] = -1
         if is_near:

@@ -63,7 +63,7 @@ def outside_box(shape, point, shapes: ShapeArrays):
 
 @func
 def sample_distance(shape, point, shapes: ShapeArrays):
-    """(gradient xyz, distance) of ``shape`` at ``point``, trilinear; the distance is negative inside the solid.
+    """(gradient xyz, distance) of ``shape`` at ``point``, trilinear; the distance is negative inside.
 
     Outside the lattice: the distance at the nearest point of its box plus the way there, which is no less than the true
     one, and the sum of both gradients, of length 1.
@@ -107,9 +107,9 @@ def single3(array: Doubles, first: ti.i32):
 
 
 @func
-def solid_distance(i: ti.i32, place: vec3, farthest: ti.f32, bodies: RigidArrays, shapes: ShapeArrays):
-    """Return the distance (cells) of ``place`` from solid ``i``, the normal there (world axes) and the rate at which a
-    deforming surface approaches (cells/s). The distance is 1e9 beyond ``farthest`` or before the solid's start."""
+def body_distance(i: ti.i32, place: vec3, farthest: ti.f32, bodies: RigidArrays, shapes: ShapeArrays):
+    """Return the distance (cells) of ``place`` from the rigid body or collider ``i``, the normal there (world axes) and
+    the rate at which a deforming surface approaches (cells/s). The distance is 1e9 beyond ``farthest`` or before its start."""
     phi, normal, swelling = 1e9, vec3(0.0, 0.0, 1.0), 0.0
     arm = place - single3(bodies.state, i * SOLID + X)
     if bodies.kinds[i * KINDS + KIND] != WAITING and arm.norm() < (
@@ -136,15 +136,15 @@ def solid_distance(i: ti.i32, place: vec3, farthest: ti.f32, bodies: RigidArrays
 
 
 @func
-def solid_velocity(i: ti.i32, place: vec3, bodies: RigidArrays):
-    """Return the predicted velocity (cells/s) of solid ``i`` at ``place`` after this substep."""
+def body_velocity(i: ti.i32, place: vec3, bodies: RigidArrays):
+    """Return the predicted velocity (cells/s) of body ``i`` at ``place`` after this substep."""
     arm = place - single3(bodies.state, i * SOLID + X)
     return single3(bodies.state, i * SOLID + V_NEXT) + single3(bodies.state, i * SOLID + W_NEXT).cross(arm)
 
 
 @func
-def solid_give(i: ti.i32, place: vec3, normal: vec3, bodies: RigidArrays):
-    """Return the inverse effective mass (1/kg) of solid ``i`` at ``place`` along ``normal``."""
+def body_compliance(i: ti.i32, place: vec3, normal: vec3, bodies: RigidArrays):
+    """Return the inverse effective mass (1/kg) of body ``i`` at ``place`` along ``normal``."""
     give = 0.0
     if bodies.kinds[i * KINDS + KIND] == DYNAMIC:
         lever = (place - single3(bodies.state, i * SOLID + X)).cross(normal)
@@ -157,7 +157,7 @@ def solid_give(i: ti.i32, place: vec3, normal: vec3, bodies: RigidArrays):
 
 @func
 def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, bodies: RigidArrays, coupling: CouplingArrays):
-    """Add the impulse ``given`` at ``place`` on solid ``i`` to ``coupling.pushes[row]``."""
+    """Add the impulse ``given`` at ``place`` on body ``i`` to ``coupling.pushes[row]``."""
     turn = (place - single3(bodies.state, i * SOLID + X)).cross(given)
     for n in ti.static(range(3)):
         coupling.pushes[row + n] += given[n]
@@ -168,7 +168,7 @@ def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, bodies: RigidArra
 def gather_pushes(
     worlds: WorldArrays, blocks: ParticleBlocks, near: NearBlocks, bodies: RigidArrays, coupling: CouplingArrays
 ):
-    """Sum the blocks' impulses on each solid into ``bodies.impulses`` and the touching mass (kg) into ``touching``."""
+    """Sum the blocks' impulses on each body into ``bodies.impulses`` and the touching mass (kg) into ``touching``."""
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
         if worlds.control[w * CONTROL_ROW + PHASE] == FULL:

@@ -26,7 +26,7 @@ the particle), which makes it exact for even contact and stable for any, by Gers
 
 import taichi as ti
 
-from .collider_distance import PUSH, add_push, solid_distance, solid_give, solid_velocity
+from .collider_distance import PUSH, add_push, body_compliance, body_distance, body_velocity
 from .kernel_arrays import (
     CouplingArrays,
     GridBlocks,
@@ -182,8 +182,8 @@ def solve_contact(
                 plane = triple(worlds.numbers, w * WORLD_ROW + PLANE_NORMAL)
                 first_touch = worlds.field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
                 has_anchors = worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
-                first_solid = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-                solid_count = worlds.integers[w * WORLD_INTEGERS + SOLIDS]
+                first_body = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
+                body_count = worlds.integers[w * WORLD_INTEGERS + SOLIDS]
                 first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
                 level = plane.dot(first_node) - worlds.numbers[w * WORLD_ROW + PLANE_OFFSET]
                 time = ti.cast(worlds.control[c + ELAPSED], ti.f32) + dt
@@ -199,9 +199,9 @@ def solve_contact(
                     obstacle, second_obstacle = 0, 0
                     if has_plane:
                         phi = level + plane.dot(gp) - fixed[3]
-                    for o in range(solid_count):
-                        found, along, rate = solid_distance(
-                            first_solid + o, first_node + gp, MOST_SLACK + AHEAD * reach + fixed[3], bodies, shapes
+                    for o in range(body_count):
+                        found, along, rate = body_distance(
+                            first_body + o, first_node + gp, MOST_SLACK + AHEAD * reach + fixed[3], bodies, shapes
                         )
                         found -= fixed[3]
                         if found < AHEAD * reach:
@@ -244,9 +244,9 @@ def solve_contact(
                             surface = swelling * normal
                             give = 0.0
                             if obstacle > 0:
-                                i = first_solid + obstacle - 1
-                                surface += solid_velocity(i, here, bodies)
-                                give = coupling.touching[i] * solid_give(i, here, normal, bodies)
+                                i = first_body + obstacle - 1
+                                surface += body_velocity(i, here, bodies)
+                                give = coupling.touching[i] * body_compliance(i, here, normal, bodies)
                             new = press(
                                 old,
                                 velocity - surface,
@@ -261,7 +261,7 @@ def solve_contact(
                             if second < reach:
                                 surface = second_swelling * second_normal
                                 if second_obstacle > 0:
-                                    surface += solid_velocity(first_solid + second_obstacle - 1, here, bodies)
+                                    surface += body_velocity(first_body + second_obstacle - 1, here, bodies)
                                 left = (velocity + share * (new - old) - surface).dot(second_normal)
                                 wanted = parting_speed(second, dt, recovery)
                                 beside = (ti.max(0.0, wanted - left) / (share + give)) * second_normal
@@ -275,11 +275,11 @@ def solve_contact(
                                 nodes.scattered[n] = nodes.scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
                             if obstacle > 0 and not pinned:
                                 row = (s * coupling.most_bodies + obstacle - 1) * PUSH
-                                add_push(first_solid + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
+                                add_push(first_body + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
                             if second_obstacle > 0 and beside.norm_sqr() > 0.0:
                                 row = (s * coupling.most_bodies + second_obstacle - 1) * PUSH
                                 given = -fixed[0] * beside
-                                add_push(first_solid + second_obstacle - 1, row, here, given, bodies, coupling)
+                                add_push(first_body + second_obstacle - 1, row, here, given, bodies, coupling)
                 near.slack[k] = least - AHEAD * reach
 
 

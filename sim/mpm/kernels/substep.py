@@ -80,8 +80,8 @@ def part_bodies_of(laws: int) -> BundledKernel:
 
 
 @kernel
-def plan_solids(worlds: WorldArrays, bodies: RigidArrays):
-    """Write the worlds' steps for the rigid kernels, 0 for idle worlds, and predict each solid's velocity."""
+def plan_bodies(worlds: WorldArrays, bodies: RigidArrays):
+    """Write the worlds' steps for the rigid kernels, 0 for idle worlds, and predict each rigid body's velocity."""
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
         bodies.steps[w] = 0.0
@@ -148,7 +148,7 @@ def substep_launcher(generation: int, laws: int, overlap: bool, bodies: bool, ne
     if overlap:
         kernels.append(part_bodies_of(laws))
     if bodies:
-        kernels.append(plan_solids)
+        kernels.append(plan_bodies)
     if near:
         kernels.append(resolve_contact)
     if bodies:

@@ -58,10 +58,10 @@ from .rigid_layout import (
 from .rigid_math import dvec3, dvec4, load3, load33, store3
 
 REACH = 0.02
-"""Cells from the other surface within which points of a solid at rest count as touching."""
+"""Cells from the other surface within which points of a body at rest count as touching."""
 
 SPEEDING = 1.5
-"""Factor by which solids may speed up within a substep."""
+"""Factor by which bodies may speed up within a substep."""
 
 DEPTH_COUNTS = 4.0
 """Cells along the surface that a cell of depth is worth when the contacts of a pair are thinned out."""
@@ -81,7 +81,7 @@ SHARP = 0.995
 
 @func
 def frame_of(w, b, bodies: RigidArrays):
-    """Origin and axes (as columns) of solid ``b``, or of the plane, whose third axis is its normal, for -1."""
+    """Origin and axes (as columns) of body ``b``, or of the plane, whose third axis is its normal, for -1."""
     axes = load33(bodies.world_numbers, w * WORLD + PLANE).transpose()
     origin = bodies.world_numbers[w * WORLD + OFFSET] * dvec3(axes[0, 2], axes[1, 2], axes[2, 2])
     if b >= 0:
@@ -92,7 +92,7 @@ def frame_of(w, b, bodies: RigidArrays):
 
 @func
 def distance_to(b, local, bodies: RigidArrays, shapes: ShapeArrays):
-    """(gradient, distance) of solid ``b``, or of the plane for -1, at a point in its frame, and the rate of a collider
+    """(gradient, distance) of body ``b``, or of the plane for -1, at a point in its frame, and the rate of a collider
     that deforms: distance of its second lattice less that of its first."""
     found = dvec4(0.0, 0.0, 1.0, local[2])
     change = ti.cast(0.0, ti.f64)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Columns of rigid bodies, contact pairs and contacts in the flat arrays of ``kernels.kernel_arrays``.
 
-A solid is a rigid body (DYNAMIC), a collider with prescribed motion (KINEMATIC) or one at rest (STATIC). Lengths
-in cells, seconds, kilograms, radians; world axes unless said otherwise. Imports no Taichi.
+A body is dynamic (DYNAMIC), or a collider with prescribed motion (KINEMATIC) or at rest (STATIC); arrays and
+checkpoints call all three solids. Lengths in cells, seconds, kilograms, radians; world axes unless said otherwise.
+Imports no Taichi.
 """
 
 WAITING, DYNAMIC, KINEMATIC, STATIC = -1, 0, 1, 2
-"""Types of solids; one that waits for its start time stays in place and touches nothing."""
+"""Types of bodies; one that waits for its start time stays in place and touches nothing."""
 
 # ---- per solid, changing: ``solids`` f64 --------------------------------------------------------------------------
 SOLID = 64

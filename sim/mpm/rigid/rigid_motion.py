@@ -66,7 +66,7 @@ ITERATIONS = 512
 
 @func
 def predict(w, dt, bodies: RigidArrays):
-    """Predict velocities of all solids of world ``w`` after ``dt``, from their accelerations in the last substep."""
+    """Predict velocities of all bodies of world ``w`` after ``dt``, from their accelerations in the last substep."""
     for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
         for c in ti.static(range(3)):
             bodies.state[i * SOLID + V_NEXT + c] = (
@@ -79,7 +79,7 @@ def predict(w, dt, bodies: RigidArrays):
 
 @func
 def act(w, i, dt, bodies: RigidArrays):
-    """Apply forces over ``dt`` and the particles' impulses to solid ``i``; the impulses are set to 0."""
+    """Apply forces over ``dt`` and the particles' impulses to body ``i``; the impulses are set to 0."""
     r, n = i * SOLID, i * NUMBERS
     inverse = bodies.numbers[n + INVERSE_MASS]
     velocity, spin = load3(bodies.state, r + V), load3(bodies.state, r + W)
@@ -156,7 +156,7 @@ def move(w, i, dt, bodies: RigidArrays):
 
 @func
 def push_and_search(w, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts):
-    """First half of a substep of world ``w``: forces on its solids over ``dt`` (f64, s), and contact search."""
+    """First half of a substep of world ``w``: forces on its bodies over ``dt`` (f64, s), and contact search."""
     for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
         act(w, i, dt, bodies)
     for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
@@ -166,7 +166,7 @@ def push_and_search(w, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: R
 
 @func
 def solve_and_move(w, dt, bodies: RigidArrays, contacts: RigidContacts):
-    """Second half: contact impulses between the solids of world ``w``, and their motion over ``dt``."""
+    """Second half: contact impulses between the bodies of world ``w``, and their motion over ``dt``."""
     first_pair, end_pair = bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]
     for c in range(REPORT):
         bodies.report[w * REPORT + c] = 0
@@ -211,7 +211,7 @@ def move_worlds(bodies: RigidArrays, contacts: RigidContacts):
 
 
 @kernel
-def advance_solids(
+def advance_bodies(
     limits: StepLimits, worlds: WorldArrays, bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts
 ):
     """Take every world that is not idle to the end of its segment of time; of worlds that hold no particles.

@@ -11,7 +11,7 @@ For each contact with gap phi, normal n from b to a, relative velocity u = u_n n
     u_n >= -phi / dt       elsewhere, phi > 0;  u_n >= 0 elsewhere
     lambda_n >= 0, complementary;  |lambda_t| <= mu lambda_n, opposed to u_t where equal;  |lambda_r| <= lever lambda_n
 
-Penetration is corrected by separate velocities (``PUSH_V``) that move the solids but are dropped afterwards, so that
+Penetration is corrected by separate velocities (``PUSH_V``) that move the bodies but are dropped afterwards, so that
 the correction adds no energy.
 """
 
@@ -81,7 +81,7 @@ SETTLED = 1e-3
 """Share of the speed that gravity gives in a substep below which a change counts as converged."""
 
 QUICK = 3.0
-"""Multiple of the speed that gravity gives in a substep above which a solid bounces."""
+"""Multiple of the speed that gravity gives in a substep above which a body bounces."""
 
 ENGAGE = 0.02
 """Cells within which slip and sticky contacts engage."""
@@ -98,7 +98,7 @@ def cross_product_matrix_column(arm, inverse_inertia, axis):
 
 @func
 def kick(i, row_v, row_w, impulse, moment, bodies: RigidArrays):
-    """Add an impulse and an angular impulse to the velocities at ``row_v`` and ``row_w`` of solid ``i``."""
+    """Add an impulse and an angular impulse to the velocities at ``row_v`` and ``row_w`` of body ``i``."""
     for c in ti.static(range(3)):
         bodies.state[i * SOLID + row_v + c] += bodies.numbers[i * NUMBERS + INVERSE_MASS] * impulse[c]
     turn = load33(bodies.state, i * SOLID + J) @ moment
