@@ -45,9 +45,9 @@ SHIPPED = frozenset(
         "pip",
     }
 )
-"""What every Blender brings along; a second copy could only disagree with it."""
+"""Packages that every Blender ships; a second copy could only conflict with them."""
 PURE = ("trimesh",)
-"""What Blender's own process uses besides numpy: it reads mesh files."""
+"""Packages that Blender's own process uses besides numpy: trimesh reads mesh files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes, compression: int) 
 
 
 def requirements(root: Path, python: str) -> list[str]:
-    """What the project at ``root`` depends on with that Python, markers resolved (pip would ask its own Python)."""
+    """Return the requirements of the project at ``root`` for that Python, markers resolved (pip would use its own)."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     found = []
     for line in project["dependencies"]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a bake needs to go on where it stopped: the engine's state, how many frames are done, their metrics."""
+"""Checkpoints, from which a stopped bake resumes: state of the engine, number of complete frames, their metrics."""
 
 from __future__ import annotations
 

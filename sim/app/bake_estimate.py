@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a bake will cost, without baking: the scene is sampled and checked as for the bake itself."""
+"""Cost of a bake, without baking: the scene is sampled and checked as for the bake itself."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ SPLAT_BYTES = 68
 """Of a PLY file, a splat: seventeen numbers. Its header is within ``FRAME_BYTES``."""
 
 SPARE_BYTES = 64 * 2**20
-"""That stay free, for what else happens on the disk."""
+"""Bytes that stay free for other programs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeCost:
-    """What a bake will take.
+    """Estimated cost of a bake.
 
     prepared: the world that it would begin with; its ``cost`` says substeps, seconds and bytes of memory.
     disk_bytes: of the finished bake and its largest checkpoint.
@@ -42,7 +42,7 @@ class BakeCost:
     disk_bytes: int
 
     def to_json(self) -> dict[str, Any]:
-        """For programs: particles, cells (filled, and their side in m), substeps, seconds, bytes, warnings."""
+        """Return the cost as JSON: particles, cells (count, side in m), substeps, seconds, bytes, warnings."""
         prepared, cost = self.prepared, self.prepared.cost
         return {
             "particles": prepared.particle_count,
@@ -57,15 +57,15 @@ class BakeCost:
 
 
 def estimate_bake(folder: Scene, options: BakeOptions) -> PreparedWorld:
-    """The world that a bake of ``folder`` would begin with; its ``cost`` is time and memory.
+    """Return the world that a bake of ``folder`` starts from; its ``cost`` is time and memory.
 
-    Raises InputError as ``setup_world.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
+    Raises InputError as ``world_setup.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
     """
     return bake_cost(folder, options).prepared
 
 
 def bake_cost(folder: Scene, options: BakeOptions) -> BakeCost:
-    """What a bake of ``folder`` will take, disk included. Raises InputError as ``estimate_bake`` does."""
+    """Return the estimated cost of a bake of ``folder``, disk included. Raises InputError as ``estimate_bake`` does."""
     meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
     prepared = prepare_world(folder, meshes, options)
@@ -74,7 +74,7 @@ def bake_cost(folder: Scene, options: BakeOptions) -> BakeCost:
 
 
 def disk_bytes(objects: Iterable[BakedObject], particles: int, frames: int) -> int:
-    """Bytes of the caches of ``objects``, and of two checkpoints: one is only given up when the next is whole."""
+    """Return the bytes of the caches of ``objects`` and of two checkpoints: one is kept until the next is complete."""
     a_frame = FRAME_BYTES
     for item in objects:
         a_frame += 12 * sum(item.files.values())

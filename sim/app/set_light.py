@@ -32,13 +32,13 @@ LIGHT_FOLDER = "light"
 
 @dataclass(frozen=True, kw_only=True)
 class LightRequest:
-    """What the light of a scene shall be; what is not given stays as it is.
+    """Changes to the light of a scene; fields that are not given leave it as it is.
 
-    environment: .hdr or .exr file; frame: where its middle looks (``sim.scene.equirectangular.FRAMES``).
-    sun: False takes the sun away. sun_direction: towards the sun (right, away, up), of any length; sun_strength: its
+    environment: .hdr or .exr file; frame: the direction of its middle column (``sim.scene.equirectangular.FRAMES``).
+    sun: False removes the sun. sun_direction: towards the sun (right, away, up), of any length; sun_strength: its
     irradiance over the environment's on open ground, 0 to 20; sun_angle_deg: its apparent diameter, 0 to 180.
-    estimate: look for the sun in the photo's shadows, and without ``environment`` take the photo's own again. A new
-    environment without any word about the sun asks for this too: the sun's ratio to it is another.
+    estimate: estimate the sun from the photo's shadows and, without ``environment``, the environment from the photo. A
+    new environment alone implies this, because the sun's strength is relative to it.
     """
 
     environment: Path | None = None
@@ -50,11 +50,11 @@ class LightRequest:
     estimate: bool = False
 
     def __post_init__(self) -> None:
-        told = [n for n in ("sun_direction", "sun_strength", "sun_angle_deg") if getattr(self, n) is not None]
-        if told and not self.sun:
-            raise InputError(f"{told[0]} and no sun: give one of them, not both")
-        if told and self.estimate:
-            raise InputError(f"{told[0]} and estimate: the sun is either told or estimated; leave one of them out")
+        given = [n for n in ("sun_direction", "sun_strength", "sun_angle_deg") if getattr(self, n) is not None]
+        if given and not self.sun:
+            raise InputError(f"{given[0]} and no sun: give one of them, not both")
+        if given and self.estimate:
+            raise InputError(f"{given[0]} and estimate: the sun is either given or estimated; leave one of them out")
         if self.frame not in FRAMES:
             raise InputError(f"frame is {self.frame!r}: choose {', '.join(FRAMES)}")
         if self.sun_direction is not None:
@@ -78,16 +78,16 @@ def set_light(scene: Scene, *, request: LightRequest, on_event: OnEvent = ignore
     def notice(message: str) -> None:
         on_event({"event": "notice", "stage": "light", "message": message})
 
-    told = (request.sun_direction, request.sun_strength, request.sun_angle_deg) != (None, None, None)
+    sun_given = (request.sun_direction, request.sun_strength, request.sun_angle_deg) != (None, None, None)
     given = None
     if request.environment is not None:
         given = prepared(request.environment, request.frame, folder.model.camera, ground)
     radiance, light = given, folder.model.light
-    if not told and (request.estimate or given is not None):
+    if not sun_given and (request.estimate or given is not None):
         radiance, light = _estimated(folder, given, request, notice)
     elif not request.sun:
         light = dataclasses.replace(light, sun_direction=None)
-    if told:
+    if sun_given:
         light = _with_sun(light, request, ground)
     light = _keep(folder, radiance, light)
     if light == folder.model.light:
@@ -96,7 +96,7 @@ def set_light(scene: Scene, *, request: LightRequest, on_event: OnEvent = ignore
     old, changed = folder.model.light.environment, dataclasses.replace(folder.model, light=light)
     saved = save_scene(scene.root, changed)
     if old is not None and old != light.environment and old.startswith(f"{LIGHT_FOLDER}/"):
-        # A file in use (Windows) stays; nothing names it any more.
+        # Windows keeps a file in use; nothing refers to it any more.
         with contextlib.suppress(OSError):
             folder.file(old).unlink(missing_ok=True)
     notice(describe_sun(light))
@@ -114,11 +114,11 @@ def _estimated(
     for item in scene.objects:
         if item.mask is None:
             raise InputError(
-                f"object {item.name!r} has no mask, so its shadow cannot be told from it; give the sun with "
+                f"object {item.name!r} has no mask, so the sun cannot be estimated from its shadow; give it with "
                 "--sun-direction, or none with --no-sun"
             )
         masks.append(read_mask(folder.file(item.mask)))
-    # A body made from its outline stands where it can; its shadow tells more when it is left where the outline has it.
+    # A body made from an outline was moved to stand safely; its shadow fits better where the outline has it.
     bare = (folder.root / STAMP_FILE).is_file() and np.allclose(ground.normal, (0, 0, 1)) and ground.point[2] == 0
     meshes = []
     for item, mask in zip(scene.objects, masks, strict=True):

@@ -36,7 +36,7 @@ ARCHITECTURES = ("cpu", "cuda", "vulkan", "metal")
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """What to render of a variant, besides ``RenderOptions``.
+    """Frames and videos to render of a variant, besides ``RenderOptions``.
 
     frames: range such as ``1-48x2``; None for all baked frames. chunk: frames per task, 1 to 10000.
     video: outputs made from the frames, some of ``VIDEOS``; may be empty.

@@ -20,13 +20,13 @@ from ...errors import InputError
 from .triangles import Array, Faces, check_closed, inside_lattice, signed_volume, validated
 
 MIN_PARTICLES = 8
-"""Fewest particles that make a body: one grid cell's worth at the usual density."""
+"""Minimum number of particles of a body: one grid cell of them at the usual density."""
 
 FINE = 3
 """Test points per particle spacing and axis."""
 
 MAX_FINE_POINTS = 400_000_000
-"""Largest lattice that is tried, about 1.2 GB of memory."""
+"""Maximum number of test points, about 1.2 GB of memory."""
 
 COVERED = 0.9
 """A test point is covered by a particle within this many spacings (half a lattice cell's diagonal is 0.87)."""
@@ -55,9 +55,9 @@ def sample_interior(
     jitter: float = 0.0,
     seed: int = 0,
 ) -> InteriorSample:
-    """Particles about ``spacing`` apart through the whole inside of a closed triangle mesh.
+    """Return particles about ``spacing`` apart that fill a closed triangle mesh.
 
-    vertices: (V, 3); faces: (T, 3) indices. Vertices in the same place are taken as one, so seams do no harm.
+    vertices: (V, 3); faces: (T, 3) indices. Coincident vertices are merged, so seams do not matter.
     spacing: distance between neighbouring particles, in the mesh's units; above 0.
     jitter: random displacement on each axis as a share of the spacing, 0 to 0.45; ``seed`` makes it repeatable.
 
@@ -118,7 +118,7 @@ def _too_few(count: int, spacing: float, extent: Array) -> InputError:
 
 
 def _cover_thin_parts(positions: Array, fine: Array, low: Array, step: Array, counts: NDArray[np.int64]) -> Array:
-    """Add a particle to each lattice cell with inside test points that no particle is near to."""
+    """Return the particles with one more in each lattice cell whose inside test points have none nearby."""
     if len(positions):
         distance = cKDTree(positions / step).query(fine / step, distance_upper_bound=COVERED)[0]
         fine = fine[~np.isfinite(distance)]
@@ -138,7 +138,7 @@ def _cover_thin_parts(positions: Array, fine: Array, low: Array, step: Array, co
 
 
 def _surface_distance(points: Array, triangles: Faces, positions: Array, spacing: float) -> Array:
-    """Distance of ``positions`` to the plane of the nearest face, inf beyond ``spacing``."""
+    """Return the distance of ``positions`` to the plane of the nearest face, inf beyond ``spacing``."""
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)

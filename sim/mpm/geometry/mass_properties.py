@@ -43,7 +43,7 @@ class MassProperties:
 def mass_properties(
     positions: NDArray[np.floating], masses: NDArray[np.floating], *, volumes: NDArray[np.floating] | None = None
 ) -> MassProperties:
-    """Of particles at positions (N, 3), metres, with masses (N,), kg.
+    """Return the mass properties of particles at positions (N, 3), metres, with masses (N,), kg.
 
     volumes: (N,) m³ gives every particle the inertia of a cube of that volume; None makes them points.
 
@@ -66,7 +66,8 @@ def mass_properties(
 
 
 def solid_mass_properties(surface: Surface, *, density: float) -> MassProperties:
-    """Of a closed surface filled evenly with a material of ``density`` kg/m³, exactly, by the divergence theorem.
+    """Return the mass properties of a closed surface filled with a material of ``density`` kg/m³, by the divergence
+    theorem, exact for the mesh.
 
     Hollows count as hollows, and parts inside others not again; where parts overlap in part, the overlap counts twice.
 
@@ -90,7 +91,7 @@ def solid_mass_properties(surface: Surface, *, density: float) -> MassProperties
 
 
 def _moments(corners: Array) -> tuple[float, Array, Array]:
-    """Volume, centre (3,) and second moments (3, 3) about the centre of what outward faces (T, 3, 3) bound."""
+    """Return volume, centre (3,) and second moments (3, 3) about it of the solid inside outward faces (T, 3, 3)."""
     middle = corners.reshape(-1, 3).mean(axis=0)
     local = corners - middle
     six = np.einsum("ti,ti->t", local[:, 0], np.cross(local[:, 1], local[:, 2]))

@@ -28,13 +28,13 @@ from .triangles import (
 )
 
 MAX_PAIRS = 200_000
-"""Pairs of faces that are tested for whether they cross."""
+"""Number of face pairs that are tested for intersection."""
 
 MAX_NEIGHBOURS = 20_000_000
-"""Neighbouring pairs that are searched at most for those to be tested."""
+"""Maximum number of neighbouring pairs from which these are drawn."""
 
 THIN_SAMPLES = 2000
-"""Places at which a surface's thickness is measured."""
+"""Number of points at which a surface's thickness is measured."""
 
 THIN_SHARE = 0.02
 """Share of a surface that may be thin without a warning."""
@@ -91,7 +91,7 @@ def check_surface(surface: Surface, *, name: str, cell_size: float | None = None
 
 
 def _crossing_faces(points: Array, triangles: Faces) -> tuple[int, int, int]:
-    """Pairs of faces without a common vertex that cross; pairs tested; pairs there are to test, about.
+    """Return the intersecting pairs of faces without a common vertex, the pairs tested, and about how many there are.
 
     Faces that only touch do not cross.
     """
@@ -146,7 +146,7 @@ def _crossing_faces(points: Array, triangles: Faces) -> tuple[int, int, int]:
 
 
 def _normals_beyond(triangles: Faces, mesh: Array) -> Array:
-    """Normals (T, 3, 3) of the faces beyond the edges, from each corner to the next; 0 where there is not just one."""
+    """Return the normals (T, 3, 3) of the faces across the edges, corner to corner; 0 unless there is just one."""
     normals = face_normals(mesh)[0]
     ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -161,7 +161,7 @@ def _normals_beyond(triangles: Faces, mesh: Array) -> Array:
 
 
 def _pierces(start: Array, end: Array, corners: Array, beyond: Array, least: float) -> NDArray[np.bool_]:
-    """Which segments (N, 3) go through their triangles (N, 3, 3), by more than the length ``least``.
+    """Return which segments (N, 3) pass through their triangles (N, 3, 3) by more than the length ``least``.
 
     beyond: (N, 3, 3) normals of the faces beyond the edges. A segment through an edge goes through the surface where
     it goes through both faces the same way; else it touches a ridge.
@@ -185,7 +185,7 @@ def _pierces(start: Array, end: Array, corners: Array, beyond: Array, least: flo
 
 
 def thin_share(surface: Surface, cell_size: float) -> float:
-    """Share of a closed surface, 0 to 1, behind which the body is thinner than ``cell_size`` metres.
+    """Return the share of a closed surface, 0 to 1, behind which the body is thinner than ``cell_size`` metres.
 
     Measured straight inward from 2000 places spread evenly over the surface, or fewer where that is too much work.
 

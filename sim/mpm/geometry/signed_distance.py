@@ -30,10 +30,10 @@ from .triangles import (
 )
 
 MAX_LATTICE_POINTS = 40_000_000
-"""Largest lattice, 160 MB of distances and about 1.5 GB while it is made."""
+"""Maximum number of lattice points: 160 MB of distances, about 1.5 GB while they are computed."""
 
 BAND = 3.0
-"""Within this many spacings of the surface distances are exact."""
+"""Spacings from the surface within which distances are exact."""
 
 FINEST_FIT = 1.25
 """Factor by which a lattice may be finer than requested, to put more of the bounding box's planes on lattice planes."""
@@ -42,7 +42,7 @@ PIECE = 1.5
 """Longest edge, in spacings, of the pieces by which triangles near a lattice point are found."""
 
 FINE_PIECE = 0.4
-"""The same, where the surface enters another part of itself."""
+"""The same, where the surface intersects itself."""
 
 
 # Shells of lattice points by their distance, through which points farther away look for the surface.
@@ -60,7 +60,7 @@ class DistanceLattice:
     """Signed distances to a surface at the points of a lattice. Raises InputError on bad shapes or numbers."""
 
     origin: Array
-    """World place (3,) in metres of the point (0, 0, 0)."""
+    """World position (3,) in metres of the lattice point (0, 0, 0)."""
 
     spacing: float
     """Metres between neighbouring points, the same on all axes."""
@@ -84,11 +84,11 @@ class DistanceLattice:
 
     @property
     def high(self) -> Array:
-        """World place (3,) of the last point, opposite to ``origin``."""
+        """World position (3,) of the last point, opposite to ``origin``."""
         return np.asarray(self.origin + self.spacing * (np.array(self.distances.shape) - 1.0))
 
     def at(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
-        """Signed distance (N,) in metres at world points (N, 3), and its gradient (N, 3).
+        """Return the signed distance (N,) in metres at world points (N, 3), and its gradient (N, 3).
 
         Trilinear; the gradient is the derivative of just that, not of length 1, and that of the cell on the far side
         where a point lies on a plane of the lattice. Beyond the lattice it is the value at the nearest place of the
@@ -121,7 +121,7 @@ class DistanceLattice:
 
 
 def signed_distance(surface: Surface, spacing: float, *, margin: float) -> DistanceLattice:
-    """Signed distance to a closed surface, negative inside, on a lattice around it.
+    """Return the signed distance to a closed surface, negative inside, on a lattice around it.
 
     spacing: metres, above 0. The lattice's is up to a fifth smaller, such that the largest extent of the surface's
         bounding box is a whole number of it, and if there is one that does so, those of the others. The low planes of
@@ -160,7 +160,7 @@ def signed_distance(surface: Surface, spacing: float, *, margin: float) -> Dista
 
 
 def _fitted(extent: Array, spacing: float, margin: float) -> tuple[float, int, NDArray[np.int64]]:
-    """Spacing, layers around the box, and points per axis of the lattice."""
+    """Return spacing, layers around the box, and points per axis of the lattice."""
     largest = float(extent.max())
 
     def lattice(cells: float) -> tuple[float, float, Array]:
@@ -190,7 +190,7 @@ def _fitted(extent: Array, spacing: float, margin: float) -> tuple[float, int, N
 def _without_buried(
     pieces: Array, owner: Faces, inside: NDArray[np.bool_], mesh: Array
 ) -> tuple[Array, Faces, NDArray[np.bool_]]:
-    """Pieces and owners but for those that lie inside the mesh, and which are of owners that lost some.
+    """Return pieces and owners without those inside the mesh, and which belong to owners that lost some.
 
     All in lattice units. Nothing is looked for where all pieces have lattice points outside around them.
     """
@@ -214,7 +214,7 @@ def _without_buried(
 
 
 def _buried(pieces: Array, mesh: Array) -> Array:
-    """Share of each piece (P, 3, 3) that has the mesh's inside on both sides, judged by four places of it."""
+    """Return the share of each piece (P, 3, 3) with the mesh's inside on both sides, from four samples."""
     if len(pieces) == 0:
         return np.zeros(0)
     buried = np.zeros(len(pieces))
@@ -226,7 +226,7 @@ def _buried(pieces: Array, mesh: Array) -> Array:
 
 
 def _distances(pieces: Array, whole: Array, shape: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Distances (nx, ny, nz) to pieces (P, 3, 3), of which each is a part of a whole (P, 3, 3), in lattice units."""
+    """Return distances (nx, ny, nz) to pieces (P, 3, 3), each part of a whole triangle (P, 3, 3), in lattice units."""
     centre = pieces.mean(axis=1)
     radius = np.linalg.norm(pieces - centre[:, None], axis=2).max(axis=1)
     reach = BAND + float(radius.max()) + HALF_DIAGONAL
@@ -311,7 +311,7 @@ def _distances(pieces: Array, whole: Array, shape: NDArray[np.int64]) -> NDArray
 
 
 def overlap(a: Surface | NDArray[np.floating], b: DistanceLattice) -> float:
-    """Largest depth of points of ``a`` in ``b``, in metres, 0 where none lies inside.
+    """Return the largest depth in metres of points of ``a`` in ``b``; 0 if none is inside.
 
     a: a surface, sampled at its vertices and between them no farther apart than b's spacing; or points (N, 3).
 

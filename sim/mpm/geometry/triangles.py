@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 MAX_PIECES = 8_000_000
-"""Most pieces a surface is cut into, about 1 GB of memory."""
+"""Maximum number of pieces that a surface is subdivided into, about 1 GB of memory."""
 
 OFF_FACE = 1e-6
-"""How far in front of and behind a face is looked, as a share of the mesh's size."""
+"""Distance in front of and behind a face at which inside and outside are tested, over the mesh's size."""
 
 SHIFTS = ((3.1e-6, 4.7e-6), (-5.3e-6, 2.9e-6), (4.3e-6, -6.1e-6))
 """Shifts of the vertical lines in lattice steps, so that they miss the edges between two faces; the next where one
@@ -34,7 +34,7 @@ INSIDE_WEIGHTS = np.array([0.314159, 0.271828, 0.414013])
 
 
 def validated(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> tuple[Array, Faces]:
-    """Vertices merged by place and faces without those that name a vertex twice."""
+    """Return the vertices with coincident ones merged, and the faces without those that repeat a vertex."""
     points = np.asarray(vertices, dtype=np.float64)
     triangles = np.asarray(faces)
     if points.ndim != 2 or points.shape[1:] != (3,) or len(points) == 0:
@@ -60,7 +60,7 @@ def validated(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> tup
 
 
 def check_closed(triangles: Faces) -> bool:
-    """Whether the faces are consistently oriented. Raises InputError when an edge has an odd number of faces."""
+    """Return whether the faces are consistently oriented. Raises InputError when an edge has an odd number of faces."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     forward = edges[:, 0] < edges[:, 1]
     _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -75,27 +75,27 @@ def check_closed(triangles: Faces) -> bool:
 
 
 def signed_volume(points: Array, triangles: Faces) -> float:
-    """Volume by the divergence theorem, about the mesh's own centre for precision."""
+    """Return the volume by the divergence theorem, about the mesh's own centre for precision."""
     corners = points[triangles] - points.mean(axis=0)
     return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
 def face_normals(corners: Array) -> tuple[Array, Array]:
-    """Unit normals (T, 3), zero where a face has no area, and areas (T,) of corners (T, 3, 3)."""
+    """Return unit normals (T, 3), zero where a face has no area, and areas (T,) of corners (T, 3, 3)."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     return normals / np.where(lengths > 0, lengths, 1.0)[:, None], 0.5 * lengths
 
 
 def batches(sizes: NDArray[np.int64], limit: int) -> list[NDArray[np.int64]]:
-    """Indices of ``sizes`` above 0 in runs whose sizes add up to about ``limit``."""
+    """Return indices of ``sizes`` above 0 in runs whose sizes add up to about ``limit``."""
     used = np.flatnonzero(sizes)
     group = np.cumsum(sizes[used]) // limit
     return np.split(used, np.flatnonzero(np.diff(group)) + 1) if len(used) else []
 
 
 def ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which run each element is of, and its value, for the runs ``start, start + 1, ...`` of ``count`` numbers."""
+    """Return the run of each element, and its value, for the runs ``start, start + 1, ...`` of ``count`` numbers."""
     run = np.repeat(np.arange(len(counts)), counts)
     return run, np.arange(len(run)) - np.repeat(np.cumsum(counts) - counts, counts) + starts[run]
 
@@ -173,7 +173,7 @@ def _vertical_hits(
 
 
 def winding_numbers(places: Array, corners: Array, oriented: bool) -> NDArray[np.int64]:
-    """Winding numbers (N,) of a closed mesh with triangle corners (T, 3, 3) about places (N, 3); 0 is outside.
+    """Return winding numbers (N,) of a closed mesh with triangle corners (T, 3, 3) at points (N, 3); 0 is outside.
 
     Where the faces are not consistently oriented, 0 or 1.
     """
@@ -192,7 +192,7 @@ def winding_numbers(places: Array, corners: Array, oriented: bool) -> NDArray[np
 
 
 def _winding_numbers(places: Array, corners: Array, oriented: bool) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Winding numbers of places, and whose vertical lines added up."""
+    """Return winding numbers at points, and for which of them the vertical line was consistent."""
     low = places[:, :2].min(axis=0)
     extent = np.maximum(np.ptp(places[:, :2], axis=0), 1e-300)
     bottom, top = corners[..., :2].min(axis=1), corners[..., :2].max(axis=1)
@@ -228,7 +228,7 @@ def _winding_numbers(places: Array, corners: Array, oriented: bool) -> tuple[NDA
 
 
 def sides(corners: Array, mesh: Array, oriented: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Winding number of the ``mesh`` just in front of each triangle (N, 3, 3), and just behind it."""
+    """Return the winding number of ``mesh`` just in front of each triangle (N, 3, 3), and just behind it."""
     normals = face_normals(corners)[0]
     middle = np.einsum("k,tkc->tc", INSIDE_WEIGHTS, corners)
     off = OFF_FACE * float(np.ptp(mesh.reshape(-1, 3), axis=0).max()) * normals
@@ -238,7 +238,7 @@ def sides(corners: Array, mesh: Array, oriented: bool) -> tuple[NDArray[np.int64
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Boundary:
-    """The faces of a closed mesh that bound its inside, turned outward."""
+    """Faces of a closed mesh that bound its inside, oriented outward."""
 
     triangles: Faces
     """(B, 3)"""
@@ -247,17 +247,17 @@ class Boundary:
     """Number of connected parts of the whole mesh."""
 
     reversed: int
-    """Parts whose faces looked inward; of a mesh that is not consistently oriented, faces."""
+    """Number of parts whose faces pointed inward; in a mesh that is not consistently oriented, of faces."""
 
     buried: int
-    """Parts that lie inside others; they are left out."""
+    """Number of parts inside others, which are left out."""
 
     overlapping: int
-    """Parts that bound the inside with some faces and lie in other parts, or the same again, with some."""
+    """Number of parts with some faces on the boundary and some inside other parts, or inside themselves."""
 
 
 def boundary(points: Array, triangles: Faces, oriented: bool, *, samples: int = 20_000) -> Boundary:
-    """Find the faces that bound the inside, and orient them outward. Tests every face, or about ``samples``, evenly.
+    """Return the faces that bound the inside, oriented outward. Tests every face, or about ``samples``, evenly.
 
     Oriented meshes are turned part by part; where faces are not consistently oriented, each face for itself.
     """
@@ -311,7 +311,7 @@ def boundary(points: Array, triangles: Faces, oriented: bool, *, samples: int = 
 
 
 def bisected(corners: Array, longest: float, *, box: tuple[Array, Array] | None = None) -> tuple[Array, Faces]:
-    """Triangles (P, 3, 3) with no edge above ``longest`` that cover the triangles (T, 3, 3), and which each is of (P,).
+    """Return triangles (P, 3, 3) with no edge above ``longest`` that cover the triangles (T, 3, 3), and their source (P,).
 
     The longest edge is halved until it is short enough: neighbours are cut alike, so their corners coincide. ``box``
     (low, high): what lies beyond it is left out. Raises InputError where it takes too many.
@@ -346,7 +346,7 @@ def bisected(corners: Array, longest: float, *, box: tuple[Array, Array] | None 
 
 
 def squared_distances(places: Array, corners: Array) -> Array:
-    """Squared distance (N,) of each place (N, 3) to its own triangle (N, 3, 3); triangles may be degenerate."""
+    """Return the squared distance (N,) of each point (N, 3) to its own, maybe degenerate, triangle (N, 3, 3)."""
     p = [np.ascontiguousarray(places[:, k]) for k in range(3)]
     v = [[np.ascontiguousarray(corners[:, n, k]) for k in range(3)] for n in range(3)]
     e = [[v[(n + 1) % 3][k] - v[n][k] for k in range(3)] for n in range(3)]
@@ -378,7 +378,7 @@ def _cross(a: list[Array], b: list[Array]) -> list[Array]:
 
 
 def bounding_box(mesh: Array) -> tuple[Array, Array]:
-    """Low corner and extent of a mesh's bounding box. Raises InputError where it is flat."""
+    """Return low corner and extent of a mesh's bounding box. Raises InputError where it is flat."""
     low = mesh.min(axis=(0, 1))
     extent = mesh.max(axis=(0, 1)) - low
     if not extent.min() > 1e-12 * extent.max():
@@ -389,7 +389,7 @@ def bounding_box(mesh: Array) -> tuple[Array, Array]:
 
 
 def bounding_faces(points: Array, triangles: Faces) -> Boundary:
-    """The faces that bound the inside, outward. Raises InputError where the mesh is not closed or has no volume."""
+    """Return the faces that bound the inside, oriented outward. Raises InputError for an open mesh or one without volume."""
     found = boundary(points, triangles, check_closed(triangles))
     extent = np.ptp(points[triangles].reshape(-1, 3), axis=0)
     volume = signed_volume(points, found.triangles)
@@ -402,7 +402,7 @@ def bounding_faces(points: Array, triangles: Faces) -> Boundary:
 
 
 def checked_places(points: NDArray[np.floating]) -> Array:
-    """``points`` as (N, 3) doubles. Raises InputError for another shape or numbers that are not finite."""
+    """Return ``points`` as (N, 3) doubles. Raises InputError for another shape or numbers that are not finite."""
     places = np.asarray(points, dtype=np.float64)
     if places.ndim != 2 or places.shape[1:] != (3,) or not np.isfinite(places).all():
         raise InputError(f"points have shape {places.shape}: give finite (N, 3)")

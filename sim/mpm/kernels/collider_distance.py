@@ -109,7 +109,7 @@ def single3(array: Doubles, first: ti.i32):
 @func
 def body_distance(i: ti.i32, place: vec3, farthest: ti.f32, bodies: RigidArrays, shapes: ShapeArrays):
     """Return the distance (cells) of ``place`` from the rigid body or collider ``i``, the normal there (world axes) and
-    the rate at which a deforming surface approaches (cells/s). The distance is 1e9 beyond ``farthest`` or before its start."""
+    the rate at which a deforming surface approaches (cells/s). 1e9 beyond ``farthest`` or before its start."""
     phi, normal, swelling = 1e9, vec3(0.0, 0.0, 1.0), 0.0
     arm = place - single3(bodies.state, i * SOLID + X)
     if bodies.kinds[i * KINDS + KIND] != WAITING and arm.norm() < (
