@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface holds on to a body that leaves it.
+"""A surface attracts a body that separates from it.
 
 Equation: a = -p n within the reach r of the surface, n its normal; parting takes the work p r per mass.
 Source: Maugis, Adhesion of spheres: the JKR–DMT transition using a Dugdale model, J. Colloid Interface Sci. 150 (1992):

@@ -3,7 +3,7 @@
 
 Equation: a = -k |v| v with k = rho c_d A / (2 m), rho the air's density, A the body's cross-section, m its mass.
 Source: the drag equation, Rayleigh, Phil. Mag. 2 (1876); coefficients c_d in Hoerner, Fluid-Dynamic Drag (1965).
-Bodies: all. Matter that deforms is held back by its local velocity.
+Bodies: all. Deformables are slowed by their local velocity.
 Twice: coefficients add up, with those of ``wind`` too: drag acts against one air.
 """
 

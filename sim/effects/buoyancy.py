@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weight carried by the medium: gravity acts weaker or stronger, in its direction.
+"""Buoyancy: the medium carries a part of the weight, or adds to it.
 
 Equation: a = (1 - f) g; a medium of density rho_m carries the share f = rho_m / rho_body of the weight.
 Source: Archimedes, On Floating Bodies; the medium's added mass is not in it.

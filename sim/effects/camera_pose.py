@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The camera is not where it was believed to be.
+"""The camera is not where it was assumed to be.
 
 Equation: X = R (X' - p) + p + d for the camera's axes and place X' in world coordinates, R the rotation by the vector
     ``rotation`` (angle times axis, world axes) about the pivot p.
@@ -21,7 +21,7 @@ from .schema import Effect, Values, leave, vector, vector_parameters
 def true_camera(
     values: Values, world_from_camera: NDArray[np.float64], *, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """Where the camera really is: the believed ``world_from_camera`` (4, 4), moved.
+    """Return the true pose of the camera: the assumed ``world_from_camera`` (4, 4), moved.
 
     pivot: world point about which ``rotation`` turns. One among the points seen, such as their mean, keeps rotation and
         shift from standing in for each other.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gravity not along the assumed direction: the ground is not level, or the camera's idea of up is wrong.
+"""Gravity not along the assumed direction: the ground is not level, or the camera's up direction is wrong.
 
 Equation: g' = R g, R the rotation by the angle a that takes -z towards (cos b, sin b, 0), b the azimuth; a gravity
     along -z becomes |g| (sin a cos b, sin a sin b, -cos a). Its strength stays.
@@ -22,7 +22,7 @@ from .schema import Effect, Parameter, Targets, Values
 
 
 def tilted(gravity: NDArray[np.float64], angle: float, azimuth: float) -> NDArray[np.float64]:
-    """``gravity`` (..., 3) turned by ``angle`` towards ``azimuth``, both in radians."""
+    """Return ``gravity`` (..., 3) turned by ``angle`` towards ``azimuth``, both in radians."""
     axis = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     along = (gravity @ axis)[..., None] * axis
     return np.asarray(

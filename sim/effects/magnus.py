@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Lift of a spinning body, across its way and its axis.
+"""Lift on a spinning body, perpendicular to its velocity and its axis.
 
 Equation: a = s w x v with the spin w and s = S / m; a sphere in slow flow has s = 3 rho_air / (4 rho_body).
 Source: Rubinow and Keller, The transverse force on a spinning sphere moving in a viscous fluid, J. Fluid
     Mech. 11 (1961).
-Bodies: all, with the velocity and spin of the body as a whole. The air is taken to be still.
+Bodies: all, with the velocity and spin of the body as a whole. The air is assumed to be still.
 Twice: coefficients add up.
 """
 

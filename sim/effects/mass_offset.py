@@ -34,13 +34,13 @@ STEPS = 60
 
 
 def pellet_width(body: BodyParticles, fraction: float) -> float:
-    """Standard deviation in metres, along each axis, of a pellet with ``fraction`` of the body's mass."""
+    """Return the standard deviation in metres, along each axis, of a pellet with ``fraction`` of the body's mass."""
     fine = float(np.cbrt(fraction * body.volumes.sum() / DENSEST)) / math.sqrt(2 * math.pi)
     return max(0.5 * float(np.cbrt(body.volumes.mean())), fine)
 
 
 def pellet_weights(body: BodyParticles, place: NDArray[np.float64], width: float) -> NDArray[np.float64] | None:
-    """Weights (N,) of a blob of ``width`` in metres whose centre is ``place`` (3,); None outside the particles.
+    """Return the weights (N,) of a blob of ``width`` m whose centre is ``place`` (3,); None outside the particles.
 
     Newton's method on the dual: ln sum m exp(-r²/2 + b r) is convex in b, and its gradient is the blob's centre.
     """
@@ -91,7 +91,7 @@ def _transform(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetu
 
 
 def _reach(body: BodyParticles, offset: NDArray[np.float64], width: float) -> float:
-    """The largest share of ``offset``, to a percent of it or so, at which a pellet still lies among the particles."""
+    """Return the largest share of ``offset``, to about a percent, at which a pellet still lies among the particles."""
     low, high = 0.0, 1.0
     for _ in range(10):
         middle = 0.5 * (low + high)

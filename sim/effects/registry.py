@@ -63,19 +63,19 @@ _EFFECTS: Mapping[str, Effect] = MappingProxyType({module.EFFECT.name: module.EF
 
 
 def effects() -> Mapping[str, Effect]:
-    """All effects by name, in a fixed order: by kind, as in ``KINDS``."""
+    """Return all effects by name, in a fixed order: by kind, as in ``KINDS``."""
     return _EFFECTS
 
 
 def effect(name: str) -> Effect:
-    """The effect called ``name``; InputError when there is none."""
+    """Return the effect called ``name``; InputError when there is none."""
     if name not in _EFFECTS:
         raise InputError(f"effect {name!r} is unknown: choose one of {', '.join(_EFFECTS)}")
     return _EFFECTS[name]
 
 
 def apply_effects(setup: WorldSetup, scene_effects: Iterable[SceneEffect]) -> WorldSetup:
-    """``setup`` with the effects of a scene, one after the other in their order; ``setup`` itself where there are none.
+    """Return ``setup`` with the effects of a scene applied in their order; ``setup`` itself without any.
 
     Raises InputError as ``Effect.apply`` does, with the number of the effect in the scene.
     """
@@ -91,7 +91,7 @@ def apply_effects(setup: WorldSetup, scene_effects: Iterable[SceneEffect]) -> Wo
 
 
 def effect_to_json(item: Effect) -> dict[str, Any]:
-    """JSON description of the effect: names, kind, parameters, equation."""
+    """Return a JSON description of the effect: names, kind, parameters, equation."""
     return {
         "name": item.name,
         "kind": item.kind,

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""How much of an impact comes back.
+"""Coefficient of restitution: how fast a body separates after an impact.
 
 Equation: v_n' = -e v_n, v_n the speed of approach at the contact.
 Source: Newton, Principia (1687), scholium to the laws of motion.
-Bodies: all. Of matter that deforms, which bounces by its own elasticity, e is the share of its outermost layer's
-    energy that comes back.
+Bodies: all. Deformables bounce by their own elasticity; for them e is the share of their outermost layer's
+    energy that is returned.
 Twice: the value is set; the last one counts.
 """
 

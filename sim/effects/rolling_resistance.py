@@ -4,7 +4,7 @@
 Equation: M = -b N w_t / |w_t|, the moment against the spin w_t along the surface under the normal force N; a rolling
     sphere of radius r loses the speed 5/7 b g / r a second.
 Source: Coulomb, Théorie des machines simples (1785); Johnson, Contact Mechanics (1985), chapter 9.
-Bodies: rigid ones; every contact of theirs. Matter that deforms loses by its own damping.
+Bodies: rigid ones; every contact of theirs. Deformables lose energy by their own damping.
 Twice: lever arms add up.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a moment on a body is dry sand and collapses.
+"""From a given time the body is dry sand and collapses.
 
 Equation: from the time t on |dev tau| <= -alpha tr tau with alpha = sqrt(2)/3 tan(phi), and no tension. Density and
     moduli stay (the softest ones where there are several), so that it adds neither mass nor energy nor substeps.

@@ -62,12 +62,12 @@ def vector_parameters(
 
 
 def vector(values: Values, prefix: str) -> tuple[float, float, float]:
-    """The three numbers that ``vector_parameters`` declared."""
+    """Return the three numbers that ``vector_parameters`` declared."""
     return values[f"{prefix}_x"], values[f"{prefix}_y"], values[f"{prefix}_z"]
 
 
 def unit_vector(values: Values, prefix: str) -> tuple[float, float, float]:
-    """The same scaled to length 1; InputError when it has no direction."""
+    """Return them scaled to length 1; InputError when they are all zero."""
     x, y, z = vector(values, prefix)
     length = math.hypot(x, y, z)
     if length < 1e-9:
@@ -76,7 +76,7 @@ def unit_vector(values: Values, prefix: str) -> tuple[float, float, float]:
 
 
 def nothing_against(body: BodyParticles) -> str | None:
-    """Obstacle of effects that apply to every body: none."""
+    """Return None: the obstacle of effects that apply to every body."""
     return None
 
 
@@ -122,7 +122,7 @@ class Effect:
             raise InputError(f"effect {self.name!r}: {error}") from None
 
     def checked(self, values: Values) -> dict[str, float]:
-        """All parameters as floats, in the order of the schema; InputError as ``apply`` says."""
+        """Return all parameters as floats, in the order of the schema; InputError as ``apply`` says."""
         known = {parameter.name for parameter in self.parameters}
         for name in values:
             if name not in known:
@@ -133,7 +133,7 @@ class Effect:
         return {parameter.name: parameter.check(values[parameter.name]) for parameter in self.parameters}
 
     def targets(self, setup: WorldSetup, bodies: Collection[str] | None) -> Targets:
-        """Indices of the bodies concerned; InputError as ``apply`` says."""
+        """Return the indices of the bodies concerned; InputError as ``apply`` says."""
         if self.of_world:
             if bodies is not None:
                 raise InputError(f"bodies is {sorted(bodies)!r}: it concerns the whole world, name no bodies")
@@ -142,7 +142,7 @@ class Effect:
             unknown = sorted(set(bodies) - {body.name for body in setup.bodies})
             if unknown or not bodies:
                 names = ", ".join(repr(body.name) for body in setup.bodies)
-                found = f"body {unknown[0]!r} is not among what moves" if unknown else "bodies is empty"
+                found = f"body {unknown[0]!r} is not a moving body" if unknown else "bodies is empty"
                 raise InputError(f"{found}: name some of {names}, or none for all")
         found_for: list[int] = []
         obstacles: list[str] = []
@@ -157,7 +157,7 @@ class Effect:
             if bodies is not None:
                 raise InputError(obstacles[-1])
         if not found_for:
-            raise InputError(f"there is no body that it means anything for: {obstacles[0]}")
+            raise InputError(f"there is no body that it applies to: {obstacles[0]}")
         return tuple(found_for)
 
     @property
@@ -166,7 +166,7 @@ class Effect:
         return {parameter.name: parameter.default for parameter in self.parameters}
 
     def neutral_values(self, setup: WorldSetup, *, bodies: Collection[str] | None = None) -> dict[str, float] | None:
-        """All parameters with values that change nothing in ``setup``, the rest at their defaults; None if none do.
+        """Return all parameters with values that change nothing in ``setup``, the rest at defaults; None if none do.
 
         Where an effect sets a value that several bodies have differently, the first body's counts.
         """
@@ -186,5 +186,5 @@ class Effect:
 
 
 def leave(setup: WorldSetup, values: Values, targets: Targets) -> WorldSetup:
-    """Transformation of effects of kind "observation": none."""
+    """Return ``setup`` unchanged: the transformation of effects of kind "observation"."""
     return setup

@@ -26,14 +26,14 @@ SOLIDS = COHERENT_SOLIDS | {GRANULAR}
 
 
 def change_bodies(setup: WorldSetup, targets: Targets, change: Callable[[BodyParticles], BodyParticles]) -> WorldSetup:
-    """``setup`` with ``change`` made to the bodies at ``targets``."""
+    """Return ``setup`` with ``change`` made to the bodies at ``targets``."""
     chosen = set(targets)
     bodies = tuple(change(body) if i in chosen else body for i, body in enumerate(setup.bodies))
     return dataclasses.replace(setup, bodies=bodies)
 
 
 def change_forces(setup: WorldSetup, targets: Targets, change: Callable[[BodyForces], BodyForces]) -> WorldSetup:
-    """``setup`` with ``change`` made to the forces on the bodies at ``targets``."""
+    """Return ``setup`` with ``change`` made to the forces on the bodies at ``targets``."""
 
     def changed(body: BodyParticles) -> BodyParticles:
         try:
@@ -45,13 +45,13 @@ def change_forces(setup: WorldSetup, targets: Targets, change: Callable[[BodyFor
 
 
 def solids(body: BodyParticles, cohesions: frozenset[str]) -> list[DeformableMaterial]:
-    """The body's materials whose cohesion is one of ``cohesions``."""
+    """Return the body's materials whose cohesion is one of ``cohesions``."""
     every = (body.material, *body.materials)
     return [m for m in every if isinstance(m, DeformableMaterial) and m.cohesion in cohesions]
 
 
 def needs(cohesions: frozenset[str], because: str) -> Callable[[BodyParticles], str | None]:
-    """The obstacle of effects that apply to materials of one of ``cohesions``; ``because`` says why."""
+    """Return the obstacle of effects that apply to materials of one of ``cohesions``; ``because`` says why."""
 
     def obstacle(body: BodyParticles) -> str | None:
         if solids(body, cohesions):
@@ -64,7 +64,7 @@ def needs(cohesions: frozenset[str], because: str) -> Callable[[BodyParticles], 
 
 
 def rigid_only(because: str) -> Callable[[BodyParticles], str | None]:
-    """The obstacle of effects that apply to rigid bodies; ``because`` says why, with the remedy."""
+    """Return the obstacle of effects that apply to rigid bodies; ``because`` says why, with the remedy."""
     return lambda body: None if body.rigid else f"deforms, {because}"
 
 
@@ -74,7 +74,7 @@ def change_materials(
     cohesions: frozenset[str],
     change: Callable[[DeformableMaterial], DeformableMaterial],
 ) -> WorldSetup:
-    """``setup`` with ``change`` made to those materials of the bodies at ``targets`` that have one of ``cohesions``."""
+    """Return ``setup`` with ``change`` made to the materials of one of ``cohesions`` of the bodies at ``targets``."""
 
     def changed(body: BodyParticles) -> BodyParticles:
         material = body.material
@@ -89,7 +89,7 @@ def change_materials(
 def change_contacts(
     setup: WorldSetup, targets: Targets, change: Callable[[SurfaceContact], SurfaceContact]
 ) -> WorldSetup:
-    """``setup`` with ``change`` made to every contact of the bodies at ``targets``: ground, colliders, other bodies.
+    """Return ``setup`` with ``change`` made to every contact of the bodies at ``targets``.
 
     Where that is all bodies, the ground's and the table's own numbers change, so that the table stays small.
     """
@@ -122,7 +122,7 @@ def change_contacts(
 
 
 def _with_rubbing(contact: SurfaceContact, other: SurfaceContact | Ground) -> SurfaceContact:
-    """``contact`` with friction and restitution of ``other``."""
+    """Return ``contact`` with friction and restitution of ``other``."""
     return dataclasses.replace(
         contact, friction=other.friction, static_friction=other.static_friction, restitution=other.restitution
     )
@@ -133,5 +133,5 @@ def _frozen(pairs: dict[tuple[str, str], SurfaceContact]) -> MappingProxyType[tu
 
 
 def contact_with_ground(setup: WorldSetup, targets: Targets) -> SurfaceContact:
-    """Contact of the first body at ``targets`` with the ground, or the table's default without one."""
+    """Return the contact of the first body at ``targets`` with the ground, or the table's default without one."""
     return setup.contacts.default if setup.ground is None else setup.contact(setup.bodies[targets[0]].name, GROUND_NAME)

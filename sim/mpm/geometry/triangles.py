@@ -311,7 +311,7 @@ def boundary(points: Array, triangles: Faces, oriented: bool, *, samples: int = 
 
 
 def bisected(corners: Array, longest: float, *, box: tuple[Array, Array] | None = None) -> tuple[Array, Faces]:
-    """Return triangles (P, 3, 3) with no edge above ``longest`` that cover the triangles (T, 3, 3), and their source (P,).
+    """Return triangles (P, 3, 3) with no edge above ``longest`` that cover ``corners`` (T, 3, 3), and their source.
 
     The longest edge is halved until it is short enough: neighbours are cut alike, so their corners coincide. ``box``
     (low, high): what lies beyond it is left out. Raises InputError where it takes too many.
@@ -389,7 +389,7 @@ def bounding_box(mesh: Array) -> tuple[Array, Array]:
 
 
 def bounding_faces(points: Array, triangles: Faces) -> Boundary:
-    """Return the faces that bound the inside, oriented outward. Raises InputError for an open mesh or one without volume."""
+    """Return the faces that bound the inside, turned outward. Raises InputError for an open or flat mesh."""
     found = boundary(points, triangles, check_closed(triangles))
     extent = np.ptp(points[triangles].reshape(-1, 3), axis=0)
     volume = signed_volume(points, found.triangles)
