@@ -79,7 +79,7 @@ def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, nei
 
 
 def compact_weights(distance: Array) -> Array:
-    """Weights (V, k) of k neighbours from the sorted distances (V, k + 1) to them and to the first one left out.
+    """Return weights (V, k) of k neighbours from the sorted distances (V, k + 1) to them and to the first one left out.
 
     That one sets the support: weights vanish where the set of neighbours changes, which keeps them continuous along
     the surface. Rows sum to 1.
@@ -90,7 +90,7 @@ def compact_weights(distance: Array) -> Array:
 
 
 def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> Array:
-    """Vertex positions (V, 3) for particle ``positions`` (N, 3) and deformation ``gradients`` (N, 3, 3), metres.
+    """Return vertex positions (V, 3) for particle ``positions`` (N, 3) and deformation ``gradients`` (N, 3, 3), metres.
 
     Particles that are not finite count as floaters. A vertex all of whose particles are lost keeps its rest place.
     """
@@ -100,7 +100,7 @@ def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray
 def deform_locally(
     binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[Array, Array]:
-    """Where ``deform`` takes the vertices (V, 3), and the deformation gradient F (V, 3, 3) around each.
+    """Return the vertices (V, 3) as ``deform`` does, and the deformation gradient F (V, 3, 3) around each.
 
     F is the mean of those particles' gradients by which the vertex is placed; gradients that are not finite or inverted
     (det F ≤ 0) do not count. It is exact for affine motion. Where none counts, or their mean is inverted, F is that of
@@ -176,19 +176,19 @@ TORN_SHARE = 0.01
 
 
 def edges(faces: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The edges (E, 2) of triangles (F, 3), each once."""
+    """Return the edges (E, 2) of triangles (F, 3), each once."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     ends.sort(axis=1)
     return np.unique(ends, axis=0)
 
 
 def lengths(vertices: NDArray[np.floating], ends: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Lengths (E,) of the edges ``ends`` (E, 2) with the vertices (V, 3) at ``vertices``."""
+    """Return the lengths (E,) of the edges ``ends`` (E, 2) with the vertices (V, 3) at ``vertices``."""
     return np.linalg.norm(np.asarray(vertices, dtype=np.float64)[ends[:, 1]] - vertices[ends[:, 0]], axis=1)
 
 
 def first_torn(samples: Iterable[NDArray[np.floating]], faces: NDArray[np.integer]) -> int | None:
-    """Index of the first of ``samples`` (V, 3) in which the skin with ``faces`` (F, 3) is torn; None: it holds.
+    """Return the index of the first of ``samples`` (V, 3) in which the skin with ``faces`` (F, 3) is torn, or None.
 
     The first sample is the skin at rest. Samples are taken one by one, and none after the answer.
     """

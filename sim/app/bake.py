@@ -111,7 +111,7 @@ def bake(
 
 
 def _refuse_foreign_folder(out: Path) -> None:
-    """A folder with other people's files is never written into, so that nothing of theirs can be overwritten."""
+    """Raise InputError for a folder with files that are no bake, so that nothing is ever overwritten."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder for the bake")
     if out.is_dir() and not (out / MANIFEST_FILE).is_file() and any(not p.name.startswith(".") for p in out.iterdir()):
@@ -120,7 +120,7 @@ def _refuse_foreign_folder(out: Path) -> None:
 
 @contextlib.contextmanager
 def _named_errors(out: Path) -> Iterator[None]:
-    """What the operating system refuses, as an InputError that says what to do."""
+    """Turn an OSError into an InputError with a remedy."""
     try:
         yield
     except OSError as error:
@@ -200,7 +200,7 @@ class _Run:
     frame_started: float = 0.0
 
     def frames(self, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
-        """Bake from sample ``frames_done`` to the end; the final manifest."""
+        """Bake from sample ``frames_done`` to the end; return the final manifest."""
         try:
             with contextlib.ExitStack() as stack:
                 writers = {name: stack.enter_context(self._writer(name)) for name in self.manifest.files}
@@ -301,7 +301,7 @@ class _Run:
             self.save("cancelled")
 
     def save(self, state: str) -> BakeManifest:
-        """Write the manifest as of now."""
+        """Write the manifest as of now and return it."""
         self.saved_at = time.monotonic()
         self.manifest = dataclasses.replace(self.manifest, state=state, frames_done=self.frames_done)
         save_manifest(self.out, self.manifest)

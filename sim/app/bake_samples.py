@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The splats of an object in a bake: read, and led by what leads the object's mesh.
-
-What a bake writes at each frame: the vertices of every object, the particles of those that flow, and splats."""
+"""The contents of a bake at each frame: vertices of every object, particles of those that flow, and splats, which move
+with the object's mesh."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ LEAST_BESIDE = 0.5
 
 
 def load_object_splats(folder: Scene, item: SceneObject, mesh: ObjectMesh) -> Splats | None:
-    """The splats of ``item``, whose mesh is ``mesh``, in the mesh file's own coordinates; None for one without.
+    """Return the splats of ``item``, whose mesh is ``mesh``, in the mesh file's own coordinates; None for one without.
 
     Raises InputError for a file that cannot be read, or whose splats lie far from the mesh.
     """
@@ -75,17 +74,17 @@ class MovingSplats:
         self._binding = None if particles is None else bind_splats(self._world, particles)
 
     def at_rest(self, *, in_world: bool) -> Array:
-        """In the world, or in the mesh file's coordinates, where they are the file's own to rounding."""
+        """Return them in the world, or in the mesh file's coordinates, where they equal the file's to rounding."""
         splats = self._world if in_world else self.rest
         return as_points(splats.centres, half_axes(splats))
 
     def with_matter(self, positions: Array, gradients: Array) -> Array:
-        """In the world, where particles (P, 3) and their deformation gradients (P, 3, 3) have taken them."""
+        """Return them in the world, moved by particles (P, 3) and their deformation gradients (P, 3, 3)."""
         assert self._binding is not None
         return as_points(*deformed_half_axes(self._world, self._binding, positions, gradients))
 
     def with_vertices(self, vertices: Array) -> Array:
-        """In the world, where the rigid motion that took the mesh to ``vertices`` (V, 3) takes them."""
+        """Return them in the world, where the rigid motion that took the mesh to ``vertices`` (V, 3) takes them."""
         matrix = _affine_map(self._vertices, vertices)
         return self.at_rest(in_world=True) @ matrix[:3] + matrix[3]
 
@@ -105,7 +104,7 @@ def baked_objects(
     prepared: PreparedWorld,
     options: BakeOptions,
 ) -> tuple[BakedObject, ...]:
-    """The caches that a bake of the scene has, one entry an object."""
+    """Return the caches of a bake of the scene, one entry per object."""
     return tuple(
         _baked_object(item.name, len(mesh.vertices), len(seen or ()), prepared, slot, options)
         for slot, (item, mesh, seen) in enumerate(zip(folder.model.objects, meshes, splats, strict=True))
@@ -167,7 +166,7 @@ class ObjectSampler:
         self._splats = None if splats is None else MovingSplats(splats, world_from_mesh, mesh.vertices, self._rest)
 
     def samples(self, index: int) -> dict[str, Array]:
-        """By file name what is appended as sample ``index``, (V, 3) or (N, 3) in the space of the bake.
+        """Return by file name the points of sample ``index``, (V, 3) or (N, 3) in the space of the bake.
 
         Sample 0 is the scene at rest to the last bit, so that it renders as the photo: the mesh's own vertices.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Another light for a scene that is there already: an environment from a file, a sun as told, or both estimated."""
+"""Changes of a scene's light: an environment from a file, a sun as given, or both estimated from the photo."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Where the vertices of a collider are at a time, for its cache.
-
-How finely a scene is simulated: the cell size that its quality asks for.
-
-What a scene must hold at the start: bodies above the ground, on sound meshes."""
+"""Checks and measures before a world is set up: the cell size of a quality, usable meshes, bodies above the ground, and
+the positions of a collider's vertices over time."""
 
 from __future__ import annotations
 
@@ -25,12 +22,12 @@ from .bake_quality import Quality
 
 
 def moves(collider: Collider) -> bool:
-    """Whether ``collider`` ever leaves its place."""
+    """Return whether ``collider`` ever moves."""
     return any(track is not None for track in (collider.translations, collider.rotations, collider.vertices))
 
 
 def vertices_at(collider: Collider, time: float) -> NDArray[np.float64]:
-    """Vertices (V, 3) of ``collider`` in world metres at ``time`` in s."""
+    """Return the vertices (V, 3) of ``collider`` in world metres at ``time`` in s."""
     if collider.vertices is not None:
         return collider.vertices.at(time)
     vertices = collider.surface.vertices
@@ -60,7 +57,7 @@ MAX_PARTICLES = 50_000_000
 def resolve(
     names: Sequence[str], meshes: Sequence[ObjectMesh], quality: Quality, arch: str
 ) -> tuple[SolverOptions, Similarity]:
-    """Solver options and similarity whose cells are as fine as ``quality`` wants for these bodies.
+    """Return solver options and similarity whose cells are as fine as ``quality`` asks for these bodies.
 
     Raises InputError when that would take absurdly many particles.
     """
@@ -70,7 +67,7 @@ def resolve(
 
 
 def cell_size(meshes: Sequence[ObjectMesh], quality: Quality) -> float:
-    """Side of a grid cell in m."""
+    """Return the side of a grid cell in m."""
     points = np.concatenate([mesh.vertices for mesh in meshes])
     if quality.grid is not None:
         return BOX_BODIES * float(np.ptp(points, axis=0).max()) / quality.grid
@@ -107,7 +104,7 @@ def _length(mesh: ObjectMesh) -> float:
 
 
 def mesh_volume(mesh: ObjectMesh) -> float:
-    """Signed volume in m³ of a closed mesh."""
+    """Return the signed volume in m³ of a closed mesh."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)
 
@@ -119,7 +116,7 @@ DEEPEST_CELLS = 1.0
 
 
 def surface_warnings(surface: Surface, name: str, cell: float) -> list[str]:
-    """What is unusual about the mesh of object ``name``. Raises InputError for one that cannot be used."""
+    """Return warnings about the mesh of object ``name``. Raises InputError for an unusable one."""
     return [str(warning) for warning in check_surface(surface, name=f"object {name}", cell_size=cell)]
 
 
