@@ -32,18 +32,21 @@ def spread_values(
     at = y[order].astype(int), x[order].astype(int)
     grid[at] = values[order]
     known[at] = 1.0
-    full = cv2.resize(_filled(grid, known), (round(columns * cell), round(rows * cell)), interpolation=cv2.INTER_LINEAR)
+    full = cv2.resize(
+        fill_gaps(grid, known), (round(columns * cell), round(rows * cell)), interpolation=cv2.INTER_LINEAR
+    )
     start = round(cell)
     return np.ascontiguousarray(full[start : start + height, start : start + width])
 
 
-def _filled(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return ``values`` with gaps filled by pull-push (Gortler et al. 1996, section 3.4) from coarser means."""
+def fill_gaps(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return ``values`` (h, w) with gaps, where ``known`` (h, w) is 0 and not 1, filled from coarser means by pull-push
+    (Gortler et al. 1996, section 3.4)."""
     if bool(known.all()) or max(values.shape) == 1:
         return values
     half = (max(1, -(-values.shape[1] // 2)), max(1, -(-values.shape[0] // 2)))
     weight = cv2.resize(known, half, interpolation=cv2.INTER_AREA)
     mean = cv2.resize(values * known, half, interpolation=cv2.INTER_AREA) / np.maximum(weight, 1e-9)
-    coarse = _filled(mean.astype(np.float32), (weight > 0).astype(np.float32))
+    coarse = fill_gaps(mean.astype(np.float32), (weight > 0).astype(np.float32))
     wide = cv2.resize(coarse, values.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.where(known > 0, values, wide).astype(np.float32)

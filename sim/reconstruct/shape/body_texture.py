@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Texture of a body: the photo projected onto it, colours for unseen surfaces, and GLB output.
+"""Pixels of the photo that correspond to each point of a body, the photo around an object, and GLB output.
 
-The texture is the photo around the object, and each vertex' UV is where the camera sees it at rest, so the front is
-the photo itself. Unseen points take the colours of their counterpart on a primitive (the opposite face of a box, the
-near side of a can or sphere), or of the photo folded over at the rim: a hidden point takes the colour as far inside
-the outline as it lies behind the rim along the surface. No pixel of the rim, half background, is stretched over a
-grazing side.
+A point that the camera sees corresponds to its own pixel. Unseen ones correspond to their counterpart on a primitive
+(the opposite face of a box, the near side of a can or sphere), or to the photo folded over at the rim: a hidden point
+corresponds to the pixel as far inside the outline as it lies behind the rim along the surface. `texture_atlas.py` makes
+the texture of both.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from trimesh.visual.material import PBRMaterial
 from ...scene.model import Camera, Matrix4
 from .inflate import Crop
 from .inflated_mesh import BodyMesh
+from .plain_matter import inner_colours
 from .primitives import Box, Primitive, Sphere, SurfaceOfRevolution
 
 Points = NDArray[np.float64]
@@ -235,11 +235,7 @@ def crop_texture(photo: NDArray[np.uint8], mask: Mask) -> CropTexture:
     top, left = max(0, int(rows[0]) - MARGIN), max(0, int(columns[0]) - MARGIN)
     window = (slice(top, int(rows[-1]) + 1 + MARGIN), slice(left, int(columns[-1]) + 1 + MARGIN))
     inside, colours = mask[window], photo[window].copy()
-    # The outermost pixels are mixed with the background: use colours from further inside.
-    core = ndimage.binary_erosion(inside, iterations=2)
-    core |= inside & ~ndimage.binary_dilation(core, iterations=4)
-    nearest = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
-    carried = ndimage.gaussian_filter(colours[tuple(nearest)].astype(np.float32), (1.0, 1.0, 0.0))
+    carried = ndimage.gaussian_filter(inner_colours(colours.astype(np.float32), inside), (1.0, 1.0, 0.0))
     colours[~inside] = np.clip(carried[~inside] + 0.5, 0, 255).astype(np.uint8)
     return CropTexture(pixels=colours, left=left, top=top)
 

@@ -26,13 +26,14 @@ from ..photo_layers import Layers
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
-from .body_texture import TexturedSurface, colour_pixels, crop_texture, textured
+from .body_texture import TexturedSurface, colour_pixels, crop_texture
 from .inflate import Crop, crop_mask, inflate
 from .inflated_mesh import WORTH_SAYING, BodyMesh, inflated_mesh, shadow_mesh, stability
 from .primitive_choice import KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import rasterize
 from .separation import PlacedBody, separate
+from .texture_atlas import textured_body
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -368,7 +369,7 @@ def _built(
     notice: Notice,
 ) -> Arrays:
     body = build_body(view, full, item, options, notice, seen=seen, pixels=colours)
-    return _arrays(textured(body.mesh, crop_texture(colours, full)), body.shape)
+    return _arrays(textured_body(view, body.mesh, crop_texture(colours, full), full), body.shape)
 
 
 def _fitted(

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""Texture of a body that may be seen from all sides: the photo where it is seen well, synthesised matter elsewhere.
+
+The picture holds the photo around the object, above charts of the rest of the surface. Faces that the camera sees
+squarely show the photo pixel for pixel. Towards the rim, where one pixel covers several texels, a chart holds the
+photo with grain whose mean over each pixel is zero: the camera of the photo still sees the photo, any other no
+streaks. What nothing shows is plain matter: the colours of its counterpart on the visible side without marks
+(`plain_matter.py`), and grain that is laid over the surface in space, so no chart has a visible border.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ...scene.model import Camera
+from ..appearance.albedo import rasterised
+from .body_texture import CropTexture, TexturedSurface
+from .inflated_mesh import BodyMesh
+from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_grain
+from .surface_charts import surface_frame, unwrap
+
+Points = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SQUARE = np.cos(np.radians(70.0))
+"""Cosine of the angle to the camera above which a face shows the photo itself: a pixel covers up to 2.9 of its size."""
+GRAIN = (np.cos(np.radians(74.0)), np.cos(np.radians(68.0)))
+"""Cosines between which grain is added to the photo's pixels: all up to the first, none from the second."""
+PURE = (0.0, 2.0)
+"""Pixels from the outline between which a pixel on a grazing side becomes free of the background."""
+OWN = (np.cos(np.radians(84.0)), np.cos(np.radians(80.0)))
+"""Cosines between which a point's own pixel replaces the one inside the outline: beyond, it is mixed with the
+background."""
+SHOWN = (np.cos(np.radians(89.0)), np.cos(np.radians(84.0)))
+"""Cosines between which the photo replaces plain matter."""
+DENSITY = 1.25
+"""Texels of charts per pixel of the photo, per side: the photo is resampled there."""
+MOST_TEXELS = 1.6e6
+"""Texels of all charts at most."""
+CELLS = 256
+"""Cells along the longer side of the depth map that tells which faces others hide."""
+BEHIND = 0.015
+"""Depth over the body's extent from which something is behind something else."""
+OUTSIDE = 3
+"""Pixels outside the outline beyond which the photo shows nothing: its border cuts the object."""
+PLANES = ((1, 2), (0, 2), (0, 1))
+"""Coordinates of the planes onto which grain is laid, by the axis that they are perpendicular to."""
+PLANE_SHARPNESS = 6.0
+
+
+def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -> TexturedSurface:
+    """Return ``body`` with its texture; vertices along the borders of charts occur once per chart.
+
+    texture: the photo around the object; mask: (H, W) the object. ``body.colours`` are the photo's pixels that
+    correspond to each vertex. Deterministic.
+    """
+    shown, cosine = _shown(camera, body, mask)
+    photo = shown & (cosine > SQUARE)
+    colours = body.pixels if body.colours is None else body.colours
+    if photo.all():
+        return TexturedSurface(body.vertices, body.faces, texture.uv(body.pixels), texture.pixels)
+    rest = body.faces[~photo]
+    normals, areas = _normals(body.vertices, body.faces)
+    frame = surface_frame(normals, areas)
+    pixels = _pixels_per_unit(camera, body.vertices)
+    scale = DENSITY * pixels
+    scale *= min(1.0, float(np.sqrt(MOST_TEXELS / max(areas[~photo].sum() * scale**2, 1.0))))
+    height, width = texture.pixels.shape[:2]
+    charts = unwrap(body.vertices, rest, frame, scale, max(width, int(np.sqrt(areas[~photo].sum()) * scale)))
+    size = (max(width, charts.size[0]), height + charts.size[1])
+    # One vertex list: of the faces that show the photo, then of the charts.
+    used, corners = np.unique(body.faces[photo], return_inverse=True)
+    place = np.concatenate([body.pixels[used] - (texture.left, texture.top), charts.texels + np.array([0.0, height])])
+    faces = np.empty_like(body.faces)
+    faces[photo] = corners.reshape(-1, 3)
+    faces[~photo] = charts.faces + len(used)
+    source = np.concatenate([used, charts.source])
+    inside = _cropped(mask, texture)
+    matter = plain_matter(texture.pixels, inside)
+    values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
+    values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown)])
+    at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
+    found = rasterised(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
+    texel = found.interpolated(charts.faces, values[charts.source])
+    below = np.zeros((charts.size[1], size[0], 3), dtype=np.uint8)
+    if len(found.rows):
+        colour = _colours(camera, texel, texture, inside, matter, frame, pixels)
+        below[found.rows, found.columns] = np.clip(colour + 0.5, 0, 255).astype(np.uint8)
+        covered = np.zeros(below.shape[:2], dtype=bool)
+        covered[found.rows, found.columns] = True
+        nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+        below = below[tuple(nearest)]
+    above = np.pad(texture.pixels, ((0, 0), (0, size[0] - width), (0, 0)), mode="edge")
+    uv = np.column_stack([place[:, 0] / size[0], 1.0 - place[:, 1] / size[1]])
+    return TexturedSurface(body.vertices[source], faces, uv, np.concatenate([above, below]))
+
+
+def _normals(vertices: Points, faces: NDArray[np.int64]) -> tuple[Points, NDArray[np.float64]]:
+    """Unit normals (T, 3) and areas (T,)."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(length, 1e-300)[:, None], length / 2.0
+
+
+def _shown(camera: Camera, body: BodyMesh, mask: Mask) -> tuple[Mask, NDArray[np.float64]]:
+    """Whether the photo shows each face (T,), and the cosine (T,) of its angle to the camera.
+
+    A face is hidden by others of the body, and where the photo's border cuts the object.
+    """
+    normals, _ = _normals(body.vertices, body.faces)
+    middle = body.vertices[body.faces].mean(axis=1)
+    towards = camera.position - middle
+    cosine = (normals * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
+    at = camera.project(body.vertices)
+    low, high = at[:, :2].min(axis=0), at[:, :2].max(axis=0)
+    cells = CELLS / max(float((high - low).max()), 1.0)
+    grid = np.column_stack([(at[:, :2] - low) * cells + 1.0, at[:, 2]])
+    size = (int((high - low)[0] * cells) + 3, int((high - low)[1] * cells) + 3)
+    front = rasterised(grid, body.faces, size, cosine > 0)
+    depth = np.full(size[::-1], np.inf)
+    depth[front.rows, front.columns] = front.interpolated(body.faces, at[:, 2:])[:, 0]
+    # The deepest of the cells around: along the outline nothing is hidden by its own slope.
+    depth = ndimage.maximum_filter(depth, 3)
+    centre = camera.project(middle)
+    column, row = ((centre[:, i] - low[i]) * cells + 1.0 for i in (0, 1))
+    slack = BEHIND * float(np.ptp(body.vertices, axis=0).max())
+    x, y = column.clip(0, size[0] - 1).astype(np.int64), row.clip(0, size[1] - 1).astype(np.int64)
+    before = centre[:, 2] <= depth[y, x] + slack
+    near = ndimage.binary_dilation(mask, iterations=OUTSIDE)
+    x, y = (np.floor(centre[:, i]).astype(np.int64) for i in (0, 1))
+    inside = (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
+    inside[inside] = near[y[inside], x[inside]]
+    return np.asarray(before & inside & (cosine > 0)), cosine
+
+
+def _pixels_per_unit(camera: Camera, vertices: Points) -> float:
+    """Pixels of the photo that a unit of length covers at the middle of ``vertices`` (V, 3)."""
+    return camera.fx / max(float(np.median(camera.project(vertices)[:, 2])), 1e-9)
+
+
+def _vertex_normals(body: BodyMesh) -> Points:
+    a, b, c = (body.vertices[body.faces[:, corner]] for corner in range(3))
+    cross = np.cross(b - a, c - a)
+    summed = np.zeros_like(body.vertices)
+    for corner in range(3):
+        np.add.at(summed, body.faces[:, corner], cross)
+    return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
+
+
+def _vertex_share(body: BodyMesh, faces: Mask) -> NDArray[np.float64]:
+    """Share (V,) of a vertex' faces that are among ``faces`` (T,)."""
+    count, total = np.zeros(len(body.vertices)), np.zeros(len(body.vertices))
+    for corner in range(3):
+        np.add.at(total, body.faces[:, corner], 1.0)
+        np.add.at(count, body.faces[:, corner], faces)
+    return count / np.maximum(total, 1.0)
+
+
+def _cropped(mask: Mask, texture: CropTexture) -> Mask:
+    height, width = texture.pixels.shape[:2]
+    return mask[texture.top : texture.top + height, texture.left : texture.left + width]
+
+
+def _ramp(value: NDArray[np.float64], ends: tuple[float, float]) -> NDArray[np.float64]:
+    """0 up to the first of ``ends``, 1 from the second, smooth between."""
+    share = np.clip((value - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share))
+
+
+def _colours(
+    camera: Camera,
+    texel: Points,
+    texture: CropTexture,
+    mask: Mask,
+    matter: PlainMatter,
+    frame: Points,
+    pixels: float,
+) -> NDArray[np.float64]:
+    """Colours (P, 3) of texels (P, 11): place, normal, counterpart's pixel, own pixel, share hidden.
+
+    mask: (h, w) the object in ``texture``. pixels: of the photo per unit of length.
+    """
+    normal = texel[:, 3:6] / np.maximum(np.linalg.norm(texel[:, 3:6], axis=1, keepdims=True), 1e-12)
+    corner = (texture.left + 0.5, texture.top + 0.5)
+    like, own = texel[:, 6:8] - corner, texel[:, 8:10] - corner
+    grain = _grain(matter, texel[:, :3] @ frame.T * pixels, normal @ frame.T)
+    grain *= _sampled(matter.contrast[..., None], like)
+    plain = _sampled(matter.colours, like) + grain
+    towards = camera.position - texel[:, :3]
+    cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
+    weight = (_ramp(cosine, SHOWN) * (1.0 - texel[:, 10]))[:, None]
+    seen = np.flatnonzero(weight[:, 0] > 0)
+    if not len(seen):
+        return plain
+    # Grain of mean zero over each pixel of the photo.
+    height, width = texture.pixels.shape[:2]
+    cell = np.clip(np.floor(own[seen] + 0.5), 0, (width - 1, height - 1)).astype(np.int64)
+    cell = cell[:, 1] * width + cell[:, 0]
+    count = np.maximum(np.bincount(cell, minlength=height * width), 1)
+    added = grain[seen]
+    for i in range(3):
+        added[:, i] -= (np.bincount(cell, added[:, i], minlength=height * width) / count)[cell]
+    added *= (1.0 - _ramp(cosine[seen], GRAIN))[:, None]
+    photo = _sampled(texture.pixels.astype(np.float32), own[seen])
+    inner = _sampled(inner_colours(texture.pixels.astype(np.float32), mask), own[seen])
+    depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
+    pure = np.maximum(_ramp(_sampled(depth, own[seen])[:, 0], PURE), _ramp(cosine[seen], GRAIN))
+    photo = inner + (pure * _ramp(cosine[seen], OWN))[:, None] * (photo - inner) + added
+    plain[seen] += weight[seen] * (photo - plain[seen])
+    return plain
+
+
+def _grain(matter: PlainMatter, place: Points, normal: Points) -> NDArray[np.float64]:
+    """Grain (P, 3) at places (P, 3) in pixels with ``normal`` (P, 3), blended between the planes that they face."""
+    weights = np.abs(normal) ** PLANE_SHARPNESS
+    weights /= np.sqrt((weights**2).sum(axis=1, keepdims=True))
+    result = np.zeros((len(place), 3))
+    for axis, plane in enumerate(PLANES):
+        for side in (0, 1):
+            used = np.flatnonzero((weights[:, axis] > 0.05) & ((normal[:, axis] > 0) == bool(side)))
+            if len(used):
+                made = synthesised_grain(matter.swatch, place[used][:, plane] * (1.0, -1.0), 2 * axis + side)
+                result[used] += weights[used, axis, None] * made
+    return result
+
+
+def _sampled(picture: NDArray[np.float32], at: Points) -> NDArray[np.float64]:
+    """``picture`` (h, w, C) at ``at`` (n, 2), x and y from the centre of the first pixel, bilinear, (n, C)."""
+    # OpenCV takes at most 32767 places in a row.
+    count, columns = len(at), 1024
+    padded = -(-max(count, 1) // columns) * columns
+    x, y = (np.pad(at[:, i].astype(np.float32), (0, padded - count)).reshape(-1, columns) for i in (0, 1))
+    found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found.reshape(padded, -1)[:count], dtype=np.float64)

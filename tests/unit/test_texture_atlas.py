@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""Bodies' textures seen from all sides: the photo in front, no mark twice, matter without seams or streaks behind."""
+
+import functools
+import math
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from physgen.sim.reconstruct.appearance.albedo import rasterised
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured
+from physgen.sim.reconstruct.shape.object_bodies import build_body
+from physgen.sim.reconstruct.shape.plain_matter import plain_matter, synthesised_grain
+from physgen.sim.reconstruct.shape.texture_atlas import textured_body
+from scipy import ndimage
+
+WIDTH, HEIGHT = 320, 280
+VIEW = camera_above_ground(WIDTH, HEIGHT, 380.0, math.radians(12.0))
+FUR, DARK, BLUE = (190, 130, 70), (25, 15, 10), (40, 60, 190)
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+TOY = ((COLUMNS - 160) / 70.0) ** 2 + ((ROWS - 150) / 80.0) ** 2 < 1
+
+
+def picture(mask, *, eyes=False, stripe=False):
+    """A photo of grainy fur on grey ground, with two dark eyes or a stripe from outline to outline."""
+    pixels = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.float64)
+    pixels[mask] = FUR
+    if stripe:
+        pixels[mask & (np.abs(ROWS - 150) < 14)] = BLUE
+    pixels += np.random.default_rng(3).normal(0, 7, (HEIGHT, WIDTH, 1))
+    if eyes:
+        for column in (135, 185):
+            pixels[(COLUMNS - column) ** 2 + (ROWS - 125) ** 2 < 9**2] = DARK
+    return np.clip(pixels, 0, 255).astype(np.uint8)
+
+
+@functools.cache
+def body(name="toy", vertices=3000):
+    mask = masks()[name]
+    request = ObjectRequest(box=(0, 0, 9, 9), name="thing", shape="inflated")
+    return build_body(VIEW, mask, request, ReconstructOptions(mesh_vertices=vertices), lambda said: None).mesh
+
+
+def masks():
+    ring = (COLUMNS - 160) ** 2 + (ROWS - 150) ** 2
+    line, dot = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool)
+    line[60:220, 150:154] = True
+    dot[200:206, 150:156] = True
+    edge = np.zeros((HEIGHT, WIDTH), bool)
+    edge[150:, :170] = True
+    return {"toy": TOY, "ring": (ring < 80**2) & (ring > 60**2), "line": line, "dot": dot, "border": edge}
+
+
+def made(photo, name="toy"):
+    mask = masks()[name]
+    return textured_body(VIEW, body(name), crop_texture(photo, mask), mask)
+
+
+def seen_from(surface, turn_deg, side=260):
+    """A picture (side, side, 4) with coverage of ``surface``, from the camera's height after a turn about it."""
+    centre = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
+    turn = math.radians(turn_deg)
+    towards = np.array([math.sin(turn), -math.cos(turn), 0.2])
+    towards /= np.linalg.norm(towards)
+    right = np.cross([0, 0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    offset = surface.vertices - centre
+    scale = 0.45 * side / np.linalg.norm(offset, axis=1).max()
+    x, y = side / 2 + scale * offset @ right, side / 2 - scale * offset @ np.cross(towards, right)
+    at = np.column_stack([x, y, 1e6 - offset @ towards])
+    a, b, c = (at[surface.faces[:, i], :2] for i in range(3))
+    front = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0
+    shown = rasterised(at, surface.faces, (side, side), front)
+    height, width = surface.picture.shape[:2]
+    uv = shown.interpolated(surface.faces, surface.uv)
+    texels = surface.picture[
+        np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1),
+        np.clip((uv[:, 0] * width).astype(int), 0, width - 1),
+    ]
+    image = np.zeros((side, side, 4), np.uint8)
+    image[shown.rows, shown.columns] = np.column_stack([texels, np.full(len(texels), 255)])
+    return image
+
+
+def dark_blobs(image):
+    """Number of dark islands of more than ten pixels on the body in ``image``."""
+    dark = (image[..., :3].mean(axis=2) < 70) & (image[..., 3] > 0)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8))
+    return int((stats[1:, cv2.CC_STAT_AREA] > 10).sum())
+
+
+def test_eyes_are_not_repeated_behind():
+    photo = picture(TOY, eyes=True)
+    now, mirrored = made(photo), textured(body(), crop_texture(photo, TOY))
+    assert dark_blobs(seen_from(now, 0)) == 2
+    assert dark_blobs(seen_from(mirrored, 180)) == 2, "the count does not find what it should"
+    for turn in (140, 160, 180, 200, 220):
+        assert dark_blobs(seen_from(now, turn)) == 0
+
+
+def test_a_stripe_that_reaches_the_outline_goes_round():
+    for turn in (90, 180, 270):
+        image = seen_from(made(picture(TOY, stripe=True)), turn).astype(int)
+        blue = (image[..., 2] > image[..., 0] + 20) & (image[..., 3] > 0)
+        covered = np.flatnonzero(image[..., 3].any(axis=0))
+        inner = covered[len(covered) // 8 : -(len(covered) // 8)]
+        assert blue[:, inner].any(axis=0).mean() > 0.95, turn
+        # It stays a stripe.
+        assert 0.05 < blue.sum() / (image[..., 3] > 0).sum() < 0.3, turn
+
+
+def test_what_is_seen_well_is_the_photo_bit_for_bit():
+    photo = picture(TOY, eyes=True)
+    surface = made(photo)
+    at = VIEW.project(surface.vertices)
+    corner = at[surface.faces]
+    a, b, c = (corner[:, i] for i in range(3))
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    places = surface.vertices[surface.faces]
+    normal = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    towards = VIEW.position - places.mean(axis=1)
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
+    well = (normal * towards).sum(axis=1) / lengths > 0.5
+    shown = rasterised(at, surface.faces, (WIDTH, HEIGHT), area < 0)
+    # Of faces within 60 degrees, the pixels in the middle of the object.
+    keep = well[shown.faces] & ndimage.binary_erosion(TOY, iterations=3)[shown.rows, shown.columns]
+    height, width = surface.picture.shape[:2]
+    uv = shown.interpolated(surface.faces, surface.uv)[keep]
+    texels = surface.picture[((1 - uv[:, 1]) * height).astype(int), (uv[:, 0] * width).astype(int)]
+    assert keep.sum() > 0.7 * TOY.sum()
+    # Texture coordinates are interpolated in space, so a pixel's centre may fall on its neighbour's edge: not here.
+    assert np.array_equal(texels, photo[shown.rows[keep], shown.columns[keep]])
+
+
+def test_the_first_frame_is_the_photo_up_to_the_rim():
+    photo = picture(TOY, eyes=True)
+    surface = made(photo)
+    side = 4
+    at = VIEW.project(surface.vertices) * (side, side, 1)
+    a, b, c = (at[surface.faces[:, i], :2] for i in range(3))
+    front = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0
+    shown = rasterised(at, surface.faces, (WIDTH * side, HEIGHT * side), front)
+    height, width = surface.picture.shape[:2]
+    uv = shown.interpolated(surface.faces, surface.uv)
+    image = np.zeros((HEIGHT * side, WIDTH * side, 3), np.float32)
+    image[shown.rows, shown.columns] = surface.picture[
+        ((1 - uv[:, 1]) * height).astype(int), (uv[:, 0] * width).astype(int)
+    ]
+    image = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    error = ((image - photo) ** 2)[ndimage.binary_erosion(TOY, iterations=2)].mean()
+    assert 10 * math.log10(255**2 / error) > 38.0
+
+
+def test_no_texel_is_stretched_on_the_unseen_side():
+    surface = made(picture(TOY))
+    places = surface.vertices[surface.faces]
+    normal = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    area = np.linalg.norm(normal, axis=1) / 2
+    height, width = surface.picture.shape[:2]
+    at = (surface.uv * (width, height))[surface.faces]
+    first, second = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    texels = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    pixels_per_unit = VIEW.fx / np.median(VIEW.project(surface.vertices)[:, 2])
+    density = np.sqrt(texels / np.maximum(area, 1e-12)) / pixels_per_unit
+    # A photo's pixel at 68° covers 1 / cos 68° = 2.7 of its size, 0.61 per side.
+    assert np.average(density > 0.45, weights=area) > 0.995
+    mirrored = textured(body(), crop_texture(picture(TOY), TOY))
+    height, width = mirrored.picture.shape[:2]
+    at = (mirrored.uv * (width, height))[mirrored.faces]
+    first, second = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    texels = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    assert (np.sqrt(texels) < 0.1 * np.median(np.sqrt(texels))).mean() > 0.02, "the bound holds for anything"
+
+
+@pytest.mark.parametrize("name", ["ring", "line", "dot", "border"])
+def test_odd_outlines_get_a_texture(name):
+    surface = made(picture(masks()[name]), name)
+    assert np.isfinite(surface.uv).all() and surface.uv.min() >= 0 and surface.uv.max() <= 1
+    assert len(surface.faces) == len(body(name).faces)
+    # Charts split vertices; welded again the body is closed.
+    welded = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    welded.merge_vertices(merge_tex=True, merge_norm=True)
+    assert welded.is_watertight
+    # Nothing of the ground, which is grey, shows on the body.
+    image = seen_from(surface, 180).astype(int)
+    there = image[ndimage.binary_erosion(image[..., 3] > 0)]
+    if name in ("ring", "border"):
+        assert (there[:, 0] - there[:, 2] > 40).mean() > 0.95
+
+
+def test_each_face_has_texels_of_its_own():
+    surface = made(picture(masks()["ring"]), "ring")
+    height, width = surface.picture.shape[:2]
+    at = np.column_stack([surface.uv * (width, -height) + (0, height), np.ones(len(surface.uv))])
+    shown = rasterised(at, surface.faces, (width, height), np.ones(len(surface.faces), bool))
+    # Where two charts overlapped, half of the faces there would own no texel.
+    corner = at[surface.faces]
+    first, second = corner[:, 1, :2] - corner[:, 0, :2], corner[:, 2, :2] - corner[:, 0, :2]
+    area = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    assert abs(len(shown.rows) / area.sum() - 1.0) < 0.02
+
+
+def test_the_same_photo_gives_the_same_bytes():
+    photo = picture(TOY, eyes=True)
+    first, second = (glb_bytes(made(photo), np.zeros(3), 1.0) for _ in range(2))
+    assert first == second
+
+
+def test_islands_are_marks_and_stripes_are_not():
+    marks = plain_matter(picture(TOY, eyes=True), TOY).marks
+    eyes = sum((COLUMNS - column) ** 2 + (ROWS - 125) ** 2 < 8**2 for column in (135, 185)) > 0
+    assert marks[eyes].all() and marks.sum() < 4 * eyes.sum()
+    matter = plain_matter(picture(TOY, stripe=True), TOY)
+    assert not matter.marks[np.abs(ROWS - 150) < 8].any()
+    assert np.abs(matter.colours[150, 120:200] - BLUE).max() < 30
+
+
+def test_synthesised_grain_keeps_its_contrast_and_does_not_repeat():
+    swatch = np.random.default_rng(0).normal(0, 10, (48, 48, 3)).astype(np.float32)
+    rows, columns = np.mgrid[:300, :300]
+    grain = synthesised_grain(swatch, np.column_stack([columns.ravel(), rows.ravel()]).astype(float), 1)
+    grain = grain.reshape(300, 300, 3)
+    # Over 20 000 patches' pixels the deviation scatters by a per cent.
+    assert abs(grain.std() / swatch.std() - 1.0) < 0.05
+    assert abs(grain.mean()) < 0.5
+    spectrum = np.abs(np.fft.fft2(grain[..., 0])) ** 2
+    repeated = np.real(np.fft.ifft2(spectrum)) / spectrum.sum() * grain[..., 0].size
+    repeated[:4, :4] = repeated[-3:, :4] = repeated[:4, -3:] = repeated[-3:, -3:] = 0
+    assert repeated.max() < 0.3 * np.real(np.fft.ifft2(spectrum))[0, 0] / spectrum.sum() * grain[..., 0].size
