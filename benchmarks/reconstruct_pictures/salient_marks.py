@@ -90,6 +90,6 @@ def _wide(lab: NDArray[np.float32], inside: Mask) -> NDArray[np.float32]:
 
 
 def unmatched(found: Marks, true: Marks, reach: int) -> int:
-    """Return how many of the marks ``found`` lie where none of ``true`` is, within ``reach`` pixels."""
+    """Return how many of the marks ``found`` lie more than half beyond ``reach`` pixels from those of ``true``."""
     near = ndimage.binary_dilation(true.labels > 0, iterations=reach)
-    return sum(not near[found.labels == index].any() for index in range(1, found.count + 1))
+    return sum(float(near[found.labels == index].mean()) < 0.5 for index in range(1, found.count + 1))

@@ -97,6 +97,10 @@ def test_marks_that_are_truly_there_do_not_count():
     assert unmatched(found, Marks(np.zeros_like(found.labels), 0), 1) == 3
     one_eye = Marks((found.labels == found.labels[52, 44]).astype(np.int32), 1)
     assert unmatched(found, one_eye, 3) == 2
+    # A logo that merely touches a ring that goes around is still a logo.
+    ring = np.zeros_like(found.labels)
+    ring[55:58] = 1
+    assert unmatched(found, Marks(ring, 1), 1) == 3
 
 
 def a_ball(behind):
