@@ -209,6 +209,22 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         soft_max=0.1,
         precision=4,
     )
+    relaxing_share: from_field(
+        Material,
+        "relaxing_share",
+        "Relaxing Share",
+        "Stiffness that gives way with time, over the lasting one. 0: bounces on; rubber 0.1, plush 2",
+        soft_max=5.0,
+        precision=2,
+    )
+    relaxation_time: from_field(
+        Material,
+        "relaxation_time",
+        "Relaxation Time",
+        "Seconds in which the relaxing part gives way",
+        soft_max=1.0,
+        precision=4,
+    )
     yield_stress: from_field(
         Material,
         "yield_stress",

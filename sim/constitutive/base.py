@@ -25,13 +25,14 @@ SHAPED, COHERENT, GRANULAR, FLUID = "shaped", "coherent", "granular", "fluid"
 RIGID = "rigid"
 """Law of bodies that do not deform."""
 
-DAMPED, FIBRED = 1 << 30, 1 << 29
-"""Bits in a set of laws: some solid in it has a damping time, some solid has fibres. Model i has the bit 1 << i."""
+DAMPED, FIBRED, RELAXING = 1 << 30, 1 << 29, 1 << 28
+"""Bits in a set of laws: some solid in it has a damping time, has fibres, has a branch that relaxes. Model i has the
+bit 1 << i."""
 
 OWN = 4
-ROW = 2 + OWN + 4
+ROW = 2 + OWN + 4 + 2
 """Numbers of a material in the kernels' table: model, damping time in s, four of the model's own, the fibres' modulus
-over 2 mu, their axis (3)."""
+over 2 mu, their axis (3), the relaxing share and its time in s."""
 
 STABLE_WAVENUMBER = 2.0 / 0.58
 """Largest wavenumber that the grid carries, 1/cells: waves of speed c are stable up to c dt = 0.58 cells."""
@@ -98,6 +99,14 @@ class DeformableMaterial:
     fibre_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector of the fibres in the undeformed body, world axes."""
 
+    relaxing_share: float = 0.0
+    """Shear modulus of a spring that is in series with a dashpot beside the law (Zener's standard linear solid), over
+    the law's own, 0 (none) to 20. What is deformed fast is 1 + share times as stiff in shear as at rest; the loss
+    factor is largest, share / (2 sqrt(1 + share)), at the angular frequency 1 / (relaxation_time sqrt(1 + share))."""
+
+    relaxation_time: float = 0.01
+    """Seconds in which the stress of that spring falls to 1/e, 1e-5 to 100."""
+
     law: ClassVar[str]
     """Name of the model in scenes and presets."""
 
@@ -142,6 +151,8 @@ class DeformableMaterial:
         self._in_range("poisson_ratio", 0.0, math.nextafter(0.5, 0.0), "give 0 or more and less than 0.5")
         self._in_range("damping_time", 0.0, 1e3, "give seconds from 0 to 1000")
         self._in_range("fibre_modulus", 0.0, 1e12, "give pascals from 0 to 1e12")
+        self._in_range("relaxing_share", 0.0, 20.0, "give 0 (none) to 20")
+        self._in_range("relaxation_time", 1e-5, 100.0, "give seconds from 1e-5 to 100")
         axis = self.fibre_axis
         if len(axis) != 3 or not abs(math.hypot(*axis) - 1.0) < 1e-3:
             raise InputError(f"material fibre_axis is {axis!r}: give a unit vector")
@@ -178,6 +189,12 @@ class DeformableMaterial:
         along = np.linalg.norm(deformation @ np.asarray(self.fibre_axis), axis=1)
         return float(volumes @ (0.5 * self.fibre_modulus * (along - 1) ** 2))
 
+    def relaxing_energy(self, volumes: Array, conformations: Array) -> float:
+        """Energy in J stored in the springs that relax, share mu/2 (tr B - 3 - ln det B), with B (N, 3, 3)."""
+        determinants = np.maximum(np.linalg.det(conformations), 1e-12)
+        stored = np.trace(conformations, axis1=1, axis2=2) - 3 - np.log(determinants)
+        return float(volumes @ (0.5 * self.relaxing_share * self.shear_modulus * stored))
+
     @property
     def shear_modulus(self) -> float:
         """First Lamé parameter of shear, mu in Pa."""
@@ -191,16 +208,18 @@ class DeformableMaterial:
 
     @property
     def wave_speed(self) -> float:
-        """Speed in m/s of longitudinal waves in the undeformed material, sqrt((lambda + 2 mu + k) / rho), along fibres.
+        """Speed in m/s of fast longitudinal waves in the undeformed material, along fibres:
+        sqrt((lambda + 2 (1 + relaxing_share) mu + k) / rho).
 
         The first substep and the estimate of cost depend on it.
         """
-        return math.sqrt((self.lame_lambda + 2 * self.shear_modulus + self.fibre_modulus) / self.density)
+        shear = (1.0 + self.relaxing_share) * self.shear_modulus
+        return math.sqrt((self.lame_lambda + 2 * shear + self.fibre_modulus) / self.density)
 
     @property
     def diffusivity(self) -> float:
         """Longitudinal kinematic viscosity in m²/s, (zeta + 4/3 eta) / rho."""
-        return self.damping_time * self.wave_speed**2
+        return self.damping_time * (self.lame_lambda + 2 * self.shear_modulus + self.fibre_modulus) / self.density
 
     @property
     def shear_number(self) -> float:
@@ -216,14 +235,16 @@ class DeformableMaterial:
     def laws(self) -> int:
         """Bits of this material in a set of laws."""
         damped = DAMPED if self.damping_time > 0 and self.cohesion != FLUID else 0
-        return (1 << self.number) | damped | (FIBRED if self.fibre_modulus > 0 else 0)
+        relaxing = RELAXING if self.relaxing_share > 0 and self.cohesion != FLUID else 0
+        return (1 << self.number) | damped | relaxing | (FIBRED if self.fibre_modulus > 0 else 0)
 
     @property
     def row(self) -> tuple[float, ...]:
         """This material's ``ROW`` numbers in the kernels' table."""
         own = self.own_numbers()
         fibres = self.fibre_modulus / (2 * self.shear_modulus)
-        return (float(self.number), self.damping_time, *own, *(0.0,) * (OWN - len(own)), fibres, *self.fibre_axis)
+        numbers = (float(self.number), self.damping_time, *own, *(0.0,) * (OWN - len(own)), fibres, *self.fibre_axis)
+        return (*numbers, self.relaxing_share, self.relaxation_time)
 
 
 @dataclass(frozen=True, kw_only=True)

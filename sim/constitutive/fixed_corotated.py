@@ -35,7 +35,13 @@ class ElasticMaterial(DeformableMaterial):
     rank: ClassVar[int] = 0
     label: ClassVar[str] = "Elastic"
     hint: ClassVar[str] = "Returns to its shape: rubber, jelly, foam, most objects"
-    reads: ClassVar[tuple[str, ...]] = (*DeformableMaterial.reads, "fibre_modulus", "fibre_axis")
+    reads: ClassVar[tuple[str, ...]] = (
+        *DeformableMaterial.reads,
+        "relaxing_share",
+        "relaxation_time",
+        "fibre_modulus",
+        "fibre_axis",
+    )
 
     def elastic_energy(self, volumes: Array, deformation: Array, memories: Array) -> float:
         """Energy in J; see the base class."""

@@ -24,7 +24,13 @@ class NeoHookeanMaterial(DeformableMaterial):
     rank: ClassVar[int] = 1
     label: ClassVar[str] = "Elastic, Large Strain"
     hint: ClassVar[str] = "For extreme compression or stretching"
-    reads: ClassVar[tuple[str, ...]] = (*DeformableMaterial.reads, "fibre_modulus", "fibre_axis")
+    reads: ClassVar[tuple[str, ...]] = (
+        *DeformableMaterial.reads,
+        "relaxing_share",
+        "relaxation_time",
+        "fibre_modulus",
+        "fibre_axis",
+    )
 
     def elastic_energy(self, volumes: Array, deformation: Array, memories: Array) -> float:
         """Energy in J; see the base class."""

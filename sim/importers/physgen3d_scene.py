@@ -175,9 +175,9 @@ def placed_object(
 def object_material(item: Physgen3dObject, settings: Physgen3dSettings | None) -> Material:
     """Return the material: stiffness and density of the folder, else its settings, else of the preset ``medium``.
 
-    Raises InputError for values out of range.
+    The law is the paper's, which loses nothing. Raises InputError for values out of range.
     """
-    usual = load_preset("medium")
+    usual = dataclasses.replace(load_preset("medium"), law="fixed_corotated", relaxing_share=0.0)
     modulus, density = item.youngs_modulus, item.density
     if settings is not None:
         modulus = settings.youngs_modulus if modulus is None else modulus

@@ -100,6 +100,7 @@ class Engine:
         self._names += ("volumes",) if several else ()
         self._names += ("anchors",) if anchored else ()
         self._names += ("slopes",) if models.volumetric else ()
+        self._names += ("conformation",) if models.relaxing else ()
         self._several = several
         self.count = 0
         self.retries = 0
@@ -145,6 +146,7 @@ class Engine:
             "volumes": ti.f32,
             "anchors": vec4,
             "slopes": vec3,
+            "conformation": mat3,
         }
         return {name: ti.ndarray(kinds[name], self._capacity) for name in self._names}
 
@@ -221,6 +223,7 @@ class Engine:
                 "volumes": added.volumes.astype(np.float32),
                 "anchors": added.anchors.astype(np.float32),
                 "slopes": np.zeros((count, 3), dtype=np.float32),
+                "conformation": np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3)),
             }
             for name in self._names:
                 parts[name].append(new[name])
@@ -333,6 +336,7 @@ class Engine:
             "volumes": sorting.permute_numbers,
             "anchors": sorting.permute_vectors,
             "slopes": sorting.permute_triples,
+            "conformation": sorting.permute_matrices,
         }
         for name in self._names:
             if name in movers:
@@ -507,6 +511,7 @@ class Engine:
             "volumes": self._masses,
             "anchors": self._nodes,
             "slopes": here["v"],
+            "conformation": here["C"],
         }
         return ParticleArrays(**{name: here.get(name, spare.get(name)) for name in ParticleArrays._fields})
 

@@ -349,6 +349,9 @@ class WorldGroup:
         }
         if "gradients" in given:
             new["F"] = given["gradients"]
+            if "conformation" in state:
+                # What relaxed in the old deformation does not belong to the new one.
+                new["conformation"] = np.broadcast_to(np.eye(3), (body.count, 3, 3))
         if "positions" in given:
             x, keys = places_in_blocks(place.field(index), place.cells.points_to_engine(given["positions"]))
             new |= {"x": x, "keys": keys}

@@ -186,11 +186,15 @@ class WorldView:
         choice = self.group.material_choice(self.index, index)
         volumes = body.volumes if body.stiffness_scale is None else body.volumes * body.stiffness_scale
         gradients, memories = self.elastic_gradients(index), self.memories(index)
-        return sum(
-            material.elastic_energy(volumes[mine], gradients[mine], memories[mine])
-            for material, mine in ((m, choice == i) for i, m in enumerate(materials_of(body)))
-            if mine.any()
-        )
+        parts = [(m, choice == i) for i, m in enumerate(materials_of(body))]
+        parts = [(m, mine) for m, mine in parts if mine.any()]
+        stored = sum(m.elastic_energy(volumes[mine], gradients[mine], memories[mine]) for m, mine in parts)
+        relaxing = [(m, mine) for m, mine in parts if m.relaxing_share > 0]
+        if relaxing:
+            at_rest = np.broadcast_to(np.eye(3), (body.count, 3, 3)).copy()
+            kept = self.group.gather("conformation", self._number(index), at_rest)
+            stored += sum(m.relaxing_energy(volumes[mine], kept[mine]) for m, mine in relaxing)
+        return stored
 
     def ground_gap(self, index: int) -> float:
         """Least distance in metres of body ``index``'s surface to the ground; below 0 under it, inf without ground."""

@@ -9,7 +9,19 @@ import sys
 import pytest
 from physgen.benchmarks.__main__ import benchmarks, main
 
-FAST = ("diagnosis", "farm", "farm_dask", "main_thread", "mpm", "playback", "render", "rest", "splats", "worlds")
+FAST = (
+    "diagnosis",
+    "farm",
+    "farm_dask",
+    "main_thread",
+    "materials",
+    "mpm",
+    "playback",
+    "render",
+    "rest",
+    "splats",
+    "worlds",
+)
 SLOW = ("compose", "demo", "first_frame", "light", "reconstruct")
 NEEDS = {
     **dict.fromkeys((*SLOW, "main_thread", "playback", "render"), "bpy"),

@@ -8,6 +8,9 @@ Besides the models' own stress:
 
     fibres       psi += k/2 (s - 1)^2, s = |F a|: tau += k (s - 1) / s  F a (F a)^T      Bonet and Burton 1998
     damping      tau += t (2 mu D + lambda tr D)      Kelvin–Voigt, with one retardation time t for shear and volume
+    relaxing     tau += q mu (B - I),  dB/dt = L B + B L^T - (B - I) / t      a spring of q mu in series with a dashpot
+                 beside the law: Zener's standard linear solid, as Oldroyd 1950 writes it for large strain; B is kept
+                 per particle (``conformation``), I at rest, positive definite whatever the step
 
 D is the symmetric part of the velocity gradient. Plastic models map the trial principal stretches s back onto the yield
 surface: F <- U diag(s_new / s) U^T F, which keeps everything else, so no right singular vectors are needed.
@@ -23,6 +26,7 @@ from ...constitutive import (
     FIBRED,
     FLUID,
     GRANULAR,
+    RELAXING,
     ROW,
     STABLE_WAVENUMBER,
     ElasticMaterial,
@@ -70,6 +74,9 @@ class LawSet(NamedTuple):
     fibred: bool
     """Whether some solid has fibres."""
 
+    relaxing: bool
+    """Whether some solid has a branch that relaxes."""
+
     only_elastic: bool
     """Whether there is nothing but plain fixed-corotated elasticity, for which the kernels are simplest."""
 
@@ -81,6 +88,9 @@ HENCKY = tuple(model.number for model in models() if model.device().hencky_retur
 PLASTIC = (*HENCKY, *(model.number for model in models() if model.device().return_map is not None))
 LOG_VOLUMES = tuple(model.number for model in models() if model.memory_is_log_volume)
 """Numbers of models by property."""
+
+RELAXING_SHARE, RELAXATION_TIME = ROW - 2, ROW - 1
+"""Numbers of the branch that relaxes in a material's row."""
 
 ONLY_ELASTIC = 1 << ElasticMaterial.number
 """The set of laws of worlds that hold nothing but plain fixed-corotated solids."""
@@ -100,6 +110,7 @@ def law_set(laws: int) -> LawSet:
         flowing=any(model.cohesion in FLOWING for model in present),
         damped=bool(laws & DAMPED),
         fibred=bool(laws & FIBRED),
+        relaxing=bool(laws & RELAXING),
         only_elastic=laws == ONLY_ELASTIC,
     )
 
@@ -174,6 +185,13 @@ def map_back(law: ti.i32, laws: ti.template(), F: mat3, memory: ti.f32, two_mu: 
 def deform(laws: ti.template(), p: ti.i32, dt: ti.f32, C: mat3, worlds: WorldArrays, particles: ParticleArrays):
     """Deformation gradient of particle ``p`` after ``dt``; of fluids only the volume changes, in ``memory``."""
     Fp = particles.F[p]
+    if ti.static(laws.relaxing):
+        row = particles.material[p] * ROW
+        if worlds.materials[row + RELAXING_SHARE] > 0.0:
+            one = ti.Matrix.identity(ti.f32, 3)
+            step = one + dt * C
+            kept = ti.exp(-dt / worlds.materials[row + RELAXATION_TIME])
+            particles.conformation[p] = one + kept * (step @ particles.conformation[p] @ step.transpose() - one)
     if ti.static(len(laws.volumetric) > 0):
         law = law_of(p, worlds, particles)
         if is_fluid(law):
@@ -228,6 +246,16 @@ def respond(
             stretch = along.norm() + 1e-12
             tau += (fibres * (stretch - 1.0) / stretch) * along.outer_product(along)
             stiffness += fibres * stretch * stretch
+    if ti.static(laws.relaxing):
+        share = worlds.materials[row + RELAXING_SHARE]
+        if share > 0.0:
+            B = particles.conformation[p]
+            mu = 0.5 * share * fixed[1]
+            tau += mu * B
+            for i in ti.static(range(3)):
+                tau[i, i] -= mu
+            # As in neo-Hookean matter; the largest square of a stretch where the two others are about 1.
+            stiffness += mu * (ti.max(B.trace() - 2.0, 1.0) + 1.0)
     if ti.static(laws.damped):
         time = worlds.materials[row + 1]
         if time > 0.0 and not is_fluid(law):

@@ -188,7 +188,7 @@ class ParticleState(NamedTuple):
 
 
 class ParticleArrays(NamedTuple):
-    """Particle arrays of the substep's kernels: the state as in ``ParticleState``, and more. Of the last five, those
+    """Particle arrays of the substep's kernels: the state as in ``ParticleState``, and more. Of the last six, those
     that no material or field needs are replaced by others."""
 
     x: Cells
@@ -212,6 +212,9 @@ class ParticleArrays(NamedTuple):
 
     slopes: Vectors3
     """(N,) slope of ln J around fluid particles, 1/cell."""
+
+    conformation: Matrices
+    """(N,) strain of the branch that relaxes, as a left Cauchy–Green tensor; the identity at rest."""
 
 
 class NodeArrays(NamedTuple):

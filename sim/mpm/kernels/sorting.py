@@ -26,6 +26,7 @@ from .layout import (
     Cells,
     Integers,
     Keys,
+    Matrices,
     Scalars,
     Vectors3,
     Vectors4,
@@ -244,5 +245,12 @@ def permute_vectors(count: ti.i32, targets: Integers, old: Vectors4, new: Vector
 @kernel
 def permute_triples(count: ti.i32, targets: Integers, old: Vectors3, new: Vectors3):
     """Move one vector of three a particle to its new index."""
+    for p in range(count):
+        new[targets[p]] = old[p]
+
+
+@kernel
+def permute_matrices(count: ti.i32, targets: Integers, old: Matrices, new: Matrices):
+    """Move one matrix a particle to its new index."""
     for p in range(count):
         new[targets[p]] = old[p]
