@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .sim.gaussians.compose.compose_options import ComposeRequest
     from .sim.importers.mesh_scene import scene_from_meshes
     from .sim.mpm.world import World
+    from .sim.reconstruct.reasoning.chat_client import ChatRequest
     from .sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
     from .sim.scene.folder import Scene, load_scene
     from .sim.version import VERSION as __version__
@@ -47,6 +48,7 @@ __all__ = [
     "Bake",
     "BakeOptions",
     "Capture",
+    "ChatRequest",
     "ComposeRequest",
     "DiagnoseOptions",
     "Diagnosis",
@@ -76,6 +78,7 @@ _HOMES = {
     "Bake": ".sim.cache.bake_folder",
     "BakeOptions": ".sim.app.bake_options",
     "Capture": ".sim.diagnose.capture",
+    "ChatRequest": ".sim.reconstruct.reasoning.chat_client",
     "ComposeRequest": ".sim.gaussians.compose.compose_options",
     "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
     "Diagnosis": ".sim.diagnose.diagnosis",
