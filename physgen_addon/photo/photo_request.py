@@ -97,11 +97,11 @@ def _of_objects(state: bpy.types.PropertyGroup, known: list[tuple[str, bpy.types
     masks = mask_files(state, scene_folder(state)) if any(box.mask for _, box in known) else {}
     given = {"mask": [f"{name}={path}" for name, (path, _) in masks.items()]}
     for flag in OF_OBJECTS:
-        given[flag] = [f"{name}={value}" for name, box in known if (value := _said(box, flag))]
+        given[flag] = [f"{name}={value}" for name, box in known if (value := _flag_value(box, flag))]
     return [word for flag, values in given.items() if values for word in (f"--{flag}", *values)]
 
 
-def _said(box: bpy.types.PropertyGroup, flag: str) -> str:
+def _flag_value(box: bpy.types.PropertyGroup, flag: str) -> str:
     """Return the setting of ``box`` for ``flag``; empty if automatic."""
     if flag == "thickness":
         return f"{box.thickness:.7g}" if box.thickness > 0 else ""

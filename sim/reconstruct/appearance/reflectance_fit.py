@@ -338,7 +338,7 @@ def fit_reflectance(scene: LocalLighting, pixels: FitPixels) -> Reflectance | st
     )
     metal = max(fit.gain for fit in metals)
     if metal > max(LEAST_METAL, best.gain):
-        roughness = _told([fit.gain for fit in metals])
+        roughness = _determined([fit.gain for fit in metals])
         if isinstance(roughness, str):
             return roughness
         return Reflectance(roughness, True, 1.0, disc, colour.albedo, metal)
@@ -357,13 +357,13 @@ def fit_reflectance(scene: LocalLighting, pixels: FitPixels) -> Reflectance | st
     rivals = [fitted(coarse @ t.T, i).gain for t in _elsewhere(scene.sun) for i in range(1, len(ROUGHNESSES), 3)]
     if best.gain < LEAST_LEAD * max(rivals, default=0.0):
         return "a sun from elsewhere would explain as much"
-    roughness = _told([fit.gain for fit in fits])
+    roughness = _determined([fit.gain for fit in fits])
     if isinstance(roughness, str):
         return roughness
     return Reflectance(roughness, False, best.strength, turned, colour.albedo, best.gain)
 
 
-def _told(gains: list[float]) -> float | str:
+def _determined(gains: list[float]) -> float | str:
     """The roughness determined by ``gains`` of all ``ROUGHNESSES``, or the reason why there is none."""
     best = max(gains)
     near = [r for r, gain in zip(ROUGHNESSES, gains, strict=True) if gain >= NEARLY * best]

@@ -244,7 +244,7 @@ def estimate_sun(
     starts = sorted(_all_over(), key=lambda p: light(p, 5, 3).cost)
     refined = [_refined(lambda p: light(p, 12).cost, start) for start in _distinct(starts, STARTS)]
     best = min(refined, key=lambda p: light(p, 48).cost)
-    best[2] = _told_angle(lambda p: light(p, 48).cost, best)
+    best[2] = _angle_or_usual(lambda p: light(p, 48).cost, best)
     final = light(best, 48, 12)
     direction, angle = _direction(best[:2]), _angle(best[2])
     clearness = _clearness(view, view.caster.reaching(*sun_disc(direction, angle, 48)), final)
@@ -266,7 +266,7 @@ def _refined(cost: Callable[[Points], float], start: Points) -> Points:
     return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
 
 
-def _told_angle(cost: Callable[[Points], float], best: Points) -> float:
+def _angle_or_usual(cost: Callable[[Points], float], best: Points) -> float:
     """The logarithm of the sun's angular size: the fitted one, or the usual one if that explains the ground as well."""
     usual = np.array([*best[:2], math.log(USUAL_ANGLE)])
     return float(usual[2] if cost(usual) <= cost(best) * 1.002 else best[2])

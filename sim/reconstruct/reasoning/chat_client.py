@@ -182,12 +182,12 @@ def _refused(reply: Reply, request: ChatRequest, key: str) -> Failure:
         return Failure(f"has no such path or model (404); check the URL and the model {request.model!r}", again=False)
     if 300 <= status < 400:
         return Failure(f"redirects (status {status}); give its target instead", again=False)
-    said = _said(reply.body, key)
+    said = _server_message(reply.body, key)
     reason = f"answers with status {status}" + (f": {said}" if said else "")
     return Failure(reason, again=status in (408, 425, 429) or (status >= 500 and status not in (501, 505)))
 
 
-def _said(body: bytes, key: str) -> str:
+def _server_message(body: bytes, key: str) -> str:
     """The server's message, as one printable line without the key; "" if there is none or it may contain the key."""
     data = _parsed(body)
     error = data.get("error", data.get("message", data.get("detail"))) if isinstance(data, dict) else None
@@ -243,7 +243,7 @@ def _content(reply: Reply, address: Address, key: str, notice: Callable[[str], N
         raise InputError(f"{address}: answers with {what}; is it a chat endpoint? Its path ends in {_ENDING}")
     data = data if isinstance(data, dict) else {}
     if data.get("error"):
-        raise InputError(f"{address}: answers with an error: {_said(reply.body, key) or 'without a message'}")
+        raise InputError(f"{address}: answers with an error: {_server_message(reply.body, key) or 'without a message'}")
     choices = data.get("choices")
     choice = choices[0] if isinstance(choices, list) and choices and isinstance(choices[0], dict) else {}
     message = choice.get("message")
