@@ -202,7 +202,7 @@ def test_what_is_seen_wears_its_own_pixels_and_the_rest_pixels_of_the_object():
         cosine = (normal * towards).sum(axis=1) / np.linalg.norm(normal, axis=1) / np.linalg.norm(towards, axis=1)
         front = np.unique(body.mesh.faces[cosine > 0.3])
         assert np.array_equal(body.mesh.colours[front], body.mesh.pixels[front])
-        back = np.setdiff1d(np.arange(len(body.mesh.vertices)), np.unique(body.mesh.faces[cosine > 0.1]))
+        back = np.setdiff1d(np.arange(len(body.mesh.vertices)), np.unique(body.mesh.faces[cosine > 0.01]))
         at = np.floor(body.mesh.colours[back]).astype(int)
         inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         assert inner[at[:, 1], at[:, 0]].mean() > 0.99

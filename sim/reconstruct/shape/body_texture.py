@@ -28,8 +28,9 @@ from .primitives import Box, Primitive, Sphere, SurfaceOfRevolution
 
 Points = NDArray[np.float64]
 
-GRAZING = np.cos(np.radians(80.0))
-"""Faces at a larger angle to the camera count as unseen: a pixel would cover six of its size on them."""
+GRAZING = np.cos(np.radians(89.0))
+"""Faces at a larger angle to the camera count as unseen. A flat face at 86°, such as a book's fore-edge, still covers a
+strip of several pixels, and the first frame is the photo only if that strip has its own."""
 RIM = (2.0, 0.015)
 """Least distance of source colours from the outline for unseen points: pixels, and share of the object's size; the
 larger."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -20,7 +21,7 @@ from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth
 from .inflate import Crop, film_profile, signed_distance
 from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, relax, standing_mesh, surface_of_size
-from .primitives import Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
+from .primitives import FINER, Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float64]
@@ -33,6 +34,8 @@ FADE = 0.6
 """Depth inside the outline at which the shift vanishes, over the widest inscribed circle."""
 SMOOTH = 0.02
 """Smoothing of the warp along the outline over the object's size: finer detail is mask noise."""
+REFINED = (0.004, 0.15)
+"""``SMOOTH`` and ``FADE`` of a second warp, for what the first one leaves: rounded corners."""
 PART = (2.5, 0.02)
 """Least protrusion of a part: pixels, and share of the object's size; the larger one."""
 REACH = 1.5
@@ -55,8 +58,11 @@ class OutlineWarp:
     fade: Field
 
 
-def warp_to_outline(crop: Crop, primitive: Mask) -> OutlineWarp:
-    """Return the warp between ``primitive`` (h, w), a fitted silhouette on the crop, and the crop's own mask."""
+def warp_to_outline(crop: Crop, primitive: Mask, *, smooth: float = SMOOTH, fade: float = FADE) -> OutlineWarp:
+    """Return the warp between ``primitive`` (h, w), a fitted silhouette on the crop, and the crop's own mask.
+
+    smooth, fade: as ``SMOOTH`` and ``FADE``.
+    """
     mask = crop.mask
     size = float(np.sqrt(mask.sum()))
     own = signed_distance(primitive)
@@ -71,8 +77,8 @@ def warp_to_outline(crop: Crop, primitive: Mask) -> OutlineWarp:
     outward = np.zeros(mask.shape)
     if good.any():
         nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
-        outward = ndimage.gaussian_filter(apart[tuple(nearest)], max(1.5, SMOOTH * size))
-    weight = np.clip(1.0 - own / max(FADE * float(own.max()), 1e-9), 0.0, 1.0)
+        outward = ndimage.gaussian_filter(apart[tuple(nearest)], max(1.5, smooth * size))
+    weight = np.clip(1.0 - own / max(fade * float(own.max()), 1e-9), 0.0, 1.0)
     shift = np.moveaxis(towards * (outward * weight * weight * (3.0 - 2.0 * weight)), 0, -1)
     parts, reach = _parts(mask, own + outward, size)
     return OutlineWarp(shift=shift, parts=parts, fade=np.clip(1.0 - (own + outward) / reach, 0.0, 1.0))
@@ -196,12 +202,8 @@ def bent_mesh(camera: Camera, crop: Crop, primitive: Primitive, fitted: OutlineW
     """Return ``primitive`` warped by ``fitted`` towards the outline of ``crop``, standing on the ground."""
     vertices, faces = primitive_mesh(primitive, target)
     projected = camera.project(vertices)
-    at = projected[:, :2] - np.array([crop.left + 0.5, crop.top + 0.5])
-    move = np.stack(
-        [ndimage.map_coordinates(fitted.shift[..., i], at[:, ::-1].T, order=1, mode="nearest") for i in (0, 1)], axis=-1
-    )
-    # The shift maps the object to the primitive; vertices move the other way.
-    pixels = projected[:, :2] - move
+    pixels = _bent(crop, projected[:, :2], fitted)
+    pixels = _refined(crop, pixels, faces)
     depth = projected[:, 2]
     before, after = (ground_depth(camera, camera.rays(p)) for p in (projected[:, :2], pixels))
     low = np.clip(1.0 - vertices[:, 2] / primitive.height, 0.0, 1.0)
@@ -211,6 +213,29 @@ def bent_mesh(camera: Camera, crop: Crop, primitive: Primitive, fitted: OutlineW
     on_ground = vertices[:, 2] <= 1e-9 * primitive.height
     depth = np.where(on_ground, after, np.minimum(depth, after))
     return standing_mesh(camera, pixels, depth, faces)
+
+
+def _refined(crop: Crop, pixels: Points, faces: Faces) -> Points:
+    """Photo pixels (V, 2) of a mesh, moved until its silhouette is the outline: a smooth warp leaves corners out, and
+    rounded edges fall short."""
+    smooth, fade = REFINED
+    return _bent(crop, pixels, warp_to_outline(crop, _silhouette(crop, pixels, faces), smooth=smooth, fade=fade))
+
+
+def _bent(crop: Crop, pixels: Points, warp: OutlineWarp) -> Points:
+    """Photo pixels (V, 2) moved by ``warp``. It maps the object to the primitive; vertices move the other way."""
+    at = pixels - np.array([crop.left + 0.5, crop.top + 0.5])
+    shift = (ndimage.map_coordinates(warp.shift[..., i], at[:, ::-1].T, order=1, mode="nearest") for i in (0, 1))
+    return np.asarray(pixels - np.stack(list(shift), axis=-1))
+
+
+def _silhouette(crop: Crop, pixels: Points, faces: Faces) -> Mask:
+    """Pixels (h, w) of ``crop`` that triangles (T, 3) with corners at photo ``pixels`` (V, 2) cover."""
+    image = np.zeros((crop.mask.shape[0] * FINER, crop.mask.shape[1] * FINER), np.uint8)
+    corners = ((pixels - [crop.left, crop.top]) * FINER - 0.5) * 16
+    for triangle in np.round(corners).astype(np.int32)[faces]:
+        cv2.fillConvexPoly(image, triangle, 255, shift=4)
+    return np.asarray(cv2.resize(image, crop.mask.shape[::-1], interpolation=cv2.INTER_AREA) > 127)
 
 
 FloatField = NDArray[np.float64]
@@ -355,5 +380,7 @@ def solid_mesh(
     points = relax(field, points, faces)
     pixels, depth, ground = field.depths(points)
     near = np.abs(depth - ground) < GROUND_TOLERANCE_PX * field.unit
+    pixels = _refined(crop, pixels, faces)
+    ground = ground_depth(camera, camera.rays(pixels))
     depth = np.where(near, ground, np.minimum(depth, ground))
     return standing_mesh(camera, pixels, depth, faces), lost

@@ -36,6 +36,9 @@ OWN = (np.cos(np.radians(84.0)), np.cos(np.radians(80.0)))
 background."""
 SHOWN = (np.cos(np.radians(89.0)), np.cos(np.radians(84.0)))
 """Cosines between which the photo replaces plain matter."""
+CLEAR = (0.5, 2.0)
+"""Pixels from the outline between which a point's own pixel is shown whatever its angle: a flat side at 86°, such as a
+book's fore-edge, is a strip of several pixels, none of them mixed with the background."""
 DENSITY = 1.25
 """Texels of charts per pixel of the photo, per side: the photo is resampled there."""
 MOST_TEXELS = 1.6e6
@@ -192,7 +195,10 @@ def _colours(
     plain = _sampled(matter.colours, like) + grain
     towards = camera.position - texel[:, :3]
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
-    weight = (_ramp(cosine, SHOWN) * (1.0 - texel[:, 10]))[:, None]
+    depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
+    away = _sampled(depth, own)[:, 0]
+    clear = _ramp(away, CLEAR) * (cosine > SHOWN[0])
+    weight = (np.maximum(_ramp(cosine, SHOWN), clear) * (1.0 - texel[:, 10]))[:, None]
     seen = np.flatnonzero(weight[:, 0] > 0)
     if not len(seen):
         return plain
@@ -207,9 +213,9 @@ def _colours(
     added *= (1.0 - _ramp(cosine[seen], GRAIN))[:, None]
     photo = _sampled(texture.pixels.astype(np.float32), own[seen])
     inner = _sampled(inner_colours(texture.pixels.astype(np.float32), mask), own[seen])
-    depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
-    pure = np.maximum(_ramp(_sampled(depth, own[seen])[:, 0], PURE), _ramp(cosine[seen], GRAIN))
-    photo = inner + (pure * _ramp(cosine[seen], OWN))[:, None] * (photo - inner) + added
+    pure = np.maximum(_ramp(away[seen], PURE), _ramp(cosine[seen], GRAIN))
+    share = np.maximum(pure * _ramp(cosine[seen], OWN), clear[seen])
+    photo = inner + share[:, None] * (photo - inner) + added
     plain[seen] += weight[seen] * (photo - plain[seen])
     return plain
 
