@@ -22,7 +22,7 @@ from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.reasoning.chat_client import ChatRequest
-from ..sim.reconstruct.reconstruct_pipeline import object_names
+from ..sim.reconstruct.reconstruct_options import object_names
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
 

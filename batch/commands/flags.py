@@ -8,12 +8,10 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...sim.app.bake_options import BakeOptions
-from ...sim.app.import_folder import mask_requests
 from ...sim.app.reconstruct import Physics
-from ...sim.app.set_light import LightRequest
 from ...sim.cache.bake_folder import SPACES
 from ...sim.errors import InputError
 from ...sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -22,6 +20,9 @@ from ...sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES, Pixel
 from ...sim.scene.equirectangular import FRAMES
 from ...sim.scene.material import preset_names
 from ...sim.scene.model import Vector
+
+if TYPE_CHECKING:
+    from ...sim.app.set_light import LightRequest
 
 Named = tuple[str, Any]
 
@@ -257,6 +258,8 @@ def object_requests(options: argparse.Namespace, out: Path) -> tuple[ObjectReque
             raise InputError(f"--name {name}: is given twice; give every object a unique name")
         fields[name] = {"box": corners, "size_m": options.size[i] if i < len(options.size) else None}
     if options.masks is not None:
+        from ...sim.app.import_folder import mask_requests
+
         folder = out.resolve().with_name(f"{out.resolve().name}_masks")
         size = ReconstructOptions().max_size
         for item in mask_requests(options.masks, options.photo, folder, max_size=size, only=options.only):
@@ -315,6 +318,8 @@ def add_sun_flags(parser: argparse.ArgumentParser) -> None:
 
 def light_request(options: argparse.Namespace) -> LightRequest:
     """Return the request of ``physgen light``. Raises InputError for an empty or contradictory one."""
+    from ...sim.app.set_light import LightRequest
+
     request = LightRequest(
         environment=options.environment,
         frame=options.environment_frame,

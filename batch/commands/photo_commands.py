@@ -7,13 +7,11 @@ import argparse
 from pathlib import Path
 
 from ...physgen_addon.render.render_options import require_video_name
-from ...sim.app.import_folder import import_folder
 from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
-from ...sim.app.set_light import set_light
 from ...sim.cache.bake_folder import load_bake
 from ...sim.events import IsCancelled
-from ...sim.importers.splat_scene import DEFAULT_UP_AXIS, SPLAT_UP_AXES
-from ...sim.reconstruct.reconstruct_pipeline import object_names
+from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
+from ...sim.reconstruct.reconstruct_options import object_names
 from ...sim.scene.folder import load_scene
 from ...sim.scene.overrides import check_overrides
 from ...sim.validation import to_json
@@ -158,6 +156,8 @@ def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
 
 def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen import``; the exit code."""
+    from ...sim.app.import_folder import import_folder
+
     import_folder(
         options.folder,
         out=options.out,
@@ -174,6 +174,8 @@ def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
 
 def run_light(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen light``; the exit code."""
+    from ...sim.app.set_light import set_light
+
     light = set_light(load_scene(options.scene), request=light_request(options), on_event=terminal).model.light
     terminal({"event": "done", "scene": str(options.scene), "light": to_json(light)})
     terminal.line(f"scene: {options.scene}")

@@ -6,11 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ...sim.app import preview_server
-from ...sim.app.bake_estimate import bake_cost
 from ...sim.app.reconstruct import set_physics, with_physics
-from ...sim.app.scene_variant import make_variant
-from ...sim.app.world_setup import cost_text
 from ...sim.cache.bake_folder import free_bake
 from ...sim.events import IsCancelled
 from ...sim.scene.folder import Scene, load_scene
@@ -65,6 +61,10 @@ def run_bake(options: argparse.Namespace, terminal: Terminal, cancelled: IsCance
 
 def run_estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen estimate``; the exit code."""
+    # What prepares worlds, and below what bakes, takes a second to import, which the other commands need not pay.
+    from ...sim.app.bake_estimate import bake_cost
+    from ...sim.app.world_setup import cost_text
+
     folder = load_scene(options.scene)
     scene = with_physics(folder.model, physics_options(options))
     cost = bake_cost(Scene(root=folder.root, model=scene), bake_options(options))
@@ -86,6 +86,8 @@ def run_free(options: argparse.Namespace, terminal: Terminal, cancelled: IsCance
 
 def run_preview(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen preview``; the exit code."""
+    from ...sim.app import preview_server
+
     return preview_server.serve(options.out, cancelled)
 
 
@@ -100,6 +102,8 @@ def add_variant(parser: argparse.ArgumentParser) -> None:
 
 def run_variant(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen variant``; the exit code."""
+    from ...sim.app.scene_variant import make_variant
+
     make_variant(
         load_scene(options.scene), out=options.out, physics=physics_options(options), effects=options.effects_json
     )

@@ -22,8 +22,7 @@ from ..errors import Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json
-from .bake import BakeOptions, bake
-from .bake_options import inputs_hash
+from .bake_options import BakeOptions, inputs_hash
 
 JOB_FORMAT = "physgen-job/1"
 UNHEARD_S = 0.5
@@ -72,6 +71,9 @@ def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
     job = parse(BakeJob, data, str(path))
     if job.expected_inputs not in (None, inputs_hash(load_scene(Path(job.scene)), job.options)):
         raise InputError(f"{job.scene}: was changed by another run since this one started; run it again")
+    # The commands that start this process need the job's format alone.
+    from .bake import bake
+
     manifest = bake(
         load_scene(Path(job.scene)), out=job.out, options=job.options, on_event=emit, cancelled=cancelled
     ).manifest

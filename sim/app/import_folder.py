@@ -12,11 +12,12 @@ from PIL import Image
 from ..atomic import replacing
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..importers import DEFAULT_UP_AXIS
 from ..importers.masks import read_masks
 from ..importers.physgen import MASKS, SETTINGS, import_physgen
 from ..importers.physgen3d import TRANSFORM_FILE
 from ..importers.physgen3d_scene import import_physgen3d
-from ..importers.splat_scene import DEFAULT_UP_AXIS, import_splats
+from ..importers.splat_scene import import_splats
 from ..reconstruct import ObjectRequest
 from ..reconstruct.photo import load_photo
 from ..scene.folder import Scene
@@ -57,7 +58,7 @@ def import_folder(
     """Return the scene folder ``out`` made of ``root``: a folder of PhysGen3D or PhysGen, or a splat file.
 
     size_m: largest extent of the first object in metres. settings: YAML file of PhysGen3D's simulation. up: up axis of
-    a splat file, one of ``splat_scene.SPLAT_UP_AXES``. Raises InputError for anything else and for arguments that do
+    a splat file, one of ``SPLAT_UP_AXES``. Raises InputError for anything else and for arguments that do
     not apply, and what the importers raise.
     """
     if root.is_file():

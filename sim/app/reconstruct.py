@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 from ..atomic import write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
-from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
+from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.adapters.adapter_registry import spec_files
 from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.reasoning.chat_client import ChatRequest
@@ -136,6 +136,8 @@ def _reconstruct_cached(
         else:
             on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
             return folder
+    from ..reconstruct import reconstruct_photo
+
     folder = reconstruct_photo(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
     stamp = Stamp(
         inputs_hash=inputs_hash,

@@ -32,7 +32,7 @@ from PIL import Image
 
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
-from ..reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
+from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.photo import load_photo
 from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, inside, load_scene, save_scene
@@ -212,6 +212,8 @@ def import_physgen(
     settings = _reconstruct_options(source, options or ReconstructOptions())
     with tempfile.TemporaryDirectory(prefix="physgen-import-") as temporary, replacing_folder(out) as partial:
         requests = object_requests(source, Path(temporary), size_m)
+        from ..reconstruct import reconstruct_photo
+
         folder = reconstruct_photo(source.photo, requests, partial, settings, on_event, cancelled)
         save_scene(partial, with_motion(source, folder, notice))
         _report(source, notice)

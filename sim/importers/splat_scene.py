@@ -29,6 +29,7 @@ from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, load_scene, save_scene
 from ..scene.model import Camera, Matrix4, SceneModel, SceneObject
 from ..scene.object_names import valid_names
+from . import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -223,9 +224,6 @@ def _marching_cubes(depth: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 DEFAULT_SIZE_M = 0.15
-SPLAT_UP_AXES = ("x", "y", "z", "x-down", "y-down", "z-down")
-DEFAULT_UP_AXIS = "y-down"
-"""Structure-from-motion cameras look along z with y down, and most splat fits keep these axes."""
 COLOUR_NEIGHBOURS = 8
 """Splats over which the colour of a mesh vertex is averaged."""
 IMAGE_SIZE = (960, 720)

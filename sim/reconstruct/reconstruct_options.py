@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
 from ..scene.equirectangular import FRAMES
-from ..scene.model import Vector
+from ..scene.model import SceneObject, Vector
 from ..validation import quantity, require, require_quantities
 
 SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
@@ -138,3 +139,15 @@ class ReconstructOptions:
             raise InputError(
                 f"horizon_y is {self.horizon_y!r} and pitch_deg is {self.pitch_deg!r}: give one of them, not both"
             )
+
+
+def object_names(objects: Sequence[ObjectRequest]) -> list[str]:
+    """Return the names of ``objects``. Raises InputError for a name that is invalid or occurs twice."""
+    names = [item.name or f"object_{number}" for number, item in enumerate(objects, start=1)]
+    for name in names:
+        # The scene model validates names; do it before any work is done.
+        SceneObject(name=name, mesh="-", size_m=1.0)
+    folded = [name.casefold() for name in names]
+    if len(set(folded)) < len(folded):
+        raise InputError(f"objects are named {names!r}: give every object a name of its own")
+    return names

@@ -44,7 +44,7 @@ from .reasoning.material_decision import (
 )
 from .reasoning.material_names import shipped_names
 from .reasoning.material_query import query_materials
-from .reconstruct_options import ObjectRequest, ReconstructOptions
+from .reconstruct_options import ObjectRequest, ReconstructOptions, object_names
 from .reconstruction_report import REPORT_FILE, ReportData, write_report
 from .scene_output import PHYSICS_FILE, replacing_folder
 from .segmentation.object_masks import segment_objects
@@ -236,18 +236,6 @@ def reconstruct_photo(
             write_report(folder / REPORT_FILE, Scene(folder, scene), report)
         steps.finish()
     return Scene(root=out, model=scene)
-
-
-def object_names(objects: Sequence[ObjectRequest]) -> list[str]:
-    """Return the names of ``objects``. Raises InputError for a name that is invalid or occurs twice."""
-    names = [item.name or f"object_{number}" for number, item in enumerate(objects, start=1)]
-    for name in names:
-        # The scene model validates names; do it before any work is done.
-        SceneObject(name=name, mesh="-", size_m=1.0)
-    folded = [name.casefold() for name in names]
-    if len(set(folded)) < len(folded):
-        raise InputError(f"objects are named {names!r}: give every object a name of its own")
-    return names
 
 
 def _in_working_pixels(item: ObjectRequest, scale: float) -> ObjectRequest:

@@ -100,6 +100,13 @@ def test_rendering_and_opening_a_scene_never_pay_for_taichi():
     assert not {"taichi", "bpy"} & set(result.stdout.split())
 
 
+def test_a_command_starts_without_what_only_another_needs():
+    """Every bake, render and task of a farm starts one; each of these takes half a second."""
+    code = "import sys, physgen.batch.cli; print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"taichi", "bpy", "trimesh", "skimage", "scipy.signal", "scipy.stats"} & set(result.stdout.split())
+
+
 def test_one_version():
     assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == VERSION
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text())

@@ -17,7 +17,7 @@ from ....sim.app.reconstruct import require_physics, with_physics
 from ....sim.cache.bake_folder import WORLD_SPACE
 from ....sim.errors import InputError
 from ....sim.reconstruct import ObjectRequest, ReconstructOptions
-from ....sim.reconstruct.reconstruct_pipeline import object_names
+from ....sim.reconstruct.reconstruct_options import object_names
 from ....sim.scene.camera_path import load_camera_path
 from ....sim.scene.folder import Scene, inside, load_scene
 from ....sim.scene.overrides import check_overrides

@@ -11,7 +11,7 @@ from ....physgen_addon.frames.frame_index import own_fps
 from ....physgen_addon.render.render_options import render_arguments
 from ....sim.app.bake_options import BakeOptions
 from ....sim.errors import InputError
-from ....sim.reconstruct.reconstruct_pipeline import object_names
+from ....sim.reconstruct.reconstruct_options import object_names
 from ....sim.scene.folder import SCENE_FILE
 from ....sim.scene.model import Vector
 from ....sim.version import VERSION

@@ -18,7 +18,6 @@ from ...events import Event, IsCancelled, OnEvent, ignore, never
 from ...scene.folder import Scene, load_scene
 from ..capture import Capture, Trial, load_capture, save_capture
 from .track_input import TrackOptions, VideoTrial
-from .track_videos import track_videos
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -148,6 +147,9 @@ def track(
             raise InputError(f"{target}: already exists; choose another folder")
     if withheld is not None and withheld.resolve().is_relative_to(out.resolve()):
         raise InputError(f"{withheld}: lies inside the capture, where a diagnosis could see it; choose another folder")
+    # OpenCV's trackers and what they need: only for who tracks, not for who asks for the arguments.
+    from .track_videos import track_videos
+
     tracked = track_videos(trials, scene, objects=objects, options=options, on_event=on_event, cancelled=cancelled)
     save_capture(tracked.capture, out)
     if withheld is not None and tracked.withheld:

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...app.world_setup import contact_table
 from ...constitutive import COHERENT, FLUID, GRANULAR, cohesion_of
 from ...errors import InputError
-from ...mpm.surface_contact import GROUND_NAME
+from ...mpm.surface_contact import GROUND_NAME, ContactTable
 from ...scene.folder import Scene
 from ...scene.meshes import load_object_mesh
 from ...scene.model import SceneModel, SceneObject
@@ -194,11 +193,18 @@ def _density(item: SceneObject) -> float:
     return item.material.density
 
 
+def _contacts(scene: SceneModel) -> ContactTable:
+    # With all that prepares worlds below it, which nobody needs who asks for the options alone.
+    from ...app.world_setup import contact_table
+
+    return contact_table(scene)
+
+
 def believed_ground(scene: SceneModel, objects: Sequence[SceneObject]) -> Ground:
     """Return the ground with the contact coefficients of the first of ``objects``: a capture has one set for all."""
     if scene.ground is None:
         raise InputError("the scene has no ground, which a capture needs: add one, below all objects if none hits it")
-    contact = contact_table(scene).between(objects[0].name, GROUND_NAME)
+    contact = _contacts(scene).between(objects[0].name, GROUND_NAME)
     return Ground(
         point=scene.ground.point,
         normal=scene.ground.normal,
@@ -210,7 +216,7 @@ def believed_ground(scene: SceneModel, objects: Sequence[SceneObject]) -> Ground
 def belief_warnings(scene: SceneModel, chosen: Sequence[int]) -> list[str]:
     """Return warnings about what a capture cannot represent of the scene."""
     warnings = []
-    table = contact_table(scene)
+    table = _contacts(scene)
     meetings = {
         (table.between(scene.objects[i].name, GROUND_NAME).friction,
          table.between(scene.objects[i].name, GROUND_NAME).restitution)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from scipy.spatial import cKDTree
 
 from .object_shading import DIELECTRIC_F0, LocalLighting, sky_lobe, sun_lobe, sun_points
@@ -346,7 +346,8 @@ def fit_reflectance(scene: LocalLighting, pixels: FitPixels) -> Reflectance | st
         return f"no highlight stands out ({max(best.gain, 0.0):.0%} explained)"
     free = max((observed.count - observed.unknowns) / CORRELATED, 2.0)
     ratio = best.gain / 3.0 / max((1.0 - best.gain) / free, 1e-9)
-    if stats.f.sf(ratio, 3, free) > SIGNIFICANCE:
+    # scipy.stats takes half a second to import, which every command would pay; this is the same function.
+    if special.fdtrc(3, free, ratio) > SIGNIFICANCE:
         return "the highlight could be chance"
     if best.bounded:
         return f"the bright part is not a highlight of this sun (strength {best.strength:.2g})"

@@ -12,12 +12,12 @@ to show something behind it. Points are x, y in pixels of that copy.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.signal import fftconvolve
 
 from ...errors import InputError
 
@@ -38,6 +38,14 @@ class OutlineGuess:
     rule: str
     outline: Mask
     misfit: float
+
+
+def _convolved(first: NDArray[Any], second: NDArray[Any], *, axes: int | None = None) -> NDArray[np.float64]:
+    """Return the full convolution of two images, along ``axes`` or both."""
+    # Half a second of imports, of scipy.stats above all, that every bake and command would pay.
+    from scipy.signal import fftconvolve
+
+    return np.asarray(fftconvolve(first, second, axes=axes))
 
 
 def ellipse(seen: Mask, unknown: Mask) -> OutlineGuess | None:
@@ -71,8 +79,8 @@ def mirrored(seen: Mask, unknown: Mask) -> OutlineGuess | None:
         turn = cv2.getRotationMatrix2D(centre, tilt, 1.0)
         own, clear = (cv2.warpAffine(m.astype(np.float32), turn, (width, height)) for m in (seen, other))
         # Entry k: the overlap after mapping x to k - x.
-        same = fftconvolve(own, own, axes=1).sum(axis=0)
-        clash = fftconvolve(own, clear, axes=1).sum(axis=0)
+        same = _convolved(own, own, axes=1).sum(axis=0)
+        clash = _convolved(own, clear, axes=1).sum(axis=0)
         score = (same - 2.0 * clash) / area - 0.004 * abs(tilt)
         k = int(np.argmax(score))
         if best is None or score[k] > best[0]:
@@ -90,7 +98,7 @@ def point_mirrored(seen: Mask, unknown: Mask) -> OutlineGuess | None:
     afar."""
     height, width = seen.shape
     own, clear = seen.astype(np.float32), (~(seen | unknown)).astype(np.float32)
-    score = fftconvolve(own, own) - 2.0 * fftconvolve(own, clear)
+    score = _convolved(own, own) - 2.0 * _convolved(own, clear)
     down, across = np.unravel_index(int(np.argmax(score)), score.shape)
     flip = np.array([[-1.0, 0.0, across], [0.0, -1.0, down]])
     image = cv2.warpAffine(own, flip, (width, height)) > 0.5
