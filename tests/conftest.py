@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 
 # Workers share the cores: threads of OpenBLAS that wait for one another took 40 % of a reconstruction's time. Children
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import settings
+from physgen.sim.reconstruct.background import background_inpainting
+from physgen.sim.reconstruct.background.inpainting_methods import MethodChoice
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.model import Camera, SceneModel, SceneObject
@@ -57,6 +60,29 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
+
+
+@pytest.fixture(scope="session")
+def without_trials():
+    """A context in which backgrounds are filled in the first way that suits, without trials of all ways.
+
+    They take 40 % of a small reconstruction; test_background_choice.py is about them. Session-wide, so that fixtures of
+    any scope can use it.
+    """
+
+    @contextlib.contextmanager
+    def patched():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(background_inpainting, "choose_method", lambda task, ways: MethodChoice(ways[0], {}, 0.0))
+            yield
+
+    return patched
+
+
+@pytest.fixture
+def first_fill(without_trials):
+    with without_trials():
+        yield
 
 
 @pytest.fixture

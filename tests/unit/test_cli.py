@@ -10,10 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from physgen.batch import stages
 from physgen.batch.cli import build_parser, main
 from physgen.batch.terminal import stop_signals
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.app.bake_worker import BakeJob, job_to_json
+from physgen.sim.app.bake_worker import BakeJob, job_to_json, run_job
 from physgen.sim.cache.bake_folder import disk_usage, load_manifest
 from physgen.sim.scene.folder import load_scene
 
@@ -142,7 +143,12 @@ def test_exit_code_and_error_leave_the_process(tmp_path):
     assert code == 3 and not events and errors.startswith("error: ") and "scene.json" in errors, errors
 
 
-def test_stages_one_by_one(tmp_path, photo, physgen):
+def bake_here(command, on_event, cancelled, **_):
+    """In place of ``run_stage``: the job of the worker in this process, which has the engine's kernels already."""
+    return run_job(Path(command[-1]), on_event, cancelled)
+
+
+def test_stages_one_by_one(first_fill, tmp_path, photo, physgen, monkeypatch):
     scene, bake = tmp_path / "scene", tmp_path / "bake"
     reconstruct = [
         "reconstruct",
@@ -168,6 +174,8 @@ def test_stages_one_by_one(tmp_path, photo, physgen):
     assert code == 0, errors
     assert [e["done"] for e in events if e["event"] == "progress"][-1] == 4
     first = load_manifest(bake)
+
+    monkeypatch.setattr(stages, "run_stage", bake_here)
 
     # What it would cost is said without a bake, and nothing is written.
     said = (scene / "scene.json").read_bytes()
@@ -243,9 +251,8 @@ def test_a_reader_that_leaves_is_no_crash(photo, tmp_path):
     assert process.wait() == 130 and b"Traceback" not in errors, errors
 
 
-def test_a_bake_is_of_the_scene_that_was_asked_for(photo, tmp_path, physgen):
-    scene = tmp_path / "scene"
-    physgen("reconstruct", photo, "--box", "105,85,215,195", "--out", scene)
+def test_a_bake_is_of_the_scene_that_was_asked_for(ball_scene, tmp_path):
+    scene = ball_scene().root
     job = BakeJob(scene=str(scene), out=str(tmp_path / "b"), options=BakeOptions(frames=2), expected_inputs="0" * 64)
     (tmp_path / "job.json").write_text(json.dumps(job_to_json(job)))
     command = [sys.executable, "-m", "physgen.sim.app.bake_worker", str(tmp_path / "job.json")]

@@ -31,6 +31,12 @@ def draw_photo():
     return np.clip(image, 0, 255).astype(np.uint8), ball, crate
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quick_backgrounds(without_trials):
+    with without_trials():
+        yield
+
+
 @pytest.fixture(scope="module")
 def reconstructed(tmp_path_factory):
     """A folder with a photo and its scene; to be copied."""

@@ -14,6 +14,11 @@ QUICK = ReconstructOptions(mesh_vertices=1200, pitch_deg=25.0, patch_radius=3, s
 ROWS, COLUMNS = np.mgrid[:200, :280] + 0.5
 
 
+@pytest.fixture(autouse=True)
+def quick_backgrounds(first_fill):
+    """What is behind them is not looked at."""
+
+
 def photo_of(*layers):
     """Layers (mask, colour) over a floor, the last one in front."""
     rng = np.random.default_rng(5)
@@ -36,8 +41,8 @@ def test_what_is_hidden_behind_a_ball_is_completed(tmp_path):
     ball = (COLUMNS - 110) ** 2 + (ROWS - 118) ** 2 < 26**2
     photo_of((crate, (60, 90, 170)), (ball, (200, 60, 40))).save(tmp_path / "photo.png")
     requests = [
-        ObjectRequest(box=(97, 38, 203, 132), name="crate"),
-        ObjectRequest(box=(78, 86, 142, 150), name="ball"),
+        ObjectRequest(box=(97, 38, 203, 132), name="crate", shape="inflated"),
+        ObjectRequest(box=(78, 86, 142, 150), name="ball", shape="inflated"),
     ]
     said = []
     reconstruct_photo(tmp_path / "photo.png", requests, tmp_path / "scene", QUICK, said.append)
@@ -58,7 +63,7 @@ def test_a_toy_on_a_chair_stands_on_the_chair(tmp_path):
     photo_of((chair, (120, 80, 50)), (toy, (230, 200, 60))).save(tmp_path / "photo.png")
     requests = [
         ObjectRequest(box=(70, 48, 210, 172), name="chair", size_m=0.8, shape="box"),
-        ObjectRequest(box=(112, 58, 168, 112), name="toy"),
+        ObjectRequest(box=(112, 58, 168, 112), name="toy", shape="inflated"),
     ]
     reconstruct_photo(tmp_path / "photo.png", requests, tmp_path / "scene", QUICK)
     folder = load_scene(tmp_path / "scene")
@@ -84,7 +89,8 @@ def test_the_order_that_was_told_counts(tmp_path):
     left = (np.abs(COLUMNS - 90) < 30) & (np.abs(ROWS - 100) < 40)
     right = (np.abs(COLUMNS - 190) < 30) & (np.abs(ROWS - 110) < 40)
     photo_of((left, (60, 90, 170)), (right, (200, 60, 40))).save(tmp_path / "photo.png")
-    requests = [ObjectRequest(box=(52, 52, 128, 148), name="a"), ObjectRequest(box=(152, 62, 228, 158), name="b")]
+    boxes = {"a": (52, 52, 128, 148), "b": (152, 62, 228, 158)}
+    requests = [ObjectRequest(box=box, name=name, shape="inflated") for name, box in boxes.items()]
     told = ReconstructOptions(mesh_vertices=800, pitch_deg=25.0, patch_radius=3, sun=False, order=("a", "b"))
     scene = reconstruct_photo(tmp_path / "photo.png", requests, tmp_path / "scene", told).model
     assert [item.occlusion_order for item in scene.objects] == [0, 1]

@@ -55,16 +55,17 @@ def test_public_names_are_typed_and_their_examples_run(name, tmp_path, monkeypat
         assert all(p.annotation is not p.empty for p in inspect.signature(value).parameters.values())
 
 
-def test_a_request_with_other_physics_is_honoured_where_the_scene_is_cached(tmp_path):
+def test_a_request_with_other_physics_is_honoured_where_the_scene_is_cached(first_fill, tmp_path):
     from PIL import Image, ImageDraw
 
     picture = Image.new("RGB", (160, 120), (180, 170, 150))
     ImageDraw.Draw(picture).ellipse((60, 40, 100, 80), fill=(200, 60, 30))
     picture.save(tmp_path / "photo.png")
-    box, options = (55, 35, 105, 85), physgen.ReconstructOptions(max_size=160, report=False)
+    quick = {"max_size": 160, "report": False, "sun": False, "mesh_vertices": 500, "patch_radius": 3}
+    box, options = (55, 35, 105, 85), physgen.ReconstructOptions(**quick)
 
     def velocity_of(**physics):
-        request = physgen.ObjectRequest(box=box, **physics.pop("request", {}))
+        request = physgen.ObjectRequest(box=box, shape="inflated", **physics.pop("request", {}))
         scene = physgen.reconstruct(
             tmp_path / "photo.png", [request], out=tmp_path / "scene", options=options, **physics
         )
@@ -79,14 +80,14 @@ def test_a_request_with_other_physics_is_honoured_where_the_scene_is_cached(tmp_
 
 
 def test_example_drop_a_mesh(tmp_path):
-    heights = example("drop_a_mesh").main(None, tmp_path, frames=12)
-    assert len(heights) == 12 and heights[0] == pytest.approx(0.3, abs=0.005)
+    heights = example("drop_a_mesh").main(None, tmp_path, frames=6)
+    assert len(heights) == 6 and heights[0] == pytest.approx(0.3, abs=0.005)
     # Free fall: half a g t².
     assert heights[4] == pytest.approx(0.3 - 4.905 * (4 / 24) ** 2, abs=0.01)
 
 
 def test_example_sand_and_honey(tmp_path):
-    reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=12)
+    reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=8)
     assert 0.0707 < reach["sand"] < reach["water"]
 
 
@@ -115,13 +116,13 @@ def test_example_csv_to_verdict(tmp_path):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="renders with bpy")
-def test_example_photo_to_video(tmp_path):
+def test_example_photo_to_video(first_fill, tmp_path):
     from PIL import Image, ImageDraw
 
     picture = Image.new("RGB", (160, 120), (180, 170, 150))
     ImageDraw.Draw(picture).ellipse((60, 40, 100, 80), fill=(200, 60, 30))
     picture.save(tmp_path / "photo.png")
-    quick = {"frames": 2, "samples": 1, "max_size": 160}
+    quick = {"frames": 2, "samples": 1, "max_size": 120}
     video = example("photo_to_video").main(tmp_path / "photo.png", [(55, 35, 105, 85)], tmp_path / "work", **quick)
     assert video.stat().st_size > 0
     assert len(list((tmp_path / "work" / "frames").glob("*.png"))) == 2

@@ -5,6 +5,8 @@ import dataclasses
 import json
 import math
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -22,6 +24,11 @@ CRATE = (215, 91, 300, 203)
 SMALL_BALL, SMALL_CRATE = (tuple(v / 2 for v in box) for box in (BALL, CRATE))
 QUICK = ReconstructOptions(mesh_vertices=2000, pitch_deg=25.0, patch_radius=3)
 SMALL = dataclasses.replace(QUICK, mesh_vertices=500, sun=False)
+"""Where only the files matter that are left behind: such bodies are inflated, without a search for a primitive."""
+
+
+def small_request(box=SMALL_BALL, **fields):
+    return ObjectRequest(box=box, shape="inflated", **fields)
 
 
 def draw_photo():
@@ -53,6 +60,20 @@ def small_photo(photo, tmp_path_factory):
     path = tmp_path_factory.mktemp("small") / "photo.png"
     Image.open(photo).resize((WIDTH // 2, HEIGHT // 2), Image.Resampling.BOX).save(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def small_scene(small_photo, tmp_path_factory, without_trials):
+    """A scene of it with the object ``first``; to be copied."""
+    out = tmp_path_factory.mktemp("small scene") / "scene"
+    with without_trials():
+        reconstruct_photo(small_photo, [small_request(name="first")], out, SMALL)
+    return out
+
+
+@pytest.fixture
+def old_scene(small_scene, tmp_path):
+    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
 
 
 @pytest.fixture(scope="module")
@@ -131,27 +152,27 @@ def test_progress_counts_up_to_the_end(result):
     json.dumps(events)
 
 
-def test_again_gives_the_same_scene(result, photo, tmp_path):
-    folder, _, out = result
+def test_again_gives_the_same_scene(first_fill, small_photo, tmp_path):
     requests = [
-        ObjectRequest(box=BALL, name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),
-        ObjectRequest(box=CRATE),
+        small_request(name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),
+        small_request(SMALL_CRATE),
     ]
-    again = reconstruct_photo(photo, requests, tmp_path / "again", QUICK)
-    assert again.model == folder.model
+    options = dataclasses.replace(SMALL, sun=True)
+    first, second = (reconstruct_photo(small_photo, requests, tmp_path / name, options) for name in ("one", "two"))
+    assert second.model == first.model
     for name in ("background.png", "meshes/ball.glb", "masks/ball.png", "shadows/ball.png"):
-        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+        assert second.file(name).read_bytes() == first.file(name).read_bytes()
 
 
-def test_large_photos_are_worked_on_smaller_and_boxes_follow(photo, tmp_path):
+def test_large_photos_are_worked_on_smaller_and_boxes_follow(first_fill, photo, tmp_path):
     large = tmp_path / "large.jpg"
-    Image.open(photo).resize((WIDTH * 20, HEIGHT * 20)).save(large, quality=85)
+    Image.open(photo).resize((WIDTH * 8, HEIGHT * 8)).save(large, quality=85)
     events = []
-    box = tuple(20.0 * v for v in BALL)
-    options = ReconstructOptions(max_size=WIDTH, mesh_vertices=1500, pitch_deg=25.0)
-    folder = reconstruct_photo(large, [ObjectRequest(box=box, name="ball")], tmp_path / "scene", options, events.append)
+    box = tuple(8.0 * v for v in BALL)
+    options = dataclasses.replace(SMALL, max_size=WIDTH)
+    folder = reconstruct_photo(large, [small_request(box, name="ball")], tmp_path / "scene", options, events.append)
     assert (folder.model.camera.width, folder.model.camera.height) == (WIDTH, HEIGHT)
-    assert any("7200x5400" in event.get("message", "") for event in events)
+    assert any("2880x2160" in event.get("message", "") for event in events)
     mask = np.asarray(Image.open(folder.file("masks/ball.png"))) > 0
     truth = draw_photo()[1]
     assert (mask & truth).sum() / (mask | truth).sum() > 0.94
@@ -183,7 +204,7 @@ def test_horizon_below_the_objects_is_refused(photo, tmp_path):
 
 
 @pytest.mark.parametrize("stop_at", ["photo", "camera", "background", "write", None])
-def test_cancelling_leaves_nothing(small_photo, tmp_path, stop_at):
+def test_cancelling_leaves_nothing(first_fill, small_photo, tmp_path, stop_at):
     reached = []
 
     def cancelled():
@@ -192,7 +213,7 @@ def test_cancelling_leaves_nothing(small_photo, tmp_path, stop_at):
     with pytest.raises(Cancelled):
         reconstruct_photo(
             small_photo,
-            [ObjectRequest(box=SMALL_BALL)],
+            [small_request()],
             tmp_path / "scene",
             SMALL,
             lambda event: reached.append(event.get("step")),
@@ -226,13 +247,12 @@ def test_unwritable_folder(photo, tmp_path):
         tmp_path.chmod(0o700)
 
 
-def test_an_old_scene_survives_a_failure_and_is_replaced_on_success(small_photo, tmp_path):
-    out = tmp_path / "scene"
-    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_BALL, name="first")], out, SMALL)
+def test_an_old_scene_survives_a_failure_and_is_replaced_on_success(first_fill, small_photo, old_scene, tmp_path):
+    out = old_scene
     with pytest.raises(InputError):
         reconstruct_photo(small_photo, [ObjectRequest(box=(900, 900, 990, 990))], out, SMALL)
     assert load_scene(out).model.objects[0].name == "first"
-    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_CRATE, name="second")], out, SMALL)
+    reconstruct_photo(small_photo, [small_request(SMALL_CRATE, name="second")], out, SMALL)
     assert [item.name for item in load_scene(out).model.objects] == ["second"]
     assert not (out / "masks" / "first.png").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"]
@@ -264,9 +284,8 @@ def test_requests_are_checked(fields):
         ObjectRequest(**{"box": BALL, **fields})
 
 
-def test_a_scene_folder_with_something_of_the_users_in_it_is_not_replaced(small_photo, tmp_path):
-    out = tmp_path / "scene"
-    reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_BALL)], out, SMALL)
+def test_a_scene_folder_with_something_of_the_users_in_it_is_not_replaced(small_photo, old_scene, tmp_path):
+    out = old_scene
     (out / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"notes\.txt"):
         reconstruct_photo(small_photo, [ObjectRequest(box=SMALL_CRATE)], out, SMALL)

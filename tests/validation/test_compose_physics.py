@@ -67,6 +67,7 @@ def test_finger_is_squeezed_into_its_ring(too_thick, keep):
     assert penetration_of_meshes(carried.resolved(), foreground).volume < 0.01 * start.volume
 
 
+@pytest.mark.slow
 def test_ball_rises_in_a_bowl_that_is_too_small():
     """It starts with its skin beyond the wall all around, and ends in the bowl, above it, not wrapped around."""
     foreground = surface_of(bowl(0.05, 0.003, np.pi / 2, np.pi))
@@ -79,6 +80,7 @@ def test_ball_rises_in_a_bowl_that_is_too_small():
     assert penetration_of_meshes(carried.resolved(), foreground).volume < 0.01 * start.volume
 
 
+@pytest.mark.slow
 def test_head_leaves_the_hat_that_was_pushed_into_it():
     foreground = surface_of(bowl(0.09, 0.003, 0.0, 0.45 * np.pi))
     background = surface_of(trimesh.creation.icosphere(subdivisions=4, radius=0.1), (0.0, 0.0, 0.004))

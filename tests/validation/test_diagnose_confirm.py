@@ -78,7 +78,13 @@ def test_the_starting_state_is_read_from_the_first_frames():
     assert np.allclose(state.rotation, np.eye(3), atol=1e-9)
 
 
-@pytest.mark.parametrize("belief", [{}, {"stiffness": "soft", "youngs_modulus_pa": 5e4}], ids=["rigid", "soft"])
+@pytest.mark.parametrize(
+    "belief",
+    [
+        pytest.param({}, id="rigid"),
+        pytest.param({"stiffness": "soft", "youngs_modulus_pa": 5e4}, id="soft", marks=pytest.mark.slow),
+    ],
+)
 def test_the_engine_confirms_drag_in_flight(belief):
     # Without spin: air holds back every part of a deforming body by its own velocity, and so stops a spin.
     trial = flight(DRAG, frames=25, spin=(0.0, 0.0, 0.0))

@@ -38,6 +38,7 @@ def test_box_rests_on_a_box_without_a_gap(box, options, similarity, cell, height
         assert abs(gap_between(world, 0, 1)) < 0.1 * cell
 
 
+@pytest.mark.slow
 def test_dropped_box_stops_where_the_other_begins(box, options, similarity, cell):
     """Dropped by two cells onto another and left to come to rest: never more than 0.2 cells deep, no hovering."""
     viscous = {"density": 1000.0, "youngs_modulus": 2e6, "poisson_ratio": 0.3, "damping_time": 2e-3}

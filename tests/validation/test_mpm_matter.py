@@ -134,6 +134,7 @@ def twist_decay(options, similarity, cell, viscosity: float) -> tuple[float, flo
     return -float(np.polyfit(times, amplitudes, 1)[0]), wave
 
 
+@pytest.mark.slow
 def test_viscosity_slows_a_twisting_fluid(options, similarity, cell):
     """The motion has no stress on any face, so it decays at eta/rho (pi/L)^2. 5 % of what the viscosity adds; what the
     transfers take without it is stated in docs/physics.md."""
@@ -166,6 +167,7 @@ def test_neo_hookean_survives_an_impact_faster_than_its_waves(options, similarit
     assert found == pytest.approx(height * (1 - 1000.0 * G * height / 2e4), abs=0.1 * height)
 
 
+@pytest.mark.slow
 def test_a_plastic_bar_shortens_on_impact_as_in_taylors_test(similarity):
     """Final length L1/L = 0.12 + 0.88 exp(-rho v^2 / 2Y) of a bar shot at a smooth rigid wall [Wilkins and Guinan
     1973]; their fit to eight metals scatters by some hundredths of L, so 0.03. And the dent stays: 1 % of it."""
@@ -234,6 +236,7 @@ def cone(cell, height: int, radius: int, friction_angle: float) -> BodyParticles
     )
 
 
+@pytest.mark.slow
 def test_a_pile_below_its_angle_of_repose_stands(options, similarity, cell):
     """A slope of 26.6 degrees of sand of 34.4 degrees: nothing moves by more than 0.1 cell in a second."""
     pile = cone(cell, 5, 10, 0.6)

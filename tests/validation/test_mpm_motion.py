@@ -126,6 +126,7 @@ LAWS = (
 )
 
 
+@pytest.mark.slow
 def test_no_laws_motion_depends_on_the_similarity_scale(block):
     """All laws with the presets' numbers, dropped side by side at k = 0.5, 1, 3 with as many cells across the bodies:
     the same places until after the impact, within 1 % of the height of the fall (PhysGen3D supplement A.4)."""

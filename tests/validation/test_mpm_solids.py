@@ -80,7 +80,9 @@ def test_jelly_on_a_rigid_block_on_the_ground(box, options, similarity, cell):
     assert abs(lowest(world, 0) - 3 * cell) < 0.02 * cell
 
 
-@pytest.mark.parametrize("density", [10.0, 500.0, 5000.0])
+@pytest.mark.parametrize(
+    "density", [pytest.param(10.0, marks=pytest.mark.slow), 500.0, pytest.param(5000.0, marks=pytest.mark.slow)]
+)
 def test_rigid_block_on_jelly_comes_to_rest(box, options, similarity, cell, density):
     """Light or heavy, on jelly of 1000 kg/m³: at rest the jelly's push is the block's weight, and the surfaces touch
     within 0.1 cell; never deeper than 0.3 cells on the way."""
