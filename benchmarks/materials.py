@@ -14,6 +14,7 @@ the speed of its fall, and is watched for two seconds:
               and the time in which the amplitude falls to 1/e, both of the damped cosine fitted to its mean shear
 
 ``wanted`` is what the sources (``TARGETS``) say of such matter; * marks a figure out of that range. Friction 0.8.
+Rigid bodies meet it with their material's restitution, all others with none.
 """
 
 from __future__ import annotations
@@ -160,7 +161,6 @@ def world_of(
     from physgen.sim.mpm.colliders import Surface
     from physgen.sim.mpm.geometry.interior_sampling import sample_interior
     from physgen.sim.mpm.solver_options import Ground, SolverOptions, fit_similarity
-    from physgen.sim.mpm.surface_contact import ContactTable, SurfaceContact
     from physgen.sim.mpm.world import World
     from physgen.sim.scene.material import load_preset
 
@@ -181,12 +181,11 @@ def world_of(
     if held:
         foot = sample.positions[:, 2] < vertices[:, 2].min() + 0.6 * options.cell_size(similarity)
         body = dataclasses.replace(body, pins=foot)
-    contact = SurfaceContact(friction=0.8)
+    bounce = material.restitution if material.law == "rigid" else 0.0
     return World(
         bodies=[body],
         gravity=(0.0, 0.0, 0.0 if held else -GRAVITY),
-        ground=None if held else Ground(friction=0.8),
-        contacts=ContactTable(default=contact),
+        ground=None if held else Ground(friction=0.8, restitution=bounce),
         similarity=similarity,
         options=options,
     )
@@ -231,14 +230,12 @@ def drop(preset: str, specimen: Specimen, cells: float) -> Drop:
     # The first contact lasts as long as waves take through the body, a few times; sampled finely, the rest coarsely.
     fine = min(0.25, 0.1 * specimen.seconds + 4.0 * gap / impact)
     times = [*np.linspace(0.0, fine, 101)[1:], *np.arange(fine, specimen.seconds, 1 / 60)[1:]]
-    touched, leaving, least = False, 0.0, tall
+    leaving, least = 0.0, tall
     for time in times:
         world.advance(time - world.time)
         places = world.positions(0)
         least = min(least, float(np.ptp(places[:, 2])))
-        clear = world.ground_gap(0) > 0.2 * gap
-        touched = touched or not clear
-        if touched and clear and leaving == 0.0:
+        if leaving == 0.0 and world.ground_gap(0) > 0.2 * gap:
             leaving = max(0.0, float(np.average(world.velocities(0)[:, 2], weights=world.bodies[0].masses)))
     return Drop(
         restitution=leaving / impact,

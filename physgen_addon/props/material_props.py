@@ -111,7 +111,7 @@ NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.na
 """Fields of ``sim.scene.material.Material`` that the user can set."""
 
 LAW_FIELDS = {
-    "rigid": (),
+    "rigid": ("restitution",),
     **{model.law: tuple(name for name in model.reads if name not in model.hidden) for model in models()},
 }
 """Fields besides the density that a constitutive model uses; the others are stored without effect."""
@@ -224,6 +224,13 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         "Seconds in which the relaxing part gives way",
         soft_max=1.0,
         precision=4,
+    )
+    restitution: from_field(
+        Material,
+        "restitution",
+        "Bounce",
+        "Speed after over speed before an impact on hard things, where surfaces say none",
+        precision=2,
     )
     yield_stress: from_field(
         Material,

@@ -92,7 +92,9 @@ HOLDS = ("separate", "slip", "sticky")
 def contact_table(scene: SceneModel) -> ContactTable:
     """The contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is.
 
-    Where there is no ground, as made of what a new scene's ground is.
+    Where there is no ground, as made of what a new scene's ground is. Where neither ground nor object says how it
+    bounces, a rigid object has its material's restitution against the ground, colliders and, the smaller of the two,
+    other rigid objects.
     """
     usual = scene.ground or Ground()
     ground = SurfaceContact(
@@ -102,15 +104,26 @@ def contact_table(scene: SceneModel) -> ContactTable:
     if scene.ground is not None:
         surfaces = {GROUND_NAME: ground, **surfaces}
     named = {frozenset(contact.between): contact for contact in scene.contacts}
+    bounces = {GROUND_NAME: math.inf} | {item.name: _bounce(item, ground) for item in scene.objects}
     table = ContactTable(default=ground)
     for a, b in itertools.combinations(surfaces, 2):
         contact = named.get(frozenset((a, b)))
         mixed = mix(surfaces[a], surfaces[b])
+        if 0.0 < min(bounces[a], bounces[b]) < math.inf:
+            mixed = dataclasses.replace(mixed, restitution=max(mixed.restitution, min(bounces[a], bounces[b])))
         if contact is not None:
             table = table.with_pair(a, b, _named(contact, mixed))
-        elif surfaces[a] != ground or surfaces[b] != ground:
+        elif mixed != ground:
             table = table.with_pair(a, b, mixed)
     return table
+
+
+def _bounce(item: SceneObject, ground: SurfaceContact) -> float:
+    """Restitution of the object's material where nothing else says one: 0 is none, infinite that the other's counts."""
+    if item.role == "collider":
+        return math.inf
+    said = item.restitution is not None or ground.restitution > 0
+    return 0.0 if said or item.material.law != "rigid" else item.material.restitution
 
 
 def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:

@@ -128,6 +128,25 @@ def test_a_deforming_collider_reads_its_file_and_counts_in_the_hash(world):
     assert [w for w in estimate_bake(folder, OPTIONS).warnings if "jumps" in w]
 
 
+def test_rigid_matter_bounces_where_nothing_else_says_how(world):
+    model = world(count=4, preset="soft").model
+    wood, metal = load_preset("wood"), load_preset("metal")
+    quiet = dataclasses.replace(model.objects[1], material=metal, restitution=0.0)
+    objects = (
+        dataclasses.replace(model.objects[0], material=wood),
+        quiet,
+        model.objects[2],
+        dataclasses.replace(model.objects[3], material=metal),
+    )
+    table = contact_table(dataclasses.replace(model, objects=objects))
+    assert table.between("ball0", "ground").restitution == wood.restitution > 0
+    assert table.between("ball0", "ball3").restitution == min(wood.restitution, metal.restitution)
+    for other in ("ball1", "ball2"):
+        assert table.between("ball0", other).restitution == table.between(other, "ground").restitution == 0.0
+    scene = dataclasses.replace(model, objects=objects, ground=Ground(restitution=0.2))
+    assert contact_table(scene).between("ball0", "ground").restitution == 0.2
+
+
 def test_surfaces_combine_by_the_documented_rules(world):
     folder = world(
         {"friction": 0.1, "restitution": 0.5, "contact_mode": "slip"},
