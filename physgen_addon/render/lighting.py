@@ -15,11 +15,11 @@ import numpy as np
 from mathutils import Vector
 from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ...sim.composite import floor_reflection
 from ...sim.composite.compositing import ObjectLayer
 from ...sim.composite.pull_push import spread_values
+from ...sim.composite.reference_light import SurfaceGraph
 from ...sim.composite.srgb import Linear
 from ...sim.errors import RenderError
 from ...sim.scene.model import Camera, SceneModel
@@ -105,13 +105,17 @@ def measure_reference_light(built: BlenderScene, folder: Path) -> None:
     built.light_scene.frame_set(built.first_frame)
     for target in built.objects:
         set_rest_light(target, np.ones_like(target.mesh.vertices), 0.0)
-    for target in built.objects:
+    graphs = [SurfaceGraph(target.mesh.vertices, target.mesh.faces) for target in built.objects]
+    for target, graph in zip(built.objects, graphs, strict=True):
         baked = cast_rays(built, target) if built.options.engine == "eevee" else _bake(built, target)
-        baked = _smoothed(baked, target)
+        baked = graph.smoothed(baked, SMOOTHING_STEPS)
         set_rest_light(target, np.clip(baked, 0.0, None) + ambient, ambient)
     seen = _visible(built)
     for _ in range(CALIBRATION_ROUNDS):
         _calibrate(built, seen, ambient, folder)
+    for target, graph, visible in zip(built.objects, graphs, seen, strict=True):
+        # The texture of what the photo hides has colours, and with them the light, of what it shows.
+        set_rest_light(target, np.maximum(graph.continued(get_rest_light(target), visible), ambient), ambient)
 
 
 def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
@@ -136,19 +140,6 @@ def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
     if not np.isfinite(values).all():
         raise RenderError(f"object {target.source.name!r}: its light at rest is not finite")
     return values
-
-
-def _smoothed(values: NDArray[np.float64], target: RenderObject) -> NDArray[np.float64]:
-    """Return ``values`` (V, 3) averaged with neighbours along the surface, against the bake's noise."""
-    faces = target.mesh.faces
-    count = len(values)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count)).tocsr()
-    graph = ((edges + edges.T) > 0).astype(np.float64) + sparse.identity(count)
-    share = 1.0 / np.asarray(graph.sum(axis=1))
-    for _ in range(SMOOTHING_STEPS):
-        values = (graph @ values) * share
-    return np.asarray(values)
 
 
 def _visible(built: BlenderScene) -> list[NDArray[np.bool_]]:
