@@ -21,7 +21,7 @@ from ..reconstruct_options import ObjectRequest
 from ..shape.body_texture import TexturedSurface
 from ..shape.object_bodies import Body, TriangleMesh
 from ..stage_cache import Arrays, Notice, StageCache, Steps
-from .albedo import CreasedSurface, compute_albedo, seen_faces, split_creases, texel_values, visible_pixels
+from .albedo import NEAR, CreasedSurface, compute_albedo, seen_faces, split_creases, texel_values, visible_pixels
 from .object_shading import DIELECTRIC_F0, LocalLighting, Mesh, Shading, local_lighting, shade, sky_lobe, sun_lobe
 from .reflectance_fit import FitPixels, Reflectance, fit_reflectance
 
@@ -87,10 +87,12 @@ def estimate_appearance(
     values = np.column_stack([shading.total, shape.normals, shading.reached, shading.openness, shape.vertices])
     texels, covered = texel_values(shape, surface.uv, facing, values, (width, height))
     if appearance.metallic > 0.5:
-        albedo, exponent = compute_albedo(picture, _mirrored(view, scene, texels), None, covered)
+        mirrored = _where_shaded(texels, covered, lambda some: _mirrored(view, scene, some))
+        albedo, exponent = compute_albedo(picture, mirrored, None, covered)
     else:
         fitted = found if appearance.source == "fitted" and not isinstance(found, str) else None
-        highlight = _reflected(view, scene, texels, appearance.roughness, fitted)
+        roughness = appearance.roughness
+        highlight = _where_shaded(texels, covered, lambda some: _reflected(view, scene, some, roughness, fitted))
         albedo, exponent = compute_albedo(picture, texels[..., :3], highlight, covered)
     if exponent < 1.0:
         notice(
@@ -156,6 +158,24 @@ def _fitted(
             openness=there[use, 11],
         ),
     )
+
+
+def _where_shaded(
+    texels: NDArray[np.float64],
+    covered: Mask,
+    light: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """``light`` (h, w, 3) of ``texels`` (h, w, 11), computed once for those, all alike, that are far from what
+    visible faces cover (h, w): most of a texture shows the unseen side."""
+    side = 2 * NEAR + 3
+    near = cv2.dilate(covered.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    far = np.argwhere(~near)
+    if not len(far):
+        return light(texels)
+    result = np.empty((*covered.shape, 3))
+    result[~near] = light(texels[None, far[0][0], far[0][1], :][None])[0, 0]
+    result[near] = light(texels[near][None])[0]
+    return result
 
 
 def _reflected(

@@ -28,6 +28,8 @@ ROUNDS = 4
 LEAST_FACES = 24
 """Smaller charts are given to a neighbour where that shrinks lengths to no less than ``LEAST_COSINE``."""
 LEAST_COSINE = 0.35
+COARSE = 256.0
+"""Cells along a chart for finding what overlaps."""
 APART = 3.0
 """Texels of height between two faces above which one hides the other in a projection."""
 
@@ -35,7 +37,7 @@ APART = 3.0
 @dataclass(frozen=True, eq=False)
 class Charts:
     """source: (N,) index of the surface's vertex; faces: (T, 3) into these; texels: (N, 2) x, y in a rectangle of
-    ``size`` (width, height). share: number of texels a unit of the surface, squared by charts' foreshortening."""
+    ``size`` (width, height)."""
 
     source: NDArray[np.int64]
     faces: Faces
@@ -70,7 +72,7 @@ def unwrap(vertices: Points, faces: Faces, frame: Points, texels: float, width: 
     links = _neighbours(faces)
     label = _labels(towards, links)
     chart = _connected(label, links)
-    _, label, chart = _merged(towards, label, chart, links)
+    label, chart = _merged(towards, label, chart, links)
     flat = np.empty((len(faces), 3, 3))
     for direction in range(6):
         rows = label == direction
@@ -112,8 +114,8 @@ def _connected(label: NDArray[np.int64], links: sparse.csr_matrix) -> NDArray[np
 
 def _merged(
     towards: Points, label: NDArray[np.int64], chart: NDArray[np.int64], links: sparse.csr_matrix
-) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
-    """Number of charts, and ``label`` and ``chart`` (T,) without charts of a few faces."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """``label`` and ``chart`` (T,) without charts of a few faces."""
     for _ in range(ROUNDS):
         small = np.bincount(chart)[chart] < LEAST_FACES
         if not small.any():
@@ -126,7 +128,7 @@ def _merged(
             break
         label = np.where(moved, best, label)
         chart = _connected(label, links)
-    return int(chart.max()) + 1, label, chart
+    return label, chart
 
 
 def _projected(local: Points, direction: int) -> Points:
@@ -152,7 +154,7 @@ def _separated(flat: Points, chart: NDArray[np.int64], links: sparse.csr_matrix)
             corner = flat[rows]
             low = corner.reshape(-1, 3).min(axis=0)
             corner = corner - low
-            coarse = max(1.0, float(corner[..., :2].max()) / 400.0)
+            coarse = max(1.0, float(corner[..., :2].max()) / COARSE)
             corner[..., :2] /= coarse
             size = (int(corner[..., 0].max()) + 1, int(corner[..., 1].max()) + 1)
             # So far away that the perspective of the rasteriser is none.
