@@ -203,7 +203,7 @@ def reconstruct_photo(
             store=store,
             steps=steps,
         )
-        bodies = make_bodies(layers, estimate.camera, objects, options, store, steps)
+        bodies = make_bodies(layers, estimate.camera, objects, options, store, steps, depth=depth)
         (folder / "light").mkdir()
         steps.begin("light")
         radiance, light = _light(folder, picture, layers, estimate.camera, bodies, options, steps)

@@ -19,6 +19,7 @@ FAST = (
     "playback",
     "render",
     "rest",
+    "shapes",
     "splats",
     "worlds",
 )

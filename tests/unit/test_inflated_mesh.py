@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from physgen.sim.reconstruct.camera import ground_camera as cameras
 from physgen.sim.reconstruct.segmentation.mask_cleanup import largest_component
 from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured, world_from_gltf
-from physgen.sim.reconstruct.shape.inflate import inflate, signed_distance, soap_film
+from physgen.sim.reconstruct.shape.inflate import covering_balls, inflate, signed_distance
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
 from scipy import ndimage
 from scipy.spatial import ConvexHull
@@ -78,13 +78,39 @@ def check_closed(body):
     return mesh
 
 
-def test_soap_film_over_a_disc_is_a_paraboloid():
-    rows, columns = np.mgrid[:121, :121] - 60
-    squared = rows**2 + columns**2
-    film = soap_film(squared < 50.0**2)
-    expected = 50.0**2 - squared
-    inside = squared < 45**2
-    assert np.abs(film[inside] - expected[inside]).max() < 0.03 * 50**2
+def test_the_union_of_balls_is_found_exactly():
+    distance = signed_distance(disc(30, 40, 20)[:90, :120] | disc(60, 45, 12)[:90, :120])
+    rows, columns = np.mgrid[:90, :120]
+    inside = np.argwhere(distance > 0)
+    expected = np.zeros(distance.shape)
+    for row, column in inside:
+        ball = distance[row, column] ** 2 - (rows - row) ** 2 - (columns - column) ** 2
+        expected = np.maximum(expected, ball)
+    assert covering_balls(distance) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_head_a_limb_and_a_belly_keep_their_own_thickness():
+    belly, head, arm = disc(150, 180, 70), disc(150, 82, 40), polygon((210, 165), (330, 165), (330, 185), (210, 185))
+    silhouette = inflate(belly | head | arm)
+    height = np.sqrt(np.maximum(silhouette.square_height, 0.0))
+
+    def thickest(x, y):
+        return height[y - silhouette.top, x - silhouette.left]
+
+    assert thickest(150, 180) == pytest.approx(70, rel=0.05)
+    assert thickest(150, 80) == pytest.approx(40, rel=0.05)
+    assert thickest(280, 175) == pytest.approx(10.5, rel=0.1)
+    # The neck lies between: joined, without a crease down to the outline and without a bulge.
+    assert 25 < thickest(150, 114) < 42
+
+
+@pytest.mark.parametrize("width", [3, 5, 9])
+def test_a_strap_on_a_large_body_is_no_thicker_than_wide(width):
+    strap = np.zeros((HEIGHT, WIDTH), bool)
+    strap[150 : 150 + width, 200:390] = True
+    silhouette = inflate(disc(150, 170, 90) | strap)
+    at = silhouette.square_height[:, 340 - silhouette.left]
+    assert np.sqrt(at.max()) < 0.5 * width + 1.5
 
 
 @pytest.mark.parametrize("radius", [20.0, 60.0, 110.0])

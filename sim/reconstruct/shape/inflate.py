@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Inflate a silhouette: the thickness of the body behind each pixel.
 
-The height of a soap film under even pressure, ∇²u = −4 with u = 0 on the outline, gives h = √u. A disc of radius R has
-u = R² − r², so it becomes a sphere. Rectangular outlines become slabs with rounded edges instead.
+A body is the union of all balls inside its outline, so that each of its parts, a head, a limb, an ear, is as thick as
+it is wide, and parts are joined smoothly. Rectangular outlines become slabs with rounded edges instead.
 """
 
 from __future__ import annotations
@@ -12,14 +12,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import splu
+from scipy import ndimage
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float64]
 
-POISSON_UNKNOWNS = 40_000
-"""Larger silhouettes are solved on a coarser grid; the outline stays at full resolution."""
+BALL_PIXELS = 60_000
+"""Larger silhouettes are inflated on a coarser grid; the outline stays at full resolution."""
+ROOM = 0.3
+"""Pixels by which the largest ball is larger than its centre's measured distance from an outline that is curved or
+slanted: of many pixels beyond it, one is always nearer than half a pixel."""
+CREASE = 0.2
+"""Width over which creases between parts are rounded, over the local half thickness."""
 RECTANGULAR = 0.88
 """Area over that of the smallest rotated rectangle above which a mask is a box; an ellipse has 0.785."""
 LONGEST_SLAB = 3.0
@@ -73,7 +77,7 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
     slab = is_box(crop)
     if thickness is None:
         thickness = SLAB_THICKNESS if slab else 1.0
-    square = _slab_profile(distance, thickness) if slab else film_profile(crop, distance, thickness)
+    square = _slab_profile(distance, thickness) if slab else limb_profile(distance, thickness)
     return Silhouette(
         mask=crop,
         distance=distance,
@@ -120,58 +124,66 @@ def roundness(mask: Mask) -> float:
     return float(np.clip((overlap - 0.9) / 0.06, 0.0, 1.0))
 
 
-def soap_film(mask: Mask) -> Field:
-    """Return u (h, w) in pixels² with ∇²u = −4 inside ``mask`` and u = 0 outside, by the five-point Laplacian."""
-    index = np.full(mask.shape, -1, dtype=np.int64)
-    count = int(mask.sum())
-    index[mask] = np.arange(count)
-    padded = np.pad(index, 1, constant_values=-1)
-    entries_row, entries_column = [np.arange(count)], [np.arange(count)]
-    values = [np.full(count, 4.0)]
-    for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        neighbour = padded[1 + dy : padded.shape[0] - 1 + dy, 1 + dx : padded.shape[1] - 1 + dx][mask]
-        linked = neighbour >= 0
-        entries_row.append(np.flatnonzero(linked))
-        entries_column.append(neighbour[linked])
-        values.append(np.full(int(linked.sum()), -1.0))
-    matrix = sparse.csc_matrix(
-        (np.concatenate(values), (np.concatenate(entries_row), np.concatenate(entries_column))), shape=(count, count)
-    )
-    film = np.zeros(mask.shape)
-    if count:
-        film[mask] = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-            np.full(count, 4.0)
-        )
-    return film
+def covering_balls(distance: Field) -> Field:
+    """Return h² (h, w) in pixels² of the union of all balls that lie within a silhouette, centred in one plane.
+
+    distance: (h, w) to the outline, positive inside. h²(p) = max_c d(c)² − |p − c|²: a dilation of d² by a paraboloid,
+    which separates into rows and columns (van den Boomgaard, Mathematical Morphology: Extensions Towards Computer
+    Vision, 1992). A disc becomes a sphere, a strip a round rod, and a limb on a body keeps its own radius.
+    """
+    square = np.where(distance > 0, distance, 0.0) ** 2
+    reach = int(np.ceil(float(distance.max())))
+    for axis in (0, 1):
+        source = np.moveaxis(square, axis, 0)
+        best = source.copy()
+        for step in range(1, min(reach, len(source) - 1) + 1):
+            np.maximum(best[step:], source[:-step] - step**2, out=best[step:])
+            np.maximum(best[:-step], source[step:] - step**2, out=best[:-step])
+        square = np.moveaxis(best, 0, axis)
+    return square
 
 
-def film_profile(mask: Mask, distance: Field, thickness: float) -> Field:
-    """Return h² (h, w) in pixels² of ``mask`` inflated, with its signed ``distance``; ``thickness`` as for
-    ``inflate``."""
-    scale = min(1.0, float(np.sqrt(POISSON_UNKNOWNS / max(1, int(mask.sum())))))
-    height, width = mask.shape
+def limb_profile(distance: Field, thickness: float) -> Field:
+    """Return h² (h, w) in pixels² of a silhouette inflated, from its signed ``distance`` in pixels; negative outside.
+
+    Each part is as thick as its own width: ``covering_balls``, with the creases between parts rounded. ``thickness``:
+    depth over width.
+    """
+    height, width = distance.shape
+    scale = min(1.0, float(np.sqrt(BALL_PIXELS / max(1, int((distance > 0).sum())))))
+    size = (max(4, round(width * scale)), max(4, round(height * scale)))
+    room = np.where(distance > 0, distance + ROOM, distance)
+    coarse = room if scale == 1.0 else np.asarray(cv2.resize(room, size), dtype=np.float64) * scale
+    balls = _rounded(covering_balls(coarse))
     if scale < 1.0:
-        size = (max(4, round(width * scale)), max(4, round(height * scale)))
-        near = cv2.resize(distance, size, interpolation=cv2.INTER_LINEAR)
-        film = soap_film(near > 0) / scale**2
-        film = np.asarray(cv2.resize(film, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float64)
-    else:
-        film = soap_film(mask)
-    # u over distance is smooth and positive up to the outline. Times the distance it vanishes exactly there, and
-    # keeps its slope outside, where the surface extraction needs values too.
+        balls = np.asarray(cv2.resize(balls, (width, height)), dtype=np.float64) / scale**2
+    balls = np.maximum(balls, np.where(distance > 0, distance, 0.0) ** 2)
+    # The ball of radius R that touches the outline has h² = d (2 R − d) along its radius there: solved for R where the
+    # distance is large enough, carried to the outline and beyond, it gives h² to sub-pixels.
     cell = 1.5 / scale
-    deep = distance > cell
-    if not deep.any():
-        deep = distance >= 0.5 * distance.max()
-    ratio = film / np.maximum(distance, cell)
+    ridge = distance > 0.7 * ndimage.maximum_filter(distance, size=2 * int(np.ceil(cell)) + 1)
+    deep = (distance > 0) & ((distance > cell) | ridge)
+    radius = (balls + distance**2) / (2.0 * np.maximum(distance, 1e-3))
     nearest = ndimage.distance_transform_edt(~deep, return_distances=False, return_indices=True)
-    ratio = ndimage.gaussian_filter(ratio[tuple(nearest)], 1.5 * cell) * ~deep + ratio * deep
-    ratio = np.maximum(ratio, 1e-3 * max(float(ratio.max()), 1e-3))
-    square = ratio * distance
-    # A long strip has u = W²/2 at its middle, a disc W²/4: measure both by their widest inscribed circle.
-    widest = float(distance.max())
-    half = max(MIN_HALF_THICKNESS, thickness * widest)
-    return np.asarray(square * half**2 / max(float(square.max()), 1e-9))
+    radius = np.maximum(ndimage.gaussian_filter(radius[tuple(nearest)], cell), 0.5)
+    weight = np.clip(distance / cell - 1.0, 0.0, 1.0)
+    square = weight * balls + (1.0 - weight) * distance * np.maximum(2.0 * radius - distance, radius)
+    least = MIN_HALF_THICKNESS / max(float(np.sqrt(max(square.max(), 0.25))), 1e-9)
+    return np.asarray(square * max(thickness, least) ** 2)
+
+
+def _rounded(balls: Field) -> Field:
+    """``balls`` with the valleys between parts filled: averaged over ``CREASE`` of the local half thickness."""
+    wanted = CREASE * np.sqrt(balls)
+    levels = 0.5 * 2.0 ** np.arange(0, int(np.ceil(np.log2(max(2.0, 2.0 * float(wanted.max()))))) + 1)
+    # A mean over σ lowers r² − ρ² by 2 σ², w² − x² by σ².
+    stack = [balls, *(ndimage.gaussian_filter(balls, level) + 1.5 * level**2 for level in levels)]
+    at = np.clip(np.log2(np.maximum(wanted, 1e-6) / 0.5) + 1.0, 0.0, len(stack) - 1.001)
+    lower = at.astype(np.int64)
+    rows, columns = np.mgrid[: balls.shape[0], : balls.shape[1]]
+    levels_of = np.stack(stack)
+    share = at - lower
+    return np.asarray((1.0 - share) * levels_of[lower, rows, columns] + share * levels_of[lower + 1, rows, columns])
 
 
 def _slab_profile(distance: Field, thickness: float) -> Field:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +25,9 @@ from skimage.measure import marching_cubes
 from ...errors import InputError
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth, on_ground
+from .depth_front import middle_surface
 from .inflate import Silhouette
+from .legs import standing_depth
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -152,12 +155,33 @@ FOLD = 0.35
 
 
 @dataclass(frozen=True)
+class MeasuredSurface:
+    """The middle of a body by a depth map or by its feet, on the crop of its silhouette.
+
+    depth: (h, w) along the optical axis, units. rise: (h, w) height of the visible front over it, pixels along the ray.
+    left, top: of the crop, photo pixels. behind: (h, w) factor of the thickness behind it; None for 1.
+    """
+
+    depth: Points
+    rise: Points
+    left: int
+    top: int
+    behind: Points | None = None
+
+    def sample(self, values: Points, pixels: Points) -> Points:
+        """Return ``values`` (h, w) at photo ``pixels`` (n, 2)."""
+        at = pixels - np.array([self.left + 0.5, self.top + 0.5])
+        return np.asarray(ndimage.map_coordinates(values, at[:, ::-1].T, order=1, mode="nearest"))
+
+
+@dataclass(frozen=True)
 class ReferenceSurface:
     """The surface about which the silhouette is inflated.
 
     camera: height 1 unit. origin: (3,) a point where the wall meets the ground; normal: (3,) unit, away from the
     camera. unit_per_pixel: length of one pixel at the object. fold: units, softens the edge between ground and wall.
-    back: thickness behind the reference over that in front, 1 or more; 0 for nothing behind it.
+    back: thickness behind the reference over that in front, 1 or more; 0 for nothing behind it. middle: replaces wall
+    and ground by a measured surface.
     """
 
     camera: Camera
@@ -166,12 +190,15 @@ class ReferenceSurface:
     unit_per_pixel: float
     fold: float
     back: float = 1.0
+    middle: MeasuredSurface | None = None
 
     def depths(self, pixels: Points) -> tuple[Points, Points, Points]:
         """Return reference depth (n), ground depth (n) and rays (n, 3) through ``pixels`` (n, 2), along the optical
         axis."""
         rays = self.camera.rays(pixels)
         ground = ground_depth(self.camera, rays)
+        if self.middle is not None:
+            return np.minimum(self.middle.sample(self.middle.depth, pixels), ground), ground, rays
         facing = rays @ self.normal
         wall = np.where(
             facing > 0.05, ((self.origin - self.camera.position) @ self.normal) / np.maximum(facing, 0.05), np.inf
@@ -270,6 +297,47 @@ def reference_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[Refer
         )
 
 
+BOOTS = (1.0, 1.6, 2.4, 3.5, 5.0)
+"""Thickness of legs behind their middle, over that in front, to try until the body stands."""
+
+
+def standing_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[ReferenceSurface]:
+    """Yield reference surfaces of a body on legs, each leg as far away as its foot; none if it has no legs."""
+    found = standing_depth(camera, silhouette.mask, silhouette.distance, silhouette.left, silhouette.top)
+    if found is None:
+        return
+    away, legs = found
+    plain = next(reference_surfaces(camera, silhouette))
+    height, width = silhouette.mask.shape
+    rows, columns = np.mgrid[:height, :width]
+    pixels = np.stack([silhouette.left + columns + 0.5, silhouette.top + rows + 0.5], axis=-1).reshape(-1, 2)
+    rays = camera.rays(pixels)
+    depth = ((away.ravel() - camera.position[1]) / np.maximum(rays[:, 1], 0.05)).reshape(height, width)
+    inflated = np.sqrt(np.maximum(silhouette.square_height, 0.0))
+    low = ndimage.gaussian_filter(legs.astype(np.float64), 2.0)
+    for boot in BOOTS:
+        surface = MeasuredSurface(depth, inflated, silhouette.left, silhouette.top, 1.0 + (boot - 1.0) * low)
+        yield replace(plain, middle=surface, back=1.0)
+
+
+def measured_surfaces(camera: Camera, silhouette: Silhouette, front: Points) -> Iterator[ReferenceSurface]:
+    """Yield reference surfaces, thicker and thicker, whose visible front is ``front`` (h, w): depth, NaN where
+    unknown."""
+    plain = next(reference_surfaces(camera, silhouette))
+    height, width = silhouette.mask.shape
+    rows, columns = np.mgrid[:height, :width]
+    pixels = np.stack([silhouette.left + columns + 0.5, silhouette.top + rows + 0.5], axis=-1).reshape(-1, 2)
+    per_depth = (plain.unit_per_pixel / np.linalg.norm(camera.rays(pixels), axis=1)).reshape(height, width)
+    middle, rise = middle_surface(front, silhouette, per_depth)
+    inflated = np.sqrt(np.maximum(silhouette.square_height, 0.0))
+    for step in (0.0, 0.15, 0.3, 0.5, 0.75, 1.0, 1.5):
+        # The front stays where it was measured: the middle moves back, and the front rises as much over it.
+        surface = MeasuredSurface(
+            middle + step * inflated * per_depth, rise + step * inflated, silhouette.left, silhouette.top
+        )
+        yield replace(plain, middle=surface, back=1.0 + step)
+
+
 def stability(vertices: Points, faces: NDArray[np.int64]) -> float:
     """Return how safely a closed body of uniform density stands on z = 0; negative if it topples.
 
@@ -329,7 +397,7 @@ class _DepthField:
     """φ(x, y, t) > 0 inside: x, y in crop pixels (centres at integers), t in pixels along the ray from the reference.
 
     φ = min(h² − t², 2 h_max (t_ground − t)): the inflated silhouette, cut by the ground; t / b for t behind the
-    reference, where the body is b times as thick.
+    reference, where the body is b times as thick, and in front of a measured middle for t as high as it was measured.
     """
 
     def __init__(self, silhouette: Silhouette, reference: ReferenceSurface) -> None:
@@ -340,23 +408,35 @@ class _DepthField:
         middle, ground, rays = reference.depths(pixels)
         self.half_thickness = silhouette.half_thickness
         self._back = reference.back
-        cap = 4.0 * self._back * self.half_thickness + 16.0
+        cap = 8.0 * self._back * self.half_thickness + 16.0
         with np.errstate(invalid="ignore"):
             below = (ground - middle) * np.linalg.norm(rays, axis=1) / reference.unit_per_pixel
         self._ground = np.minimum(np.nan_to_num(below, nan=cap, posinf=cap), cap).reshape(height, width)
+        self._steep = np.ones_like(self._square)
+        self._gentle = np.ones_like(self._square)
+        self._front = self._behind = self.half_thickness
+        if reference.middle is not None:
+            inflated = np.sqrt(np.maximum(self._square, 0.25))
+            self._steep = inflated / np.maximum(reference.middle.rise, 0.2 * inflated)
+            self._front = max(self._front, float(reference.middle.rise.max()))
+            if reference.middle.behind is not None:
+                self._gentle = 1.0 / reference.middle.behind
+                self._behind = max(self._behind, float((inflated * reference.middle.behind).max()))
 
     def sample(self, points: Points) -> tuple[Points, Points]:
         """Return both arguments of the minimum (n), (n) at ``points`` (n, 3) as x, y, t."""
         at = points[:, 1::-1].T
         square = ndimage.map_coordinates(self._square, at, order=1, mode="nearest")
         ground = ndimage.map_coordinates(self._ground, at, order=1, mode="nearest")
+        steep = ndimage.map_coordinates(self._steep, at, order=1, mode="nearest")
+        gentle = ndimage.map_coordinates(self._gentle, at, order=1, mode="nearest")
         t = points[:, 2]
-        return self._film(square, t), 2.0 * self.half_thickness * (ground - t)
+        return self._film(square, steep, gentle, t), 2.0 * self.half_thickness * (ground - t)
 
-    def _film(self, square: Points, t: Points) -> Points:
+    def _film(self, square: Points, steep: Points, gentle: Points, t: Points) -> Points:
         if self._back == FLAT:
-            return np.asarray(np.minimum(square - t**2, -2.0 * self.half_thickness * t))
-        return np.asarray(square - np.where(t > 0, t / self._back, t) ** 2)
+            return np.asarray(np.minimum(square - (steep * t) ** 2, -2.0 * self.half_thickness * t))
+        return np.asarray(square - np.where(t > 0, gentle * t / self._back, steep * t) ** 2)
 
     def value(self, points: Points) -> Points:
         """φ (n) at ``points`` (n, 3)."""
@@ -371,7 +451,8 @@ class _DepthField:
         """
         steps = np.array([spacing, spacing, min(spacing, self.half_thickness / 3.0)])
         height, width = self._square.shape
-        front, behind = (int(np.ceil(factor * self.half_thickness / steps[2])) + 2 for factor in (1.0, self._back))
+        extents = (self._front, self._back * self._behind)
+        front, behind = (int(np.ceil(extent / steps[2])) + 2 for extent in extents)
         # Half a cell off t = 0, so that no grid node lies exactly on the surface along the outline.
         first = np.array([0.25, 0.25, -(front + 0.5) * steps[2]])
         counts = (
@@ -384,9 +465,12 @@ class _DepthField:
         at = flat[:, 1::-1].T
         square = ndimage.map_coordinates(self._square, at, order=1, mode="nearest")
         ground = 2.0 * self.half_thickness * ndimage.map_coordinates(self._ground, at, order=1, mode="nearest")
+        steep = ndimage.map_coordinates(self._steep, at, order=1, mode="nearest")
         shape = (counts[0], counts[1], 1)
         t = axes[2][None, None, :]
-        field = np.minimum(self._film(square.reshape(shape), t), ground.reshape(shape) - 2.0 * self.half_thickness * t)
+        gentle = ndimage.map_coordinates(self._gentle, at, order=1, mode="nearest")
+        film = self._film(square.reshape(shape), steep.reshape(shape), gentle.reshape(shape), t)
+        field = np.minimum(film, ground.reshape(shape) - 2.0 * self.half_thickness * t)
         # A closed surface needs a negative border.
         for axis in range(3):
             edge = [slice(None)] * 3
@@ -398,7 +482,7 @@ class _DepthField:
 
 
 def inflated_mesh(
-    camera: Camera, silhouette: Silhouette, target: int = 12_000, *, flat: bool = False
+    camera: Camera, silhouette: Silhouette, target: int = 12_000, *, flat: bool = False, front: Points | None = None
 ) -> tuple[BodyMesh, float, float]:
     """Return the closed surface of the body with about ``target`` vertices, standing on the ground.
 
@@ -406,10 +490,23 @@ def inflated_mesh(
     which it stands safely is used, or the best. Stability is evaluated on the mesh itself: the contact is often a
     narrow strip, which anything coarser would miss.
 
-    flat: nothing behind the reference surface. Raises InputError when the silhouette is too thin for a closed surface.
+    flat: nothing behind the reference surface. front: (h, w) depth along the optical axis of the visible front on the
+    silhouette's crop, units, NaN where unknown; None inflates about a wall, or about legs where they stand. Raises
+    InputError when the silhouette is too thin for a closed surface.
     """
     best: tuple[BodyMesh, float, float] | None = None
-    for reference in reference_surfaces(camera, silhouette):
+    if front is not None:
+        choices = measured_surfaces(camera, silhouette, front)
+    elif silhouette.slab or flat:
+        choices = reference_surfaces(camera, silhouette)
+    else:
+        choices = chain(standing_surfaces(camera, silhouette), reference_surfaces(camera, silhouette))
+    on_legs = False
+    for reference in choices:
+        # Moved back, legs would become flaps on the ground: only what would topple otherwise is.
+        if on_legs and reference.middle is None and best is not None and best[1] > 0.0:
+            break
+        on_legs |= front is None and reference.middle is not None
         if flat:
             reference = replace(reference, back=FLAT)
         field = _DepthField(silhouette, reference)

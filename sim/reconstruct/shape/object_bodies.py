@@ -22,14 +22,18 @@ from ...scene.model import Camera
 from ..adapters.adapter_registry import adapter_content
 from ..adapters.protocols import Mesher
 from ..adapters.resolve import resolve
+from ..camera.depth_map import DepthMap
 from ..photo_layers import Layers
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
 from .body_texture import TexturedSurface, colour_pixels, crop_texture
+from .depth_front import front_of
+from .furniture import furniture_boards
+from .furniture_mesh import furniture_mesh
 from .inflate import Crop, crop_mask, inflate
 from .inflated_mesh import WORTH_SAYING, BodyMesh, inflated_mesh, shadow_mesh, stability
-from .primitive_choice import KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
+from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import rasterize
 from .separation import PlacedBody, separate
@@ -187,12 +191,14 @@ def build_body(
     *,
     seen: Mask | None = None,
     pixels: NDArray[np.uint8] | None = None,
+    depth: DepthMap | None = None,
+    others: Mask | None = None,
 ) -> BuiltBody:
     """Return the body whose silhouette in the photo is ``full``.
 
     camera: 1 unit above the ground z = 0. full: (H, W), not empty, the object's whole mask. seen: (H, W) its visible
     part; None for all. pixels: (H, W, 3) sRGB, the photo, whose inner edges help to separate a box' depth from its
-    height.
+    height. depth: a depth map of the photo, which shapes the front of an inflated body. others: (H, W) other objects.
 
     Raises InputError when the mask is empty or too thin for a closed surface.
     """
@@ -202,8 +208,12 @@ def build_body(
     seen = full if seen is None else seen & full
     kind = shape_of_kind(request.kind)
     crop = crop_mask(full)
+    inflated = _Inflation(camera, full, request, kind, options.mesh_vertices, depth, others, notice)
     # Choosing a back implies an inflated body.
     shape = "inflated" if request.shape == "auto" and request.back != "auto" else request.shape
+    built = _furniture(camera, crop, full, request, kind, options.mesh_vertices) if shape == "auto" else None
+    if built is not None:
+        return built
     choice = choose_primitive(camera, crop, full, seen, pixels, shape=shape, kind=kind, thickness=request.thickness)
     if choice is None and request.shape not in ("auto", "inflated"):
         notice(f"{name}: no {request.shape} on the ground has this outline; it is inflated instead, check the horizon")
@@ -213,7 +223,7 @@ def build_body(
             "shape auto or inflated may fit better"
         )
     if choice is None:
-        mesh, margin, lost = _inflated(camera, full, request, kind, options.mesh_vertices)
+        mesh, margin, lost = inflated.mesh()
         shape = "inflated"
     else:
         part = 1.0 if request.thickness is None or choice.primitive.name == "box" else request.thickness
@@ -224,7 +234,7 @@ def build_body(
     if choice is not None and fit < KEPT and request.shape == "auto":
         # Reject an automatic primitive that does not keep the outline.
         choice, shape = None, "inflated"
-        mesh, margin, lost = _inflated(camera, full, request, kind, options.mesh_vertices)
+        mesh, margin, lost = inflated.mesh()
         fit = silhouette_overlap(camera, mesh, full)
     elif fit < KEPT:
         notice(f"{name}: the body's silhouette overlaps its mask by {fit:.2f} only; give another shape or mask")
@@ -247,19 +257,58 @@ def _solid(
     return solid_mesh(camera, crop, choice.primitive, fitted, target, thickness)
 
 
-def _inflated(
-    camera: Camera, full: Mask, request: ObjectRequest, kind: KindShape | None, target: int
-) -> tuple[BodyMesh, float, float]:
-    thickness = request.thickness
-    if thickness is None and kind is not None and kind.shape == "inflated":
-        thickness = kind.thickness
-    back = request.back
-    if back == "auto":
-        back = "symmetric" if kind is None else kind.back
-    silhouette = inflate(full, thickness)
-    if request.shape == "inflated" and silhouette.slab and thickness is None:
-        silhouette = inflate(full, 1.0)
-    return inflated_mesh(camera, silhouette, target, flat=back == "flat")
+@dataclass(frozen=True)
+class _Inflation:
+    """How to inflate one object."""
+
+    camera: Camera
+    full: Mask
+    request: ObjectRequest
+    kind: KindShape | None
+    target: int
+    depth: DepthMap | None
+    others: Mask | None
+    notice: Notice
+
+    def mesh(self) -> tuple[BodyMesh, float, float]:
+        """As ``inflated_mesh``."""
+        request, kind = self.request, self.kind
+        thickness = request.thickness
+        if thickness is None and kind is not None and kind.shape == "inflated":
+            thickness = kind.thickness
+        back = request.back
+        if back == "auto":
+            back = "symmetric" if kind is None else kind.back
+        silhouette = inflate(self.full, thickness)
+        if request.shape == "inflated" and silhouette.slab and thickness is None:
+            silhouette = inflate(self.full, 1.0)
+        front = None
+        if self.depth is not None:
+            others = np.zeros_like(self.full) if self.others is None else self.others
+            name = request.name or "object"
+            front = front_of(self.depth, self.camera, silhouette, self.full, others, name, self.notice)
+        return inflated_mesh(self.camera, silhouette, self.target, flat=back == "flat", front=front)
+
+
+def _furniture(
+    camera: Camera, crop: Crop, full: Mask, request: ObjectRequest, kind: KindShape | None, target: int
+) -> BuiltBody | None:
+    """A chair, table or shelf; None for anything else, or if its boards do not make one body with this outline."""
+    asked = kind is not None and kind.shape == FURNITURE
+    if request.thickness is not None or (kind is not None and not asked):
+        return None
+    boards = furniture_boards(camera, crop, asked=asked)
+    if boards is None:
+        return None
+    try:
+        mesh, _ = furniture_mesh(camera, crop, boards, target)
+    except InputError:
+        return None
+    margin, fit = stability(mesh.vertices, mesh.faces), silhouette_overlap(camera, mesh, full)
+    if fit < KEPT or margin < TOPPLES:
+        return None
+    mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, None))
+    return BuiltBody(mesh=mesh, shape=FURNITURE, stability=margin, fit=fit)
 
 
 def silhouette_overlap(camera: Camera, mesh: BodyMesh, full: Mask) -> float:
@@ -308,10 +357,13 @@ def make_bodies(
     options: ReconstructOptions,
     store: StageCache,
     steps: Steps,
+    *,
+    depth: DepthMap | None = None,
 ) -> list[Body]:
     """Return the bodies of ``objects``, whose names and kinds are resolved, each where the photo shows it.
 
-    Raises InputError for an outline or mesh that no body can be made from.
+    depth: a depth map of the photo, which shapes the fronts of inflated bodies. Raises InputError for an outline or
+    mesh that no body can be made from.
     """
     mesher = None if options.mesher is None else resolve("mesher", options.mesher, steps.cancelled)
     bodies = []
@@ -321,10 +373,13 @@ def make_bodies(
         inputs = {"full": full, "seen": seen, "pixels": colours, "view": view, "name": item.name}
         if item.mesh is None and mesher is None:
             fields = {name: getattr(item, name) for name in ("kind", "shape", "back", "thickness")}
+            others = np.logical_or.reduce([np.zeros_like(full), *layers.seen[:i], *layers.seen[i + 1 :]])
+            if depth is not None:
+                fields |= {"depth": depth.values, "disparity": depth.disparity, "others": others}
             made = store.run(
                 "mesh",
                 {**inputs, **fields, "vertices": options.mesh_vertices},
-                partial(_built, view, full, seen, colours, item, options),
+                partial(_built, view, full, seen, colours, item, options, depth, others),
             )
         else:
             given = {
@@ -366,9 +421,11 @@ def _built(
     colours: Pixels,
     item: ObjectRequest,
     options: ReconstructOptions,
+    depth: DepthMap | None,
+    others: Mask,
     notice: Notice,
 ) -> Arrays:
-    body = build_body(view, full, item, options, notice, seen=seen, pixels=colours)
+    body = build_body(view, full, item, options, notice, seen=seen, pixels=colours, depth=depth, others=others)
     return _arrays(textured_body(view, body.mesh, crop_texture(colours, full), full), body.shape)
 
 

@@ -24,10 +24,14 @@ from .inflate import Crop
 from .primitive_fit import InnerEdges, fit_box, fit_cylinder, fit_sphere
 from .primitives import Outline, Primitive, Sphere, SurfaceOfRevolution, outline_of, rasterize
 
+FURNITURE = "furniture"
+"""Shape of chairs, tables and shelves: boards and rods."""
+
 
 @dataclass(frozen=True)
 class KindShape:
-    """Usual shape of a kind of object: ``box``, ``cylinder``, ``sphere`` or ``inflated``, the last for all others.
+    """Usual shape of a kind of object: ``box``, ``cylinder``, ``sphere``, ``furniture`` or ``inflated``, the last for
+    all others.
 
     thickness: depth over width; of a box its smallest extent over its largest. None leaves it to the outline. back:
     ``symmetric`` or ``flat``.
@@ -55,7 +59,9 @@ KINDS: dict[str, KindShape] = {
     **_rows("inflated", 0.9, "teddy, teddy bear, bear, plush, doll, toy, figure, figurine, statue, bust, duck"),
     **_rows("inflated", 0.8, "clay, dog, cat, animal, bunny, rabbit, horse, pumpkin, pear, bag, shoe, camera"),
     **_rows("inflated", 1.0, "banana, cucumber, carrot, pen, pencil, stick, sausage, rope, snake, egg, lemon, potato"),
-    **_rows("inflated", 0.6, "chair, car, toy car, bread, loaf, pillow, cushion"),
+    **_rows("furniture", None, "chair, armchair, stool, bar stool, bench, table, desk, coffee table, shelf, bookshelf"),
+    **_rows("furniture", None, "bookcase, rack, shoe rack, side table, nightstand, easel, high chair, trestle"),
+    **_rows("inflated", 0.6, "car, toy car, bread, loaf, pillow, cushion"),
     **_rows("inflated", 0.12, "leaf, feather, cookie, biscuit, coin purse, key, sticker, drawing, sheet", "flat"),
 }
 """Names in the singular, lower case."""
@@ -231,7 +237,7 @@ def choose_primitive(
     shape: the requested shape or ``auto``. seen: (H, W) the visible part of ``full``. pixels: (H, W, 3) sRGB, whose
     inner edges determine the depth of boxes.
     """
-    if shape == "inflated" or (shape == "auto" and kind is not None and kind.shape == "inflated"):
+    if shape == "inflated" or (shape == "auto" and kind is not None and kind.shape in ("inflated", FURNITURE)):
         return None
     if shape == "auto" and thickness is not None and kind is None and not ROUND[0] <= thickness <= ROUND[1]:
         # Neither a sphere nor a can has this depth; a box may.

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth
-from .inflate import Crop, film_profile, signed_distance
+from .inflate import Crop, limb_profile, signed_distance
 from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, relax, standing_mesh, surface_of_size
 from .primitives import FINER, Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
 
@@ -273,7 +273,7 @@ class SolidField:
     def _add_parts(self, fitted: OutlineWarp, thickness: float) -> None:
         crop, camera = self._crop, self._camera
         distance = np.minimum(signed_distance(fitted.parts) + crop.outset, crop.distance)
-        self._square = film_profile(fitted.parts, distance, thickness)
+        self._square = limb_profile(distance, thickness)
         # Thinner farther in, or a handle would emerge on the other side of the wall.
         self._square = np.where(self._square > 0, self._square * fitted.fade**2, self._square)
         self._half = float(np.sqrt(max(float(self._square.max()), 0.25)))

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""Mesh of a piece of furniture: the union of its boards, each cut by its region of the photo, by marching cubes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ...scene.model import Camera
+from ..camera.ground_camera import ground_depth
+from .furniture import OVERLAP_PX, Board
+from .inflate import Crop, signed_distance
+from .inflated_mesh import BodyMesh, relax, standing_mesh, surface_of_size
+
+Points = NDArray[np.float64]
+Faces = NDArray[np.int64]
+MARGIN_PX = 6.0
+"""Depth of the grid before and behind the boards."""
+FOOT_PX = 2.0
+"""Height over the ground in pixels of what stands on it: outlines of feet are no better known."""
+FINEST_SHARE = 0.25
+"""Smallest step in depth over the step in the photo's plane."""
+
+
+class BoardField:
+    """φ of the union of boards, in pixels. t: pixels behind the depth of their middle."""
+
+    def __init__(self, camera: Camera, crop: Crop, boards: Sequence[Board]) -> None:
+        self._camera, self._crop, self._boards = camera, crop, boards
+        self._outline = crop.distance
+        self._regions = [np.minimum(crop.distance, signed_distance(board.region) + OVERLAP_PX) for board in boards]
+        low, high = np.inf, -np.inf
+        rays = camera.rays(crop.pixels())
+        ground = ground_depth(camera, rays)
+        for board in boards:
+            inside = board.region.ravel()
+            slab = board.slabs[0]
+            facing = rays[inside] @ slab.normal
+            facing = np.where(np.abs(facing) < 1e-3, np.copysign(1e-3, facing), facing)
+            ends = np.stack([(side - camera.position @ slab.normal) / facing for side in (slab.low, slab.high)])
+            ends = np.minimum(ends, ground[inside])
+            ends = ends[:, np.isfinite(ends).all(axis=0) & (ends > 0).all(axis=0)]
+            if ends.size:
+                low, high = min(low, float(ends.min())), max(high, float(np.quantile(ends.max(axis=0), 0.999)))
+        self._middle = (low + high) / 2.0
+        self.unit = self._middle / camera.fx
+        self._range = ((low - self._middle) / self.unit - MARGIN_PX, (high - self._middle) / self.unit + MARGIN_PX)
+        self.thinnest = min((slab.high - slab.low) / self.unit for board in boards for slab in board.slabs)
+
+    def _world(self, points: Points) -> Points:
+        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
+        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
+        return np.asarray(self._camera.position + depth[:, None] * self._camera.rays(pixels))
+
+    def sample(self, points: Points) -> tuple[Points, Points]:
+        """Return boards and ground (n), (n) at ``points`` (n, 3), in pixels."""
+        at, world = points[:, 1::-1].T, self._world(points)
+        best = np.full(len(points), -np.inf)
+        for board, region in zip(self._boards, self._regions, strict=True):
+            inside = np.full(len(points), np.inf)
+            for slab in board.slabs:
+                along = world @ slab.normal
+                inside = np.minimum(inside, np.minimum(along - slab.low, slab.high - along) / self.unit)
+            near = inside > best
+            if near.any():
+                cut = ndimage.map_coordinates(region, at[:, near], order=1, mode="nearest")
+                best[near] = np.maximum(best[near], np.minimum(inside[near], cut))
+        return best, world[:, 2] / self.unit
+
+    def value(self, points: Points) -> Points:
+        """φ (n) at ``points`` (n, 3)."""
+        body, ground = self.sample(points)
+        return np.minimum(body, ground)
+
+    def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points, Points]:
+        """Return φ on a grid (x, y, t), its first corner (3,) and its steps (3,)."""
+        height, width = self._crop.mask.shape
+        steps = np.array([spacing, spacing, max(min(spacing, self.thinnest / 3.0), FINEST_SHARE * spacing)])
+        low, high = self._range
+        first = np.array([0.25, 0.25, low])
+        counts = (int((width - 1) // spacing) + 1, int((height - 1) // spacing) + 1, int((high - low) // steps[2]) + 2)
+        axes = [first[i] + steps[i] * np.arange(counts[i]) for i in range(3)]
+        flat = np.stack(np.meshgrid(axes[0], axes[1], indexing="ij"), axis=-1).reshape(-1, 2)
+        outline = ndimage.map_coordinates(self._outline, flat[:, ::-1].T, order=1, mode="nearest")
+        near = outline > -2.0 * spacing
+        points = np.column_stack([np.repeat(flat[near], counts[2], axis=0), np.tile(axes[2], int(near.sum()))])
+        columns = np.repeat(np.minimum(outline, -1.0)[:, None], counts[2], axis=1)
+        columns[near] = self.value(points).reshape(-1, counts[2])
+        field = columns.reshape(counts)
+        for axis in range(3):
+            edge = [slice(None)] * 3
+            for end in (0, -1):
+                edge[axis] = end  # type: ignore[call-overload]
+                field[tuple(edge)] = np.minimum(field[tuple(edge)], -1e-3)
+        field[np.abs(field) < 1e-4] = -1e-4
+        return field.astype(np.float32), first, steps
+
+    def depths(self, points: Points) -> tuple[Points, Points, Points]:
+        """Return photo pixels (n, 2), depth (n) and depth of the ground (n) of ``points`` (n, 3)."""
+        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
+        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
+        return pixels, depth, ground_depth(self._camera, self._camera.rays(pixels))
+
+
+def furniture_mesh(camera: Camera, crop: Crop, boards: Sequence[Board], target: int) -> tuple[BodyMesh, float]:
+    """Return the closed surface of ``boards`` with the outline of ``crop``, about ``target`` vertices, on the ground.
+
+    Also the share of it that was disconnected and removed. Raises InputError when the outline is too thin for a closed
+    surface.
+    """
+    field = BoardField(camera, crop, boards)
+    points, faces, lost = surface_of_size(field, float(crop.mask.sum()), target)
+    points = relax(field, points, faces)
+    pixels, depth, ground = field.depths(points)
+    # Feet that end within a pixel or two of the ground stand on it.
+    height = camera.position[2] + depth * camera.rays(pixels)[:, 2]
+    depth = np.where(height < FOOT_PX * field.unit, ground, np.minimum(depth, ground))
+    return standing_mesh(camera, pixels, depth, faces), lost
