@@ -149,10 +149,10 @@ def snowman() -> Body:
 
 def figure() -> Body:
     """A person with arms away from the body."""
-    made: Body = [Capsule((0, 0, 0.55), (0, 0, 0.75), 0.12), _ball_at(0, 0, 1.02, 0.11)]
-    made.append(Capsule((0, 0, 0.85), (0, 0, 0.95), 0.05))
+    made: Body = [Capsule((0, 0, 0.55), (0, 0, 0.7), 0.12), _ball_at(0, 0, 0.93, 0.1)]
+    made.append(Capsule((0, 0, 0.78), (0, 0, 0.9), 0.05))
     for side in (-1.0, 1.0):
-        made.append(Capsule((side * 0.1, 0, 0.82), (side * 0.36, 0, 0.55), 0.045))
+        made.append(Capsule((side * 0.1, 0, 0.75), (side * 0.36, 0, 0.5), 0.045))
         made.append(Capsule((side * 0.07, 0, 0.5), (side * 0.14, 0, 0.06), 0.06))
     return made
 

@@ -150,6 +150,10 @@ ROUND_YAW_SHARE = 0.4
 LEAN = 0.3
 """Lean of the wall for objects that are neither boxes nor spheres, as a share of the viewing angle below the
 horizontal."""
+MOVED = 2
+"""Steps of the wall before the unseen side is made thicker."""
+THICKER, THICKEST = 0.1, 1.6
+"""Increase of the unseen side's thickness with each further step, and its largest value, over the usual one."""
 FOLD = 0.35
 """Width of the fold between floor and wall over the half thickness."""
 
@@ -269,7 +273,8 @@ def reference_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[Refer
     """Yield reference surfaces to try, the most natural one first.
 
     The wall starts where a sphere of this thickness would touch the ground, R tan(a/2) behind the lowest visible point
-    for a view a below the horizontal, and moves back in steps, which enlarges the base.
+    for a view a below the horizontal, and moves back in steps, which enlarges the base. After the first ones the unseen
+    side is thicker as well: moving alone would leave a flap on the ground in front.
     """
     contact = contact_pixel(silhouette)
     ray = camera.rays(contact)
@@ -286,14 +291,15 @@ def reference_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[Refer
     front = float((outline @ away).min()) if len(outline) else float(touch @ away)
     # The middle plane of a sphere meets the ground before the tangent line of sight does.
     start = thick * (np.tan(declination / 2.0) - silhouette.roundness * np.tan(lean))
-    for step in np.concatenate([[0.0], np.geomspace(0.08, 3.0, 12)]):
+    for number, step in enumerate(np.concatenate([[0.0], np.geomspace(0.08, 3.0, 12)])):
         yield ReferenceSurface(
             camera=camera,
             origin=away * (front + start + step * thick),
             normal=np.cos(lean) * away - np.sin(lean) * np.array([0.0, 0.0, 1.0]),
             unit_per_pixel=unit,
             fold=FOLD * thick,
-            back=1.0 + 0.6 * np.sin(lean) * (1.0 - silhouette.roundness),
+            back=(1.0 + 0.6 * np.sin(lean) * (1.0 - silhouette.roundness))
+            * min(1.0 + THICKER * max(number - MOVED, 0), THICKEST),
         )
 
 
@@ -408,6 +414,7 @@ class _DepthField:
         middle, ground, rays = reference.depths(pixels)
         self.half_thickness = silhouette.half_thickness
         self._back = reference.back
+        self._measured = reference.middle is not None
         cap = 8.0 * self._back * self.half_thickness + 16.0
         with np.errstate(invalid="ignore"):
             below = (ground - middle) * np.linalg.norm(rays, axis=1) / reference.unit_per_pixel
@@ -428,10 +435,16 @@ class _DepthField:
         at = points[:, 1::-1].T
         square = ndimage.map_coordinates(self._square, at, order=1, mode="nearest")
         ground = ndimage.map_coordinates(self._ground, at, order=1, mode="nearest")
-        steep = ndimage.map_coordinates(self._steep, at, order=1, mode="nearest")
-        gentle = ndimage.map_coordinates(self._gentle, at, order=1, mode="nearest")
+        steep, gentle = self._slopes(at)
         t = points[:, 2]
         return self._film(square, steep, gentle, t), 2.0 * self.half_thickness * (ground - t)
+
+    def _slopes(self, at: Points) -> tuple[Points, Points]:
+        """Factors of t in front of and behind the middle at ``at`` (2, n), each (n) or (1) where they are 1."""
+        if not self._measured:
+            return np.ones(1), np.ones(1)
+        steep = ndimage.map_coordinates(self._steep, at, order=1, mode="nearest")
+        return steep, ndimage.map_coordinates(self._gentle, at, order=1, mode="nearest")
 
     def _film(self, square: Points, steep: Points, gentle: Points, t: Points) -> Points:
         if self._back == FLAT:
@@ -465,11 +478,10 @@ class _DepthField:
         at = flat[:, 1::-1].T
         square = ndimage.map_coordinates(self._square, at, order=1, mode="nearest")
         ground = 2.0 * self.half_thickness * ndimage.map_coordinates(self._ground, at, order=1, mode="nearest")
-        steep = ndimage.map_coordinates(self._steep, at, order=1, mode="nearest")
+        steep, gentle = (slope if len(slope) == 1 else slope.reshape(*counts[:2], 1) for slope in self._slopes(at))
         shape = (counts[0], counts[1], 1)
         t = axes[2][None, None, :]
-        gentle = ndimage.map_coordinates(self._gentle, at, order=1, mode="nearest")
-        film = self._film(square.reshape(shape), steep.reshape(shape), gentle.reshape(shape), t)
+        film = self._film(square.reshape(shape), steep, gentle, t)
         field = np.minimum(film, ground.reshape(shape) - 2.0 * self.half_thickness * t)
         # A closed surface needs a negative border.
         for axis in range(3):

@@ -137,6 +137,8 @@ SHORT = 1.8
 """Least length of a leg over its width."""
 FARTHEST = 0.5
 """Largest distance of a foot behind the foremost one, over the body's width; others hang in the air."""
+SLOPE = 0.15
+"""Smoothing of distances, over the width of legs."""
 LOWEST = 0.03
 """Height of the foremost foot over the outline's lowest point, over its longer side: what stands on legs touches the
 ground with nothing else."""
@@ -177,11 +179,14 @@ def standing_depth(camera: Camera, mask: Mask, distance: Points, left: int, top:
         # The middle of a round foot is behind the point that touches its line of sight.
         away[region & ~pinned] = place[1] + 0.5 * leg.width * unit * np.tan(declination / 2.0)
         pinned |= region
-    return _carried(mask, away, pinned), pinned
+    # Between two legs of different distance side by side there is a slope, not a cliff.
+    slope = SLOPE * float(np.median([leg.width for leg in chosen]))
+    return _carried(mask, away, pinned, slope), pinned
 
 
-def _carried(mask: Mask, values: Points, pinned: Mask) -> Points:
-    """``values`` (h, w) of the ``pinned`` pixels carried through ``mask`` harmonically, and beyond it by nearness."""
+def _carried(mask: Mask, values: Points, pinned: Mask, slope: float) -> Points:
+    """``values`` (h, w) of the ``pinned`` pixels carried through ``mask`` harmonically, and beyond it by nearness;
+    smooth over ``slope`` pixels."""
     height, width = mask.shape
     step = max(1, int(np.ceil(max(mask.shape) / COARSE)))
     rows, columns = -(-height // step), -(-width // step)
@@ -211,4 +216,4 @@ def _carried(mask: Mask, values: Points, pinned: Mask) -> Points:
     nearest = ndimage.distance_transform_edt(np.isnan(coarse), return_distances=False, return_indices=True)
     coarse = coarse[tuple(nearest)]
     fine = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)[:height, :width]
-    return np.asarray(ndimage.gaussian_filter(fine, 0.5 * step, mode="nearest"), dtype=np.float64)
+    return np.asarray(ndimage.gaussian_filter(fine, max(0.5 * step, slope), mode="nearest"), dtype=np.float64)
