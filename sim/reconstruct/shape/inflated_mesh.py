@@ -102,7 +102,7 @@ def _surface(field: Field, spacing: float) -> tuple[Points, Faces, float]:
     return keep_main_part(points, faces.astype(np.int64))
 
 
-def relax(field: Field, points: Points, faces: Faces) -> Points:
+def relax(field: Field, points: Points, faces: Faces, rounds: int = RELAXATION_ROUNDS) -> Points:
     """Return ``points`` relaxed along the surface: moved towards the neighbours' mean, then back onto φ = 0.
 
     Vertices at the edge between base and body, and their neighbours, stay, or the edge would be rounded.
@@ -116,7 +116,7 @@ def relax(field: Field, points: Points, faces: Faces) -> Points:
     on_base = (ground < film).astype(np.float64)
     share = mean @ on_base
     free = (np.abs(share - on_base) < 1e-9)[:, None]
-    for _ in range(RELAXATION_ROUNDS):
+    for _ in range(rounds):
         gradient = _gradient(field, points)
         normal = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
         move = mean @ points - points
@@ -150,9 +150,9 @@ ROUND_YAW_SHARE = 0.4
 LEAN = 0.3
 """Lean of the wall for objects that are neither boxes nor spheres, as a share of the viewing angle below the
 horizontal."""
-MOVED = 2
+MOVED = 5
 """Steps of the wall before the unseen side is made thicker."""
-THICKER, THICKEST = 0.1, 1.6
+THICKER, THICKEST = 0.06, 1.6
 """Increase of the unseen side's thickness with each further step, and its largest value, over the usual one."""
 FOLD = 0.35
 """Width of the fold between floor and wall over the half thickness."""
@@ -506,7 +506,7 @@ def inflated_mesh(
     silhouette's crop, units, NaN where unknown; None inflates about a wall, or about legs where they stand. Raises
     InputError when the silhouette is too thin for a closed surface.
     """
-    best: tuple[BodyMesh, float, float] | None = None
+    best: tuple[ReferenceSurface, Points, Faces, float, float] | None = None
     if front is not None:
         choices = measured_surfaces(camera, silhouette, front)
     elif silhouette.slab or flat:
@@ -516,22 +516,27 @@ def inflated_mesh(
     on_legs = False
     for reference in choices:
         # Moved back, legs would become flaps on the ground: only what would topple otherwise is.
-        if on_legs and reference.middle is None and best is not None and best[1] > 0.0:
+        if on_legs and reference.middle is None and best is not None and best[4] > 0.0:
             break
         on_legs |= front is None and reference.middle is not None
         if flat:
             reference = replace(reference, back=FLAT)
         field = _DepthField(silhouette, reference)
         points, faces, lost = surface_of_size(field, float(silhouette.mask.sum()), target)
-        body = _to_world(silhouette, reference, relax(field, points, faces), faces)
+        # One round brings the base onto the ground; the rest is for the one that is taken.
+        points = relax(field, points, faces, 1)
+        body = _to_world(silhouette, reference, points, faces)
         margin = stability(body.vertices, body.faces)
-        if best is None or margin > best[1]:
-            best = (body, margin, lost)
+        if best is None or margin > best[4]:
+            best = (reference, points, faces, lost, margin)
         # A relief need not stand by itself, as long as it touches the ground: moving it back only enlarges it.
         if margin >= STABLE or (flat and margin > NO_BASE):
             break
     assert best is not None
-    return best
+    reference, points, faces, lost, _ = best
+    points = relax(_DepthField(silhouette, reference), points, faces, RELAXATION_ROUNDS - 1)
+    body = _to_world(silhouette, reference, points, faces)
+    return body, stability(body.vertices, body.faces), lost
 
 
 def shadow_mesh(camera: Camera, silhouette: Silhouette, target: int = 3000) -> BodyMesh:

@@ -78,7 +78,7 @@ def find_legs(mask: Mask, widest: float, longest: float) -> list[Leg]:
     for column in np.argsort(-lowest, kind="stable"):
         if lowest[column] < 0 or taken[column]:
             continue
-        leg = _leg(mask, int(column), int(lowest[column]))
+        leg = _leg(mask, int(column), int(lowest[column]), widest)
         if leg is None:
             taken[column] = True
             continue
@@ -90,13 +90,13 @@ def find_legs(mask: Mask, widest: float, longest: float) -> list[Leg]:
     return sorted(legs, key=lambda leg: float(leg.foot[0]))
 
 
-def _leg(mask: Mask, column: int, bottom: int) -> Leg | None:
-    """The run of ``mask`` upwards from its lower end at ``column``, ``bottom``."""
+def _leg(mask: Mask, column: int, bottom: int, widest: float) -> Leg | None:
+    """The run of ``mask`` upwards from its lower end at ``column``, ``bottom``; None if it is wider than ``widest``."""
     rows: list[int] = []
     left: list[int] = []
     right: list[int] = []
     low, high = column, column + 1
-    beside = 0
+    beside, own = 0, 0.0
     for row in range(bottom, -1, -1):
         line = mask[row]
         inside = np.flatnonzero(line[low:high])
@@ -108,7 +108,10 @@ def _leg(mask: Mask, column: int, bottom: int) -> Leg | None:
         gaps = np.flatnonzero(~line[at:])
         end = at + int(gaps[0]) if len(gaps) else len(line)
         if len(rows) >= 6:
-            own = float(np.median(np.subtract(right, left)))
+            if len(rows) < 12 or len(rows) % 8 == 0:
+                own = float(np.median(np.subtract(right, left)))
+            if own > 2.0 * widest:
+                return None
             jump = max(STEP[0], STEP[1] * own)
             wider = (left[-1] - start > jump, end - right[-1] > jump)
             if end - start > BESIDE * own or all(wider):
