@@ -10,9 +10,9 @@ import trimesh
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.geometry.triangles import check_closed, validated
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
-from physgen.sim.reconstruct.user_mesh.fit_user_mesh import fit_mesh
+from physgen.sim.reconstruct.user_mesh.fit_user_mesh import fit_mesh, reproject_photo
 from physgen.sim.reconstruct.user_mesh.mesh_alignment import UPS, align
-from physgen.sim.reconstruct.user_mesh.mesh_repair import repair_mesh
+from physgen.sim.reconstruct.user_mesh.mesh_repair import RepairedMesh, repair_mesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
@@ -180,3 +180,20 @@ def test_the_photo_is_seen_where_the_camera_sees_the_mesh(tmp_path):
     assert reddish[~towards].mean() < 0.1 and blue[~towards].mean() > 0.9
     assert reddish[towards].mean() > 0.6
     assert "%" in said[-1]
+
+
+def test_a_mesh_without_colours_has_no_second_face_behind():
+    mesh = trimesh.creation.icosphere(4, 0.3)
+    centre = np.array([0.0, 2.0, 0.3])
+    world, faces = np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces)
+    seen = outline(world, faces)
+    photo = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    photo[seen] = (200, 60, 40)
+    middle = VIEW.project(centre)[:2].astype(int)
+    for side in (-14, 14):
+        cv2.circle(photo, (int(middle[0]) + side, int(middle[1])), 6, (10, 10, 10), -1)
+    surface = reproject_photo(VIEW, RepairedMesh(world, faces, None, None, None), world, seen, photo)
+    assert check_closed(validated(surface.vertices, surface.faces)[1])
+    colours = colours_at(surface.uv[surface.faces].mean(axis=1), surface.picture)
+    behind = (surface.vertices[surface.faces].mean(axis=1) - centre) @ (centre - VIEW.position) > 0
+    assert (colours[~behind, 0] < 80).any() and not (colours[behind, 0] < 120).any()

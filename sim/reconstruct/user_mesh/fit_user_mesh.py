@@ -3,7 +3,8 @@
 
 The texture is the part of the photo around the object with the mesh's own texture below it. Faces that the camera sees
 squarely take the photo; the rest keep the mesh's texture, matched to the photo's brightness and colour. A mesh without
-colours takes them from the nearest visible point, or the nearest point whose mirror image is visible.
+colours gets an atlas as reconstructed bodies do (``shape/texture_atlas.py``), where a hidden point corresponds to the
+nearest visible point, or the nearest point whose mirror image is visible.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from ...scene.meshes import read_mesh
 from ...scene.model import Camera
 from ..reconstruct_options import UP_AXES, Pixel
 from ..shape.body_texture import CropTexture, TexturedSurface, crop_texture
+from ..shape.inflated_mesh import BodyMesh
+from ..shape.texture_atlas import textured_body
 from .mesh_alignment import Mask, Points, Pose, align, sample_surface
 from .mesh_repair import RepairedMesh, repair_mesh
 
@@ -49,16 +52,15 @@ def reproject_photo(
         own_uv, own = _palette(mesh.colours)
     else:
         own_uv, own = None, None
-    photo_uv = crop.uv(projected)
     if own_uv is None or own is None:
-        uv = photo_uv.copy()
+        alike = projected.copy()
         shown = np.zeros(len(vertices), dtype=bool)
         shown[mesh.faces[from_photo]] = True
         if shown.any():
-            uv[~shown] = photo_uv[_lookalike(camera, vertices, shown)]
-        return TexturedSurface(vertices, mesh.faces, uv, crop.pixels)
+            alike[~shown] = projected[_lookalike(camera, vertices, shown)]
+        return textured_body(camera, BodyMesh(vertices, mesh.faces, projected, alike), crop, seen)
     picture, photo_part, own_part = _stacked(crop.pixels, own)
-    return _joined(vertices, mesh.faces, from_photo, photo_part(photo_uv), own_part(own_uv), picture)
+    return _joined(vertices, mesh.faces, from_photo, photo_part(crop.uv(projected)), own_part(own_uv), picture)
 
 
 def _seen_faces(camera: Camera, vertices: Points, faces: NDArray[np.int64], seen: Mask) -> NDArray[np.bool_]:
