@@ -14,6 +14,7 @@ import numpy as np
 from mathutils import Vector
 
 from ...sim.errors import InputError
+from ..compat import OperatorMixin
 from ..context import redraw
 from .photo_maths import Mask, ellipse, extent, resized
 
@@ -296,7 +297,7 @@ def _pixels(image: bpy.types.Image) -> np.ndarray:
     return pixels.reshape(height, width, image.channels)[::-1]
 
 
-class PhotoTool:
+class PhotoTool(OperatorMixin):
     """Mixin of modal operators that work over the photo in the image editor: enabled while it is visible, with a cursor
     and a line of help until it ends.
 
@@ -311,7 +312,7 @@ class PhotoTool:
         """Enabled unless ``why_not`` gives a reason."""
         why = cls.why_not(context)
         if why:
-            cls.poll_message_set(why)  # type: ignore[attr-defined]
+            cls.poll_message_set(why)
         return not why
 
     @classmethod
