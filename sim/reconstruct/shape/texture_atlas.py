@@ -39,6 +39,9 @@ SHOWN = (np.cos(np.radians(89.0)), np.cos(np.radians(84.0)))
 CLEAR = (0.5, 2.0)
 """Pixels from the outline between which a point's own pixel is shown whatever its angle: a flat side at 86°, such as a
 book's fore-edge, is a strip of several pixels, none of them mixed with the background."""
+BENT = (1.0, 0.4)
+"""Curvature times the body's extent (2 on a ball) from which ``CLEAR`` holds not at all, and up to which fully: the
+pixels along the outline of a round side are mixed with the background, and other cameras would see them as a line."""
 DENSITY = 1.25
 """Texels of charts per pixel of the photo, per side: the photo is resampled there."""
 MOST_TEXELS = 9e5
@@ -84,7 +87,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     inside = _cropped(mask, texture)
     matter = plain_matter(texture.pixels, inside)
     values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
-    values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown)])
+    values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
     found = rasterised(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
     texel = found.interpolated(charts.faces, values[charts.source])
@@ -163,6 +166,26 @@ def _vertex_share(body: BodyMesh, faces: Mask) -> NDArray[np.float64]:
     return count / np.maximum(total, 1.0)
 
 
+def _flatness(body: BodyMesh, normals: Points) -> NDArray[np.float64]:
+    """Flatness (V,) of the flattest face at each vertex, 0 where curved as a ball and 1 on a plane."""
+    ends = np.sort(np.stack([body.faces, np.roll(body.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    pairs = np.flatnonzero((ends[order][1:] == ends[order][:-1]).all(axis=1))
+    first, second = order[pairs] // 3, order[pairs + 1] // 3
+    middle = body.vertices[body.faces].mean(axis=1)
+    bend = np.linalg.norm(normals[first] - normals[second], axis=1)
+    bend /= np.maximum(np.linalg.norm(middle[first] - middle[second], axis=1), 1e-300)
+    around = np.zeros((len(body.faces), 3))
+    for one, edge in ((first, order[pairs]), (second, order[pairs + 1])):
+        around[one, edge % 3] = bend
+    extent = float(np.ptp(body.vertices, axis=0).max())
+    flat = 1.0 - _ramp(np.median(around, axis=1) * extent, BENT[::-1])
+    result = np.zeros(len(body.vertices))
+    for corner in range(3):
+        np.maximum.at(result, body.faces[:, corner], flat)
+    return result
+
+
 def _cropped(mask: Mask, texture: CropTexture) -> Mask:
     height, width = texture.pixels.shape[:2]
     return mask[texture.top : texture.top + height, texture.left : texture.left + width]
@@ -183,7 +206,7 @@ def _colours(
     frame: Points,
     pixels: float,
 ) -> NDArray[np.float64]:
-    """Colours (P, 3) of texels (P, 11): place, normal, counterpart's pixel, own pixel, share hidden.
+    """Colours (P, 3) of texels (P, 12): place, normal, counterpart's pixel, own pixel, share hidden, flatness.
 
     mask: (h, w) the object in ``texture``. pixels: of the photo per unit of length.
     """
@@ -197,7 +220,7 @@ def _colours(
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
     depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
     away = _sampled(depth, own)[:, 0]
-    clear = _ramp(away, CLEAR) * (cosine > SHOWN[0])
+    clear = _ramp(away, CLEAR) * (cosine > SHOWN[0]) * texel[:, 11]
     weight = (np.maximum(_ramp(cosine, SHOWN), clear) * (1.0 - texel[:, 10]))[:, None]
     seen = np.flatnonzero(weight[:, 0] > 0)
     if not len(seen):
