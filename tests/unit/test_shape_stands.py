@@ -3,10 +3,17 @@
 
 import tomllib
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from physgen.sim.app.bake_quality import QUALITY_FOLDER
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.shape import footing
+from physgen.sim.reconstruct.shape.footing import footed
+from physgen.sim.reconstruct.shape.inflate import inflate
+from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
+from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
 from physgen.sim.reconstruct.shape.support import COARSEST_CELLS, COARSEST_PARTICLES, support_of
 
 
@@ -41,6 +48,38 @@ def test_a_film_on_the_ground_is_no_base():
     both = support(trimesh.util.concatenate([box, film]))
     # The film's own weight moves the centre of mass by 2.5 % of 15 cm.
     assert both.margin == pytest.approx(0.05, abs=0.005)
+
+
+@pytest.mark.parametrize("pitch", [12.0, 30.0])
+def test_an_inflated_body_gets_a_broader_base_that_the_photo_does_not_show(pitch, monkeypatch):
+    """A pear on its thin end, 60 by 110 pixels: its margin grows by a third or more, and it keeps its outline."""
+    camera = camera_above_ground(400, 300, 430.0, np.radians(pitch))
+    mask = np.zeros((300, 400), np.uint8)
+    corners = [(170, 120), (200, 90), (230, 120), (225, 150), (208, 200), (192, 200), (175, 150)]
+    cv2.fillPoly(mask, [np.array(corners)], 1)
+    silhouette = inflate(mask > 0)
+    body = inflated_mesh(camera, silhouette, 3000)[0]
+    monkeypatch.setattr(footing, "FOOTINGS", ())
+    plain = inflated_mesh(camera, silhouette, 3000)[0]
+    before, after = (support_of(each.vertices, each.faces).margin for each in (plain, body))
+    assert after > 1.33 * before > 0
+    assert silhouette_overlap(camera, body, mask > 0) > 0.97
+    np.testing.assert_allclose(camera.project(body.vertices)[:, :2], body.pixels, atol=1e-6)
+
+
+def test_only_what_is_hidden_comes_down():
+    camera = camera_above_ground(400, 300, 430.0, np.radians(25.0))
+    rows, columns = np.mgrid[:300, :400] + 0.5
+    silhouette = inflate((columns - 200) ** 2 + (rows - 170) ** 2 < 50**2)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.25)
+    ball.apply_translation((0.0, 2.0, 0.25))
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    after, moved = footed(camera, silhouette, vertices, faces)
+    assert moved.any() and (after[moved, 2] < vertices[moved, 2]).all() and after[:, 2].min() >= 0.0
+    np.testing.assert_array_equal(after[:, :2], vertices[:, :2])
+    towards = camera.position - vertices[moved]
+    normals = vertices[moved] - (0.0, 2.0, 0.25)
+    assert (np.einsum("ij,ij->i", towards, normals) < 0.01).all(), "the near side stays"
 
 
 def test_the_coarsest_quality_is_the_coarsest():

@@ -26,6 +26,7 @@ from ...errors import InputError
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth, on_ground
 from .depth_front import middle_surface
+from .footing import footed
 from .inflate import Silhouette
 from .legs import standing_depth
 
@@ -536,7 +537,16 @@ def inflated_mesh(
     reference, points, faces, lost, _ = best
     points = relax(_DepthField(silhouette, reference), points, faces, RELAXATION_ROUNDS - 1)
     body = _to_world(silhouette, reference, points, faces)
+    if not flat:
+        body = _footed(camera, silhouette, body)
     return body, stability(body.vertices, body.faces), lost
+
+
+def _footed(camera: Camera, silhouette: Silhouette, body: BodyMesh) -> BodyMesh:
+    """``body`` with a broader base where nobody sees it."""
+    vertices, moved = footed(camera, silhouette, body.vertices, body.faces)
+    pixels = np.where(moved[:, None], camera.project(vertices)[:, :2], body.pixels)
+    return replace(body, vertices=vertices, pixels=pixels)
 
 
 def shadow_mesh(camera: Camera, silhouette: Silhouette, target: int = 3000) -> BodyMesh:
