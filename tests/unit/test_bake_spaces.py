@@ -298,12 +298,12 @@ def test_a_seed_moves_the_particles_and_nothing_else(ball_scene):
 
 
 def test_old_scenes_hash_as_they_did(ball_scene):
-    """Bakes of earlier versions stay up to date: the hash of a scene whose every field is fixed here."""
+    """Bakes of earlier versions with this ENGINE_REVISION (4) stay up to date: the hash of a scene fixed here."""
     folder = ball_scene()
     (folder.root / "meshes" / "ball0.glb").write_bytes(b"stands for a mesh")
     item = dataclasses.replace(folder.model.objects[0], material=Material())
     folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
-    assert inputs_hash(folder, QUICK) == "a23202dafc4ed5c65c904e33d63aaa26c3dfb6eef62d39c7a6a824e92e774aa1"
+    assert inputs_hash(folder, QUICK) == "80bbaf539e92ab5c5fac5331835f6292d512cc711067f6a5c437db5e403806eb"
 
 
 def test_blenders_process_can_ask_what_is_out_of_date():
