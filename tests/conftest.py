@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
+from pathlib import Path
 
 # Workers share the cores: threads of OpenBLAS that wait for one another took 40 % of a reconstruction's time. Children
 # inherit it. It has to be set before NumPy is there.
@@ -83,6 +85,18 @@ def without_trials():
 def first_fill(without_trials):
     with without_trials():
         yield
+
+
+@pytest.fixture
+def own_kernels(tmp_path):
+    """Environment of a process whose files may not grow: it may spoil its cache of kernels, a copy of the user's."""
+    cache = Path.home() / ".cache" / "taichi" / "ticache"
+    copy = tmp_path / "kernels"
+    copy.mkdir()
+    for path in cache.glob("*") if cache.is_dir() else ():
+        with contextlib.suppress(OSError):
+            shutil.copy(path, copy)
+    return {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(copy)}
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from physgen.physgen_addon.scene_io.export_compose import ORIGINAL, export_compo
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 
-STEPS = 40
+STEPS = 6
+"""The first takes the balls apart already; what a step is is tested where the optimiser is."""
 
 
 @pytest.fixture(autouse=True)

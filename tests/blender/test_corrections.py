@@ -15,8 +15,10 @@ from PIL import Image
 
 bpy = pytest.importorskip("bpy")
 import physgen
+from physgen.batch.cli import build_parser
 from physgen.batch.commands.flags import object_requests, reconstruct_options
 from physgen.batch.commands.photo_commands import add_reconstruct
+from physgen.physgen_addon.operators import photo_ops
 from physgen.physgen_addon.operators.photo_ops import (
     add_box,
     set_photo,
@@ -193,7 +195,30 @@ def volume(folder):
     return trimesh.Trimesh(mesh.vertices, mesh.faces).volume / height**3
 
 
-def test_a_correction_repeats_only_what_depends_on_it(photo, world):
+class Said:
+    """A terminal that remembers the events."""
+
+    def __init__(self):
+        self.events = []
+
+    def __call__(self, event):
+        self.events.append(event)
+
+    def line(self, text):
+        pass
+
+
+def command_here(command, on_event, cancelled, **_):
+    """In place of ``run_stage``: the command in this process; that it has one of its own is test_import_scene.py's."""
+    options = build_parser().parse_args(command[command.index("batch.cli") + 1 :])
+    said = Said()
+    assert options.run(options, said, cancelled) == 0
+    for event in said.events[:-1]:
+        on_event(event)
+    return said.events[-1]
+
+
+def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, monkeypatch):
     """A mask and a horizon as told; then another back, for which nothing is cut out or filled in again."""
     scene, box = bpy.context.scene, photo.boxes[0]
     mask = truth(world)
@@ -203,6 +228,7 @@ def test_a_correction_repeats_only_what_depends_on_it(photo, world):
     photo.camera, photo.horizon, photo.roll, photo.report = "HORIZON", -0.1, math.radians(4), True
     photo.use_fov, photo.fov = True, math.radians(47)
     assert made_folder(photo) is None
+    monkeypatch.setattr(photo_ops, "run_stage", command_here)
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
     folder = made_folder(photo)
     assert folder == scene_folder(photo)

@@ -435,17 +435,17 @@ def test_what_is_no_photo_is_refused(tmp_path):
 def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
     """The whole way, blocking as a script has it: boxes, child process, import."""
     photo = tmp_path / "ball.png"
-    Image.open(world.folder.file("photo.png")).resize((320, 240)).save(photo)
+    Image.open(world.folder.file("photo.png")).save(photo)
     scene = bpy.context.scene
     set_photo(scene, photo)
     rows, columns = np.nonzero(np.asarray(Image.open(world.folder.file("masks/ball.png"))))
-    corners = (2 * columns.min() - 8, 2 * rows.min() - 8, 2 * columns.max() + 10, 2 * rows.max() + 10)
+    corners = (columns.min() - 4, rows.min() - 4, columns.max() + 5, rows.max() + 5)
     add_box(scene, tuple(map(int, corners)), "ball").size_m = 0.1
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
     item = scene.physgen.photo_root.objects["ball"]
     assert max(item.dimensions) == pytest.approx(0.1, rel=0.01)
     assert load_scene(tmp_path / "ball_scene").model.objects[0].name == item.physgen.source
-    assert (scene.render.resolution_x, scene.render.resolution_y) == (320, 240)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (160, 120)
 
 
 def test_an_output_folder_of_physgen3d_becomes_a_scene_in_the_worker(world, tmp_path):

@@ -11,7 +11,9 @@ from physgen.benchmarks.light import WANTED_DEG, WANTED_SHARE, Case, measure
     "case",
     [
         Case(azimuth=150, elevation=40, strength=1.5, shape="ball", ground="grain"),
-        Case(azimuth=25, elevation=30, strength=3.0, shape="jug", ground="planks", angle=3),
+        pytest.param(
+            Case(azimuth=25, elevation=30, strength=3.0, shape="jug", ground="planks", angle=3), marks=pytest.mark.slow
+        ),
     ],
     ids=lambda case: case.shape,
 )

@@ -15,7 +15,7 @@ from physgen.sim.cache.bake_folder import load_manifest
 
 pytest.importorskip("bpy")
 
-FRAMES = 6
+FRAMES = 5
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_another_material_bakes_again_without_reconstructing(job, photo):
     assert "frames/0001.png" not in changed and f"frames/{FRAMES:04d}.png" in changed
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
 def test_a_stopped_run_goes_on(prepared, photo, tmp_path, how):
     work = tmp_path / "work"
     shutil.copytree(prepared, work)

@@ -100,7 +100,7 @@ def test_softness_and_glow_lose_against_the_right_texture():
     assert similarity(shifted, truth, hole) > similarity(soft, truth, hole) + 1.0
 
 
-@pytest.mark.parametrize("border", [50, 62])
+@pytest.mark.parametrize("border", [50, pytest.param(62, marks=pytest.mark.slow)])
 def test_a_table_ends_before_a_cluttered_room(border):
     table = wood(2, 110.0)
     blocks = np.random.default_rng(3).uniform(20, 240, size=(10, 12, 3)).astype(np.float32)

@@ -191,7 +191,7 @@ def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):
         bake(load_scene(folder.root), out=tmp_path / "file", options=QUICK)
 
 
-def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
+def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, own_kernels, tmp_path):
     folder = ball_scene()
     job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
     (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
@@ -201,12 +201,11 @@ def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, tmp_path):
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    environment = {**os.environ, "TI_OFFLINE_CACHE": "0"}
     result = subprocess.run(
         [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")],
         capture_output=True,
         preexec_fn=small_files,
-        env=environment,
+        env=own_kernels,
         check=False,
     )
     assert result.returncode == 3, result.stderr[-2000:].decode()

@@ -242,7 +242,7 @@ def test_requests_are_checked(fields):
         LightRequest(**fields)
 
 
-def test_a_photo_is_reconstructed_under_a_file_and_again_when_the_file_changes(tmp_path):
+def test_a_photo_is_reconstructed_under_a_file_and_again_when_the_file_changes(first_fill, tmp_path):
     rng = np.random.default_rng(0)
     pixels = rng.integers(150, 170, (90, 120, 3), dtype=np.uint8)
     pixels[30:60, 40:75] = (200, 30, 30)
@@ -253,7 +253,7 @@ def test_a_photo_is_reconstructed_under_a_file_and_again_when_the_file_changes(t
 
     def once():
         said.clear()
-        request = ObjectRequest(box=(30, 20, 85, 70))
+        request = ObjectRequest(box=(30, 20, 85, 70), shape="inflated")
         return reconstruct(
             tmp_path / "photo.png", [request], out=tmp_path / "scene", options=options, on_event=said.append
         )

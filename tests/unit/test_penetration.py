@@ -11,8 +11,8 @@ from physgen.sim.gaussians.compose.penetration import penetration_of_meshes
 from physgen.sim.mpm.colliders import Surface
 
 
-def ball(radius: float, x: float = 0.0) -> Surface:
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+def ball(radius: float, x: float = 0.0, subdivisions: int = 4) -> Surface:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     return Surface(vertices=np.asarray(mesh.vertices) + np.array([x, 0.0, 0.0]), faces=np.asarray(mesh.faces))
 
 
@@ -32,12 +32,12 @@ def test_two_balls_share_a_lens(apart):
 
 
 def test_one_inside_the_other():
-    inner = penetration_of_meshes(ball(0.03, 0.02), ball(0.1))
+    inner = penetration_of_meshes(ball(0.03, 0.02), ball(0.1, subdivisions=3))
     assert inner.contained == "background"
     assert inner.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.02)
     assert inner.share == pytest.approx(1.0, abs=0.01)
     assert inner.deepest == pytest.approx(0.1, rel=0.02)
-    outer = penetration_of_meshes(ball(0.1), ball(0.03, 0.02))
+    outer = penetration_of_meshes(ball(0.1, subdivisions=3), ball(0.03, 0.02, subdivisions=3))
     assert outer.contained == "foreground"
     assert "foreground lies completely inside the background" in outer.describe()
 

@@ -125,7 +125,7 @@ def blob(seed):
     return image > 0
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000), pitch=st.floats(8.0, 55.0), shape=st.sampled_from(["auto", "box", "cylinder"]))
 def test_any_blob_becomes_a_sound_body_with_its_silhouette(seed, pitch, shape):
     notices = []
