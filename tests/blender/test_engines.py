@@ -29,6 +29,25 @@ def drawing():
         pytest.skip(str(error))
 
 
+def test_eevee_draws_the_moved_ball_as_cycles_does(drawing, world, bake):
+    """At half the size and one sample; test-all compares whole pictures, soft shadows and outlines."""
+    opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)
+    made = {}
+    for engine, samples in (("cycles", 16), ("eevee", 1)):
+        options = RenderOptions(engine=engine, samples=samples, motion_blur=0.0, scale=0.5)
+        renderer = Renderer(world.folder, opened, options)
+        made[engine] = renderer.frame(1)
+        renderer.close()
+    assert not [scene for scene in bpy.data.scenes if scene.name.startswith("PhysGen")]
+    cycles, eevee = (linear_to_bytes(frame.beauty) for frame in made.values())
+    assert psnr(eevee, cycles) > 30
+    shadow, other = (made[engine].shadow.mean(axis=-1) for engine in ("eevee", "cycles"))
+    deep = other < 0.75
+    assert deep.sum() > 25
+    assert abs(float((shadow - other)[deep].mean())) < 0.1
+
+
+@pytest.mark.slow
 def test_eevee_makes_the_same_pictures(drawing, world, bake):
     opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)
     made = {}

@@ -16,10 +16,14 @@ NOT_SHIPPED = {"tests", "benchmarks", "examples", "setup", "docs", "build", "dis
 def tree(suffixes):
     """Files of the product with these suffixes, as a wheel names them."""
     names = set()
-    for path in ROOT.rglob("*"):
-        parts = path.relative_to(ROOT).parts
-        if path.suffix in suffixes and not (parts[0] in NOT_SHIPPED or any(p.startswith(".") for p in parts)):
-            names.add("/".join(("physgen", *parts)))
+    for top in ROOT.iterdir():
+        # A virtual environment here has more files than all the rest.
+        if top.name in NOT_SHIPPED or top.name.startswith("."):
+            continue
+        for path in (top, *top.rglob("*")):
+            parts = path.relative_to(ROOT).parts
+            if path.suffix in suffixes and not any(p.startswith(".") for p in parts):
+                names.add("/".join(("physgen", *parts)))
     return names - {"physgen/setup.py"}
 
 

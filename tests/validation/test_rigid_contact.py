@@ -123,7 +123,7 @@ def test_ball_keeps_rolling_on_the_level(ball_body, solids):
     assert world.pose(0, "ball").velocity[0] == pytest.approx(1.0, rel=0.01)
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_boxes_stay_stacked(box_body, solids, count):
     """Drift below 1 % of the size in 5 s."""
     bodies = tuple(box_body(name=f"box{i}", center=(0.0, 0.0, 0.1 + 0.2 * i)) for i in range(count))
