@@ -24,8 +24,8 @@ from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.model import Camera, SceneModel, SceneObject
 
 # Every run draws the same examples, so that none fails for what it did not touch; `make test-explore` draws new ones.
-settings.register_profile("ci", derandomize=True)
-settings.register_profile("explore", derandomize=False, print_blob=True)
+settings.register_profile("ci", derandomize=True, deadline=None)
+settings.register_profile("explore", derandomize=False, deadline=None, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 LONGEST = (
