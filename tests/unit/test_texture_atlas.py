@@ -230,3 +230,10 @@ def test_synthesised_grain_keeps_its_contrast_and_does_not_repeat():
     repeated = np.real(np.fft.ifft2(spectrum)) / spectrum.sum() * grain[..., 0].size
     repeated[:4, :4] = repeated[-3:, :4] = repeated[:4, -3:] = repeated[-3:, -3:] = 0
     assert repeated.max() < 0.3 * np.real(np.fft.ifft2(spectrum))[0, 0] / spectrum.sum() * grain[..., 0].size
+
+
+def test_print_all_over_is_no_grain():
+    calm = picture(TOY)
+    checks = np.where(((ROWS // 5 + COLUMNS // 5) % 2)[..., None] > 0, 220, 40) + (calm.astype(int) - FUR) // 4
+    assert plain_matter(calm, TOY).swatch.std() > 5
+    assert plain_matter(np.clip(checks, 0, 255).astype(np.uint8), TOY).swatch.std() < 2
