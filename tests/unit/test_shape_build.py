@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.shape.inflated_mesh import keep_main_part
 from physgen.sim.reconstruct.shape.object_bodies import build_body
 from physgen.sim.reconstruct.shape.primitive_mesh import cube_surface
 from physgen.sim.reconstruct.shape.primitives import Box, Sphere, SurfaceOfRevolution, rasterize
+from physgen.sim.reconstruct.shape.surface_mesh import keep_main_part
 
 WIDTH, HEIGHT = 480, 360
 BOX = Box(0.1, 2.1, 0.5, 0.5, 0.4, 0.3)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
-from physgen.sim.reconstruct.shape.object_bodies import first_hit, place_on_supports, resting_on
+from physgen.sim.reconstruct.shape.object_supports import first_hit, place_on_supports, resting_on
 
 HEIGHT, WIDTH = 300, 400
 VIEW = camera_above_ground(WIDTH, HEIGHT, 350.0, np.radians(25.0))

@@ -19,7 +19,8 @@ from ..photo_layers import Layers
 from ..reasoning.material_decision import ObjectPhysics
 from ..reconstruct_options import ObjectRequest
 from ..shape.body_texture import TexturedSurface
-from ..shape.object_bodies import Body, TriangleMesh
+from ..shape.object_bodies import Body
+from ..shape.object_supports import TriangleMesh
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from .albedo import NEAR, CreasedSurface, compute_albedo, seen_faces, split_creases, texel_values, visible_pixels
 from .object_shading import DIELECTRIC_F0, LocalLighting, Mesh, Shading, local_lighting, shade, sky_lobe, sun_lobe

@@ -32,7 +32,7 @@ def footed(
     """Return ``vertices`` (V, 3) with as much of the underside on the ground z = 0 as the body needs to stand safely,
     and which of them moved (V,).
 
-    camera: above the ground. As safely as ``support.Support.wanted`` says, or as the hidden underside allows.
+    camera: above the ground. As safely as ``support.SupportMargin.wanted`` says, or as the hidden underside allows.
     """
     stands = support_of(vertices, faces)
     best, safest = vertices, stands.margin

@@ -13,7 +13,8 @@ from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth
 from .furniture import OVERLAP_PX, Board
 from .inflate import Crop, signed_distance
-from .inflated_mesh import BodyMesh, relax, standing_mesh, surface_of_size
+from .inflated_mesh import BodyMesh, standing_mesh
+from .surface_mesh import relax, surface_of_size
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int64]

@@ -20,8 +20,9 @@ from scipy import ndimage
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth
 from .inflate import Crop, limb_profile, signed_distance
-from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, relax, standing_mesh, surface_of_size
+from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, standing_mesh
 from .primitives import FINER, Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
+from .surface_mesh import relax, surface_of_size
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float64]

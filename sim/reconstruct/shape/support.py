@@ -29,7 +29,7 @@ ON_BASE = 1e-6
 
 
 @dataclass(frozen=True)
-class Support:
+class SupportMargin:
     """How a closed body of uniform density stands on the level through its lowest vertex; lengths in the mesh's unit.
 
     margin: from the foot of its centre of mass to the edge of the convex hull of its base, negative outside, -inf
@@ -54,14 +54,14 @@ class Support:
         return max(MARGIN_CELLS * self.cell, MARGIN_HEIGHT * self.height)
 
 
-def support_of(vertices: Points, faces: NDArray[np.int64]) -> Support:
+def support_of(vertices: Points, faces: NDArray[np.int64]) -> SupportMargin:
     """Return how the closed surface of ``vertices`` (V, 3) and ``faces`` (T, 3) stands; +Z is up."""
     extent = np.ptp(vertices, axis=0)
     a, b, c = (vertices[faces[:, corner]] - vertices.mean(axis=0) for corner in range(3))
     volumes = np.einsum("ti,ti->t", a, np.cross(b, c))
     total = float(volumes.sum())
     centre = vertices.mean(axis=0) + ((a + b + c) * volumes[:, None]).sum(axis=0) / (4.0 * total)
-    stands = Support(-np.inf, 0.0, float(extent[2]), abs(total) / 6.0, float(extent.max()))
+    stands = SupportMargin(-np.inf, 0.0, float(extent[2]), abs(total) / 6.0, float(extent.max()))
     base = _base(vertices, faces, ON_BASE * stands.longest, FILM * stands.cell)
     margin, inradius = stands.margin, stands.inradius
     if len(base) >= 3:
