@@ -181,7 +181,7 @@ def world_of(
     if held:
         foot = sample.positions[:, 2] < vertices[:, 2].min() + 0.6 * options.cell_size(similarity)
         body = dataclasses.replace(body, pins=foot)
-    bounce = material.restitution if material.law == "rigid" else 0.0
+    bounce = material.rigid_restitution if material.law == "rigid" else 0.0
     return World(
         bodies=[body],
         gravity=(0.0, 0.0, 0.0 if held else -GRAVITY),

@@ -5,6 +5,7 @@ import dataclasses
 import math
 import zlib
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
@@ -107,11 +108,21 @@ LAW_ITEMS = [
 ]
 """Menu of constitutive models."""
 
+STARTS_AS = "medium"
+"""Preset of a new object; its numbers are the defaults of the properties."""
+
+
+def _from_medium(field: str, name: str, description: str = "", **arguments: Any) -> Any:
+    """Return the property of a field of ``Material`` with the number of the preset that a new object has."""
+    start = {"default": getattr(_SHIPPED.good[STARTS_AS], field)}
+    return from_field(Material, field, name, description, **{**start, **arguments})
+
+
 NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "preset")
 """Fields of ``sim.scene.material.Material`` that the user can set."""
 
 LAW_FIELDS = {
-    "rigid": ("restitution",),
+    "rigid": ("rigid_restitution",),
     **{model.law: tuple(name for name in model.reads if name not in model.hidden) for model in models()},
 }
 """Fields besides the density that a constitutive model uses; the others are stored without effect."""
@@ -173,11 +184,10 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         get=_get_preset,
         set=_set_preset,
     )
-    preset_name: StringProperty(default="medium")
+    preset_name: StringProperty(default=STARTS_AS)
     """Shown by ``preset``; also if there is no such preset on this computer."""
-    law: from_field(Material, "law", "Behaviour", "Constitutive model", items=LAW_ITEMS)
-    density: from_field(
-        Material,
+    law: _from_medium("law", "Behaviour", "Constitutive model", items=LAW_ITEMS)
+    density: _from_medium(
         "density",
         "Density",
         "Mass per volume in kg/m³: water 1000, wood 500, steel 7800",
@@ -186,102 +196,89 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         soft_max=8000.0,
         precision=1,
     )
-    youngs_modulus: from_field(
-        Material,
+    youngs_modulus: _from_medium(
         "youngs_modulus",
         "Stiffness",
         "Young's modulus in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
         soft_max=1e8,
         precision=0,
     )
-    poisson_ratio: from_field(
-        Material,
+    poisson_ratio: _from_medium(
         "poisson_ratio",
         "Poisson's Ratio",
         "Lateral bulging under compression: cork 0, most materials 0.3, rubber 0.45",
         precision=3,
     )
-    damping_time: from_field(
-        Material,
+    damping_time: _from_medium(
         "damping_time",
         "Damping",
         "Damping time in seconds: viscosity over stiffness (Kelvin-Voigt). 0: none",
         soft_max=0.1,
         precision=4,
     )
-    relaxing_share: from_field(
-        Material,
+    relaxing_share: _from_medium(
         "relaxing_share",
         "Relaxing Share",
         "Stiffness that gives way with time, over the lasting one. 0: bounces on; rubber 0.1, plush 2",
         soft_max=5.0,
         precision=2,
     )
-    relaxation_time: from_field(
-        Material,
+    relaxation_time: _from_medium(
         "relaxation_time",
         "Relaxation Time",
         "Seconds in which the relaxing part gives way",
         soft_max=1.0,
         precision=4,
     )
-    restitution: from_field(
-        Material,
-        "restitution",
+    rigid_restitution: _from_medium(
+        "rigid_restitution",
         "Bounce",
         "Speed after over speed before an impact on hard things, where surfaces say none",
         precision=2,
     )
-    yield_stress: from_field(
-        Material,
+    yield_stress: _from_medium(
         "yield_stress",
         "Yield Stress",
         "Stress in Pa above which deformation is permanent",
         soft_max=1e8,
         precision=0,
     )
-    friction_angle: from_field(
-        Material, "friction_angle", "Friction Angle", "Internal friction angle; about the slope of a heap"
+    friction_angle: _from_medium(
+        "friction_angle", "Friction Angle", "Internal friction angle; about the slope of a heap"
     )
-    critical_compression: from_field(
-        Material,
+    critical_compression: _from_medium(
         "critical_compression",
         "Compression",
         "Compressive strain above which snow packs permanently",
         precision=4,
     )
-    critical_stretch: from_field(
-        Material, "critical_stretch", "Stretch", "Tensile strain above which snow tears", precision=4
-    )
-    hardening: from_field(Material, "hardening", "Hardening", "Stiffening of packed snow")
-    bulk_modulus: from_field(
-        Material,
+    critical_stretch: _from_medium("critical_stretch", "Stretch", "Tensile strain above which snow tears", precision=4)
+    hardening: _from_medium("hardening", "Hardening", "Stiffening of packed snow")
+    bulk_modulus: _from_medium(
         "bulk_modulus",
         "Bulk Modulus",
         "Bulk modulus of a fluid in Pa. Real water has 2.2e9; 2e5 is enough here, and faster",
         soft_max=1e7,
         precision=0,
     )
-    viscosity: from_field(
-        Material,
+    viscosity: _from_medium(
         "viscosity",
         "Viscosity",
         "Dynamic viscosity in Pa s: water 0.001, honey 10",
         soft_max=100.0,
         precision=3,
     )
-    fibre_modulus: from_field(
-        Material,
+    fibre_modulus: _from_medium(
         "fibre_modulus",
         "Fibre Modulus",
         "Stiffness in Pa that fibres add along their axis; 0 for none",
         soft_max=1e8,
         precision=0,
     )
-    fibre_axis: from_field(Material, "fibre_axis", "Fibre Axis", "Direction of the fibres at rest", subtype="DIRECTION")
+    fibre_axis: _from_medium("fibre_axis", "Fibre Axis", "Direction of the fibres at rest", subtype="DIRECTION")
 
 
 # Parameters that a constitutive model adds to the material.
 PHYSGEN_PG_material.__annotations__.update(
-    {p.name: from_field(Material, p.name, readable(p.name)) for model in models() for p in model.parameters}
+    {p.name: _from_medium(p.name, readable(p.name)) for model in models() for p in model.parameters}
 )

@@ -123,7 +123,7 @@ def _bounce(item: SceneObject, ground: SurfaceContact) -> float:
     if item.role == "collider":
         return math.inf
     said = item.restitution is not None or ground.restitution > 0
-    return 0.0 if said or item.material.law != "rigid" else item.material.restitution
+    return 0.0 if said or item.material.law != "rigid" else item.material.rigid_restitution
 
 
 def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:

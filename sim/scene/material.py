@@ -49,8 +49,8 @@ class Material:
         shear modulus, over the law's own, of a spring beside it that gives way in this time (standard linear solid). It
         is what keeps soft toys and foam from bouncing for ever: the loss factor is at most
         share / (2 sqrt(1 + share)), at the angular frequency 1 / (relaxation_time sqrt(1 + share)).
-    restitution: 0 to 1; of ``rigid``: speed of leaving over speed of approach on what does not deform either, where
-        neither object nor ground say one.
+    rigid_restitution: 0 to 1; of ``rigid``: speed of leaving over speed of approach on what does not deform either,
+        where neither object nor ground say one.
     yield_stress: Pa, 1 to 1e12; of ``von_mises``, in tension.
     friction_angle: radians, 0.01 to 1.4; of ``sand``, internal.
     critical_compression, critical_stretch: strains, 1e-4 to 0.5; elastic limits of ``snow``.
@@ -72,7 +72,7 @@ class Material:
     damping_time: float = quantity(0.0, 0.0, 10.0, "seconds")
     relaxing_share: float = quantity(0.0, 0.0, 20.0)
     relaxation_time: float = quantity(0.01, 1e-5, 100.0, "seconds")
-    restitution: float = quantity(0.0, 0.0, 1.0)
+    rigid_restitution: float = quantity(0.0, 0.0, 1.0)
     yield_stress: float = quantity(1e4, 1.0, 1e12, "pascals")
     friction_angle: float = quantity(0.6, 0.01, 1.4, "radians")
     critical_compression: float = quantity(0.025, 1e-4, 0.5, "a strain")
