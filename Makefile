@@ -1,11 +1,12 @@
 # make demo | test | test-all | test-explore | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
-# PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on,
+# PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
 # WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
 # ZIPS=… which zips `make extension` builds (all, or names), BLENDER=… the program that `make test-blender-app` drives.
 SHELL := /bin/sh
 VENV ?= .venv
 TESTS ?= tests
+MARKS ?= not slow and not long
 WORKERS ?= auto
 DEMO_OUT ?= demo_out
 PYTHON ?= $(shell setup/pick_python.sh)
@@ -27,7 +28,7 @@ demo: setup
 	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT)
 
 test: setup
-	$(PYTEST) -m "not slow" $(TESTS)
+	$(PYTEST) -m "$(MARKS)" $(TESTS)
 
 test-all: setup
 	$(PYTEST) $(TESTS)

@@ -354,6 +354,7 @@ class Live(Bake):
         assert reached(), self.said
 
 
+@pytest.mark.long
 def test_a_bake_is_played_stopped_killed_and_goes_on(tmp_path):
     found = a_scene(frames=24, law="fixed_corotated")
     save(tmp_path)

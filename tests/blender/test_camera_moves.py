@@ -30,6 +30,7 @@ def camera_file(tmp_path, *keys):
     return str(path)
 
 
+@pytest.mark.long
 def test_the_moved_camera_sees_what_is_there(world, bake, truth, tmp_path):
     folder, plain = bake([REST, REST, REST]), tmp_path / "plain"
     path = camera_file(tmp_path, {"frame": 1}, {"frame": 3, **OFFSET})

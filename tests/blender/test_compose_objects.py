@@ -91,6 +91,7 @@ def test_the_active_object_stays_and_the_others_yield():
     assert not background_jobs.running()
 
 
+@pytest.mark.long
 def test_objects_that_share_a_mesh_part_ways_and_undo_takes_it_all_back():
     one = a_ball("one", 0.0, subdivisions=2)
     two = bpy.data.objects.new("two", one.data)
@@ -170,6 +171,7 @@ class Live(Compose):
         assert reached(), self.said
 
 
+@pytest.mark.long
 def test_it_shows_progress_and_cancelling_changes_nothing():
     one, two = a_ball("one", 0.0, subdivisions=2), a_ball("two", 0.08, subdivisions=2)
     bpy.context.scene.physgen_together.steps = 100_000

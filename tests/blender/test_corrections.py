@@ -218,6 +218,7 @@ def command_here(command, on_event, cancelled, **_):
     return said.events[-1]
 
 
+@pytest.mark.long
 def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, monkeypatch):
     """A mask and a horizon as told; then another back, for which nothing is cut out or filled in again."""
     scene, box = bpy.context.scene, photo.boxes[0]

@@ -29,6 +29,7 @@ def drawing():
         pytest.skip(str(error))
 
 
+@pytest.mark.long
 def test_eevee_draws_the_moved_ball_as_cycles_does(drawing, world, bake):
     """At half the size and one sample; test-all compares whole pictures, soft shadows and outlines."""
     opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)

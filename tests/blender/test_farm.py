@@ -73,6 +73,7 @@ def states(process):
     return {e["task"]: e["state"] for e in ended}
 
 
+@pytest.mark.long
 def test_whatever_is_killed_costs_a_retry_and_nothing_else(job):
     # The scheduler itself, in the middle of the bake: what it had started ends by itself, what was done is kept.
     scheduler = physgen(job)

@@ -432,6 +432,7 @@ def test_what_is_no_photo_is_refused(tmp_path):
     assert not bpy.data.images
 
 
+@pytest.mark.long
 def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
     """The whole way, blocking as a script has it: boxes, child process, import."""
     photo = tmp_path / "ball.png"

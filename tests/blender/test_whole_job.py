@@ -102,6 +102,7 @@ def test_the_same_again_does_nothing(job, photo):
     assert sum("up to date" in e.get("message", "") for e in events) >= 4
 
 
+@pytest.mark.long
 def test_another_material_bakes_again_without_reconstructing(job, photo):
     work, _ = job
     before, baked = state(work), load_manifest(work / "bake").inputs_hash

@@ -103,6 +103,7 @@ def test_what_flows_gets_its_particles(ball_scene, material, effects, points):
     assert extra == (12 * 4 * with_points.prepared.particle_count if points else 0)
 
 
+@pytest.mark.long
 def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_scene, tmp_path, monkeypatch):
     folder = crooked(ball_scene(preset="sand", velocity=(0.0, 0.0, -1.0)))
     options = dataclasses.replace(POINTS, space="mesh")

@@ -148,6 +148,7 @@ def bake_here(command, on_event, cancelled, **_):
     return run_job(Path(command[-1]), on_event, cancelled)
 
 
+@pytest.mark.long
 def test_stages_one_by_one(first_fill, tmp_path, photo, physgen, monkeypatch):
     scene, bake = tmp_path / "scene", tmp_path / "bake"
     reconstruct = [

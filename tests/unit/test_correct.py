@@ -81,6 +81,7 @@ def corrected(scene, **changes):
     return changed(scene, before)
 
 
+@pytest.mark.long
 def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_path):
     assert corrected(scene, size_m=0.3) == set()
     assert load_scene(scene).model.objects[0].size_m == pytest.approx(0.3)

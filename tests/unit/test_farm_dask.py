@@ -83,6 +83,7 @@ class Killer:
             psutil.Process(self._pids[name]).kill()
 
 
+@pytest.mark.long
 def test_a_killed_worker_and_a_killed_command_cost_a_retry_and_nothing_else(ball_scene, tmp_path):
     ball_scene()
     plan = a_plan(

@@ -152,6 +152,7 @@ def test_progress_counts_up_to_the_end(result):
     json.dumps(events)
 
 
+@pytest.mark.long
 def test_again_gives_the_same_scene(first_fill, small_photo, tmp_path):
     requests = [
         small_request(name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),

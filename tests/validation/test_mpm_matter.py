@@ -245,6 +245,7 @@ def test_a_pile_below_its_angle_of_repose_stands(options, similarity, cell):
     assert np.linalg.norm(world.positions(0) - pile.positions, axis=1).max() < 0.1 * cell
 
 
+@pytest.mark.long
 def test_a_pile_above_its_angle_of_repose_slides(options, similarity, cell):
     """A slope of 48 degrees of sand of 28.6 degrees comes to rest below 28.6 degrees, and no volume is made or lost.
     Its flank, from 30 to 70 % of its height, is within 5 degrees of the angle, as dry sand starts and stops."""
@@ -311,6 +312,7 @@ def pond(similarity, depth: int) -> tuple[World, float]:
     return world, cell
 
 
+@pytest.mark.long
 def test_a_pond_stays_above_the_ground_and_keeps_its_volume(similarity):
     """0.1 cell deep at most, as for solids; the mean compression is rho g H / 2K = 0.6 %, so 1 %."""
     world, cell = pond(similarity, 4)
