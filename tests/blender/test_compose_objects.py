@@ -65,6 +65,7 @@ def refused(words):
         bpy.ops.physgen.compose_objects()
 
 
+@pytest.mark.long
 def test_the_active_object_stays_and_the_others_yield():
     stays, yields = a_ball("Stays.001", 0.0), a_ball("Yields", 0.08)
     # An object of another scale and turn: its mesh is in its own space.

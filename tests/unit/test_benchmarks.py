@@ -39,6 +39,7 @@ def test_the_list_names_every_benchmark_with_what_it_measures(capsys):
         main(["no_such_benchmark"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_a_benchmark_runs_quickly_and_prints_json(name):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:

@@ -39,6 +39,7 @@ def check_closed_manifold(part):
     assert volume(part) > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_parts_fit_at_the_truth_and_not_at_the_start(name):
     item = asset(name)

@@ -55,6 +55,7 @@ def resolved(background: Surface, foreground: Surface, steps: int, **options: fl
     return body, carried
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("too_thick, keep", [(0.05, 0.0), (0.15, 1.0)])
 def test_finger_is_squeezed_into_its_ring(too_thick, keep):
     """Nothing leaks to the ring's outside, though the finger's skin lies in the outer half of its wall (15 %)."""
@@ -96,6 +97,7 @@ TAPER = revolved((0, 0), (0.012, 0), (0.008, 0.06), (0, 0.06))
 THIN_RING = trimesh.creation.torus(major_radius=0.0115, minor_radius=0.0015, major_sections=64, minor_sections=16)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "background, foreground, stays",
     [

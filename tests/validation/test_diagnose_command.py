@@ -57,6 +57,7 @@ def capture(tmp_path_factory):
     return folder, takes[2][1]
 
 
+@pytest.mark.long
 def test_drag_is_found_predicted_confirmed_and_reported(capture, tmp_path, capsys):
     folder, truth = capture
     out = tmp_path / "diagnosis"

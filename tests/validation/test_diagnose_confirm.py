@@ -106,6 +106,7 @@ def test_a_wrong_verdict_is_not_confirmed():
     assert result.word == "contradicted" and result.before_rms_m < 2e-3 < result.after_rms_m
 
 
+@pytest.mark.long
 def test_a_fast_clock_is_given_to_the_engine():
     real = flight(DRAG * 0, frames=60)
     recorded = dataclasses.replace(real, times=real.times / 1.1)

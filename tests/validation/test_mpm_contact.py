@@ -17,6 +17,7 @@ def tilt(angle: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("height_in_cells", [0.0, 0.23, 0.5, 0.81])
 @pytest.mark.parametrize("youngs_modulus", [5e4, 2e6])
 def test_box_at_rest_has_its_underside_on_the_ground(box, options, similarity, cell, height_in_cells, youngs_modulus):

@@ -187,6 +187,7 @@ def test_a_plastic_bar_shortens_on_impact_as_in_taylors_test(similarity):
     assert lengths[2] == pytest.approx(lengths[1], abs=0.01 * (1 - lengths[1]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share, stands", [(0.7, True), (2.5, False)])
 def test_clay_stands_up_to_the_height_that_it_bears(options, similarity, cell, share, stands):
     """A column yields at its foot where rho g h exceeds the yield stress. Below, it stays elastic (shorter by

@@ -105,6 +105,7 @@ def test_the_error_of_a_bars_frequency_falls_faster_than_the_cells(bar_frequency
     assert min(orders) > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ratio", [1.0, 4.0, 100.0])
 def test_fibres_stiffen_a_bar_along_them(bar_frequency, ratio):
     """Modulus E + k along the fibres, so the frequency grows by sqrt((E + k) / E) within 3 % (the issue's)."""
@@ -113,6 +114,7 @@ def test_fibres_stiffen_a_bar_along_them(bar_frequency, ratio):
     assert along == pytest.approx(bar_frequency(elastic()), rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("poisson_ratio", [0.0, 0.3])
 def test_fibres_leave_a_bar_across_them_as_it_is(bar_frequency, poisson_ratio):
     """Across the fibres the frequency stays within 3 % of what linear theory has: the modulus E for nu = 0, otherwise
@@ -129,6 +131,7 @@ def upper(low, high):
     return lambda places: np.where(places[:, 2] > 0, high, low)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "stiffer, denser, fields",
     [

@@ -32,6 +32,7 @@ def plate(center, size, name="plate", **motion) -> Collider:
     return Collider(name=name, surface=surface, **motion)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["ball", "box"])
 @pytest.mark.parametrize("restitution", [0.0, 0.3, 0.5, 0.8, 1.0])
 def test_bounce_height(box_body, ball_body, solids, shape, restitution):
