@@ -53,7 +53,7 @@ def cone(a: Triple, b: Triple, radius_a: float, radius_b: float) -> Field:
     def field(p: Array) -> Array:
         height = (p - start) @ unit
         radius = lengths(p - start - height[:, None] * unit)
-        # Which of three parts is nearest is told along the mantle's own direction.
+        # The coordinate along the mantle decides which of the three parts is nearest.
         place = height * rise - radius * slope
         low, high = np.hypot(radius, height) - radius_a, np.hypot(radius, height - length) - radius_b
         mantle = radius * rise + height * slope - radius_a
@@ -192,7 +192,7 @@ def mesh_of(field: Field, low: Triple, high: Triple, spacing: float) -> tuple[Ar
     box is cut open, so give a box with room.
     """
     side = BLOCK * spacing
-    # A shift that nobody models in keeps flat faces off the lattice's planes, where marching cubes makes slivers.
+    # A shift by no round number keeps flat faces off the lattice's planes, where marching cubes makes slivers.
     origin = np.array(low) - side * np.array([1.0137, 1.0271, 1.0093])
     blocks = np.ceil((np.array(high) - origin) / side).astype(np.int64) + 1
     index = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), axis=-1).reshape(-1, 3)

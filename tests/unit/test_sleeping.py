@@ -117,7 +117,7 @@ def test_a_static_table_carries_and_a_moving_one_keeps_awake():
 
 def test_a_scene_says_what_will_not_stay(ball_scene):
     """On the ground a ball of 10 cm stays; 1 cm above it (over half a cell of the coarsest quality) it falls, and that
-    is said, unless it is thrown or nobody claims that it rests."""
+    is said, unless it is thrown or is not marked asleep."""
     for height, fields, said in (
         (0.05, {}, False),
         (0.06, {}, True),

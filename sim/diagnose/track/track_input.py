@@ -194,7 +194,7 @@ def _density(item: SceneObject) -> float:
 
 
 def _contacts(scene: SceneModel) -> ContactTable:
-    # With all that prepares worlds below it, which nobody needs who asks for the options alone.
+    # Imported here: it pulls in the preparation of worlds, which reading the options does not need.
     from ...app.world_setup import contact_table
 
     return contact_table(scene)

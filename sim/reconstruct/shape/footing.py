@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A broader base for inflated bodies: what hangs over the ground where nobody sees it comes down to it.
+"""A broader base for inflated bodies: the hidden underside is lowered to the ground.
 
 Inflated bodies are round below and would stand on a spot, where real things have settled. The part of the underside
 that faces away from the camera sags to the ground wherever the body still hides it there. The photo shows none of it:
@@ -15,6 +15,7 @@ from scipy import ndimage
 from ...scene.model import Camera
 from .inflate import Silhouette
 from .support import support_of
+from .surface_mesh import area_normals
 
 Points = NDArray[np.float64]
 
@@ -50,11 +51,7 @@ def _settled(
     camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64], height: float
 ) -> Points:
     """``vertices`` with the hidden underside below ``height`` on the ground, and what is above it drawn after."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], across)
+    normals = area_normals(vertices, faces)
     unseen = np.einsum("ij,ij->i", normals, camera.position - vertices) < 0.0
     z = vertices[:, 2]
     sagged = vertices.copy()

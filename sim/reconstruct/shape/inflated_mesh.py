@@ -23,6 +23,7 @@ from ...scene.model import Camera
 from .footing import footed
 from .inflate import Silhouette
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
+from .support import centroid, inside_hull
 from .surface_mesh import RELAXATION_ROUNDS, Faces, Points, relax, surface_of_size
 
 STABLE = 0.25
@@ -49,18 +50,7 @@ def stability(vertices: Points, faces: NDArray[np.int64]) -> float:
     volumes = np.einsum("ti,ti->t", a, np.cross(b, c))
     centre = ((a + b + c) * volumes[:, None]).sum(axis=0) / (4.0 * volumes.sum())
 
-    def inside(point: NDArray[np.float64]) -> float:
-        return -float((hull.equations[:, :2] @ point + hull.equations[:, 2]).max())
-
-    return inside(centre[:2]) / max(inside(_centroid(base[hull.vertices])), 1e-12)
-
-
-def _centroid(polygon: Points) -> NDArray[np.float64]:
-    """Centroid of the area of a convex ``polygon`` (n, 2) with ordered corners."""
-    first = polygon[0]
-    a, b = polygon[1:-1] - first, polygon[2:] - first
-    areas = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return np.asarray(first + ((a + b) * areas[:, None]).sum(axis=0) / (3.0 * areas.sum()))
+    return inside_hull(hull, centre[:2]) / max(inside_hull(hull, centroid(base[hull.vertices])), 1e-12)
 
 
 BARE_THICKNESS = 0.8
@@ -229,7 +219,7 @@ def inflated_mesh(
 
 
 def _footed(camera: Camera, silhouette: Silhouette, body: BodyMesh) -> BodyMesh:
-    """``body`` with a broader base where nobody sees it."""
+    """``body`` with its hidden underside lowered to the ground."""
     vertices, moved = footed(camera, silhouette, body.vertices, body.faces)
     pixels = np.where(moved[:, None], camera.project(vertices)[:, :2], body.pixels)
     return replace(body, vertices=vertices, pixels=pixels)

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from .surface_mesh import area_normals
+
 Points = NDArray[np.float64]
 
 MARGIN_CELLS = 2.0
@@ -70,19 +72,15 @@ def support_of(vertices: Points, faces: NDArray[np.int64]) -> SupportMargin:
         except QhullError:
             pass
         else:
-            margin = _inside(hull, centre[:2])
-            inradius = _inside(hull, _centroid(base[hull.vertices]))
+            margin = inside_hull(hull, centre[:2])
+            inradius = inside_hull(hull, centroid(base[hull.vertices]))
     return replace(stands, margin=float(margin), inradius=float(inradius))
 
 
 def _base(vertices: Points, faces: NDArray[np.int64], level: float, film: float) -> Points:
     """Places (n, 2) of the lowest vertices, to ``level``, over which the body is thicker than ``film``."""
     height = vertices[:, 2] - vertices[:, 2].min()
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], across)
+    normals = area_normals(vertices, faces)
     lowest = height < level
     up = (normals[:, 2] > FACES_UP * np.linalg.norm(normals, axis=1)) & ~lowest
     if not up.any() or not lowest.any():
@@ -91,12 +89,13 @@ def _base(vertices: Points, faces: NDArray[np.int64], level: float, film: float)
     return np.asarray(vertices[lowest][height[up][over] > film][:, :2])
 
 
-def _inside(hull: ConvexHull, point: NDArray[np.float64]) -> float:
+def inside_hull(hull: ConvexHull, point: NDArray[np.float64]) -> float:
+    """Return the distance of ``point`` (2,) from the edge of ``hull`` (in the plane), negative outside."""
     return -float((hull.equations[:, :2] @ point + hull.equations[:, 2]).max())
 
 
-def _centroid(polygon: Points) -> NDArray[np.float64]:
-    """Centroid of the area of a convex ``polygon`` (n, 2) with ordered corners."""
+def centroid(polygon: Points) -> NDArray[np.float64]:
+    """Return the centroid (2,) of the area of a convex ``polygon`` (n, 2) with ordered corners."""
     first = polygon[0]
     a, b = polygon[1:-1] - first, polygon[2:] - first
     areas = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -21,6 +21,7 @@ from .body_texture import CropTexture, TexturedSurface
 from .inflated_mesh import BodyMesh
 from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_grain
 from .surface_charts import surface_frame, unwrap
+from .surface_mesh import area_normals
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -149,11 +150,7 @@ def _pixels_per_unit(camera: Camera, vertices: Points) -> float:
 
 
 def _vertex_normals(body: BodyMesh) -> Points:
-    a, b, c = (body.vertices[body.faces[:, corner]] for corner in range(3))
-    cross = np.cross(b - a, c - a)
-    summed = np.zeros_like(body.vertices)
-    for corner in range(3):
-        np.add.at(summed, body.faces[:, corner], cross)
+    summed = area_normals(body.vertices, body.faces)
     return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
 
 
