@@ -14,7 +14,6 @@ from pathlib import Path
 from ..physgen_addon.render.render_options import RenderOptions, render_arguments, require_video_name
 from ..sim.app import bake_worker
 from ..sim.app.bake_options import BakeOptions, inputs_hash
-from ..sim.app.bake_quality import load_quality
 from ..sim.app.reconstruct import Physics, reconstruct, require_physics
 from ..sim.app.stage_process import own_command, run_stage
 from ..sim.cache.bake_folder import Bake, load_bake
@@ -23,6 +22,7 @@ from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.reasoning.chat_client import ChatRequest
 from ..sim.reconstruct.reconstruct_options import object_names
+from ..sim.scene.bake_quality import load_quality
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
 

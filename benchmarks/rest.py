@@ -28,7 +28,6 @@ import numpy as np
 import trimesh
 from physgen.benchmarks.common import benchmark_parser
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.app.bake_quality import quality_names
 from physgen.sim.app.reconstruct import reconstruct
 from physgen.sim.app.simulation import start_world
 from physgen.sim.app.world_setup import prepare_world
@@ -36,6 +35,7 @@ from physgen.sim.errors import PhysGenError
 from physgen.sim.importers.mesh_scene import scene_from_meshes
 from physgen.sim.reconstruct import ObjectRequest
 from physgen.sim.reconstruct.shape.support import support_of
+from physgen.sim.scene.bake_quality import quality_names
 from physgen.sim.scene.folder import SCENE_FILE, Scene, load_scene
 from physgen.sim.scene.material import load_preset, preset_names
 from physgen.sim.scene.meshes import ObjectMesh, load_object_mesh

@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from physgen.sim.smoothstep import smoothstep
 
 from .sdf import Array, Field, Triple, Warp, mesh_of
 
@@ -31,8 +32,7 @@ def over(colours: Array, share: Array, code: str) -> Array:
 
 def inside(values: Array, soft: float) -> Array:
     """Share 1 where ``values`` are below 0, fading over ``soft`` of their unit."""
-    part = np.clip(0.5 - values / soft, 0.0, 1.0)
-    return part * part * (3.0 - 2.0 * part)
+    return smoothstep(0.5 - values / soft)
 
 
 def bands(coordinate: Array, period: float, soft: float, duty: float = 0.5) -> Array:
@@ -52,8 +52,7 @@ def dots(points: Array, spacing: float, radius: float, soft: float, seed: int) -
 def noise(points: Array, size: float, seed: int) -> Array:
     """Smooth noise of -1 to 1, about 0, whose grains are ``size`` metres wide."""
     cell = np.floor(points / size).astype(np.int64)
-    part = points / size - cell
-    part = part * part * (3.0 - 2.0 * part)
+    part = smoothstep(points / size - cell)
     total = np.zeros(len(points))
     for corner in product((0, 1), repeat=3):
         weight = np.where(np.array(corner, bool), part, 1.0 - part).prod(axis=1)

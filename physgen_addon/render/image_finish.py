@@ -16,6 +16,7 @@ from ...sim.composite.compositing import ObjectLayer
 from ...sim.composite.pull_push import spread_values
 from ...sim.composite.srgb import Linear
 from ...sim.scene.model import Camera, SceneModel
+from ...sim.smoothstep import smoothstep
 from .clean_plate import CleanPlate
 from .motion_blur import Vertices
 from .render_options import RenderOptions
@@ -95,8 +96,8 @@ class ImageFinish:
         for rest, positions in zip(self._rest, now, strict=True):
             distance = np.linalg.norm(self._pixels(camera, positions) - self._pixels(self._camera, rest), axis=1)
             start, end = MOVED_PX
-            t = np.clip((np.nan_to_num(distance, nan=end, posinf=end) - start) / (end - start), 0.0, 1.0)
-            weights.append((t * t * (3.0 - 2.0 * t)).astype(np.float32))
+            moved = smoothstep(np.nan_to_num(distance, nan=end, posinf=end), start, end)
+            weights.append(moved.astype(np.float32))
         return weights
 
     def _magnification(self, camera: Camera, now: Vertices) -> list[NDArray[np.float64]]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.scene.model import Camera, SceneModel
+from ...sim.smoothstep import smoothstep
 
 MARGIN_PX = 3
 SHADOW_REACH = 4.0
@@ -170,7 +171,7 @@ def feather(box: Box, size: tuple[int, int], share: float = 0.12) -> NDArray[np.
             weight = np.minimum(weight, position / width)
         if not at_end:
             weight = np.minimum(weight, (count - position) / width)
-        return (weight * weight * (3 - 2 * weight)).astype(np.float32)
+        return smoothstep(weight).astype(np.float32)
 
     width, height = size
     rows = ramp(box.height, box.y0 == 0, box.y1 == height)

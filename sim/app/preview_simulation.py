@@ -26,13 +26,13 @@ from ..events import IsCancelled, OnEvent
 from ..mpm.colliders import Surface
 from ..mpm.cost_estimate import stable_step
 from ..mpm.solver_options import SolverOptions
+from ..scene.bake_quality import Quality
 from ..scene.folder import Scene, load_scene
 from ..scene.meshes import ObjectMesh, load_object_mesh
 from ..scene.model import GROUND, Box, Material, SceneModel, SceneObject
 from ..scene.overrides import apply_overrides
 from ..skinning import Binding, bind, deform
 from .bake_options import BakeOptions
-from .bake_quality import Quality
 from .preview_server import PreviewRequest
 from .simulation import Simulation, start_world
 from .world_setup import PreparedWorld, prepare_world

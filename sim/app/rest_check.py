@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from ..errors import InputError
 from ..mpm.sleeping import Sleepers
+from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
 from .bake_options import BakeOptions
 from .world_setup import prepare_world
-
-COARSEST = "preview"
-"""The quality whose cells are largest, and where a base therefore carries least."""
 
 
 def rest_notices(folder: Scene) -> list[str]:

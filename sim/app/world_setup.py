@@ -37,13 +37,13 @@ from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, samp
 from ..mpm.solver_options import SolverOptions
 from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
 from ..mpm.world_setup import WorldSetup
+from ..scene.bake_quality import Quality, load_quality
 from ..scene.folder import Scene
 from ..scene.meshes import ObjectMesh, load_vertex_track
 from ..scene.model import Contact, Ground, Keys, Material, Motion, SceneModel, SceneObject
 from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
-from .bake_quality import Quality, load_quality
 from .world_separation import separate
 from .world_setup_checks import require_above_ground, resolve, surface_warnings, vertices_at
 

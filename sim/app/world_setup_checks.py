@@ -15,10 +15,10 @@ from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import SAMPLING_BYTES, available_memory, require_memory
 from ..mpm.geometry.mesh_checks import check_surface
 from ..mpm.solver_options import SolverOptions, centred
+from ..scene.bake_quality import Quality
 from ..scene.meshes import ObjectMesh
 from ..scene.model import Ground
 from ..scene.units import Similarity
-from .bake_quality import Quality
 
 
 def moves(collider: Collider) -> bool:

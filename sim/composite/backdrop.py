@@ -22,6 +22,7 @@ from scipy import ndimage
 
 from ..scene.camera_path import level_forward
 from ..scene.model import Camera, Ground
+from ..smoothstep import smoothstep
 from .disocclusion import push_pull
 from .outpaint import Borders, needed_borders, pixel_grid, resample
 from .srgb import Linear
@@ -224,8 +225,8 @@ def split_depth(
     # Background off the proxy, such as a nearer wall, has its own depth; blended in smoothly, because a step would tear
     # the surface.
     share = np.where(foreground, 1.0, flat / base[inner])
-    away = np.clip((np.abs(share - 1.0) - GROUND_SHARE / 2) / GROUND_SHARE, 0.0, 1.0)
-    wanted = (1.0 + (share - 1.0) * away * away * (3.0 - 2.0 * away)).astype(np.float32)
+    away = smoothstep(np.abs(share - 1.0), GROUND_SHARE / 2, GROUND_SHARE * 1.5)
+    wanted = (1.0 + (share - 1.0) * away).astype(np.float32)
     behind = push_pull(np.repeat(wanted[..., None], 3, axis=-1), ~(foreground | own))[..., 0]
     return DepthLayers(layers=tuple(found), hidden=where, ratio=np.asarray(borders.padded(behind), dtype=np.float32))
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ..smoothstep import smoothstep
 from .srgb import Linear
 
 FADE_START = 0.004
@@ -48,13 +49,7 @@ def contact_displacement(
 
 def rest_weight(displacement: float) -> float:
     """Return 1 at rest, 0 when gone, smooth in between; ``displacement`` is that of ``contact_displacement``."""
-    return float(_smooth_fade(np.asarray(displacement), FADE_START, FADE_END))
-
-
-def _smooth_fade(value: NDArray[np.floating], start: float, end: float) -> NDArray[np.float64]:
-    """Return 1 up to ``start``, 0 from ``end``, smooth in between."""
-    t = np.clip((np.asarray(value, dtype=np.float64) - start) / (end - start), 0.0, 1.0)
-    return 1.0 - t * t * (3.0 - 2.0 * t)
+    return float(1.0 - smoothstep(np.asarray(displacement, dtype=np.float64), FADE_START, FADE_END))
 
 
 def influence(places: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
@@ -91,7 +86,7 @@ def rim_strength(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[
         width = max(2.0, RIM_SHARE * max(mask.shape))
         distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
         rim = (distance <= width) & ~mask & ~others
-        strength[rim] = _smooth_fade(np.asarray(distance[rim], dtype=np.float64), width / 2, width)
+        strength[rim] = 1.0 - smoothstep(np.asarray(distance[rim], dtype=np.float64), width / 2, width)
     return strength
 
 
@@ -115,7 +110,7 @@ class Rim:
         if not len(self._known):
             return
         moved = np.linalg.norm(np.asarray(now_px) - self._rest_px, axis=1)[self._vertex]
-        weight = _smooth_fade(np.nan_to_num(moved, nan=np.inf, posinf=1e9), *RIM_FADE_PX)
+        weight = 1.0 - smoothstep(np.nan_to_num(moved, nan=np.inf, posinf=1e9), *RIM_FADE_PX)
         at_rest[self._pixels] *= (1.0 - self._strength * (1.0 - weight)).astype(np.float32)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..smoothstep import smoothstep
 from . import srgb
 from .inpaint import FillOptions, inpaint
 
@@ -65,7 +66,7 @@ class Borders:
             beyond.append(np.clip(1.0 - share, 0.0, 1.0))
         weight = np.minimum(beyond[0][:, None], beyond[1][None, :])[..., None]
         # Perception is logarithmic, so a shadow fades as a power of itself.
-        return np.asarray(self.padded(ratio) ** (weight * weight * (3.0 - 2.0 * weight)), dtype=np.float32)
+        return np.asarray(self.padded(ratio) ** smoothstep(weight), dtype=np.float32)
 
 
 def needed_borders(

@@ -81,13 +81,19 @@ class Engine:
     """
 
     def __init__(
-        self, *, capacity: int, cfl_elastic: float, cfl_velocity: float, numbers: PackedWorlds, solids: RigidBodies
+        self,
+        *,
+        capacity: int,
+        cfl_elastic: float,
+        cfl_velocity: float,
+        numbers: PackedWorlds,
+        rigid_bodies: RigidBodies,
     ) -> None:
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
-        self.solids = solids
-        self._most_solids = int(numbers.world_integers[:, layout.SOLIDS].max())
+        self.rigid_bodies = rigid_bodies
+        self._most_rigid_bodies = int(numbers.world_integers[:, layout.RIGID_BODIES].max())
         self._running = ti.ndarray(ti.i32, 1)
-        self._touching = ti.ndarray(ti.f32, max(1, solids.count))
+        self._touching = ti.ndarray(ti.f32, max(1, rigid_bodies.count))
         self.laws = numbers.laws
         models = law_set(self.laws)
         self._flowing = models.flowing
@@ -159,7 +165,7 @@ class Engine:
             self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
             self._touched, self._slack = ti.ndarray(ti.i32, p), ti.ndarray(ti.f32, p)
-            self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_solids * PUSH))
+            self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_rigid_bodies * PUSH))
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
             self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
             self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
@@ -345,9 +351,9 @@ class Engine:
         self._list_contacts()
 
     def _list_contacts(self) -> None:
-        solids = self.solids
+        rigid = self.rigid_bodies
         near, blocks, grid = self._near_blocks(), self._blocks(), self._grid()
-        found = broad_phase.list_near_blocks(self._worlds(), blocks, grid, near, solids.bodies, solids.shapes)
+        found = broad_phase.list_near_blocks(self._worlds(), blocks, grid, near, rigid.bodies, rigid.shapes)
         self._touched.fill(0)
         self._slack.fill(0.0)
         self._near = (int(found[0]), int(found[1]))
@@ -364,7 +370,7 @@ class Engine:
 
     def _stable_steps(self, control: Array) -> Array:
         scale = control[:, layout.CFL_SCALE]
-        fastest = np.maximum(control[:, layout.SPEED], control[:, layout.SOLID_SPEED])
+        fastest = np.maximum(control[:, layout.SPEED], control[:, layout.RIGID_SPEED])
         wave = scale * self.cfl_elastic / np.maximum(control[:, layout.WAVE_SPEED], 1e-30)
         step = np.minimum(control[:, layout.LONGEST_STEP], wave)
         return np.asarray(np.minimum(step, scale * self.cfl_velocity / np.maximum(fastest, 1e-30)))
@@ -388,7 +394,7 @@ class Engine:
         while (control[:, layout.STATUS] == layout.WANTS_SORT).any():
             self._put_control(control)
             means = self._means.to_numpy() if self._mean_fields else None
-            before = self.solids.state() if self.solids.count else None
+            before = self.rigid_bodies.state() if self.rigid_bodies.count else None
             self._sort()
             while True:
                 prime_worlds(self._limits(), self._worlds())
@@ -402,7 +408,7 @@ class Engine:
                 elif stop():
                     raise Stopped
                 else:
-                    self._advance_solids()
+                    self._advance_rigid_bodies()
                 after = self.control()
                 lost = after[:, layout.STATUS] == layout.DIVERGED
                 if not lost.any():
@@ -413,7 +419,7 @@ class Engine:
                 if means is not None:
                     self._means.from_numpy(means)
                 if before is not None:
-                    self.solids.put_back(before)
+                    self.rigid_bodies.put_back(before)
                 self._group()
                 if attempts.max() > MOST_RETRIES:
                     self._put_control(control)
@@ -429,15 +435,15 @@ class Engine:
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
         self._put_control(control)
 
-    def _advance_solids(self) -> None:
+    def _advance_rigid_bodies(self) -> None:
         """All substeps of all worlds, none of which holds particles."""
-        solids = self.solids
-        advance_bodies(self._limits(), self._worlds(), solids.bodies, solids.shapes, solids.contacts)
+        rigid = self.rigid_bodies
+        advance_bodies(self._limits(), self._worlds(), rigid.bodies, rigid.shapes, rigid.contacts)
 
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""
         return substep_launcher(
-            runtime.generation(), self.laws, self._overlap[2] > 0, self.solids.count > 0, self._near[0] > 0
+            runtime.generation(), self.laws, self._overlap[2] > 0, self.rigid_bodies.count > 0, self._near[0] > 0
         )
 
     # ---- bundles ------------------------------------------------------------------------------------------------
@@ -454,10 +460,10 @@ class Engine:
             "particles": self._particle_bundle(),
             "nodes": NodeArrays(self._window, self._scattered, self._nodes, self._sums, self._masses, self._block_sums),
             "flow": FlowArrays(self._past_window, self._past_scattered, self._past_nodes),
-            "bodies": self.solids.bodies,
-            "shapes": self.solids.shapes,
-            "contacts": self.solids.contacts,
-            "coupling": CouplingArrays(self.solids.count, self._most_solids, self._touching, self._pushes),
+            "bodies": self.rigid_bodies.bodies,
+            "shapes": self.rigid_bodies.shapes,
+            "contacts": self.rigid_bodies.contacts,
+            "coupling": CouplingArrays(self.rigid_bodies.count, self._most_rigid_bodies, self._touching, self._pushes),
             "running": self._running,
         }
 

@@ -125,7 +125,7 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
         setup, soft = place.setup, place.soft
         obstacles = collider_names(setup)
         row = world_integers[place.world]
-        row[layout.FIRST_SOLID], row[layout.SOLIDS] = first_body, len(obstacles)
+        row[layout.FIRST_RIGID_BODY], row[layout.RIGID_BODIES] = first_body, len(obstacles)
         row[layout.FIRST_FIELD], row[layout.FIELDS] = place.first_field, len(soft)
         row[layout.FIRST_PAIR] = len(pairs)
         first_body += len(obstacles)

@@ -17,7 +17,7 @@ from .colliders import SAME_TIME
 from .diagnostics import FittedGradients
 from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks
 from .kernels import layout, runtime
-from .kernels.time_stepping import SOLID_LOST
+from .kernels.time_stepping import RIGID_LOST
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
 from .solver_options import SolverOptions
@@ -28,7 +28,7 @@ State = dict[str, NDArray[np.generic]]
 
 CHECKPOINT_FORMAT = 2
 
-SOLIDS = "solids."
+RIGID_PREFIX = "solids."
 """Prefix of the rigid bodies' arrays in a checkpoint."""
 
 ROUNDING = 1e-12
@@ -77,22 +77,22 @@ class WorldGroup:
                 self._asleep[self._first_body[world] : self._first_body[world + 1]] = sleepers.asleep
         self._times = np.zeros(len(self.setups))
         self._between = False
-        self._solids = self._new_solids()
+        self._rigid_bodies = self._new_rigid_bodies()
         self._engine = self._new_engine()
         self._host: State | None = None
         self._poses: dict[tuple[int, str], RigidPose] = {}
         self._fits: dict[int, FittedGradients] = {}
         self._reach_times(np.full(len(self), -math.inf))
 
-    def _new_solids(self) -> RigidBodies:
+    def _new_rigid_bodies(self) -> RigidBodies:
         origin = self.cells.points_to_world(np.zeros((1, 3)))[0]
         place = (float(origin[0]), float(origin[1]), float(origin[2]))
-        solids = RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
+        rigid_bodies = RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
         for world, setup in enumerate(self.setups):
             first = int(self._first_body[world])
             rigid = [i for i, body in enumerate(setup.bodies) if body.rigid and self._asleep[first + i]]
-            solids.asleep |= {(world, setup.bodies[i].name) for i in rigid}
-        return solids
+            rigid_bodies.asleep |= {(world, setup.bodies[i].name) for i in rigid}
+        return rigid_bodies
 
     def _new_engine(self) -> Engine:
         soft = [not body.rigid for setup in self.setups for body in setup.bodies]
@@ -101,7 +101,7 @@ class WorldGroup:
             cfl_elastic=self.options.cfl_elastic,
             cfl_velocity=self.options.cfl_velocity,
             numbers=packing.pack(self._places),
-            solids=self._solids,
+            rigid_bodies=self._rigid_bodies,
         )
 
     def __len__(self) -> int:
@@ -149,9 +149,9 @@ class WorldGroup:
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
-            if self._solids.count:
+            if self._rigid_bodies.count:
                 moving = np.flatnonzero(stops > self._times)
-                self._solids.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
+                self._rigid_bodies.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
             self._poses = {}
             longest = [self._longest_step(place) for place in self._places]
             self._host = None
@@ -210,7 +210,7 @@ class WorldGroup:
                 for i in sleepers.with_neighbours(woken, asleep):
                     self._asleep[first + i], self._started[first + i] = False, True
                     if place.setup.bodies[i].rigid:
-                        self._solids.asleep.discard((world, place.setup.bodies[i].name))
+                        self._rigid_bodies.asleep.discard((world, place.setup.bodies[i].name))
                     else:
                         choice = self._material_choice(place, i, now + SAME_TIME)
                         fresh.append(packing.particles(place, i, int(self._offsets[first + i]), choice))
@@ -373,8 +373,8 @@ class WorldGroup:
         soft = place.soft
         index = failure.field - place.first_field
         name = place.setup.bodies[soft[index] if 0 <= index < len(soft) else 0].name
-        if failure.field >= SOLID_LOST:
-            name = self._solids.name(failure.field - SOLID_LOST)
+        if failure.field >= RIGID_LOST:
+            name = self._rigid_bodies.name(failure.field - RIGID_LOST)
         return SimulationError(
             f"body {name!r}{where} became unstable after t = {time:g} s, and substeps shortened to "
             f"1/{2**MOST_RETRIES} did not help: check its density and Young's modulus, what hits it and how fast, or "
@@ -408,7 +408,7 @@ class WorldGroup:
         self._check_generation()
         self._check_whole()
         if (world, name) not in self._poses:
-            self._poses[(world, name)] = self._solids.pose(world, name)
+            self._poses[(world, name)] = self._rigid_bodies.pose(world, name)
         return self._poses[(world, name)]
 
     def started(self, number: int) -> bool:
@@ -450,8 +450,8 @@ class WorldGroup:
         state["offsets"] = self._offsets.astype(np.int64)
         state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
         state["grid"] = np.array(self.options.grid)
-        if self._solids.count:
-            state |= {f"{SOLIDS}{name}": values for name, values in self._solids.state().items()}
+        if self._rigid_bodies.count:
+            state |= {f"{RIGID_PREFIX}{name}": values for name, values in self._rigid_bodies.state().items()}
         return state
 
     def restore(self, checkpoint: Mapping[str, NDArray[np.generic]]) -> None:
@@ -474,10 +474,14 @@ class WorldGroup:
         self._times = np.array(checkpoint["times"], dtype=np.float64)
         self._started = np.array(checkpoint["started"], dtype=bool)
         self._asleep = np.array(checkpoint.get("asleep", np.zeros(len(self._started))), dtype=bool)
-        self._solids = self._new_solids()
-        if self._solids.count:
-            solids = {name.removeprefix(SOLIDS): checkpoint[name] for name in checkpoint if name.startswith(SOLIDS)}
-            self._solids.restore(solids)
+        self._rigid_bodies = self._new_rigid_bodies()
+        if self._rigid_bodies.count:
+            rigid_bodies = {
+                name.removeprefix(RIGID_PREFIX): checkpoint[name]
+                for name in checkpoint
+                if name.startswith(RIGID_PREFIX)
+            }
+            self._rigid_bodies.restore(rigid_bodies)
         self._engine = self._new_engine()
         self._engine.restore(checkpoint)
         self._between = False

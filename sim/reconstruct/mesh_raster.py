@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Textured triangle meshes to pictures: a z-buffer in numpy, perspective-correct, without lights.
+"""Triangle meshes to pixels: a z-buffer in numpy, perspective-correct, and the unlit colours of a textured mesh.
 
-It shows bodies as they are painted: the report's turntables and the benchmarks look at colours, not at shading.
+1/depth is linear on the screen, and so are w/depth of the barycentric coordinates w (Heckbert and Moreton,
+Interpolation for Polygon Texture Mapping and Shading, 1991).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -13,17 +15,164 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from ..scene.model import Camera
+
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
+Points = NDArray[np.float64]
 
+CHUNK = 2_000_000
+"""Pairs of triangle and pixel that are tested at a time."""
+NEAR = 1e-9
+"""Triangles that come this near, as depth, are left out."""
+DEPTH_CELLS = 256
+"""Cells along the longer side of the depth map of ``seen_faces``."""
+BEHIND = 0.015
+"""Depth tolerance of visible faces over the extent."""
 PLAIN = 190
 """Grey value of surfaces without texture and colours, 0 to 255."""
 MOST_LEVELS = 4
 """Halvings of a texture that are made for minification; more would mix the charts of an atlas."""
-CHUNK = 1_500_000
-"""Pairs of triangle and pixel that are tested at a time: about 60 MB."""
-NEAR = 1e-6
-"""Triangles that come this near, in metres along the optical axis, are left out."""
+
+
+def doubled_area(corners: NDArray[np.floating]) -> Points:
+    """Return twice the signed area (T,) of triangles (T, 3, 2 or more) in x and y."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    return np.asarray((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+
+
+def fragments(
+    at: Points, faces: Ints, size: tuple[int, int], use: NDArray[np.bool_]
+) -> Iterator[tuple[Ints, Ints, Points]]:
+    """Yield, in batches of n, the pixels whose centres triangles cover: triangle (n,), pixel (n,), coordinates (n, 3).
+
+    at: (N, 3) x, y in pixels, the centre of the top left one at (0.5, 0.5), and depth of the vertices. faces: (T, 3);
+    ``use`` (T,) of them. size: width, height; pixels are counted row by row. The coordinates are barycentric on the
+    screen. Triangles with a corner behind ``NEAR`` and those seen edge-on are left out; the others are covered from
+    either side, and a centre on a common edge by both.
+    """
+    width, height = size
+    corner = at[faces]
+    a, b, c = corner[:, 0, :2], corner[:, 1, :2], corner[:, 2, :2]
+    with np.errstate(invalid="ignore"):
+        area = doubled_area(corner)
+        low = np.maximum(np.ceil(corner[..., :2].min(axis=1) - 0.5), 0)
+        high = np.minimum(np.floor(corner[..., :2].max(axis=1) - 0.5), (width - 1, height - 1))
+        span = (high - low + 1).clip(0)
+        kept = np.flatnonzero(
+            use & (corner[..., 2] > NEAR).all(axis=1) & (np.abs(area) > 1e-12) & (span > 0).all(axis=1)
+        )
+    counts = (span[kept, 0] * span[kept, 1]).astype(np.int64)
+    ends = np.cumsum(counts)
+    start = 0
+    while start < len(kept):
+        done = ends[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
+        part, number = kept[start:stop], counts[start:stop]
+        face = np.repeat(part, number)
+        offset = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+        columns = (low[face, 0] + offset % span[face, 0]).astype(np.int64)
+        rows = (low[face, 1] + offset // span[face, 0]).astype(np.int64)
+        x, y = columns + 0.5, rows + 0.5
+        flat = np.empty((len(face), 3))
+        for k, (first, second) in enumerate(((b, c), (c, a), (a, b))):
+            p, q = first[face], second[face]
+            flat[:, k] = ((q[:, 0] - p[:, 0]) * (y - p[:, 1]) - (q[:, 1] - p[:, 1]) * (x - p[:, 0])) / area[face]
+        inside = (flat >= -1e-9).all(axis=1)
+        yield face[inside], (rows * width + columns)[inside], flat[inside]
+        start = stop
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePixels:
+    """P pixels of a grid that show a mesh, row by row.
+
+    rows, columns: (P,). faces: (P,) the nearest triangle. corners: (P, 3) its barycentric coordinates in space, summing
+    to 1. depth: (P,).
+    """
+
+    rows: Ints
+    columns: Ints
+    faces: Ints
+    corners: Points
+    depth: Points
+
+    def interpolated(self, faces: Ints, values: NDArray[np.floating]) -> Points:
+        """Return ``values`` (N, C) at the vertices of ``faces`` (T, 3), interpolated at the pixels (P, C)."""
+        return np.asarray(np.einsum("pk,pkc->pc", self.corners, np.asarray(values)[faces[self.faces]]))
+
+    def on_grid(self, size: tuple[int, int]) -> NDArray[np.bool_]:
+        """Return (height, width) whether anything is seen, on the grid of ``size`` (width, height)."""
+        covered = np.zeros(size[::-1], dtype=bool)
+        covered[self.rows, self.columns] = True
+        return covered
+
+
+def rasterise(at: Points, faces: Ints, size: tuple[int, int], use: NDArray[np.bool_] | None = None) -> VisiblePixels:
+    """Return the nearest triangles ``faces`` (T, 3) at the pixels of a grid of ``size`` (width, height).
+
+    at: (N, 3) x, y in pixels and depth of the vertices, as in ``fragments``. use: (T,) which triangles are drawn, all
+    by default. Among equal depths the first triangle of a batch wins.
+    """
+    width, height = size
+    depths = at[:, 2][faces]
+    best_depth = np.full(width * height, np.inf)
+    best_face = np.full(width * height, -1, dtype=np.int64)
+    best_corners = np.zeros((width * height, 3))
+    for face, cell, flat in fragments(at, faces, size, np.ones(len(faces), dtype=bool) if use is None else use):
+        weight = flat / depths[face]
+        depth = 1.0 / weight.sum(axis=1)
+        nearer = np.flatnonzero(depth < best_depth[cell])
+        np.minimum.at(best_depth, cell[nearer], depth[nearer])
+        # Of several values for one place numpy keeps the last.
+        won = nearer[depth[nearer] == best_depth[cell[nearer]]][::-1]
+        best_face[cell[won]] = face[won]
+        best_corners[cell[won]] = weight[won] * depth[won, None]
+    found = np.flatnonzero(best_face >= 0)
+    return VisiblePixels(found // width, found % width, best_face[found], best_corners[found], best_depth[found])
+
+
+def depth_range(at: Points, faces: Ints, size: tuple[int, int]) -> tuple[Points, Points]:
+    """Return nearest and farthest depth (height, width) of a mesh, +inf and -inf where there is none; see
+    ``rasterise``."""
+    width, height = size
+    near, far = np.full(width * height, np.inf), np.full(width * height, -np.inf)
+    depths = at[:, 2][faces]
+    for face, cell, flat in fragments(at, faces, size, np.ones(len(faces), dtype=bool)):
+        depth = 1.0 / (flat / depths[face]).sum(axis=1)
+        np.minimum.at(near, cell, depth)
+        np.maximum.at(far, cell, depth)
+    return near.reshape(height, width), far.reshape(height, width)
+
+
+def visible_pixels(
+    camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64], scale: float = 1.0
+) -> VisiblePixels:
+    """Return the nearest surface at the pixel centres of the photo scaled by ``scale``.
+
+    Back faces, and faces behind the camera or reaching there, are left out.
+    """
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    at = camera.project(vertices)
+    at[:, :2] *= (size[0] / camera.width, size[1] / camera.height)
+    # Pixel rows run downward: a front face is oriented the other way round in the image.
+    return rasterise(at, faces, size, doubled_area(at[faces]) < 0)
+
+
+def seen_faces(camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the faces (T,) towards the camera whose centres are in front of all others."""
+    corner = camera.project(vertices)[faces]
+    towards = (doubled_area(corner) < 0) & (corner[..., 2] > NEAR).all(axis=1)
+    extent = float(np.ptp(corner[..., :2].reshape(-1, 2), axis=0).max())
+    scale = min(1.0, DEPTH_CELLS / max(extent, 1.0))
+    shown = visible_pixels(camera, vertices, faces, scale)
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    depth = np.full(size[::-1], np.inf)
+    depth[shown.rows, shown.columns] = shown.interpolated(faces, camera.project(vertices)[:, 2:])[:, 0]
+    middle = corner.mean(axis=1)
+    x, y = ((middle[:, i] * scale).clip(0, size[i] - 1).astype(np.int64) for i in (0, 1))
+    slack = BEHIND * float(np.ptp(vertices, axis=0).max())
+    return np.asarray(towards & (middle[:, 2] <= depth[y, x] + slack))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,30 +187,6 @@ class Paint:
     colours: NDArray[np.float64] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Fragments:
-    """What each of (h, w) pixels sees.
-
-    face: (h, w) index of the nearest triangle, -1 for none. weights: (h, w, 3) of its corners, perspective-correct,
-    summing to 1. depth: (h, w) along the optical axis in the unit of the input, infinite for none.
-    """
-
-    face: NDArray[np.int64]
-    weights: Floats
-    depth: Floats
-
-    @property
-    def covered(self) -> NDArray[np.bool_]:
-        """(h, w) whether anything is seen."""
-        return self.face >= 0
-
-    def interpolated(self, faces: Ints, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return (n, c) ``values`` (V, c) of vertices at the covered pixels, row by row."""
-        seen = self.covered
-        corners = np.asarray(values)[faces[self.face[seen]]]
-        return np.asarray(np.einsum("nk,nkc->nc", self.weights[seen], corners), dtype=np.float64)
-
-
 def paint_of(mesh: trimesh.Trimesh) -> Paint:
     """Return what ``mesh`` wears: its texture, else its vertices' colours, else plain grey."""
     uv = getattr(mesh.visual, "uv", None)
@@ -74,133 +199,20 @@ def paint_of(mesh: trimesh.Trimesh) -> Paint:
     return Paint(colours=np.full((len(mesh.vertices), 3), float(PLAIN)))
 
 
-def rasterise(projected: NDArray[np.floating], faces: Ints, size: tuple[int, int]) -> Fragments:
-    """Return the nearest triangles in a picture of ``size`` (height, width).
-
-    projected: (V, 3) x, y in pixels, the centre of the top left one at (0.5, 0.5), and depth > 0 along the optical
-    axis. faces: (T, 3), seen from both sides. Triangles with a corner nearer than ``NEAR`` are left out. 1/depth is
-    linear on the screen, and so are w/depth of the barycentric coordinates w (Heckbert and Moreton, Interpolation for
-    Polygon Texture Mapping and Shading, 1991).
-    """
-    height, width = size
-    seen = np.asarray(projected, dtype=np.float64)
-    inverse = np.zeros(height * width, dtype=np.float32)
-    nearest = np.full(height * width, -1, dtype=np.int64)
-    corners = seen[faces]
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    with np.errstate(invalid="ignore"):
-        low = np.ceil(corners[..., :2].min(axis=1) - 0.5)
-        high = np.floor(corners[..., :2].max(axis=1) - 0.5)
-        good = (corners[..., 2].min(axis=1) > NEAR) & (np.abs(area) > 1e-12) & np.isfinite(low + high).all(axis=1)
-        low = np.maximum(low, 0)
-        high = np.minimum(high, (width - 1, height - 1))
-        good &= (high >= low).all(axis=1)
-    chosen = np.flatnonzero(good)
-    first = low[chosen].astype(np.int64)
-    span = high[chosen].astype(np.int64) - first + 1
-    planes = _planes(corners[chosen], area[chosen])
-    count = span.prod(axis=1)
-    for part in _chunks(count):
-        _fill(inverse, nearest, chosen[part], first[part], span[part], count[part], planes[part], width)
-    return _fragments(inverse, nearest, seen, faces, size)
-
-
-def _planes(corners: NDArray[np.float64], area: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3, 3): second and third barycentric coordinate and 1/depth as (x, y, 1) . plane on the screen."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    planes = np.empty((len(corners), 3, 3))
-    planes[:, 0, 0], planes[:, 0, 1] = (c[:, 1] - a[:, 1]) / area, -(c[:, 0] - a[:, 0]) / area
-    planes[:, 1, 0], planes[:, 1, 1] = -(b[:, 1] - a[:, 1]) / area, (b[:, 0] - a[:, 0]) / area
-    planes[:, :2, 2] = -(planes[:, :2, 0] * a[:, :1] + planes[:, :2, 1] * a[:, 1:2])
-    near = 1.0 / corners[..., 2]
-    planes[:, 2] = planes[:, 0] * (near[:, 1] - near[:, 0])[:, None] + planes[:, 1] * (near[:, 2] - near[:, 0])[:, None]
-    planes[:, 2, 2] += near[:, 0]
-    return planes
-
-
-def _chunks(count: Ints) -> list[slice]:
-    """Consecutive slices of triangles with at most ``CHUNK`` pairs each, or a single triangle."""
-    ends = np.cumsum(count)
-    slices, start = [], 0
-    while start < len(count):
-        done = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
-        slices.append(slice(start, stop))
-        start = stop
-    return slices
-
-
-def _fill(
-    inverse: Floats,
-    nearest: Ints,
-    triangles: Ints,
-    first: Ints,
-    span: Ints,
-    count: Ints,
-    planes: NDArray[np.float64],
-    width: int,
-) -> None:
-    """Test all pixels of the triangles' boxes and write the nearest hits into ``inverse`` depth and ``nearest``."""
-    owner = np.repeat(np.arange(len(count)), count)
-    offset = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-    # Coordinates relative to the box keep single precision exact enough, at half the time of double.
-    across = span[:, 0].astype(np.int32)[owner]
-    row = (offset // across).astype(np.int32)
-    column = (offset - row * across.astype(np.int64)).astype(np.int32)
-    corner = np.einsum("nkj,nj->nk", planes, np.concatenate([first + 0.5, np.ones((len(first), 1))], axis=1))
-    slopes = np.concatenate([planes[:, :, :2].reshape(-1, 6), corner], axis=1).astype(np.float32)
-    x, y = column.astype(np.float32), row.astype(np.float32)
-    second = slopes[owner, 0] * x + slopes[owner, 1] * y + slopes[owner, 6]
-    third = slopes[owner, 2] * x + slopes[owner, 3] * y + slopes[owner, 7]
-    # A pixel's centre on an edge belongs to both triangles: rounding leaves no gaps.
-    hit = np.flatnonzero((second >= -1e-6) & (third >= -1e-6) & (second + third <= 1 + 2e-6))
-    of = owner[hit]
-    near = slopes[of, 4] * x[hit] + slopes[of, 5] * y[hit] + slopes[of, 8]
-    pixel = (first[of, 1] + row[hit]) * width + first[of, 0] + column[hit]
-    better = np.flatnonzero(near > inverse[pixel])
-    np.maximum.at(inverse, pixel[better], near[better])
-    won = better[near[better] == inverse[pixel[better]]]
-    nearest[pixel[won]] = triangles[of[won]]
-
-
-def _fragments(
-    inverse: Floats, nearest: Ints, seen: NDArray[np.float64], faces: Ints, size: tuple[int, int]
-) -> Fragments:
-    height, width = size
-    pixels = np.flatnonzero(nearest >= 0)
-    corners = seen[faces[nearest[pixels]]]
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    place = np.stack([pixels % width + 0.5, pixels // width + 0.5], axis=-1)
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    second = ((place[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (place[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
-    third = ((b[:, 0] - a[:, 0]) * (place[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (place[:, 0] - a[:, 0])) / area
-    flat = np.clip(np.stack([1.0 - second - third, second, third], axis=-1), 0.0, 1.0) / corners[..., 2]
-    weights = np.zeros((height * width, 3), dtype=np.float32)
-    weights[pixels] = flat / flat.sum(axis=1, keepdims=True)
-    depth = np.full(height * width, np.inf, dtype=np.float32)
-    depth[pixels] = 1.0 / inverse[pixels]
-    return Fragments(
-        face=nearest.reshape(height, width),
-        weights=weights.reshape(height, width, 3),
-        depth=depth.reshape(height, width),
-    )
-
-
-def colours(fragments: Fragments, projected: NDArray[np.floating], faces: Ints, paint: Paint) -> Floats:
-    """Return (n, 3), 0 to 255, of the covered pixels, row by row: the texture, bilinear and filtered, or the colours.
+def colours(shown: VisiblePixels, projected: NDArray[np.floating], faces: Ints, paint: Paint) -> Floats:
+    """Return (P, 3), 0 to 255, of the pixels ``shown``: the texture, bilinear and filtered, or the colours.
 
     Each triangle takes the halving of the texture whose texels are about as large as its pixels (Williams, Pyramidal
     Parametrics, 1983), so that a fine texture does not sparkle.
     """
     if paint.texture is None or paint.uv is None:
         if paint.colours is None:
-            return np.full((int(fragments.covered.sum()), 3), float(PLAIN), dtype=np.float32)
-        return fragments.interpolated(faces, paint.colours).astype(np.float32)
-    uv = fragments.interpolated(faces, paint.uv)
+            return np.full((len(shown.faces), 3), float(PLAIN), dtype=np.float32)
+        return shown.interpolated(faces, paint.colours).astype(np.float32)
+    uv = shown.interpolated(faces, paint.uv)
     outside = (uv < 0) | (uv > 1)
     uv[outside] %= 1.0
-    levels = _levels(fragments, projected, faces, paint)
+    levels = _levels(shown, projected, faces, paint)
     picture = np.zeros((len(uv), 3), dtype=np.float32)
     texture = paint.texture
     for level in range(int(levels.max(initial=0)) + 1):
@@ -213,11 +225,11 @@ def colours(fragments: Fragments, projected: NDArray[np.floating], faces: Ints, 
     return picture
 
 
-def _levels(fragments: Fragments, projected: NDArray[np.floating], faces: Ints, paint: Paint) -> Ints:
-    """(n,) halvings of the texture for each covered pixel."""
+def _levels(shown: VisiblePixels, projected: NDArray[np.floating], faces: Ints, paint: Paint) -> Ints:
+    """(P,) halvings of the texture for each pixel."""
     assert paint.texture is not None
     assert paint.uv is not None
-    used, index = np.unique(fragments.face[fragments.covered], return_inverse=True)
+    used, index = np.unique(shown.faces, return_inverse=True)
     texels = _areas(paint.uv[faces[used]] * (paint.texture.shape[1], paint.texture.shape[0]))
     pixels = _areas(np.asarray(projected)[faces[used]][..., :2])
     level = np.round(0.5 * np.log2(np.maximum(texels, 1e-9) / np.maximum(pixels, 1e-9)))
@@ -226,8 +238,7 @@ def _levels(fragments: Fragments, projected: NDArray[np.floating], faces: Ints, 
 
 
 def _areas(corners: NDArray[np.floating]) -> NDArray[np.float64]:
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2)
+    return np.asarray(np.abs(doubled_area(corners)) / 2)
 
 
 def _looked_up(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from .mesh_raster import Fragments, Paint, colours, paint_of, rasterise
+from .mesh_raster import Paint, colours, paint_of, rasterise
 
 Pixels = NDArray[np.uint8]
 Points = NDArray[np.float64]
@@ -106,15 +106,15 @@ def view(body: Turned, azimuth: float, *, side: int = SIDE, rise: float = RISE_D
     """
     camera = _camera(body, azimuth, rise, side * FINER)
     projected = camera.project(body.vertices)
-    fragments = rasterise(projected, body.faces, (side * FINER, side * FINER))
+    shown = rasterise(projected, body.faces, (side * FINER, side * FINER))
     backdrop = _backdrop(camera, body, side * FINER) if ground else np.full((side * FINER,) * 2 + (3,), WALL, np.uint8)
-    return _averaged(fragments, colours(fragments, projected, body.faces, body.paint), backdrop, side)
+    seen = shown.on_grid((side * FINER, side * FINER))
+    return _averaged(seen, colours(shown, projected, body.faces, body.paint), backdrop, side)
 
 
-def _averaged(fragments: Fragments, shown: NDArray[np.float32], backdrop: Pixels, side: int) -> View:
-    seen = fragments.covered
+def _averaged(seen: NDArray[np.bool_], colour: NDArray[np.float32], backdrop: Pixels, side: int) -> View:
     alone = np.zeros((*seen.shape, 3), dtype=np.float32)
-    alone[seen] = shown
+    alone[seen] = colour
     share = cv2.resize(seen.astype(np.float32), (side, side), interpolation=cv2.INTER_AREA)
     small = cv2.resize(alone, (side, side), interpolation=cv2.INTER_AREA)
     around = np.where(seen[..., None], 0.0, backdrop).astype(np.float32)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..errors import InputError
+from ..smoothstep import smoothstep
 from ..validation import finite, parse, read_json, require, require_range, to_json
 from .model import Camera, Ground
 from .scene_object import Matrix4
@@ -372,7 +373,7 @@ def interpolate_keys(
     slopes[1:-1] = np.where(rising, mean, 0.0)
     width = widths[index][:, None]
     low, high = values[index], values[index + 1]
-    rest = t * t * (3 - 2 * t)
+    rest = smoothstep(t)
     bend = width * (t * (1 - t) ** 2 * slopes[index] - t * t * (1 - t) * slopes[index + 1])
     # Weighted from the nearer key, so that a constant value stays the same to the last bit.
     return np.asarray(np.where(rest < 0.5, low + rest * (high - low), high - (1 - rest) * (high - low)) + bend)

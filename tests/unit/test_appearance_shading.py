@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.reconstruct.appearance.albedo import seen_faces, split_creases, visible_pixels
+from physgen.sim.reconstruct.appearance.albedo import split_creases
 from physgen.sim.reconstruct.appearance.object_shading import (
     LocalLighting,
     Occluders,
@@ -20,6 +20,7 @@ from physgen.sim.reconstruct.appearance.object_shading import (
 )
 from physgen.sim.reconstruct.camera import ground_camera as cameras
 from physgen.sim.reconstruct.lighting.ground_lighting import surface_points
+from physgen.sim.reconstruct.mesh_raster import seen_faces, visible_pixels
 from physgen.sim.scene.equirectangular import directions
 from physgen.sim.scene.model import Light
 

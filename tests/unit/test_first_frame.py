@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.events import ignore, never
-from physgen.sim.reconstruct.appearance.albedo import visible_pixels
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.mesh_raster import visible_pixels
 from physgen.sim.reconstruct.photo_layers import Layers
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.shape.object_bodies import make_bodies

@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: MIT
 """How safely bodies stand: margins of known shapes, and what counts as their base."""
 
-import tomllib
-
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.bake_quality import QUALITY_FOLDER
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.shape import footing
 from physgen.sim.reconstruct.shape.footing import footed
 from physgen.sim.reconstruct.shape.inflate import inflate
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
 from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
-from physgen.sim.reconstruct.shape.support import COARSEST_CELLS, COARSEST_PARTICLES, support_of
+from physgen.sim.reconstruct.shape.support import support_of
+from physgen.sim.scene.bake_quality import COARSEST, load_quality, quality_names
 
 
 def support(mesh):
@@ -83,7 +81,6 @@ def test_only_what_is_hidden_comes_down():
 
 
 def test_the_coarsest_quality_is_the_coarsest():
-    found = [tomllib.loads(path.read_text(encoding="utf-8")) for path in QUALITY_FOLDER.glob("*.toml")]
-    coarse = [quality for quality in found if "grid" not in quality]
-    assert min(quality["particles"] for quality in coarse) == COARSEST_PARTICLES
-    assert min(quality["smallest_cells"] for quality in coarse) == COARSEST_CELLS
+    coarse = [quality for quality in map(load_quality, quality_names()) if quality.grid is None]
+    assert min(quality.particles for quality in coarse) == load_quality(COARSEST).particles
+    assert min(quality.smallest_cells for quality in coarse) == load_quality(COARSEST).smallest_cells

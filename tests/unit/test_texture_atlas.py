@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.reconstruct.appearance.albedo import rasterised
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.mesh_raster import rasterise
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured
 from physgen.sim.reconstruct.shape.object_bodies import build_body
@@ -73,7 +73,7 @@ def seen_from(surface, turn_deg, side=260):
     at = np.column_stack([x, y, 1e6 - offset @ towards])
     a, b, c = (at[surface.faces[:, i], :2] for i in range(3))
     front = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0
-    shown = rasterised(at, surface.faces, (side, side), front)
+    shown = rasterise(at, surface.faces, (side, side), front)
     height, width = surface.picture.shape[:2]
     uv = shown.interpolated(surface.faces, surface.uv)
     texels = surface.picture[
@@ -124,7 +124,7 @@ def test_what_is_seen_well_is_the_photo_bit_for_bit():
     towards = VIEW.position - places.mean(axis=1)
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
     well = (normal * towards).sum(axis=1) / lengths > 0.5
-    shown = rasterised(at, surface.faces, (WIDTH, HEIGHT), area < 0)
+    shown = rasterise(at, surface.faces, (WIDTH, HEIGHT), area < 0)
     # Of faces within 60 degrees, the pixels in the middle of the object.
     keep = well[shown.faces] & ndimage.binary_erosion(TOY, iterations=3)[shown.rows, shown.columns]
     height, width = surface.picture.shape[:2]
@@ -142,7 +142,7 @@ def test_the_first_frame_is_the_photo_up_to_the_rim():
     at = VIEW.project(surface.vertices) * (side, side, 1)
     a, b, c = (at[surface.faces[:, i], :2] for i in range(3))
     front = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0
-    shown = rasterised(at, surface.faces, (WIDTH * side, HEIGHT * side), front)
+    shown = rasterise(at, surface.faces, (WIDTH * side, HEIGHT * side), front)
     height, width = surface.picture.shape[:2]
     uv = shown.interpolated(surface.faces, surface.uv)
     image = np.zeros((HEIGHT * side, WIDTH * side, 3), np.float32)
@@ -195,7 +195,7 @@ def test_each_face_has_texels_of_its_own():
     surface = made(picture(masks()["ring"]), "ring")
     height, width = surface.picture.shape[:2]
     at = np.column_stack([surface.uv * (width, -height) + (0, height), np.ones(len(surface.uv))])
-    shown = rasterised(at, surface.faces, (width, height), np.ones(len(surface.faces), bool))
+    shown = rasterise(at, surface.faces, (width, height), np.ones(len(surface.faces), bool))
     # Where two charts overlapped, half of the faces there would own no texel.
     corner = at[surface.faces]
     first, second = corner[:, 1, :2] - corner[:, 0, :2], corner[:, 2, :2] - corner[:, 0, :2]

@@ -12,12 +12,12 @@ from typing import Any
 from ....physgen_addon.frames.frame_index import parse_frame_range
 from ....physgen_addon.render.render_options import RenderOptions
 from ....sim.app.bake_options import BakeOptions
-from ....sim.app.bake_quality import load_quality
 from ....sim.app.reconstruct import require_physics, with_physics
 from ....sim.cache.bake_folder import WORLD_SPACE
 from ....sim.errors import InputError
 from ....sim.reconstruct import ObjectRequest, ReconstructOptions
 from ....sim.reconstruct.reconstruct_options import object_names
+from ....sim.scene.bake_quality import load_quality
 from ....sim.scene.camera_path import load_camera_path
 from ....sim.scene.folder import Scene, inside, load_scene
 from ....sim.scene.overrides import check_overrides

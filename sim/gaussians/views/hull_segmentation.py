@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from ...errors import InputError
 from ...mpm.colliders import Surface
 from ...mpm.geometry.signed_distance import DistanceLattice, signed_distance
+from ...mpm.geometry.triangles import area_normals
 from .posed_images import FOREGROUND, Labels, View
 from .visual_hull import VoxelGrid, depth_buffer
 
@@ -122,7 +123,8 @@ def vote_labels(vertices: Array, faces: Faces, views: Sequence[View], options: V
 
 def _ballots(vertices: Array, faces: Faces, views: Sequence[View], highest: int) -> Array:
     """Return (views, V, highest) weights of each view's vote for each label."""
-    normals = _vertex_normals(vertices, faces)
+    normals = area_normals(vertices, faces)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     found = np.zeros((len(views), len(vertices), highest))
     for ballot, view in zip(found, views, strict=True):
         assert view.labels is not None
@@ -201,16 +203,6 @@ def _neighbour_means(count: int, faces: Faces) -> sparse.csr_matrix:
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     weights = 1.0 / np.bincount(edges[:, 0], minlength=count)[edges[:, 0]]
     return sparse.csr_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(count, count))
-
-
-def _vertex_normals(vertices: Array, faces: Faces) -> Array:
-    """Return (V, 3) unit normals, means over the triangles around each vertex weighted by area."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(across[:, i], 3), minlength=len(vertices)) for i in range(3)], axis=1
-    )
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30))
 
 
 MIN_PIECE_VOLUME = 0.05

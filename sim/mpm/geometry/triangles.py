@@ -87,6 +87,19 @@ def face_normals(corners: Array) -> tuple[Array, Array]:
     return normals / np.where(lengths > 0, lengths, 1.0)[:, None], 0.5 * lengths
 
 
+def area_normals(vertices: Array, faces: Faces) -> Array:
+    """Return the sum (V, 3) of the normals of each vertex' faces, each as long as twice its face's area.
+
+    vertices: (V, 3); faces: (T, 3), counter-clockwise from outside.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    across = np.cross(b - a, c - a)
+    summed = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(summed, faces[:, corner], across)
+    return summed
+
+
 def batches(sizes: NDArray[np.int64], limit: int) -> list[NDArray[np.int64]]:
     """Return indices of ``sizes`` above 0 in runs whose sizes add up to about ``limit``."""
     used = np.flatnonzero(sizes)

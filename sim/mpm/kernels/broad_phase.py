@@ -22,12 +22,12 @@ from .layout import (
     FIELD_INTEGERS,
     FIELDS,
     FIRST_FIELD,
-    FIRST_SOLID,
+    FIRST_RIGID_BODY,
     HAS_ANCHORS,
     HAS_PLANE,
     PLANE_NORMAL,
     PLANE_OFFSET,
-    SOLIDS,
+    RIGID_BODIES,
     WORLD,
     WORLD_INTEGERS,
     WORLD_ROW,
@@ -70,8 +70,8 @@ def list_near_blocks(
             normal = triple(worlds.numbers, row + PLANE_NORMAL)
             half = HALF_SIDE * (ti.abs(normal[0]) + ti.abs(normal[1]) + ti.abs(normal[2]))
             is_near = is_near or normal.dot(centre) - worlds.numbers[row + PLANE_OFFSET] - half < NEAR
-        first = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-        for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + SOLIDS]):
+        first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+        for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
             if not is_near:
                 phi, _, _ = body_distance(i, centre, HALF_DIAGONAL + NEAR, bodies, shapes)
                 is_near = phi < HALF_DIAGONAL + NEAR

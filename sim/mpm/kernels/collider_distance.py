@@ -22,7 +22,7 @@ from ..rigid.rigid_layout import (
     NUMBERS,
     RADIUS,
     SHAPE,
-    SOLID,
+    STATE,
     V_NEXT,
     W_NEXT,
     WAITING,
@@ -35,10 +35,10 @@ from .kernel_bundles import func
 from .layout import (
     CONTROL_ROW,
     FIELD_INTEGERS,
-    FIRST_SOLID,
+    FIRST_RIGID_BODY,
     FULL,
     PHASE,
-    SOLIDS,
+    RIGID_BODIES,
     WORLD,
     WORLD_INTEGERS,
     Doubles,
@@ -111,35 +111,35 @@ def body_distance(i: ti.i32, place: vec3, farthest: ti.f32, bodies: RigidArrays,
     """Return the distance (cells) of ``place`` from the rigid body or collider ``i``, the normal there (world axes) and
     the rate at which a deforming surface approaches (cells/s). 1e9 beyond ``farthest`` or before its start."""
     phi, normal, swelling = 1e9, vec3(0.0, 0.0, 1.0), 0.0
-    arm = place - single3(bodies.state, i * SOLID + X)
+    arm = place - single3(bodies.state, i * STATE + X)
     if bodies.kinds[i * KINDS + KIND] != WAITING and arm.norm() < (
         ti.cast(bodies.numbers[i * NUMBERS + RADIUS], ti.f32) + farthest
     ):
         local = vec3(0.0)
         for n in ti.static(range(3)):
             for m in ti.static(range(3)):
-                local[n] += ti.cast(bodies.state[i * SOLID + R + 3 * m + n], ti.f32) * arm[m]
+                local[n] += ti.cast(bodies.state[i * STATE + R + 3 * m + n], ti.f32) * arm[m]
         shape = bodies.kinds[i * KINDS + SHAPE]
         found = sample_distance(shape, local, shapes)
         if bodies.kinds[i * KINDS + LAYERS] == 2:
             later = sample_distance(shape + 1, local, shapes)
             swelling = (found[3] - later[3]) * ti.cast(bodies.numbers[i * NUMBERS + BLEND_RATE], ti.f32)
-            found += ti.cast(bodies.state[i * SOLID + BLEND], ti.f32) * (later - found)
+            found += ti.cast(bodies.state[i * STATE + BLEND], ti.f32) * (later - found)
         phi = found[3]
         gradient = vec3(found[0], found[1], found[2])
         gradient /= ti.max(gradient.norm(), 1e-9)
         for n in ti.static(range(3)):
             normal[n] = 0.0
             for m in ti.static(range(3)):
-                normal[n] += ti.cast(bodies.state[i * SOLID + R + 3 * n + m], ti.f32) * gradient[m]
+                normal[n] += ti.cast(bodies.state[i * STATE + R + 3 * n + m], ti.f32) * gradient[m]
     return phi, normal, swelling
 
 
 @func
 def body_velocity(i: ti.i32, place: vec3, bodies: RigidArrays):
     """Return the predicted velocity (cells/s) of body ``i`` at ``place`` after this substep."""
-    arm = place - single3(bodies.state, i * SOLID + X)
-    return single3(bodies.state, i * SOLID + V_NEXT) + single3(bodies.state, i * SOLID + W_NEXT).cross(arm)
+    arm = place - single3(bodies.state, i * STATE + X)
+    return single3(bodies.state, i * STATE + V_NEXT) + single3(bodies.state, i * STATE + W_NEXT).cross(arm)
 
 
 @func
@@ -147,10 +147,10 @@ def body_compliance(i: ti.i32, place: vec3, normal: vec3, bodies: RigidArrays):
     """Return the inverse effective mass (1/kg) of body ``i`` at ``place`` along ``normal``."""
     give = 0.0
     if bodies.kinds[i * KINDS + KIND] == DYNAMIC:
-        lever = (place - single3(bodies.state, i * SOLID + X)).cross(normal)
+        lever = (place - single3(bodies.state, i * STATE + X)).cross(normal)
         turned = vec3(0.0)
         for n in ti.static(range(3)):
-            turned[n] = single3(bodies.state, i * SOLID + J + 3 * n).dot(lever)
+            turned[n] = single3(bodies.state, i * STATE + J + 3 * n).dot(lever)
         give = ti.cast(bodies.numbers[i * NUMBERS + INVERSE_MASS], ti.f32) + lever.dot(turned)
     return give
 
@@ -158,7 +158,7 @@ def body_compliance(i: ti.i32, place: vec3, normal: vec3, bodies: RigidArrays):
 @func
 def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, bodies: RigidArrays, coupling: CouplingArrays):
     """Add the impulse ``given`` at ``place`` on body ``i`` to ``coupling.pushes[row]``."""
-    turn = (place - single3(bodies.state, i * SOLID + X)).cross(given)
+    turn = (place - single3(bodies.state, i * STATE + X)).cross(given)
     for n in ti.static(range(3)):
         coupling.pushes[row + n] += given[n]
         coupling.pushes[row + 3 + n] += turn[n]
@@ -172,8 +172,8 @@ def gather_pushes(
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
         if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-            first = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-            for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + SOLIDS]):
+            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+            for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
                 coupling.touching[i] = 0.0
                 for n in range(6):
                     bodies.impulses[6 * i + n] = 0.0
@@ -181,8 +181,8 @@ def gather_pushes(
     for s in range(near.particle_count):
         w = worlds.field_integers[blocks.field[near.particle_blocks[s]] * FIELD_INTEGERS + WORLD]
         if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-            first = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-            for o in range(worlds.integers[w * WORLD_INTEGERS + SOLIDS]):
+            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+            for o in range(worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
                 row = (s * coupling.most_bodies + o) * PUSH
                 for n in range(6):
                     bodies.impulses[6 * (first + o) + n] += coupling.pushes[row + n]

@@ -273,7 +273,7 @@ class RigidArrays(NamedTuple):
     """(S, NUMBERS) mass (kg), inertia (kg cells²), forces."""
 
     state: Doubles
-    """(S, SOLID) pose, velocity, momenta, and intermediate results of the substep."""
+    """(S, STATE) pose, velocity, momenta, and intermediate results of the substep."""
 
     impulses: Doubles
     """(S, 6) momentum (kg cells/s) and angular momentum about the centre of mass (kg cells²/s) given by particles."""

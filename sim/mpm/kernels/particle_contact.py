@@ -44,7 +44,7 @@ from .layout import (
     CONTROL_ROW,
     ELAPSED,
     FIELD_INTEGERS,
-    FIRST_SOLID,
+    FIRST_RIGID_BODY,
     FIRST_TOUCH,
     FIXED_ONE,
     FULL,
@@ -56,11 +56,11 @@ from .layout import (
     PLANE_OFFSET,
     RECOVERY_SPEED,
     RESTITUTION,
+    RIGID_BODIES,
+    RIGID_SPEED,
     SEPARATE,
     SLIDING,
     SLIP,
-    SOLID_SPEED,
-    SOLIDS,
     SPEED,
     SPREAD,
     STEP,
@@ -170,7 +170,7 @@ def solve_contact(
             for n in range(coupling.most_bodies * PUSH):
                 coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
             dt = ti.cast(worlds.control[c + STEP], ti.f32)
-            fastest = ti.cast(ti.max(worlds.control[c + SPEED], worlds.control[c + SOLID_SPEED]), ti.f32)
+            fastest = ti.cast(ti.max(worlds.control[c + SPEED], worlds.control[c + RIGID_SPEED]), ti.f32)
             if worlds.control[c + PHASE] == FULL:
                 near.slack[k] -= 2.0 * REACH_FACTOR * fastest * dt
             if worlds.control[c + PHASE] == FULL and near.slack[k] <= 0.0:
@@ -182,8 +182,8 @@ def solve_contact(
                 plane = triple(worlds.numbers, w * WORLD_ROW + PLANE_NORMAL)
                 first_touch = worlds.field_integers[f * FIELD_INTEGERS + FIRST_TOUCH]
                 has_anchors = worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1
-                first_body = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-                body_count = worlds.integers[w * WORLD_INTEGERS + SOLIDS]
+                first_body = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+                body_count = worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]
                 first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
                 level = plane.dot(first_node) - worlds.numbers[w * WORLD_ROW + PLANE_OFFSET]
                 time = ti.cast(worlds.control[c + ELAPSED], ti.f32) + dt

@@ -13,7 +13,7 @@ A world that must sort its particles, has reached the end or has diverged become
 
 import taichi as ti
 
-from ..rigid.rigid_layout import DYNAMIC, KIND, KINDS, KINEMATIC, NUMBERS, RADIUS, SOLID, V, W
+from ..rigid.rigid_layout import DYNAMIC, KIND, KINDS, KINEMATIC, NUMBERS, RADIUS, STATE, V, W
 from ..rigid.rigid_math import load3
 from .kernel_arrays import ParticleBlocks, RigidArrays, StepLimits, WorldArrays
 from .kernel_bundles import func, kernel
@@ -25,7 +25,7 @@ from .layout import (
     ELAPSED,
     FASTEST_FIELD,
     FIELD_INTEGERS,
-    FIRST_SOLID,
+    FIRST_RIGID_BODY,
     FULL,
     IDLE,
     LONGEST_STEP,
@@ -35,13 +35,13 @@ from .layout import (
     PHASE,
     PRIME,
     REMAINING,
+    RIGID_BODIES,
+    RIGID_DRIFT,
+    RIGID_SPEED,
     RUNNING,
     SCALARS_PER_BLOCK,
     SCATTER,
     SHORTEST_STEP,
-    SOLID_DRIFT,
-    SOLID_SPEED,
-    SOLIDS,
     SPEED,
     STATUS,
     STEP,
@@ -59,10 +59,10 @@ SAFETY = 1.5
 LEAST_MARGIN = 0.1
 """Cells kept free between the particles and the limits of their windows, for particles that start from rest."""
 
-MOST_SOLID_DRIFT = 1.0
+MOST_RIGID_DRIFT = 1.0
 """Cells that rigid bodies may move before the blocks near them are listed anew."""
 
-SOLID_LOST = 1_000_000
+RIGID_LOST = 1_000_000
 """LOST_FIELD of a world in which rigid body i diverged is this plus i."""
 
 FARTHEST_STEP = 0.9
@@ -96,7 +96,7 @@ def even_step(c: ti.i32, remaining: ti.f64, limits: StepLimits, worlds: WorldArr
     step = ti.min(step, scale * limits.elastic / ti.max(worlds.control[c + WAVE_SPEED], 1e-30))
     step = ti.min(
         step,
-        scale * limits.velocity / ti.max(ti.max(worlds.control[c + SPEED], worlds.control[c + SOLID_SPEED]), 1e-30),
+        scale * limits.velocity / ti.max(ti.max(worlds.control[c + SPEED], worlds.control[c + RIGID_SPEED]), 1e-30),
     )
     return remaining / ti.max(1.0, ti.ceil(remaining / step - 1e-6))
 
@@ -107,10 +107,10 @@ def plan(c: ti.i32, limits: StepLimits, worlds: WorldArrays):
     step = worlds.control[c + STEP]
     remaining = worlds.control[c + REMAINING] - step
     last = remaining < 0.5 * step
-    drift = worlds.control[c + SOLID_DRIFT] + 2.0 * worlds.control[c + SOLID_SPEED] * step
+    drift = worlds.control[c + RIGID_DRIFT] + 2.0 * worlds.control[c + RIGID_SPEED] * step
     must_sort = (
         worlds.control[c + MARGIN] < 2.0 * SAFETY * worlds.control[c + SPEED] * step + LEAST_MARGIN
-        or drift > MOST_SOLID_DRIFT
+        or drift > MOST_RIGID_DRIFT
     )
     stop = last or must_sort
     worlds.control[c + SCATTER] = ti.select(stop, 0.0, 1.0)
@@ -126,16 +126,16 @@ def forget_reports(w: ti.i32, worlds: WorldArrays, bodies: RigidArrays):
         worlds.control[c + SPEED] = 0.0
         worlds.control[c + MARGIN] = 1e9
         worlds.control[c + FASTEST_FIELD] = -1.0
-    worlds.control[c + SOLID_SPEED] = 0.0
-    first = worlds.integers[w * WORLD_INTEGERS + FIRST_SOLID]
-    for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + SOLIDS]):
+    worlds.control[c + RIGID_SPEED] = 0.0
+    first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+    for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
         kind = bodies.kinds[i * KINDS + KIND]
         if kind == DYNAMIC or kind == KINEMATIC:
-            turning = load3(bodies.state, i * SOLID + W).norm() * bodies.numbers[i * NUMBERS + RADIUS]
-            speed = load3(bodies.state, i * SOLID + V).norm() + turning
+            turning = load3(bodies.state, i * STATE + W).norm() * bodies.numbers[i * NUMBERS + RADIUS]
+            speed = load3(bodies.state, i * STATE + V).norm() + turning
             if double_not_finite(speed):
-                lose(c, SOLID_LOST + i, worlds)
-            worlds.control[c + SOLID_SPEED] = ti.max(worlds.control[c + SOLID_SPEED], speed)
+                lose(c, RIGID_LOST + i, worlds)
+            worlds.control[c + RIGID_SPEED] = ti.max(worlds.control[c + RIGID_SPEED], speed)
     if worlds.control[c + PHASE] != IDLE and worlds.control[c + SCATTER] == 1.0:
         worlds.control[c + WAVE_SPEED] = 0.0
 
@@ -158,7 +158,7 @@ def settle(w: ti.i32, limits: StepLimits, worlds: WorldArrays):
             worlds.control[c + ELAPSED] += step
             worlds.control[c + REMAINING] -= step
             worlds.control[c + SUBSTEPS] += 1.0
-            worlds.control[c + SOLID_DRIFT] += worlds.control[c + SOLID_SPEED] * step
+            worlds.control[c + RIGID_DRIFT] += worlds.control[c + RIGID_SPEED] * step
             if not lost and worlds.control[c + SPEED] * step > FARTHEST_STEP:
                 lost = True
                 worlds.control[c + LOST_FIELD] = worlds.control[c + FASTEST_FIELD]
@@ -220,7 +220,7 @@ def review(limits: StepLimits, worlds: WorldArrays, blocks: ParticleBlocks, bodi
 @func
 def prime(c: ti.i32, limits: StepLimits, worlds: WorldArrays):
     """Let the world at ``c`` start after a sort: particles to grid, with the stress of the step that follows."""
-    worlds.control[c + SOLID_DRIFT] = 0.0
+    worlds.control[c + RIGID_DRIFT] = 0.0
     worlds.control[c + MARGIN] = 1.0
     worlds.control[c + NEXT_STEP] = even_step(c, worlds.control[c + REMAINING], limits, worlds)
     worlds.control[c + STEP] = worlds.control[c + NEXT_STEP]

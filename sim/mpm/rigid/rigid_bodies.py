@@ -56,8 +56,8 @@ class RigidPose:
 
 
 @dataclass(kw_only=True, eq=False)
-class _Solid:
-    """One solid of one world on the host."""
+class _RigidBody:
+    """A rigid body or collider of one world, on the host."""
 
     world: int
     name: str
@@ -87,7 +87,7 @@ class RigidBodies:
         self.setups = tuple(setups)
         self.scales = tuple(float(scale) for scale in scales)
         self.origins = np.asarray(origins, dtype=np.float64)
-        self._solids: list[_Solid] = []
+        self._rigid_bodies: list[_RigidBody] = []
         self._baked: dict[tuple[int, float], DistanceLattice] = {}
         self._segments: dict[int, tuple[float, float]] = {}
         self._keys_done = np.full(len(setups), -np.inf)
@@ -95,19 +95,19 @@ class RigidBodies:
         self.arrays: dict[str, ti.Ndarray] = {}
         spans = []
         for w, setup in enumerate(self.setups):
-            first = len(self._solids)
-            self._solids += [self._new_body(w, body) for body in setup.bodies if body.rigid]
-            self._solids += [self._new_collider(w, collider) for collider in setup.colliders]
-            spans.append((first, len(self._solids)))
+            first = len(self._rigid_bodies)
+            self._rigid_bodies += [self._new_body(w, body) for body in setup.bodies if body.rigid]
+            self._rigid_bodies += [self._new_collider(w, collider) for collider in setup.colliders]
+            spans.append((first, len(self._rigid_bodies)))
         self._pack(spans)
         self.set_segments(dict.fromkeys(range(len(self.setups)), (0.0, 1.0)))
 
     # ---- packing ------------------------------------------------------------------------------------------------
 
-    def _new_body(self, w: int, body: BodyParticles) -> _Solid:
+    def _new_body(self, w: int, body: BodyParticles) -> _RigidBody:
         assert body.surface is not None
         center = np.asarray(mass_properties(body.positions, body.masses, volumes=body.volumes).center)
-        return _Solid(
+        return _RigidBody(
             world=w,
             name=body.name,
             source=body,
@@ -116,11 +116,13 @@ class RigidBodies:
             points=points_of(body.surface, center),
         )
 
-    def _new_collider(self, w: int, collider: Collider) -> _Solid:
+    def _new_collider(self, w: int, collider: Collider) -> _RigidBody:
         center = collider.middle
         if collider.vertices is not None:
-            return _Solid(world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS)
-        return _Solid(
+            return _RigidBody(
+                world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS
+            )
+        return _RigidBody(
             world=w,
             name=collider.name,
             source=collider,
@@ -130,17 +132,17 @@ class RigidBodies:
         )
 
     def _pack(self, spans: list[tuple[int, int]]) -> None:
-        worlds, count = len(self.setups), len(self._solids)
+        worlds, count = len(self.setups), len(self._rigid_bodies)
         kinds = np.zeros((max(count, 1), at.KINDS), dtype=np.int32)
         numbers = np.zeros((max(count, 1), at.NUMBERS))
-        state = np.zeros((max(count, 1), at.SOLID))
+        state = np.zeros((max(count, 1), at.STATE))
         rows, balls, starts = [], [], [np.zeros(1, dtype=np.int64)]
         shape = cluster = point = 0
-        for i, solid in enumerate(self._solids):
-            scale = self.scales[solid.world]
-            points = solid.points
-            layers = 2 if not solid.lattices else 1
-            solid.shape = shape
+        for i, rigid in enumerate(self._rigid_bodies):
+            scale = self.scales[rigid.world]
+            points = rigid.points
+            layers = 2 if not rigid.lattices else 1
+            rigid.shape = shape
             kinds[i, at.SHAPE], kinds[i, at.LAYERS] = shape, layers
             kinds[i, at.CLUSTERS : at.CLUSTERS_END + 1] = cluster, cluster + points.hull, cluster + len(points.balls)
             shape += layers
@@ -154,20 +156,20 @@ class RigidBodies:
             numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
                 np.array([points.radius, points.spacing, points.bulge]) * scale
             )
-            if isinstance(solid.source, Collider) and solid.source.lattice is not None:
-                numbers[i, at.RADIUS] = max(points.radius, reach_of(solid.source.lattice, solid.center)) * scale
-            if isinstance(solid.source, Collider) and solid.source.vertices is not None:
-                farthest = np.linalg.norm(solid.source.vertices.values - solid.center, axis=2).max()
+            if isinstance(rigid.source, Collider) and rigid.source.lattice is not None:
+                numbers[i, at.RADIUS] = max(points.radius, reach_of(rigid.source.lattice, rigid.center)) * scale
+            if isinstance(rigid.source, Collider) and rigid.source.vertices is not None:
+                farthest = np.linalg.norm(rigid.source.vertices.values - rigid.center, axis=2).max()
                 numbers[i, at.RADIUS] = float(farthest) * scale
-            state[i, at.X : at.X + 3] = (solid.center - self.origins[solid.world]) * scale
+            state[i, at.X : at.X + 3] = (rigid.center - self.origins[rigid.world]) * scale
             state[i, at.Q] = 1.0
             state[i, at.R : at.R + 9] = np.eye(3).ravel()
-            if isinstance(solid.source, BodyParticles):
-                self._pack_body(solid.source, scale, self.origins[solid.world], numbers[i], state[i])
+            if isinstance(rigid.source, BodyParticles):
+                self._pack_body(rigid.source, scale, self.origins[rigid.world], numbers[i], state[i])
                 kinds[i, at.KIND] = at.DYNAMIC
             else:
-                moves = solid.source.translations is not None or solid.source.rotations is not None
-                moves = moves or solid.source.vertices is not None
+                moves = rigid.source.translations is not None or rigid.source.rotations is not None
+                moves = moves or rigid.source.vertices is not None
                 kinds[i, at.KIND] = at.KINEMATIC if moves else at.STATIC
         pairs, pair_numbers, pair_spans = self._pairs(spans)
         world_spans = np.array([[*a, *b] for a, b in zip(spans, pair_spans, strict=True)], dtype=np.int32)
@@ -190,7 +192,7 @@ class RigidBodies:
         self._put("reaches", np.zeros(len(pairs)), ti.f64)
         self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
         self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
-        self._put_shapes({i: [solid.lattices[0]] for i, solid in enumerate(self._solids) if solid.lattices})
+        self._put_shapes({i: [rigid.lattices[0]] for i, rigid in enumerate(self._rigid_bodies) if rigid.lattices})
 
     def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
         properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
@@ -205,25 +207,25 @@ class RigidBodies:
         state[at.J : at.J + 9] = np.linalg.inv(inertia).ravel()
 
     def _pairs(self, spans: list[tuple[int, int]]) -> tuple[NDArray[np.int32], Array, list[tuple[int, int]]]:
-        """Every solid that can move freely against the plane and against all others, either way round."""
+        """Every body that can move freely against the plane and against all others, either way round."""
         rows: list[tuple[int, int, int, int]] = []
         laws: list[Array] = []
         pair_spans = []
         for w, (first, end) in enumerate(spans):
             begin = len(rows)
-            bodies = [i for i in range(first, end) if isinstance(self._solids[i].source, BodyParticles)]
+            bodies = [i for i in range(first, end) if isinstance(self._rigid_bodies[i].source, BodyParticles)]
             if self.setups[w].ground is not None:
                 for i in bodies:
                     rows.append((i, -1, -1, len(laws)))
-                    laws.append(self._law(w, self._solids[i].name, GROUND_NAME))
+                    laws.append(self._law(w, self._rigid_bodies[i].name, GROUND_NAME))
             for i in bodies:
                 for j in range(i + 1, end):
                     p = len(rows)
-                    both = len(self._solids[j].points.rows) > 0
+                    both = len(self._rigid_bodies[j].points.rows) > 0
                     rows.append((i, j, p + 1 if both else -1, len(laws)))
                     if both:
                         rows.append((j, i, p, len(laws)))
-                    laws.append(self._law(w, self._solids[i].name, self._solids[j].name))
+                    laws.append(self._law(w, self._rigid_bodies[i].name, self._rigid_bodies[j].name))
             pair_spans.append((begin, len(rows)))
         rows = rows or [(0, -1, -1, 0)]
         return np.asarray(rows, dtype=np.int32), np.asarray(laws or [np.zeros(at.CONTACT)]), pair_spans
@@ -259,12 +261,12 @@ class RigidBodies:
 
     def _put_shapes(self, changed: Mapping[int, list[DistanceLattice]]) -> None:
         for i, lattices in changed.items():
-            self._solids[i].lattices = lattices
+            self._rigid_bodies[i].lattices = lattices
         parts = []
-        for solid in self._solids:
-            lattices = solid.lattices or [lattice_of(solid.source.surface)] * 2  # type: ignore[arg-type, union-attr]
-            solid.lattices = lattices
-            parts += [(lattice, solid.center, self.scales[solid.world]) for lattice in lattices]
+        for rigid in self._rigid_bodies:
+            lattices = rigid.lattices or [lattice_of(rigid.source.surface)] * 2  # type: ignore[arg-type, union-attr]
+            rigid.lattices = lattices
+            parts += [(lattice, rigid.center, self.scales[rigid.world]) for lattice in lattices]
         table = tables(parts)
         self._put("shape_numbers", np.append(table.numbers, np.float32(1)), ti.f32)
         self._put("shape_dims", np.append(table.dims, np.int32(2)), ti.i32)
@@ -273,20 +275,20 @@ class RigidBodies:
     # ---- finding ------------------------------------------------------------------------------------------------
 
     def index(self, w: int, name: str) -> int:
-        """Row in the arrays of the solid ``name`` of world ``w``."""
-        for i, solid in enumerate(self._solids):
-            if solid.world == w and solid.name == name:
+        """Row in the arrays of the body or collider ``name`` of world ``w``."""
+        for i, rigid in enumerate(self._rigid_bodies):
+            if rigid.world == w and rigid.name == name:
                 return i
         raise InputError(f"world {w} has no rigid body or collider {name!r}")
 
     def name(self, i: int) -> str:
-        """Name of the solid in row ``i`` of the arrays."""
-        return self._solids[i].name
+        """Name of the body or collider in row ``i`` of the arrays."""
+        return self._rigid_bodies[i].name
 
     @property
     def count(self) -> int:
-        """Solids of all worlds."""
-        return len(self._solids)
+        """Rigid bodies and colliders of all worlds."""
+        return len(self._rigid_bodies)
 
     @property
     def bodies(self) -> RigidArrays:
@@ -326,18 +328,18 @@ class RigidBodies:
             flight = math.sqrt(2 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
             world[w, at.RECOVERY] = max(flight, LEAST_RECOVERY)
         kinds, numbers = self._get("solid_kinds", at.KINDS), self._get("solid_numbers", at.NUMBERS)
-        state = self._get("solids", at.SOLID)
+        state = self._get("solids", at.STATE)
         changed: dict[int, list[DistanceLattice]] = {}
-        for i, solid in enumerate(self._solids):
-            if solid.world not in segments:
+        for i, rigid in enumerate(self._rigid_bodies):
+            if rigid.world not in segments:
                 continue
-            start, end = segments[solid.world]
-            if isinstance(solid.source, BodyParticles):
-                self._set_body(solid, start, end, kinds[i], numbers[i], state[i])
-            elif solid.source.vertices is not None:
+            start, end = segments[rigid.world]
+            if isinstance(rigid.source, BodyParticles):
+                self._set_body(rigid, start, end, kinds[i], numbers[i], state[i])
+            elif rigid.source.vertices is not None:
                 changed |= self._set_deforming(i, start, end, state[i], numbers[i])
             elif kinds[i, at.KIND] == at.KINEMATIC:
-                self._set_pose(solid, start, end, state[i])
+                self._set_pose(rigid, start, end, state[i])
         for w, (start, end) in segments.items():
             self._keys_done[w] = start + SAME_TIME
             self._segments[w] = (start, end)
@@ -349,24 +351,24 @@ class RigidBodies:
             self._put_shapes(changed)
 
     def _set_body(
-        self, solid: _Solid, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
+        self, rigid: _RigidBody, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
     ) -> None:
-        body, scale = solid.source, self.scales[solid.world]
+        body, scale = rigid.source, self.scales[rigid.world]
         assert isinstance(body, BodyParticles)
-        starts = body.start_time <= start + SAME_TIME and (solid.world, solid.name) not in self.asleep
+        starts = body.start_time <= start + SAME_TIME and (rigid.world, rigid.name) not in self.asleep
         kinds[at.KIND] = at.DYNAMIC if starts else at.WAITING
         if body.acceleration is not None:
             numbers[at.UNIFORM : at.UNIFORM + 3] = body.acceleration.at(0.5 * (start + end)) * scale
         if body.velocity_keys is not None and starts:
-            done = self._keys_done[solid.world]
+            done = self._keys_done[rigid.world]
             due = [k for k, t in enumerate(body.velocity_keys.times) if done < t <= start + SAME_TIME]
             if due:
                 state[at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
 
-    def _set_pose(self, solid: _Solid, start: float, end: float, state: Array) -> None:
-        collider = solid.source
+    def _set_pose(self, rigid: _RigidBody, start: float, end: float, state: Array) -> None:
+        collider = rigid.source
         assert isinstance(collider, Collider)
-        scale, origin = self.scales[solid.world], self.origins[solid.world]
+        scale, origin = self.scales[rigid.world], self.origins[rigid.world]
         here, there = np.zeros(3), np.zeros(3)
         if collider.translations is not None:
             here, there = collider.translations.at(start), collider.translations.at(end)
@@ -374,7 +376,7 @@ class RigidBodies:
         if collider.rotations is not None:
             turn, spin = _turn(collider.rotations.times, collider.rotations.values, start, end)
         x, y, z, s = turn.as_quat()
-        state[at.X : at.X + 3] = (solid.center + here - origin) * scale
+        state[at.X : at.X + 3] = (rigid.center + here - origin) * scale
         state[at.Q : at.Q + 4] = s, x, y, z
         state[at.V : at.V + 3] = (there - here) * scale / (end - start)
         state[at.W : at.W + 3] = spin
@@ -384,7 +386,7 @@ class RigidBodies:
         self, i: int, start: float, end: float, state: Array, numbers: Array
     ) -> dict[int, list[DistanceLattice]]:
         """Lattices of the keyframes around the segment; returns those that are new."""
-        collider = self._solids[i].source
+        collider = self._rigid_bodies[i].source
         assert isinstance(collider, Collider)
         assert collider.vertices is not None
         track = collider.vertices
@@ -406,7 +408,7 @@ class RigidBodies:
                 self._baked[(i, float(key))] = lattice_of(surface, margin=way)
             lattices.append(self._baked[(i, float(key))])
         self._baked = {key: value for key, value in self._baked.items() if key[0] != i or key[1] in (k, n)}
-        old = self._solids[i].lattices
+        old = self._rigid_bodies[i].lattices
         return {} if len(old) == 2 and all(a is b for a, b in zip(old, lattices, strict=True)) else {i: lattices}
 
     def advance(self, dt: float | Sequence[float], substeps: int = 1) -> None:
@@ -451,8 +453,8 @@ class RigidBodies:
     def pose(self, w: int, name: str) -> RigidPose:
         """Pose and motion of the rigid body or collider ``name`` of world ``w``."""
         i = self.index(w, name)
-        solid, scale = self._solids[i], self.scales[w]
-        row = np.asarray(self._get("solids", at.SOLID)[i], dtype=np.float64)
+        rigid, scale = self._rigid_bodies[i], self.scales[w]
+        row = np.asarray(self._get("solids", at.STATE)[i], dtype=np.float64)
         numbers = self._get("solid_numbers", at.NUMBERS)[i]
         rotation = row[at.R : at.R + 9].reshape(3, 3)
         center = row[at.X : at.X + 3] / scale + self.origins[w]
@@ -463,7 +465,7 @@ class RigidBodies:
         gravity = world[at.GRAVITY : at.GRAVITY + 3] / scale
         return RigidPose(
             rotation=rotation,
-            translation=center - rotation @ solid.center,
+            translation=center - rotation @ rigid.center,
             center=center,
             velocity=velocity,
             spin=spin,

@@ -46,8 +46,8 @@ from .rigid_layout import (
     RUB,
     SHAPE,
     SLOTS,
-    SOLID,
     SPACING,
+    STATE,
     WAITING,
     WORLD,
     R,
@@ -85,8 +85,8 @@ def frame_of(w, b, bodies: RigidArrays):
     axes = load33(bodies.world_numbers, w * WORLD + PLANE).transpose()
     origin = bodies.world_numbers[w * WORLD + OFFSET] * dvec3(axes[0, 2], axes[1, 2], axes[2, 2])
     if b >= 0:
-        axes = load33(bodies.state, b * SOLID + R)
-        origin = load3(bodies.state, b * SOLID + X)
+        axes = load33(bodies.state, b * STATE + R)
+        origin = load3(bodies.state, b * STATE + X)
     return origin, axes
 
 
@@ -98,7 +98,7 @@ def distance_to(b, local, bodies: RigidArrays, shapes: ShapeArrays):
     change = ti.cast(0.0, ti.f64)
     if b >= 0:
         found = dvec4(0.0)
-        blend = bodies.state[b * SOLID + BLEND]
+        blend = bodies.state[b * STATE + BLEND]
         shape = bodies.kinds[b * KINDS + SHAPE]
         for k in range(bodies.kinds[b * KINDS + LAYERS]):
             layer = sample_distance(shape + k, local, shapes)
@@ -140,18 +140,18 @@ def gather_points(w, p, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: 
     """The surface points of pair ``p`` that may touch, thinned out: ``chosen``, -1 for none. ``reaches``: how far
     (cells) the points may be from the other surface, -1 when nothing is near."""
     a, b = contacts.pairs[p * PAIRS], contacts.pairs[p * PAIRS + 1]
-    centre = load3(bodies.state, a * SOLID + X)
+    centre = load3(bodies.state, a * STATE + X)
     origin, axes = frame_of(w, b, bodies)
     shift = axes.transpose() @ (centre - origin)
     radius = bodies.numbers[a * NUMBERS + RADIUS]
-    velocity = load3(bodies.state, a * SOLID + V)
-    speed = load3(bodies.state, a * SOLID + W).norm() * radius
+    velocity = load3(bodies.state, a * STATE + V)
+    speed = load3(bodies.state, a * STATE + W).norm() * radius
     awake = bodies.kinds[a * KINDS + KIND] != WAITING
     clusters_end = bodies.kinds[a * KINDS + HULL_END]
     shape = -1
     if b >= 0:
-        velocity -= load3(bodies.state, b * SOLID + V)
-        speed += load3(bodies.state, b * SOLID + W).norm() * (shift.norm() + radius)
+        velocity -= load3(bodies.state, b * STATE + V)
+        speed += load3(bodies.state, b * STATE + W).norm() * (shift.norm() + radius)
         awake = awake and bodies.kinds[b * KINDS + KIND] != WAITING
         clusters_end = bodies.kinds[a * KINDS + CLUSTERS_END]
         shape = bodies.kinds[b * KINDS + SHAPE]
@@ -162,7 +162,7 @@ def gather_points(w, p, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: 
     if awake and far < radius + reach:
         contacts.reaches[p] = reach
         reach += bodies.numbers[a * NUMBERS + BULGE]
-        relative = axes.transpose() @ load33(bodies.state, a * SOLID + R)
+        relative = axes.transpose() @ load33(bodies.state, a * STATE + R)
         base = p * BINS * CHOSEN
         tie = TIE * bodies.numbers[a * NUMBERS + SPACING]
         for k in range(BINS * CHOSEN):
@@ -214,9 +214,9 @@ def find_contacts(w, p, bodies: RigidArrays, shapes: ShapeArrays, contacts: Rigi
     sure = 0
     reach = contacts.reaches[p]
     if reach >= 0.0:
-        centre = load3(bodies.state, a * SOLID + X)
+        centre = load3(bodies.state, a * STATE + X)
         origin, axes = frame_of(w, b, bodies)
-        relative = axes.transpose() @ load33(bodies.state, a * SOLID + R)
+        relative = axes.transpose() @ load33(bodies.state, a * STATE + R)
         shift = axes.transpose() @ (centre - origin)
         spacing = bodies.numbers[a * NUMBERS + SPACING]
         step = spacing

@@ -2,15 +2,15 @@
 """Columns of rigid bodies, contact pairs and contacts in the flat arrays of ``kernels.kernel_arrays``.
 
 A body is dynamic (DYNAMIC), or a collider with prescribed motion (KINEMATIC) or at rest (STATIC); arrays and
-checkpoints call all three solids. Lengths in cells, seconds, kilograms, radians; world axes unless said otherwise.
+checkpoints call them solids. Lengths in cells, seconds, kilograms, radians; world axes unless said otherwise.
 Imports no Taichi.
 """
 
 WAITING, DYNAMIC, KINEMATIC, STATIC = -1, 0, 1, 2
 """Types of bodies; one that waits for its start time stays in place and touches nothing."""
 
-# ---- per solid, changing: ``solids`` f64 --------------------------------------------------------------------------
-SOLID = 64
+# ---- per body, changing: ``solids`` f64 --------------------------------------------------------------------------
+STATE = 64
 """Stride."""
 
 X = 0  # centre of mass, of colliders the pivot (3)
@@ -28,10 +28,10 @@ PUSH_V = 46  # velocity that only takes depth out of contacts, not kept (3)
 PUSH_W = 49  # (3)
 V_BEFORE = 52  # V when the substep began (3)
 W_BEFORE = 55  # (3)
-TOUCHED = 58  # 1 when something pushed the solid in this substep, 2 when it bounced
+TOUCHED = 58  # 1 when something pushed the body in this substep, 2 when it bounced
 BLEND = 59  # share of the second lattice in a collider that deforms
 
-# ---- per solid, constant between segments: ``solid_numbers`` f64 ---------------------------------------------------
+# ---- per body, constant between segments: ``solid_numbers`` f64 ---------------------------------------------------
 NUMBERS = 48
 INVERSE_MASS = 0
 MASS = 1
@@ -51,7 +51,7 @@ BLEND_RATE = 36  # 1/s
 SPACING = 37  # of the surface points
 BULGE = 38  # how far the surface stands out between its points where it is round
 
-# ---- per solid, whole numbers: ``solid_kinds`` i32 ------------------------------------------------------------------
+# ---- per body, whole numbers: ``solid_kinds`` i32 ------------------------------------------------------------------
 KINDS = 8
 KIND = 0
 SHAPE = 1  # first lattice
@@ -65,7 +65,7 @@ POINT = 12
 """Stride: ``collision_shapes.PATCH`` numbers and 1 where the surface is smooth, 0 at edges and corners."""
 
 # ---- per world: ``world_spans`` i32, ``world_numbers`` f64, ``world_report`` f64 ------------------------------------
-SPANS = 4  # first solid, end of solids, first pair, end of pairs
+SPANS = 4  # first body, end of bodies, first pair, end of pairs
 WORLD = 16
 GRAVITY = 0  # (3)
 PLANE = 3  # two tangents and the normal of the plane (9)
@@ -74,7 +74,7 @@ RECOVERY = 13  # fastest speed at which depth is taken out
 REPORT = 4  # contacts, largest depth, iterations, spare
 
 # ---- pairs: ``pairs`` i32, ``pair_numbers`` f64 ---------------------------------------------------------------------
-PAIRS = 4  # solid a whose points touch, solid b that they touch (-1: the plane), the pair the other way round or -1
+PAIRS = 4  # body a whose points touch, body b that they touch (-1: the plane), the pair the other way round or -1
 CONTACT = 8
 KINETIC, STATIC_FRICTION, RESTITUTION, MODE, LEVER, ADHESION, ADHESION_REACH = range(7)
 SEPARATE, SLIP, STICKY = range(3)

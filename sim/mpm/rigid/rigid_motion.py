@@ -34,9 +34,9 @@ from .rigid_layout import (
     PUSH_V,
     PUSH_W,
     REPORT,
-    SOLID,
     SPANS,
     SPIN_UP,
+    STATE,
     TETHER_ANCHOR,
     TETHER_LENGTH,
     TETHER_STIFFNESS,
@@ -69,18 +69,18 @@ def predict(w, dt, bodies: RigidArrays):
     """Predict velocities of all bodies of world ``w`` after ``dt``, from their accelerations in the last substep."""
     for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
         for c in ti.static(range(3)):
-            bodies.state[i * SOLID + V_NEXT + c] = (
-                bodies.state[i * SOLID + V + c] + dt * bodies.state[i * SOLID + ACCELERATION + c]
+            bodies.state[i * STATE + V_NEXT + c] = (
+                bodies.state[i * STATE + V + c] + dt * bodies.state[i * STATE + ACCELERATION + c]
             )
-            bodies.state[i * SOLID + W_NEXT + c] = (
-                bodies.state[i * SOLID + W + c] + dt * bodies.state[i * SOLID + SPIN_UP + c]
+            bodies.state[i * STATE + W_NEXT + c] = (
+                bodies.state[i * STATE + W + c] + dt * bodies.state[i * STATE + SPIN_UP + c]
             )
 
 
 @func
 def act(w, i, dt, bodies: RigidArrays):
     """Apply forces over ``dt`` and the particles' impulses to body ``i``; the impulses are set to 0."""
-    r, n = i * SOLID, i * NUMBERS
+    r, n = i * STATE, i * NUMBERS
     inverse = bodies.numbers[n + INVERSE_MASS]
     velocity, spin = load3(bodies.state, r + V), load3(bodies.state, r + W)
     store3(bodies.state, r + V_BEFORE, velocity)
@@ -119,7 +119,7 @@ def act(w, i, dt, bodies: RigidArrays):
 @func
 def move(w, i, dt, bodies: RigidArrays):
     """Update position and orientation at the end of the substep, and what follows from them."""
-    r, n = i * SOLID, i * NUMBERS
+    r, n = i * STATE, i * NUMBERS
     kind = bodies.kinds[i * KINDS + KIND]
     velocity, spin = load3(bodies.state, r + V), load3(bodies.state, r + W)
     q = dvec4(bodies.state[r + Q], bodies.state[r + Q + 1], bodies.state[r + Q + 2], bodies.state[r + Q + 3])

@@ -58,7 +58,7 @@ from .rigid_layout import (
     SEPARATE,
     SLIP,
     SLOTS,
-    SOLID,
+    STATE,
     STATIC_FRICTION,
     STICKY,
     TARGET,
@@ -100,10 +100,10 @@ def cross_product_matrix_column(arm, inverse_inertia, axis):
 def kick(i, row_v, row_w, impulse, moment, bodies: RigidArrays):
     """Add an impulse and an angular impulse to the velocities at ``row_v`` and ``row_w`` of body ``i``."""
     for c in ti.static(range(3)):
-        bodies.state[i * SOLID + row_v + c] += bodies.numbers[i * NUMBERS + INVERSE_MASS] * impulse[c]
-    turn = load33(bodies.state, i * SOLID + J) @ moment
+        bodies.state[i * STATE + row_v + c] += bodies.numbers[i * NUMBERS + INVERSE_MASS] * impulse[c]
+    turn = load33(bodies.state, i * STATE + J) @ moment
     for c in ti.static(range(3)):
-        bodies.state[i * SOLID + row_w + c] += turn[c]
+        bodies.state[i * STATE + row_w + c] += turn[c]
 
 
 @func
@@ -117,11 +117,11 @@ def prepare(w, dt, p, bodies: RigidArrays, contacts: RigidContacts):
     fall = dt * weight + 1e-6
     recovery = bodies.world_numbers[w * WORLD + RECOVERY]
     inverse = bodies.numbers[a * NUMBERS + INVERSE_MASS]
-    Ja = load33(bodies.state, a * SOLID + J)
+    Ja = load33(bodies.state, a * STATE + J)
     Jb = Ja * 0
     if b >= 0:
         inverse += bodies.numbers[b * NUMBERS + INVERSE_MASS]
-        Jb = load33(bodies.state, b * SOLID + J)
+        Jb = load33(bodies.state, b * STATE + J)
     # The adhesion, a force of so much times the reduced mass, is shared by the contacts in its reach.
     pull, within = contacts.pair_numbers[law + ADHESION], contacts.pair_numbers[law + ADHESION_REACH]
     sharing = 0
@@ -154,11 +154,11 @@ def prepare(w, dt, p, bodies: RigidArrays, contacts: RigidContacts):
         rows = ti.abs(both) @ dvec3(1.0)
         contacts.rows[c + KR] = rows.max()
         drift = load3(contacts.rows, c + DRIFT)
-        u = load3(bodies.state, a * SOLID + V) + load3(bodies.state, a * SOLID + W).cross(ra) - drift
-        before = load3(bodies.state, a * SOLID + V_BEFORE) + load3(bodies.state, a * SOLID + W_BEFORE).cross(ra) - drift
+        u = load3(bodies.state, a * STATE + V) + load3(bodies.state, a * STATE + W).cross(ra) - drift
+        before = load3(bodies.state, a * STATE + V_BEFORE) + load3(bodies.state, a * STATE + W_BEFORE).cross(ra) - drift
         if b >= 0:
-            u -= load3(bodies.state, b * SOLID + V) + load3(bodies.state, b * SOLID + W).cross(rb)
-            before -= load3(bodies.state, b * SOLID + V_BEFORE) + load3(bodies.state, b * SOLID + W_BEFORE).cross(rb)
+            u -= load3(bodies.state, b * STATE + V) + load3(bodies.state, b * STATE + W).cross(rb)
+            before -= load3(bodies.state, b * STATE + V_BEFORE) + load3(bodies.state, b * STATE + W_BEFORE).cross(rb)
         closing = u.dot(n)
         gap = contacts.rows[c + GAP]
         target = -ti.max(gap, 0) / dt
@@ -217,16 +217,16 @@ def sweep(p, bodies: RigidArrays, contacts: RigidContacts):
         lever = contacts.pair_numbers[contacts.pairs[p * PAIRS + 3] * CONTACT + LEVER]
         ma = bodies.numbers[a * NUMBERS + INVERSE_MASS]
         mb = ma * 0
-        Ja = load33(bodies.state, a * SOLID + J)
+        Ja = load33(bodies.state, a * STATE + J)
         Jb = Ja * 0
-        va, wa = load3(bodies.state, a * SOLID + V), load3(bodies.state, a * SOLID + W)
-        pa, qa = load3(bodies.state, a * SOLID + PUSH_V), load3(bodies.state, a * SOLID + PUSH_W)
+        va, wa = load3(bodies.state, a * STATE + V), load3(bodies.state, a * STATE + W)
+        pa, qa = load3(bodies.state, a * STATE + PUSH_V), load3(bodies.state, a * STATE + PUSH_W)
         vb, wb, pb, qb = dvec3(0.0), dvec3(0.0), dvec3(0.0), dvec3(0.0)
         if b >= 0:
             mb = bodies.numbers[b * NUMBERS + INVERSE_MASS]
-            Jb = load33(bodies.state, b * SOLID + J)
-            vb, wb = load3(bodies.state, b * SOLID + V), load3(bodies.state, b * SOLID + W)
-            pb, qb = load3(bodies.state, b * SOLID + PUSH_V), load3(bodies.state, b * SOLID + PUSH_W)
+            Jb = load33(bodies.state, b * STATE + J)
+            vb, wb = load3(bodies.state, b * STATE + V), load3(bodies.state, b * STATE + W)
+            pb, qb = load3(bodies.state, b * STATE + PUSH_V), load3(bodies.state, b * STATE + PUSH_W)
         for s in range(contacts.counts[p]):
             c = (p * SLOTS + s) * ROW
             ra, rb, n = (
@@ -284,15 +284,15 @@ def sweep(p, bodies: RigidArrays, contacts: RigidContacts):
                 qa += Ja @ ra.cross(change)
                 pb -= mb * change
                 qb -= Jb @ rb.cross(change)
-        store3(bodies.state, a * SOLID + V, va)
-        store3(bodies.state, a * SOLID + W, wa)
-        store3(bodies.state, a * SOLID + PUSH_V, pa)
-        store3(bodies.state, a * SOLID + PUSH_W, qa)
+        store3(bodies.state, a * STATE + V, va)
+        store3(bodies.state, a * STATE + W, wa)
+        store3(bodies.state, a * STATE + PUSH_V, pa)
+        store3(bodies.state, a * STATE + PUSH_W, qa)
         if b >= 0:
-            store3(bodies.state, b * SOLID + V, vb)
-            store3(bodies.state, b * SOLID + W, wb)
-            store3(bodies.state, b * SOLID + PUSH_V, pb)
-            store3(bodies.state, b * SOLID + PUSH_W, qb)
+            store3(bodies.state, b * STATE + V, vb)
+            store3(bodies.state, b * STATE + W, wb)
+            store3(bodies.state, b * STATE + PUSH_V, pb)
+            store3(bodies.state, b * STATE + PUSH_W, qb)
     return worst
 
 
@@ -315,10 +315,10 @@ def finish(w, p, bodies: RigidArrays, contacts: RigidContacts):
                     arm = load3(contacts.rows, c + ti.select(d == 0, ARM_A, ARM_B))
                     gain = sign * (arm.cross(impulse) + roll)
                     for k in ti.static(range(3)):
-                        bodies.state[i * SOLID + L + k] += gain[k]
+                        bodies.state[i * STATE + L + k] += gain[k]
                     bounced = contacts.rows[c + BOUNCE] > 0.5
-                    bodies.state[i * SOLID + TOUCHED] = ti.max(
-                        bodies.state[i * SOLID + TOUCHED], ti.select(bounced, 2, 1)
+                    bodies.state[i * STATE + TOUCHED] = ti.max(
+                        bodies.state[i * STATE + TOUCHED], ti.select(bounced, 2, 1)
                     )
             store3(contacts.memory, m, load3(contacts.rows, c + PLACE))
             contacts.memory[m + 3] = ti.select(contacts.rows[c + BOUNCE] > 0.5, 0, contacts.rows[c + IMPULSE])

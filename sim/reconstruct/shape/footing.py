@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...mpm.geometry.triangles import area_normals
 from ...scene.model import Camera
 from .inflate import Silhouette
 from .support import support_of
-from .surface_mesh import area_normals
 
 Points = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
+from ...smoothstep import smoothstep
 from ..camera.ground_camera import ground_depth
 from .inflate import Crop, limb_profile, signed_distance
 from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, standing_mesh
@@ -79,8 +80,8 @@ def warp_to_outline(crop: Crop, primitive: Mask, *, smooth: float = SMOOTH, fade
     if good.any():
         nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
         outward = ndimage.gaussian_filter(apart[tuple(nearest)], max(1.5, smooth * size))
-    weight = np.clip(1.0 - own / max(fade * float(own.max()), 1e-9), 0.0, 1.0)
-    shift = np.moveaxis(towards * (outward * weight * weight * (3.0 - 2.0 * weight)), 0, -1)
+    weight = smoothstep(1.0 - own / max(fade * float(own.max()), 1e-9))
+    shift = np.moveaxis(towards * (outward * weight), 0, -1)
     parts, reach = _parts(mask, own + outward, size)
     return OutlineWarp(shift=shift, parts=parts, fade=np.clip(1.0 - (own + outward) / reach, 0.0, 1.0))
 

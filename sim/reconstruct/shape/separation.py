@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth
+from ..mesh_raster import depth_range
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -127,15 +128,15 @@ class _Pair:
         if (high <= low).any():
             return None
         cell = float((high - low).max()) / CELLS
-        shape = tuple(int(n) for n in np.ceil((high - low) / cell)[::-1] + 2)
+        size = tuple(int(n) for n in np.ceil((high - low) / cell) + 2)
         corner = low - cell
         return _Pair(
             front=first,
             behind=second,
             corner=corner,
             cell=cell,
-            front_range=_depth_range(first, front.faces, corner, cell, (shape[0], shape[1])),
-            behind_range=_depth_range(second, behind.faces, corner, cell, (shape[0], shape[1])),
+            front_range=_depth_range(first, front.faces, corner, cell, size),
+            behind_range=_depth_range(second, behind.faces, corner, cell, size),
             gap=GAP * front.extent,
             touching=TOUCHING * front.extent,
             kept=THINNEST * front.extent,
@@ -187,43 +188,11 @@ class _Pair:
 
 
 def _depth_range(
-    projected: Points, faces: Faces, corner: Points, cell: float, shape: tuple[int, int]
+    projected: Points, faces: Faces, corner: Points, cell: float, size: tuple[int, ...]
 ) -> tuple[Points, Points]:
     """Nearest and farthest depth (h, w) of a mesh with ``projected`` vertices (V, 3) at the middles of the cells.
 
-    At the middles, not anywhere in a cell: bodies that rest on each other have the same depth there. Inverse depth is
-    linear in the photo.
+    At the middles, not anywhere in a cell: bodies that rest on each other have the same depth there.
     """
-    near, far = np.full(shape, np.inf), np.full(shape, -np.inf)
-    triangles = projected[faces]
-    # In cells, whose middles are at whole numbers.
-    corners = (triangles[:, :, :2] - corner) / cell - 0.5
-    first = np.maximum(np.ceil(corners.min(axis=1)), 0).astype(int)
-    last = np.minimum(np.floor(corners.max(axis=1)), np.array(shape[::-1]) - 1).astype(int)
-    sides = (last - first).max(axis=1) + 1
-    hit = (last >= first).all(axis=1)
-    inverse = 1.0 / triangles[:, :, 2]
-    classes = np.where(hit, np.ceil(np.log2(np.maximum(sides, 1))), -1).astype(int)
-    for size in np.unique(classes[hit]):
-        chosen = np.flatnonzero(classes == size)
-        offsets = np.stack(np.meshgrid(*[np.arange(2**size)] * 2), axis=-1).reshape(-1, 2)
-        for part in np.array_split(chosen, max(1, len(chosen) * len(offsets) // 500_000)):
-            cells = first[part, None] + offsets
-            a, b, c = (corners[part, None, k] for k in range(3))
-            weights = np.stack([_area(b, c, cells), _area(c, a, cells), _area(a, b, cells)], axis=-1)
-            total = weights.sum(axis=-1)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                shares = weights / total[..., None]
-            inside = (shares >= -1e-9).all(axis=-1) & (cells <= last[part, None]).all(axis=-1)
-            triangle, place = np.nonzero(inside)
-            depth = 1.0 / (shares[triangle, place] * inverse[part[triangle]]).sum(axis=-1)
-            columns, rows = cells[triangle, place].T
-            np.minimum.at(near, (rows, columns), depth)
-            np.maximum.at(far, (rows, columns), depth)
-    return near, far
-
-
-def _area(first: Points, second: Points, third: NDArray[np.int64]) -> Points:
-    """Twice the signed area (...) of triangles with corners (..., 2)."""
-    one, two = second - first, third - first
-    return np.asarray(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0])
+    at = np.column_stack([(projected[:, :2] - corner) / cell, projected[:, 2]])
+    return depth_range(at, faces, (size[0], size[1]))

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from .surface_mesh import area_normals
+from ...mpm.geometry.triangles import area_normals
+from ...scene.bake_quality import COARSEST, load_quality
 
 Points = NDArray[np.float64]
 
@@ -20,8 +21,6 @@ MARGIN_CELLS = 2.0
 """Least margin in grid cells: what stands on less is held by the rounding of one cell's contact."""
 MARGIN_HEIGHT = 0.15
 """Least margin over the body's height: it stands on slopes of 17° if its centre of mass is half way up."""
-COARSEST_PARTICLES, COARSEST_PER_CELL, COARSEST_CELLS = 6000, 8, 6
-"""Particles, particles per cell and cells along the longest side of the coarsest quality (``presets/qualities``)."""
 FILM = 0.5
 """Least thickness in grid cells of what counts as base."""
 FACES_UP = 0.2
@@ -47,8 +46,9 @@ class SupportMargin:
     @property
     def cell(self) -> float:
         """Side of a grid cell when the body is simulated alone in the coarsest quality."""
-        filled = (self.volume * COARSEST_PER_CELL / COARSEST_PARTICLES) ** (1 / 3)
-        return float(min(filled, self.longest / COARSEST_CELLS))
+        quality = load_quality(COARSEST)
+        filled = (self.volume * quality.particles_per_cell / quality.particles) ** (1 / 3)
+        return float(min(filled, self.longest / quality.smallest_cells))
 
     @property
     def wanted(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..appearance.albedo import rasterised
+from ..mesh_raster import rasterise
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -159,7 +159,7 @@ def _separated(flat: Points, chart: NDArray[np.int64], links: sparse.csr_matrix)
             size = (int(corner[..., 0].max()) + 1, int(corner[..., 1].max()) + 1)
             # So far away that the perspective of the rasteriser is none.
             points = corner.reshape(-1, 3) + np.array([0.0, 0.0, 1e7])
-            shown = rasterised(points, np.arange(len(points)).reshape(-1, 3), size, np.ones(len(rows), dtype=bool))
+            shown = rasterise(points, np.arange(len(points)).reshape(-1, 3), size, np.ones(len(rows), dtype=bool))
             depth = np.full(size[::-1], np.inf)
             depth[shown.rows, shown.columns] = shown.interpolated(
                 np.arange(len(points)).reshape(-1, 3), corner.reshape(-1, 3)[:, 2:]

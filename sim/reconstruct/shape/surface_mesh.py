@@ -19,19 +19,6 @@ WORTH_SAYING = 0.01
 """Share of the surface above which its removal gives a notice."""
 
 
-def area_normals(vertices: Points, faces: Faces) -> Points:
-    """Return the sum (V, 3) of the normals of each vertex' faces, each as long as twice its face's area.
-
-    vertices: (V, 3); faces: (T, 3), counter-clockwise from outside.
-    """
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    summed = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(summed, faces[:, corner], across)
-    return summed
-
-
 def keep_main_part(points: Points, faces: Faces) -> tuple[Points, Faces, float]:
     """Return the connected part with the largest area, its vertices renumbered in order, and the removed share of the
     area.

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...mpm.geometry.triangles import area_normals
 from ...scene.model import Camera
-from ..appearance.albedo import rasterised
+from ...smoothstep import smoothstep
+from ..mesh_raster import rasterise
 from .body_texture import CropTexture, TexturedSurface
 from .inflated_mesh import BodyMesh
 from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_grain
 from .surface_charts import surface_frame, unwrap
-from .surface_mesh import area_normals
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -90,7 +91,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
     values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
-    found = rasterised(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
+    found = rasterise(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
     texel = found.interpolated(charts.faces, values[charts.source])
     below = np.zeros((charts.size[1], size[0], 3), dtype=np.uint8)
     if len(found.rows):
@@ -127,7 +128,7 @@ def _shown(camera: Camera, body: BodyMesh, mask: Mask) -> tuple[Mask, NDArray[np
     cells = CELLS / max(float((high - low).max()), 1.0)
     grid = np.column_stack([(at[:, :2] - low) * cells + 1.0, at[:, 2]])
     size = (int((high - low)[0] * cells) + 3, int((high - low)[1] * cells) + 3)
-    front = rasterised(grid, body.faces, size, cosine > 0)
+    front = rasterise(grid, body.faces, size, cosine > 0)
     depth = np.full(size[::-1], np.inf)
     depth[front.rows, front.columns] = front.interpolated(body.faces, at[:, 2:])[:, 0]
     # The deepest of the cells around: along the outline nothing is hidden by its own slope.
@@ -176,7 +177,7 @@ def _flatness(body: BodyMesh, normals: Points) -> NDArray[np.float64]:
     for one, edge in ((first, order[pairs]), (second, order[pairs + 1])):
         around[one, edge % 3] = bend
     extent = float(np.ptp(body.vertices, axis=0).max())
-    flat = 1.0 - _ramp(np.median(around, axis=1) * extent, BENT[::-1])
+    flat = 1.0 - smoothstep(np.median(around, axis=1) * extent, *BENT[::-1])
     result = np.zeros(len(body.vertices))
     for corner in range(3):
         np.maximum.at(result, body.faces[:, corner], flat)
@@ -186,12 +187,6 @@ def _flatness(body: BodyMesh, normals: Points) -> NDArray[np.float64]:
 def _cropped(mask: Mask, texture: CropTexture) -> Mask:
     height, width = texture.pixels.shape[:2]
     return mask[texture.top : texture.top + height, texture.left : texture.left + width]
-
-
-def _ramp(value: NDArray[np.float64], ends: tuple[float, float]) -> NDArray[np.float64]:
-    """0 up to the first of ``ends``, 1 from the second, smooth between."""
-    share = np.clip((value - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
-    return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
 def _colours(
@@ -217,8 +212,8 @@ def _colours(
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
     depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
     away = _sampled(depth, own)[:, 0]
-    clear = _ramp(away, CLEAR) * (cosine > SHOWN[0]) * texel[:, 11]
-    weight = (np.maximum(_ramp(cosine, SHOWN), clear) * (1.0 - texel[:, 10]))[:, None]
+    clear = smoothstep(away, *CLEAR) * (cosine > SHOWN[0]) * texel[:, 11]
+    weight = (np.maximum(smoothstep(cosine, *SHOWN), clear) * (1.0 - texel[:, 10]))[:, None]
     seen = np.flatnonzero(weight[:, 0] > 0)
     if not len(seen):
         return plain
@@ -230,11 +225,11 @@ def _colours(
     added = grain[seen]
     for i in range(3):
         added[:, i] -= (np.bincount(cell, added[:, i], minlength=height * width) / count)[cell]
-    added *= (1.0 - _ramp(cosine[seen], GRAIN))[:, None]
+    added *= (1.0 - smoothstep(cosine[seen], *GRAIN))[:, None]
     photo = _sampled(texture.pixels.astype(np.float32), own[seen])
     inner = _sampled(inner_colours(texture.pixels.astype(np.float32), mask), own[seen])
-    pure = np.maximum(_ramp(away[seen], PURE), _ramp(cosine[seen], GRAIN))
-    share = np.maximum(pure * _ramp(cosine[seen], OWN), clear[seen])
+    pure = np.maximum(smoothstep(away[seen], *PURE), smoothstep(cosine[seen], *GRAIN))
+    share = np.maximum(pure * smoothstep(cosine[seen], *OWN), clear[seen])
     photo = inner + share[:, None] * (photo - inner) + added
     plain[seen] += weight[seen] * (photo - plain[seen])
     return plain

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from ..errors import InputError
 from ..validation import parse
 
 QUALITY_FOLDER = Path(__file__).resolve().parents[2] / "presets" / "qualities"
+COARSEST = "preview"
+"""The quality whose cells are largest, so that a base carries least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +50,7 @@ def quality_names() -> list[str]:
     return sorted(path.stem for path in QUALITY_FOLDER.glob("*.toml"))
 
 
+@cache
 def load_quality(name: str) -> Quality:
     """Return the quality ``name``. Raises InputError for an unknown name."""
     if name not in quality_names():
