@@ -302,7 +302,7 @@ def test_two_scenes_of_a_file_keep_to_themselves(file):
     assert bake_state.refresh(first).status == "baked"
 
 
-def test_what_cannot_be_baked_says_why(tmp_path):
+def test_baking_reports_why_it_is_impossible(tmp_path):
     with pytest.raises(RuntimeError, match="no object takes part"):
         bpy.ops.physgen.bake("EXEC_DEFAULT")
     found = a_scene()

@@ -114,7 +114,7 @@ def test_objects_that_share_a_mesh_part_ways_and_undo_takes_it_all_back():
     assert len(bpy.context.scene.physgen_together.pairs) == 0
 
 
-def test_what_cannot_be_fitted_is_said_and_nothing_is_changed():
+def test_impossible_composition_is_reported_and_changes_nothing():
     one, two = a_ball("one", 0.0, subdivisions=2), a_ball("two", 0.4, subdivisions=2)
     select(one, two)
     rest = points(two)
@@ -143,7 +143,7 @@ def test_what_cannot_be_fitted_is_said_and_nothing_is_changed():
     assert not list(Path(bpy.app.tempdir).glob("compose-*"))
 
 
-def test_it_is_exported_vertex_for_vertex_in_its_own_space(tmp_path):
+def test_export_keeps_vertices_and_local_space(tmp_path):
     item, other = a_ball("Ball/ü", 0.0), a_ball("b", 0.08)
     bpy.context.scene.unit_settings.scale_length = 0.1
     item.scale = (1, 2, 1)
@@ -173,7 +173,7 @@ class Live(Compose):
 
 
 @pytest.mark.long
-def test_it_shows_progress_and_cancelling_changes_nothing():
+def test_progress_is_shown_and_cancelling_changes_nothing():
     one, two = a_ball("one", 0.0, subdivisions=2), a_ball("two", 0.08, subdivisions=2)
     bpy.context.scene.physgen_together.steps = 100_000
     select(one, two)

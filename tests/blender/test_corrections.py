@@ -92,7 +92,7 @@ def drawn():
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-def test_what_was_not_set_is_not_said(photo):
+def test_unset_fields_give_no_options(photo):
     words = arguments(photo)
     assert [word for word in words if word.startswith("--")] == ["--box", "--name"]
 
@@ -120,7 +120,7 @@ def test_the_command_understands_all_that_was_set(photo, tmp_path):
 
 
 @pytest.mark.parametrize("end", [-1e9, -1e-9, 1e9])
-def test_whatever_the_fields_hold_the_command_takes(photo, end):
+def test_command_accepts_all_field_values(photo, end):
     photo.fov = photo.pitch = photo.horizon = photo.roll = end
     photo.use_fov = True
     for camera in ("PITCH", "HORIZON"):
@@ -128,7 +128,7 @@ def test_whatever_the_fields_hold_the_command_takes(photo, end):
         read(arguments(photo))
 
 
-def test_there_is_one_way_to_tell_the_tilt(photo):
+def test_tilt_has_one_option(photo):
     photo.camera, photo.horizon, photo.pitch = "PITCH", 0.1, math.radians(30)
     _, options = read(arguments(photo))
     assert (options.horizon_y, options.pitch_deg) == (None, pytest.approx(30, abs=1e-4))
@@ -152,7 +152,7 @@ def test_files_that_are_gone_are_told_at_once(photo, tmp_path, where, words):
 # -- asking a model ---------------------------------------------------------------------------------------------------
 
 
-def test_nobody_is_asked_without_consent(photo, tmp_path):
+def test_no_request_without_consent(photo, tmp_path):
     photo.ask_url, photo.ask_model = "https://host/v1", "seer"
     assert not photo.send_photo and "--ask=https://host/v1" not in arguments(photo, online=True)
     photo.send_photo = True
@@ -259,7 +259,7 @@ def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, 
     assert made_folder(state) is None and not state.has_found
 
 
-def test_what_was_changed_by_hand_stays_and_the_rest_is_new(world, tmp_path):
+def test_manual_changes_survive_a_new_reconstruction(world, tmp_path):
     scene, root = bpy.context.scene, tmp_path / "scene"
     shutil.copytree(world.folder.root, root)
     import_scene(scene, root)

@@ -389,7 +389,7 @@ def test_colours_are_where_the_discrepancy_is(throw):
     assert colours[local[:, 0] < -0.045, 1].min() > 0.35
 
 
-def test_it_plays_from_the_file_without_the_addon(throw, tmp_path):
+def test_saved_file_plays_without_the_addon(throw, tmp_path):
     capture, folder = throw
     save_diagnosis(a_diagnosis(capture), folder.with_name("throw_diagnosis"))
     load(folder).most = 4.0

@@ -85,7 +85,7 @@ def test_without_graphics_the_message_says_what_to_install(monkeypatch):
         render_engines.require_graphics()
 
 
-def test_what_is_not_there_falls_back_to_the_cpu(world, bake, tmp_path):
+def test_missing_device_falls_back_to_cpu(world, bake, tmp_path):
     events = []
     settings = RenderOptions(samples=2, device="metal" if os.uname().sysname != "Darwin" else "cuda")
     baked = bake([(0, 0, 0)])

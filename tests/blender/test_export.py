@@ -133,7 +133,7 @@ def test_objects_may_share_a_mesh_and_seams_may_be_open(scene, tmp_path):
     prepared(folder)
 
 
-def test_what_is_edited_counts(scene, tmp_path):
+def test_edits_change_the_fingerprint(scene, tmp_path):
     item = add()
     bpy.context.view_layer.objects.active = item
     bpy.ops.object.mode_set(mode="EDIT")
@@ -295,7 +295,7 @@ def _nla(item):
         (_nla, "animated"),
     ],
 )
-def test_what_is_simulated_must_not_be_moved_by_something_else(scene, tmp_path, how, word):
+def test_simulated_objects_may_not_be_animated_otherwise(scene, tmp_path, how, word):
     item = add()
     how(item)
     refused(scene, tmp_path, "'Cube'", word, "collider")
@@ -446,7 +446,7 @@ def test_the_numbers_of_an_object(scene, tmp_path):
     assert (effect.name, effect.objects, dict(effect.parameters)["start"]) == ("sandy", ("Cube",), 0.0)
 
 
-def test_what_cannot_be_is_refused_in_the_artists_words(scene, tmp_path):
+def test_invalid_scenes_are_refused_in_the_artists_words(scene, tmp_path):
     body = add().physgen
     body.material.preset = "wood"
     body.material.law = "rigid"
@@ -580,7 +580,7 @@ def test_the_second_scene_of_a_file_is_exported_as_it_is(scene, tmp_path):
     assert bpy.context.scene == scene
 
 
-def test_what_is_linked_from_another_file_needs_an_override(scene, tmp_path):
+def test_linked_objects_need_an_override(scene, tmp_path):
     library = tmp_path / "library.blend"
     bpy.data.libraries.write(str(library), {add("brick")})
     bpy.data.objects.remove(bpy.data.objects["brick"])

@@ -74,7 +74,7 @@ def states(process):
 
 
 @pytest.mark.long
-def test_whatever_is_killed_costs_a_retry_and_nothing_else(job):
+def test_killed_process_costs_only_a_retry(job):
     # The scheduler itself, in the middle of the bake: what it had started ends by itself, what was done is kept.
     scheduler = physgen(job)
     for line in scheduler.stdout:

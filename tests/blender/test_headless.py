@@ -112,7 +112,7 @@ def test_a_folder_in_use_is_refused_and_not_disturbed(world, bake, tmp_path):
         assert [p.name for p in out.iterdir()] == [".lock"]
 
 
-def test_what_blender_lacks_is_named_and_taken_from_where_somebody_says(world, bake, bare, tmp_path):
+def test_missing_packages_are_named_and_found_on_a_given_path(world, bake, bare, tmp_path):
     arguments = [world.folder.root, "--bake", bake(SHIFTS), "--out", tmp_path / "out", "--frames", "1", *QUICK]
     lacking = start(tmp_path, *bare, BATCH / "render.py", *arguments, HOME=str(tmp_path))
     here = {"HOME": str(tmp_path), "PHYSGEN_PYTHON": sys.executable}
@@ -138,7 +138,7 @@ def test_a_verb_that_simulates_becomes_the_python_that_can(bare, tmp_path):
         assert code == 3 and words in json.loads(said)["message"]
 
 
-def test_what_a_bake_lacks_comes_with_the_way_out(world, bake, tmp_path):
+def test_incomplete_bakes_are_reported_with_a_remedy(world, bake, tmp_path):
     folder, options = bake(SHIFTS), RenderOptions(samples=1, scale=0.25)
     path = folder / MANIFEST_FILE
     whole = json.loads(path.read_text())

@@ -422,7 +422,7 @@ def test_boxes_become_the_commands_arguments(world, tmp_path):
     assert not state.boxes
 
 
-def test_what_is_no_photo_is_refused(tmp_path):
+def test_other_files_than_photos_are_refused(tmp_path):
     for name, content, words in (("a.png", b"nothing", "not a readable"), ("a.txt", b"x", "is no photo")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(RuntimeError, match=words):

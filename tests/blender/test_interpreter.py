@@ -40,7 +40,7 @@ def test_a_folder_of_an_environment_is_as_good_as_its_python(bare):
         interpreter.find_python(str(bare))
 
 
-def test_one_that_was_named_is_never_replaced_and_the_command_mends_it(bare, monkeypatch):
+def test_named_interpreter_is_kept_and_repaired_by_command(bare, monkeypatch):
     monkeypatch.setenv(interpreter.VARIABLE, str(bare))
     with pytest.raises(interpreter.NoPython, match=r"named in PHYSGEN_PYTHON.*taichi.*In a terminal: ") as raised:
         interpreter.find_python()
@@ -50,12 +50,12 @@ def test_one_that_was_named_is_never_replaced_and_the_command_mends_it(bare, mon
 
 
 @pytest.mark.parametrize("name", ["/nowhere/python", "/", "no-such-python"])
-def test_what_cannot_be_started_is_named(name):
+def test_interpreter_that_does_not_start_is_named(name):
     with pytest.raises(interpreter.NoPython, match=rf"{name}, named in the preferences, is no Python"):
         interpreter.find_python(name)
 
 
-def test_what_is_no_python_is_quoted():
+def test_output_of_other_programs_is_quoted():
     with pytest.raises(interpreter.NoPython, match="cannot simulate: "):
         interpreter.find_python("/bin/cat")
     with pytest.raises(interpreter.NoPython, match="it answered '/"):
@@ -84,7 +84,7 @@ def test_the_environment_that_the_command_makes_is_found_unnamed(tmp_path, monke
     assert str(interpreter.find_python()) == python
 
 
-def test_one_that_lies_there_half_done_is_completed(bare, monkeypatch):
+def test_incomplete_environment_is_completed(bare, monkeypatch):
     monkeypatch.setenv("HOME", str(bare.parent))
     monkeypatch.setattr(sys, "executable", "/bin/echo")
     (bare.parent / "physgen-python").symlink_to(bare)

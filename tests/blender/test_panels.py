@@ -75,7 +75,7 @@ def a_body(name="Cube", **options):
 # -- registering ------------------------------------------------------------------------------------------------------
 
 
-def test_it_comes_and_goes_as_often_as_one_likes():
+def test_extension_registers_and_unregisters_repeatedly():
     for _ in range(2):
         physgen.unregister()
         assert not hasattr(bpy.types.Object, "physgen") and not hasattr(bpy.types, "PHYSGEN_PT_world")
@@ -103,7 +103,7 @@ def registered_groups():
     ]
 
 
-def test_what_a_user_can_set_explains_itself():
+def test_every_property_has_a_description():
     for kind in registered_groups():
         for name in inspect.get_annotations(kind):
             found = kind.bl_rna.properties[name]
@@ -572,7 +572,7 @@ def test_layers_of_a_still_are_shown_and_another_format_wants_another_folder(wor
         bpy.ops.physgen.render_still()
 
 
-def test_what_cannot_be_rendered_says_why(world, bake, tmp_path, monkeypatch):
+def test_rendering_reports_why_it_is_impossible(world, bake, tmp_path, monkeypatch):
     assert not bpy.ops.physgen.render_still.poll()
     folder = bake([(0, 0, 0)])
     state = a_photo_scene(world, folder, tmp_path)

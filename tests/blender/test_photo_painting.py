@@ -351,7 +351,7 @@ os._exit(0)
 """
 
 
-def test_what_is_drawn_over_the_photo_lies_where_it_belongs(tmp_path):
+def test_overlays_are_drawn_at_the_right_place_on_the_photo(tmp_path):
     """By Blender's own graphics, without a window, in a process of its own: without a driver it may die."""
     command = [sys.executable, "-c", DRAWING, str(ROOT.parent), str(tmp_path / "seen.npy")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)

@@ -37,7 +37,7 @@ def hue(pixels):
 
 
 @pytest.mark.parametrize("look", ["grains", "surface"])
-def test_it_is_the_photo_until_it_falls_apart_and_wears_its_colours_then(world, bake, tmp_path, look):
+def test_particles_show_the_photo_until_they_separate_and_keep_its_colours(world, bake, tmp_path, look):
     vertices = load_object_mesh(world.folder, world.folder.model.objects[0]).vertices
     rest, spread, flat = heap(vertices)
     folder = bake([(0, 0, 0)] * 2)

@@ -136,7 +136,7 @@ def test_particles_stand_in_for_what_flows(a_bake, law):
     assert not len(bpy.data.objects["Cube"].modifiers) and record.path.is_dir()
 
 
-def test_what_turns_to_sand_is_itself_until_then(a_bake):
+def test_object_is_a_mesh_until_it_turns_to_sand(a_bake):
     a_bake(look=Look(name="Cube", shape=bake_record.GRAINS, from_frame=START + 2))
     bake_state.refresh(bpy.context.scene)
     name = particles.find(bpy.context.scene, "Cube").name
@@ -181,7 +181,7 @@ def test_a_file_with_a_bake_plays_without_the_extension(a_bake):
         physgen.register()
 
 
-def test_what_is_baked_is_blurred_by_its_motion(a_bake, tmp_path):
+def test_baked_motion_is_motion_blurred(a_bake, tmp_path):
     a_bake()
     scene = bpy.context.scene
     bake_state.refresh(scene)

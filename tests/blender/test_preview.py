@@ -83,7 +83,7 @@ def test_frames_arrive_a_changed_number_runs_again_and_stop_leaves_nothing():
     assert session.join(WAIT_S) and not root.exists()
 
 
-def test_what_cannot_be_simulated_is_said_and_mending_it_goes_on():
+def test_preview_reports_invalid_scenes_and_recovers():
     ball = add_body()
     ball.scale.z = 0.0
     session = Session(bpy.context.scene.session_uid, command)

@@ -199,7 +199,7 @@ def test_scenes_that_share_objects_say_whose_bake_plays(folder):
     assert "Cube plays another bake" in bake_state.refresh(first).trouble
 
 
-def test_what_the_simulation_does_not_see_does_not_make_a_bake_out_of_date(folder):
+def test_changes_that_do_not_affect_motion_keep_the_bake_current(folder):
     before = fingerprint(scene())
     modifier = cube().modifiers.new("Subdivision", "SUBSURF")
     assert fingerprint(scene()) == before
@@ -220,7 +220,7 @@ def test_a_collider_that_looks_at_a_simulated_object_sees_its_modifiers(folder):
     assert fingerprint(scene()) != before
 
 
-def test_what_is_too_far_away_is_said_so(tmp_path):
+def test_objects_too_far_away_are_reported(tmp_path):
     add_cube().location.x = 1e20
     with pytest.raises(InputError, match="'Cube': is 1e\\+20 m away"):
         export_scene(scene(), tmp_path / "out")
@@ -364,7 +364,7 @@ GOOD = """'{"python": "3.13.0", "missing": [], "installs": true, "trouble": ""}'
         "kill -SEGV $$",
     ],
 )
-def test_what_is_no_python_is_said_in_words(python, text):
+def test_other_programs_than_python_are_reported(python, text):
     python(text)
     with pytest.raises(interpreter.NoPython, match="named in PHYSGEN_PYTHON, cannot simulate: "):
         interpreter.find_python()
@@ -372,7 +372,7 @@ def test_what_is_no_python_is_said_in_words(python, text):
 
 @posix
 @pytest.mark.parametrize("text", ["sleep 100", "sleep 100 & sleep 100"])
-def test_one_that_does_not_answer_is_given_up(python, text, monkeypatch):
+def test_unresponsive_interpreter_times_out(python, text, monkeypatch):
     monkeypatch.setattr(interpreter, "_TIMEOUT_S", 0.3)
     python(text)
     with pytest.raises(interpreter.NoPython, match=r"did not answer within 0.3 s"):

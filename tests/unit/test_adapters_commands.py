@@ -88,7 +88,7 @@ def test_a_mesher_sees_the_object_alone_and_its_files_come_along(tmp_path):
     assert sorted(p.name for p in out.iterdir()) == ["it.obj", "material.mtl"]
 
 
-def test_it_runs_where_nothing_of_ours_is(tmp_path, monkeypatch):
+def test_adapter_runs_outside_the_source_tree(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     body = (
         "assert os.getcwd() == os.path.dirname(os.path.realpath(output)), os.getcwd()\n"

@@ -134,7 +134,7 @@ def test_mistakes_of_a_function_are_told_as_its_own(module, name):
         ("", "has no target"),
     ],
 )
-def test_what_cannot_be_the_stage_is_refused_at_once(module, target, words):
+def test_unsuitable_functions_are_refused_at_once(module, target, words):
     with pytest.raises(InputError, match=words):
         resolve("inpainter", f"python:{target.format(module=module)}")
 

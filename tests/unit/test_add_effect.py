@@ -70,7 +70,7 @@ def test_no_finding_is_nothing_to_add(effect):
 
 
 @pytest.mark.parametrize("value", [None, "much", math.nan, True])
-def test_what_is_no_number_is_named(value):
+def test_values_that_are_not_numbers_are_named(value):
     with pytest.raises(InputError, match=r"air_drag\.drag_per_mass"):
         found_effects(a_report(drag_per_mass=value))
 
@@ -100,7 +100,7 @@ def test_two_of_the_same_name_become_one():
 
 
 @pytest.mark.parametrize("name", ["time_scale", "camera_pose"])
-def test_what_concerns_the_recording_is_refused(name):
+def test_observation_effects_are_refused(name):
     with pytest.raises(InputError, match="concerns how the recording was made"):
         with_effects(a_scene(), {name: effects()[name].defaults})
 

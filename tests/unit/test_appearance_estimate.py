@@ -192,7 +192,7 @@ def test_the_exponent_is_where_one_colour_is_most_even(truth, seed):
 
 
 @pytest.mark.parametrize("how", [{}, {"paint": "spot"}, {"paint": "checks", "roughness": 0.2}])
-def test_what_is_no_highlight_of_this_sun_is_not_taken_for_one(how):
+def test_bright_spots_off_the_sun_are_not_highlights(how):
     found, _ = estimated(**how)
     assert found.source == "default"
     assert (found.roughness, found.metallic) == (0.6, 0.0)

@@ -165,7 +165,7 @@ def test_a_wall_in_the_depth_stands_where_it_is():
 
 @settings(max_examples=25, deadline=None)
 @given(dark=st.floats(0.2, 0.9), seed=st.integers(0, 99))
-def test_what_comes_to_light_is_in_the_shade_that_the_photo_shows(dark, seed):
+def test_disoccluded_background_is_shaded_like_the_photo(dark, seed):
     background = (0.4 + 0.2 * np.random.default_rng(seed).random((40, 60, 3))).astype(np.float32)
     mask, shadow = np.zeros((40, 60), bool), np.zeros((40, 60), bool)
     mask[10:25, 20:40] = True

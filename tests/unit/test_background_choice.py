@@ -152,7 +152,7 @@ def test_shadow_outside_of_the_hole_is_no_source():
     assert leftover_shadow(logarithms(checks()), hole, hole).sum() == 0
 
 
-def test_nothing_is_led_up_to_shade():
+def test_fill_is_not_extended_into_shade():
     photo = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     hole = disc(100, 75, 30)
     shade = ~hole & disc(100, 75, 40)

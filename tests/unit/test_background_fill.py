@@ -81,7 +81,7 @@ def test_a_floor_ends_at_its_wall_behind_the_object():
     assert edges_behind(logarithms(plain), hole, hole) == []
 
 
-def test_what_is_barred_is_no_source():
+def test_excluded_pixels_are_not_copied():
     view = camera()
     photo = np.full((HEIGHT, WIDTH, 3), 150, np.uint8)
     hole = disc(100, 100, 20)

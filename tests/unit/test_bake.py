@@ -75,7 +75,7 @@ def test_a_moving_collider_is_baked_where_it_goes(ball_scene, tmp_path):
     assert any("about" in n.get("message", "") and "MiB" in n.get("message", "") for n in notices), "what it will cost"
 
 
-def test_nothing_changed_nothing_done(ball_scene, tmp_path):
+def test_unchanged_inputs_skip_the_bake(ball_scene, tmp_path):
     folder = ball_scene()
     out = tmp_path / "bake"
     first = bake(load_scene(folder.root), out=out, options=QUICK).manifest

@@ -72,7 +72,7 @@ def test_a_manifest_says_space_and_points_and_old_ones_say_neither(tmp_path):
             BakedObject(**{"name": "cup", "file": "cup.pc2", "vertices": 2, **changes})
 
 
-def test_what_it_takes_is_what_is_free_again(tmp_path):
+def test_reported_size_equals_freed_size(tmp_path):
     bake = a_bake(tmp_path / "bake")
     files = [p for p in bake.rglob("*") if p.is_file()]
     assert disk_usage(bake) == sum(p.stat().st_size for p in files) > 3 * 32
@@ -82,7 +82,7 @@ def test_what_it_takes_is_what_is_free_again(tmp_path):
         free_bake(bake)
 
 
-def test_what_no_manifest_lists_stays(tmp_path):
+def test_unlisted_files_are_kept(tmp_path):
     bake = a_bake(tmp_path / "bake")
     (bake / "thesis.txt").write_text("years of work")
     (bake / "checkpoints" / "mine.npz").write_text("mine")
@@ -142,7 +142,7 @@ def test_a_bake_that_runs_is_not_freed(tmp_path):
     assert not bake.exists()
 
 
-def test_what_cannot_be_deleted_is_named_and_can_be_freed_later(tmp_path):
+def test_undeletable_files_are_named_and_freed_later(tmp_path):
     bake = a_bake(tmp_path / "bake")
     (bake / "sand.points.pc2").unlink()
     (bake / "sand.points.pc2").mkdir()

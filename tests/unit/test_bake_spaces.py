@@ -94,7 +94,7 @@ def test_a_mirrored_stretched_object_is_filled_like_the_same_shape_made_so(ball_
         (load_preset("wood"), (), False),
     ],
 )
-def test_what_flows_gets_its_particles(ball_scene, material, effects, points):
+def test_flowing_materials_get_particle_caches(ball_scene, material, effects, points):
     folder = ball_scene(effects=effects)
     item = dataclasses.replace(folder.model.objects[0], material=material)
     folder = save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))

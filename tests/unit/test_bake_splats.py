@@ -178,7 +178,7 @@ def test_a_stopped_bake_goes_on_to_the_same_bytes_and_a_lost_frame_is_baked_agai
     assert not is_up_to_date(load_scene(folder.root), out, shorter)
 
 
-def test_what_it_takes_on_the_disk_is_told_before_and_freed_after(splat_scene, tmp_path):
+def test_splat_caches_are_estimated_and_freed(splat_scene, tmp_path):
     folder, out = splat_scene(count=2000), tmp_path / "bake"
     told = bake_cost(folder, QUICK).disk_bytes
     bake(load_scene(folder.root), out=out, options=QUICK)
@@ -211,7 +211,7 @@ def test_a_scene_names_splats_inside_its_folder_only(splat_scene, name):
         load_scene(folder.root)
 
 
-def test_what_cannot_have_splats_is_said(splat_scene):
+def test_objects_that_cannot_have_splats_are_named(splat_scene):
     folder = splat_scene(count=5)
     item = folder.model.objects[0]
     assert load_scene(folder.root).model == folder.model

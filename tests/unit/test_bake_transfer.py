@@ -66,7 +66,7 @@ def made(tmp_path):
     return photo, scene, bake
 
 
-def test_it_is_in_world_metres_under_the_photos_names(made, tmp_path):
+def test_transferred_bake_is_in_world_metres_under_scene_names(made, tmp_path):
     photo, scene, bake = made
     events = []
     transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"}, on_event=events.append)
@@ -80,7 +80,7 @@ def test_it_is_in_world_metres_under_the_photos_names(made, tmp_path):
     assert not events
 
 
-def test_what_was_moved_in_blender_is_said(made, tmp_path):
+def test_objects_moved_in_blender_are_named(made, tmp_path):
     photo, scene, bake = made
     item = scene.model.objects[0]
     matrix = np.asarray(item.world_from_mesh) + np.pad([[0.5]], ((0, 3), (3, 0)))

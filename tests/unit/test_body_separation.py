@@ -59,7 +59,7 @@ def test_bodies_that_touch_or_stand_apart_stay_as_they_are():
         assert np.array_equal(before.vertices, after)
 
 
-def test_what_the_photo_shows_behind_is_put_behind():
+def test_overlapping_bodies_follow_the_photos_depth_order():
     # The photo shows the ball in front, though its body was placed behind the box.
     bodies = [ball((0, 3.2, 0.3)), box((0, 2.35, 0.2))]
     apart, found = separate(VIEW, bodies, (0, 1))

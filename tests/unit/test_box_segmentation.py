@@ -104,7 +104,7 @@ def test_largest_component_of_nothing_is_nothing():
     assert not largest_component(np.zeros((20, 20), bool)).any()
 
 
-def test_what_colour_cannot_tell_falls_back_with_a_warning():
+def test_objects_of_the_grounds_colour_fall_back_with_a_warning():
     told = []
     photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     mask = segment(photo, (100, 80, 200, 180), "ghost", warn=told.append)

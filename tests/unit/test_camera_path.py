@@ -140,7 +140,7 @@ def test_a_swing_starts_and_ends_at_rest():
          "not a rotation"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(tmp_path, content, message):
+def test_errors_name_the_wrong_field(tmp_path, content, message):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({"format": "physgen-camera/1", **content}))
     with pytest.raises(InputError, match=message):

@@ -72,7 +72,7 @@ def rewrite(folder, name="take01", **arrays):
     np.savez(path, **{k: v for k, v in (old | arrays).items() if v is not None})
 
 
-def test_what_is_written_comes_back(folder):
+def test_capture_round_trip(folder):
     found, meant = load_capture(folder), a_capture()
     assert found.warnings == () and found.ground == meant.ground and found.objects[0].belief == meant.objects[0].belief
     assert np.allclose(found.objects[0].vertices, BOX.vertices, atol=1e-7)

@@ -115,7 +115,7 @@ def test_equal_input_gives_equal_bytes(ring, ball, reference):
     np.testing.assert_array_equal(first.parts[1].surface.vertices, second.parts[1].surface.vertices)
 
 
-def test_what_is_not_moved_is_kept(ring, ball, reference):
+def test_colours_opacities_and_other_parts_are_unchanged(ring, ball, reference):
     begin = swollen(ball)
     after = compose([ring, begin], reference=reference, options=dataclasses.replace(SHORT, steps=2)).parts[1]
     np.testing.assert_array_equal(after.splats.colours, begin.splats.colours)
@@ -162,7 +162,7 @@ def test_a_broken_guidance_is_said(ring, ball, reference):
         )
 
 
-def test_what_cannot_be_composed_is_said(ring, ball, reference):
+def test_impossible_compositions_are_refused(ring, ball, reference):
     with pytest.raises(InputError, match="at least two"):
         compose([ring], reference=reference)
     with pytest.raises(InputError, match="without a picture"):

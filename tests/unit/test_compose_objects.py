@@ -44,13 +44,13 @@ def test_the_one_that_passes_through_at_an_edge_is_found(tmp_path):
         (("a", "q"), "there is no 'q'"),
     ],
 )
-def test_what_does_not_touch_is_said_with_the_distance(tmp_path, chosen, words):
+def test_objects_apart_are_refused_with_their_distance(tmp_path, chosen, words):
     folder = a_scene(tmp_path / "s", {"a": ball(0), "b": ball(0.3)})
     with pytest.raises(InputError, match=words):
         contact_groups(folder, chosen, cells=40)
 
 
-def test_what_cannot_be_fitted_is_refused(tmp_path):
+def test_impossible_meshes_are_refused(tmp_path):
     inner = a_scene(tmp_path / "in", {"seed": ball(0, 0.02), "fruit": ball(0)})
     with pytest.raises(InputError, match="'seed': is completely inside 'fruit'"):
         contact_groups(inner, (), cells=40)

@@ -75,7 +75,7 @@ def world(folder, name):
     return load_object_mesh(folder, item).vertices
 
 
-def test_what_passes_through_is_pushed_out_and_the_rest_stays(scene, tmp_path):
+def test_penetration_is_resolved_and_other_objects_are_unchanged(scene, tmp_path):
     out, said = tmp_path / "out", []
     request = ComposeRequest(options=PHYSICS, picture=False, splats=1000)
     folder = compose(load_scene(scene.root), out=out, request=request, on_event=said.append)
@@ -137,7 +137,7 @@ def test_the_picture_is_the_photo_but_for_the_objects(scene):
         photo_reference(folder, items, size=48)
 
 
-def test_what_cannot_be_is_refused_and_leaves_nothing(scene, tmp_path):
+def test_refused_compositions_leave_no_files(scene, tmp_path):
     physics = ComposeRequest(options=PHYSICS, picture=False)
     root = scene.root
     mine = tmp_path / "mine"

@@ -95,7 +95,7 @@ def test_point_maps_bring_their_focal_length(tmp_path):
     assert not read.disparity
 
 
-def test_what_moge_saves(tmp_path):
+def test_moge_output_is_read(tmp_path):
     depth, mask = scene()
     known = ~mask
     intrinsics = np.array([[FOCAL / WIDTH, 0, 0.5], [0, FOCAL / HEIGHT, 0.5], [0, 0, 1]], np.float32)
@@ -160,7 +160,7 @@ def test_no_ground_where_everything_is_a_wall(tmp_path):
     assert fit_ground_plane(read_depth(tmp_path / "metric.npy", WIDTH, HEIGHT), FOCAL, []) is None
 
 
-def test_what_is_no_depth_map(tmp_path):
+def test_files_that_are_not_depth_maps_are_refused(tmp_path):
     depth, _ = scene()
     np.save(tmp_path / "map.npy", depth)
     with pytest.raises(InputError, match="aspect ratio"):

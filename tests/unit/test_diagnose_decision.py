@@ -73,7 +73,7 @@ def test_nothing_missing_is_none_and_everything_bad_is_unknown():
     assert bad.verdict.effect == UNKNOWN and bad.verdict.effects == ()
 
 
-def test_what_cannot_be_told_apart_is_named():
+def test_indistinguishable_candidates_are_named():
     result = weighed(fit("time_scale", evidence=300.0), fit("buoyancy", evidence=297.0), nominal_misfit=5.0)
     assert result.verdict.effect == "time_scale" and result.verdict.alternatives == ("buoyancy",)
 
@@ -84,7 +84,7 @@ def test_two_causes_count_for_the_first():
     assert result.verdict.effect == "friction" and result.verdict.effects == ("friction", "air_drag")
 
 
-def test_what_predicts_no_better_is_no_cause():
+def test_candidates_without_predictive_gain_are_rejected():
     result = weighed(fit("restitution", evidence=56.0, rms=0.012), nominal_misfit=1.2)
     assert result.verdict.effect == NONE
 

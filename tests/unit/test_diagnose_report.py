@@ -313,7 +313,7 @@ def test_a_cause_that_does_not_beat_its_controls_is_called_so(tmp_path):
     assert "is not a cause" in said(written(bad, capture, tmp_path / "bad")[0])
 
 
-def test_what_concerns_the_recording_is_not_added_to_a_scene():
+def test_observation_effects_are_not_added_to_a_scene():
     clock = RankedEffect(
         name="time_scale",
         kind="observation",
@@ -363,7 +363,7 @@ EMPTY = {
 
 
 @pytest.mark.parametrize("name", EMPTY)
-def test_what_is_empty_is_left_out(name, tmp_path):
+def test_empty_figures_are_left_out(name, tmp_path):
     diagnosis, capture = case(**EMPTY[name])
     _, names = written(diagnosis, capture, tmp_path)
     assert names >= FILES - {"tracks.svg"}

@@ -215,7 +215,7 @@ def test_lift_is_found_in_flights_and_predicted():
     assert after < 0.2 * np.abs(fits.predict(fits.nominal)["take4"] - truth).max()
 
 
-def test_nothing_is_found_where_nothing_is():
+def test_no_effect_is_found_in_plain_motion():
     capture, _ = flights()
     fits = fit_rigid(capture, ["magnus", "air_drag", "buoyancy"])
     assert fits.nominal.misfit < 1.4

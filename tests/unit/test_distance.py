@@ -532,7 +532,7 @@ def test_bad_masses_are_input_errors():
         pytest.param(trimesh.util.concatenate([box((1, 1, 1)), box((1, 1, 1), at=(1, 1, 0))]), id="common edge"),
     ],
 )
-def test_nothing_is_said_of_sound_surfaces(mesh):
+def test_sound_surfaces_give_no_notice(mesh):
     for angle in (0.0, 0.7):
         assert check_surface(surface(turned(mesh, angle)), name="thing", cell_size=0.01) == ()
 
@@ -574,7 +574,7 @@ def test_a_ball_pushed_through_itself_is_found():
     assert any("crosses itself" in line for line in said)
 
 
-def test_what_is_said_names_the_thing_and_the_trouble():
+def test_notices_name_the_object_and_the_defect():
     mesh = ball(subdivisions=2)
     for thing, words in (
         (surface(inverted(mesh)), "1 of 1 parts are inside out"),

@@ -168,7 +168,7 @@ def test_every_effect_is_in_the_documentation(name):
     assert len(rows) == 1 and all(f"`{p.name}`" in rows[0] for p in effect(name).parameters)
 
 
-def test_there_is_no_file_without_an_entry():
+def test_every_effect_file_is_registered():
     helpers = {"__init__", "schema", "setup_changes", "registry"}
     assert {path.stem for path in (ROOT / "sim" / "effects").glob("*.py")} - helpers == set(NAMES)
 
@@ -199,7 +199,7 @@ def test_the_neutral_values_change_nothing(name, make):
 
 
 @pytest.mark.parametrize("name", NO_NEUTRAL)
-def test_what_always_changes_something_says_so(name):
+def test_effects_without_a_neutral_value_say_so(name):
     assert effect(name).neutral_values(world()) is None
 
 
@@ -334,7 +334,7 @@ def test_an_effect_for_all_needs_somebody_to_act_on():
         ("tether", []),
     ],
 )
-def test_who_an_effect_means_something_for(name, refused):
+def test_effects_refuse_bodies_they_do_not_apply_to(name, refused):
     matter = {
         "elastic": JELLY,
         "clay": VonMisesMaterial(**SOLID, yield_stress=1e3),

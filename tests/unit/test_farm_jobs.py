@@ -163,7 +163,7 @@ def test_the_example_of_the_documentation_works(tmp_path):
         (b"#" * (MAX_BYTES + 1), "larger than 1 MiB"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_by_name(job, text, words):
+def test_invalid_job_entries_are_refused_by_name(job, text, words):
     with pytest.raises(InputError, match=words):
         job(text)
 

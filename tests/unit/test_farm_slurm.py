@@ -117,7 +117,7 @@ JSON = st.recursive(
         ),
     )
 )
-def test_whatever_a_plan_holds_it_is_read_or_refused(tmp_path_factory, content):
+def test_any_plan_is_read_or_refused(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "fuzzed.json"
     path.write_bytes(content)
     try:
@@ -257,7 +257,7 @@ def test_the_scripts_carry_out_the_plan_and_a_failure_holds_back_what_needs_it_a
     assert main([str(file), "cup/reconstruct"]) == 0
 
 
-def test_what_cannot_be_submitted_whole_is_taken_back(tmp_path):
+def test_partial_submissions_are_cancelled(tmp_path):
     plan = a_plan(tmp_path / "root", a_task("a", "bake"), a_task("b", "render", "a"))
     (tmp_path / "root").mkdir()
     export_slurm(plan, FarmOptions(out=tmp_path / "scripts"))
@@ -287,6 +287,6 @@ def test_a_number_outside_the_list_is_refused(tmp_path):
         {"python": "py\nthon"},
     ],
 )
-def test_what_would_break_a_script_is_refused(change):
+def test_values_that_would_break_a_script_are_refused(change):
     with pytest.raises(InputError, match="--"):
         ClusterOptions(**change)

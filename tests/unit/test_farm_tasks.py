@@ -93,7 +93,7 @@ def test_a_bakes_particles_are_among_what_it_made(tmp_path):
         produced_hashes(task, tmp_path)
 
 
-def test_what_a_task_cannot_do_is_in_its_outcome(ball_scene, tmp_path):
+def test_failures_are_recorded_in_the_outcome(ball_scene, tmp_path):
     ball_scene()
     other = carry_out(variant("a"), tmp_path, version="0.0.9")
     assert (other.state, other.exit_code, other.attempts) == ("failed", 3, 0)
@@ -188,7 +188,7 @@ def test_a_damaged_record_is_none(tmp_path_factory, noise, seed):
     assert up_to_date_record(task, root, VERSION) is None
 
 
-def test_what_is_worth_another_attempt():
+def test_retryable_failures():
     def worth(code, attempts=1, state="failed"):
         return is_worth_retrying(Outcome(task="t", state=state, exit_code=code), attempts=attempts, retries=2)
 

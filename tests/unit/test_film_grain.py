@@ -37,7 +37,7 @@ def octave_sigmas(frame: np.ndarray, truth: np.ndarray, where: np.ndarray) -> np
 
 
 @pytest.mark.parametrize("grain_px", [0.0, 0.7])
-def test_what_lost_its_grain_gets_the_photos(grain_px):
+def test_smoothed_pixels_get_the_photos_grain(grain_px):
     clean = picture()
     photo = linear(clean + noise(1, clean, grain_px))
     model = film_grain.estimate_noise(photo)
@@ -58,7 +58,7 @@ def test_what_lost_its_grain_gets_the_photos(grain_px):
         assert np.array_equal(given, again)
 
 
-def test_what_shows_the_photo_gets_next_to_nothing():
+def test_photo_pixels_get_almost_no_grain():
     clean = picture()
     photo = linear(clean + noise(1, clean, 0.0))
     given = film_grain.Grain(film_grain.estimate_noise(photo), (WIDTH, HEIGHT), seed=0).add(

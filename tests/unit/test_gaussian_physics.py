@@ -138,7 +138,7 @@ def test_points_put_elsewhere(ball):
     assert body.particles.mean(axis=0) == pytest.approx([0.0, 0.3, 0.0], abs=1e-3)
 
 
-def test_what_the_step_refuses(ball):
+def test_invalid_steps_are_refused(ball):
     body = PhysicalBody(points=ball.vertices, surface=ball, options=COARSE)
     with pytest.raises(InputError, match="velocities"):
         body.step(np.full_like(ball.vertices, np.nan))

@@ -66,7 +66,7 @@ def test_angle_of_view_round_trip(fov, width, height):
     assert cameras.fov_of_focal(width, height, cameras.focal_of_fov(width, height, fov)) == pytest.approx(fov)
 
 
-def test_what_stands_above_a_tilted_horizon_is_refused():
+def test_objects_above_a_tilted_horizon_are_refused():
     camera = cameras.camera_above_ground(640, 480, 600.0, math.radians(5), math.radians(15))
     row = horizon_row(480, 600.0, math.radians(5), math.radians(15)) + 60
     cameras.check_below_horizon(camera, np.array([320.0, row]), "cup")

@@ -204,7 +204,7 @@ def test_large_sets_are_exact_and_close_twins_are_told_apart():
         (lambda: CheckedGuidance(IdealDenoiser(pictures(1)), most=0), "most is 0"),
     ],
 )
-def test_what_cannot_be_used_is_named(make, said):
+def test_unusable_guidances_are_named(make, said):
     with pytest.raises(InputError, match=said):
         make()
 

@@ -58,7 +58,7 @@ def test_ends_and_middle_are_one_line(horizon, roll, aspect):
 
 
 @given(st.floats(-100, 100), st.floats(-100, 100), st.floats(0.3, 3))
-def test_whatever_is_dragged_the_command_takes_it(left, right, aspect):
+def test_command_accepts_any_dragged_horizon(left, right, aspect):
     horizon, roll = of_ends(left, right, aspect)
     ReconstructOptions(horizon_y=horizon, roll_deg=math.degrees(roll))
     assert abs(roll) <= math.radians(45)

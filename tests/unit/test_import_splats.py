@@ -87,7 +87,7 @@ def test_floaters_fog_and_holes_do_not_matter():
     assert any("80 of" in text and "left out" in text for text in said)
 
 
-def test_what_encloses_nothing_is_as_thick_as_its_splats():
+def test_open_clouds_are_as_thick_as_their_splats():
     """A sheet: nothing inside, but not nothing."""
     said = []
     found = splat_surface(on_surface(trimesh.creation.box((2.0, 2.0, 1e-4)), 6000), "leaf", said.append)
@@ -96,7 +96,7 @@ def test_what_encloses_nothing_is_as_thick_as_its_splats():
     assert any("enclose no volume" in text for text in said)
 
 
-def test_what_shows_no_body_is_refused():
+def test_clouds_without_a_body_are_refused():
     splats = on_surface(trimesh.creation.icosphere(2), 200)
     with pytest.raises(InputError, match="nothing is visible"):
         splat_surface(splats.changed(opacities=np.full(200, 0.01)), "ghost", quiet)
@@ -107,7 +107,7 @@ def test_what_shows_no_body_is_refused():
 
 
 @pytest.mark.parametrize("up", ["y-down", "x", "z-down"])
-def test_it_stands_upright_on_the_ground(tmp_path, up):
+def test_imported_splats_stand_upright_on_the_ground(tmp_path, up):
     """A pole with a red top, along any axis of the file: in the world its top is up, and it is not mirrored."""
     direction = np.zeros(3)
     direction["xyz".index(up[0])] = -1.0 if up.endswith("down") else 1.0

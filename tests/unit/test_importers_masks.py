@@ -259,7 +259,7 @@ def test_garbage_is_named(tmp_path, name):
     assert name in str(caught.value)
 
 
-def test_what_is_not_there(tmp_path):
+def test_missing_files_are_named(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         read(tmp_path / "x.png")
 

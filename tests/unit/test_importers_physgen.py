@@ -71,7 +71,7 @@ def root(tmp_path):
     return folder
 
 
-def test_what_the_files_say(root):
+def test_all_files_are_read(root):
     found = read_physgen(root)
     ball, box = found.objects
     assert (ball.number, ball.label, ball.mass, ball.friction, ball.elasticity) == (1, "ball", 100, 0.5, 0.8)

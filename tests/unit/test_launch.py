@@ -71,7 +71,7 @@ def test_the_command_names_what_differs_only():
     ]
 
 
-def test_what_is_asked_of_an_interpreter_is_what_the_project_depends_on():
+def test_interpreter_check_lists_the_projects_dependencies():
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     wanted = {re.split("[<>=]", item)[0] for item in listed}
     assert {re.split("[<>=]", item)[0] for item in requirements.REQUIREMENTS.values()} == wanted

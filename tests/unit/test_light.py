@@ -54,7 +54,7 @@ def test_a_turned_map_shines_from_the_turned_direction(turn, height):
     assert brightest(turned(spot_map(towards), rotation)) @ (rotation @ towards) > math.cos(math.radians(4))
 
 
-def test_what_is_ahead_and_right_in_a_file_is_so_in_the_scene():
+def test_environment_map_orientation():
     # The file's middle is +x of its own axes, its right half lies towards -y.
     ahead = world_from_file("ahead", CAMERA, Ground())
     assert ahead @ [1, 0, 0] == pytest.approx([0, 1, 0])
@@ -213,7 +213,7 @@ def test_an_environment_replaces_the_old_one_and_its_file(scene, tmp_path):
     assert load_scene(scene).model.light == second
 
 
-def test_what_fails_leaves_the_scene_as_it_was(scene, tmp_path):
+def test_failed_changes_leave_the_scene_unchanged(scene, tmp_path):
     before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
     write_environment(tmp_path / "even.exr", np.ones((32, 64, 3), np.float32))
     for request in (

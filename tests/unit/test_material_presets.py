@@ -19,7 +19,7 @@ from physgen.sim.scene.material import (
 OAK = Material(density=700.5, law="von_mises", yield_stress=1e-7 + 2.0, fibre_axis=(0.6, 0.0, 0.8), viscosity=1e-5)
 
 
-def test_what_is_saved_comes_back(tmp_path):
+def test_preset_round_trip(tmp_path):
     folder = tmp_path / "not yet" / "é"
     save_preset(folder, "Old oak-1", OAK, 'says "so"\n\tand \\ more \x7f ü')
     found = read_presets(folder)
@@ -70,7 +70,7 @@ def test_garbage_is_named_and_the_rest_is_read(tmp_path):
         delete_preset(tmp_path, "a folder")
 
 
-def test_there_may_be_no_folder(tmp_path):
+def test_missing_preset_folder_is_empty(tmp_path):
     assert not read_presets(tmp_path / "nowhere").good
     (tmp_path / "file").write_text("")
     assert not read_presets(tmp_path / "file").good

@@ -124,7 +124,7 @@ def test_floaters_and_broken_gradients_do_not_count():
 
 
 @pytest.mark.parametrize("gradient", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
-def test_where_no_gradient_is_sound_splats_keep_their_shape(gradient):
+def test_splats_keep_their_shape_without_valid_gradients(gradient):
     splats, rest = some(), particles()
     found = deform_splats(splats, bind_splats(splats, rest), rest, everywhere(gradient, len(rest)))
     assert_covariances(found, splats.covariances())

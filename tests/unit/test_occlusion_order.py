@@ -88,7 +88,7 @@ def test_a_circle_gives_way_at_its_weakest_pair():
         assert kept == (pair is not weakest)
 
 
-def test_one_thing_and_none():
+def test_order_of_one_object_and_of_none():
     assert occlusion_order([disc(60, 80, 25)]).front_to_back == (0,)
     assert occlusion_order([]).front_to_back == ()
 

@@ -57,7 +57,7 @@ def test_fields_of_objects_materials_ground_and_scene(ball_scene):
         ("ball0.velocity=1,2", "velocity: expected 3 entries"),
     ],
 )
-def test_what_cannot_be_set_is_named(ball_scene, text, words):
+def test_invalid_overrides_are_named(ball_scene, text, words):
     with pytest.raises(InputError, match=words):
         changed(ball_scene(), text)
     with pytest.raises(InputError):

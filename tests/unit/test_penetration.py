@@ -31,7 +31,7 @@ def test_two_balls_share_a_lens(apart):
     assert not found.contained and found.apart == 0
 
 
-def test_one_inside_the_other():
+def test_contained_object_is_reported():
     inner = penetration_of_meshes(ball(0.03, 0.02), ball(0.1, subdivisions=3))
     assert inner.contained == "background"
     assert inner.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.02)
@@ -53,7 +53,7 @@ def test_apart(apart):
         assert found.apart == pytest.approx(apart - 0.15, abs=1e-3)
 
 
-def test_what_cannot_be_measured():
+def test_unmeasurable_pairs_are_refused():
     good = ball(0.1)
     holed = Surface(vertices=good.vertices, faces=good.faces[1:])
     with pytest.raises(InputError, match="background: mesh is not closed"):

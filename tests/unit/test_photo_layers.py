@@ -36,7 +36,7 @@ def overlap(first, second):
     return (first & second).sum() / (first | second).sum()
 
 
-def test_what_is_hidden_behind_a_ball_is_completed(tmp_path):
+def test_part_hidden_by_a_ball_is_completed(tmp_path):
     crate = (np.abs(COLUMNS - 150) < 45) & (np.abs(ROWS - 85) < 40)
     ball = (COLUMNS - 110) ** 2 + (ROWS - 118) ** 2 < 26**2
     photo_of((crate, (60, 90, 170)), (ball, (200, 60, 40))).save(tmp_path / "photo.png")

@@ -306,7 +306,7 @@ def test_objects_that_its_simulation_leaves_in_the_air_stay_there(output, tmp_pa
     assert points_of(folder, folder.model.objects[0])[:, 2].min() == pytest.approx(0.03, rel=1e-6)
 
 
-def test_what_inverse_rendering_adds(output, tmp_path):
+def test_inverse_rendering_output_is_used(output, tmp_path):
     Image.new("RGB", (32, 32), (10, 200, 10)).save(output / "meshes" / "teddy1_albedo.png")
     Image.new("L", (32, 32), 51).save(output / "meshes" / "teddy1_roughness.png")
     Image.new("L", (32, 32), 204).save(output / "meshes" / "teddy1_metallic.png")

@@ -130,7 +130,7 @@ def test_wrong_requests_are_answered_and_the_worker_lives_on(worker, tmp_path):
     worker.until("done", 7)
 
 
-def test_it_ends_when_its_input_is_closed_in_the_middle_of_a_run(tmp_path):
+def test_server_ends_when_input_closes_during_a_run(tmp_path):
     worker = Worker(tmp_path / "runs")
     worker.ask(1, scene_folder(tmp_path / "scene", start_time=1e4), frames=1000, fps=1.0)
     worker.until("started", 1)

@@ -246,7 +246,7 @@ EMPTY = Splats(
     [EMPTY, one((0, 0, -1.0)), one(opacity=0.0), one((0, 0, 0.001)), one((1e200, 0, 1e200)), one((9.0, 0.0, 1.0))],
     ids=["none", "behind", "clear", "too near", "too far", "beside"],
 )
-def test_nothing_to_be_seen(rasteriser, splats):
+def test_empty_view_is_background(rasteriser, splats):
     seen = rasteriser.render(splats, camera(), background=BACKGROUND)
     np.testing.assert_array_equal(seen.colour, np.broadcast_to(np.float32(BACKGROUND), (29, 37, 3)))
     assert not seen.alpha.any() and not seen.depth.any()

@@ -99,7 +99,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_what_models_send_in_place_of_the_format_is_read(form):
+def test_common_format_deviations_are_read(form):
     answers = read_answer(FORMS[form], 2)
     for found, meant in zip(answers.objects, (MODEL, CAMERA), strict=True):
         assert found.density == pytest.approx(meant.density) and found.size_m == pytest.approx(meant.size_m)

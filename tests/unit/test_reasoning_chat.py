@@ -106,7 +106,7 @@ def refusal(url, **values):
     return str(caught.value)
 
 
-def test_what_is_sent_is_a_chat_request_with_the_picture():
+def test_request_is_a_chat_message_with_the_picture():
     with Server(lambda h, n: send(h, completion())) as server:
         text, notices = ask(server.url, model="a model")
     ((path, headers, body),) = server.received
@@ -307,7 +307,7 @@ def test_nonsense_is_said_to_be_nonsense(body, what):
 
 
 @pytest.mark.parametrize("status", [400, 404, 413, 422, 501])
-def test_what_another_attempt_cannot_mend_is_not_repeated(status):
+def test_permanent_errors_are_not_retried(status):
     with Server(lambda h, n: send(h, b'{"detail": "no good"}', status)) as server:
         assert str(status) in refusal(server.url, retries=3)
     assert len(server.received) == 1

@@ -107,7 +107,7 @@ def test_case_plural_and_compounds_do_not_matter(said, meant):
 
 
 @pytest.mark.parametrize("said", ["", None, "object_1", "zzz", "orange juice", "12", "_", "???", "left", "x" * 999])
-def test_what_the_table_does_not_know_is_none(said):
+def test_unknown_names_are_none(said):
     assert TABLE.find(said) is None
 
 

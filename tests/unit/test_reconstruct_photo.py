@@ -151,7 +151,7 @@ _values = st.one_of(
     details=st.dictionaries(st.sampled_from([0xA405, 0x920A, 0xA404, 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210]), _values),
     base=st.dictionaries(st.sampled_from([0x010F, 0x0110]), _values),
 )
-def test_whatever_stands_in_exif_the_focal_length_is_sound_or_none(details, base):
+def test_focal_length_is_valid_or_none_for_any_exif(details, base):
     found = focal_from_exif(base, details, 640, 480)
     assert found is None or (0.01 < found.per_diagonal < 500 and found.sigma > 0)
 

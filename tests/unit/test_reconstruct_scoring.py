@@ -58,7 +58,7 @@ def test_the_silhouette_has_the_pixels_that_are_more_than_half_covered():
     assert np.array_equal(seen, a_mask(60, 20, 120, 70))
 
 
-def test_what_is_behind_the_camera_is_not_seen():
+def test_points_behind_the_camera_are_not_seen():
     cube = trimesh.creation.box(bounds=[[-0.4, -2.0, -0.2], [0.2, -1.0, 0.3]])
     assert not scoring.silhouette(a_camera(), cube.vertices, cube.faces).any()
 

@@ -48,7 +48,7 @@ def test_smoothing_does_not_stop_where_vertices_are_split():
     assert np.array_equal(parts[-ROWS:], parts[[10, 31, 52]])
 
 
-def test_nothing_seen_changes_nothing_and_loose_parts_get_the_mean():
+def test_hidden_objects_are_unchanged_and_loose_parts_get_the_mean():
     vertices, faces = tube(9, False)
     light = np.random.default_rng(0).uniform(0.5, 1.0, (len(vertices), 3))
     graph = SurfaceGraph(vertices, faces)

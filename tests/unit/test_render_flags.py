@@ -17,7 +17,7 @@ def parse(arguments):
     return render_options(parser.parse_args(arguments))
 
 
-def test_nothing_given_is_the_default():
+def test_no_flags_give_the_defaults():
     assert parse([]) == RenderOptions()
     assert render_arguments(RenderOptions()) == []
 

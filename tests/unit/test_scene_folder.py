@@ -154,7 +154,7 @@ def scenes(draw):
 
 @given(scenes())
 @settings(max_examples=60)
-def test_what_is_saved_is_what_is_loaded(scene):
+def test_scene_round_trip(scene):
     data = json.loads(json.dumps(scene_to_json(scene)))
     assert parse_scene(data, "scene.json") == scene
 
@@ -422,7 +422,7 @@ def test_a_scene_may_have_neither_photo_nor_ground(tmp_path):
         a_scene(photo=None)
 
 
-def test_what_is_not_there_has_no_contacts():
+def test_contacts_of_missing_objects_are_refused():
     pair = Contact(between=("cup", GROUND), friction=0.2)
     assert a_scene(contacts=(pair,)).contacts == (pair,)
     with pytest.raises(InputError, match="there is no ground; choose two of cup"):

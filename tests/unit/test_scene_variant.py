@@ -47,7 +47,7 @@ def test_a_variant_has_its_own_physics_and_the_scenes_files(ball_scene, tmp_path
     assert (out / "photo.png").read_bytes() == (source.root / "photo.png").read_bytes()
 
 
-def test_what_cannot_become_a_variant_is_refused(ball_scene, tmp_path):
+def test_invalid_variants_are_refused(ball_scene, tmp_path):
     root = ball_scene().root
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")

@@ -168,7 +168,7 @@ def rectangle(top, left, height, width):
     ],
     ids=["inside", "one pixel", "cut by the border", "everything", "nothing"],
 )
-def test_nothing_to_see_gives_little_or_nothing(pixels, mask):
+def test_photos_without_shadow_give_almost_none(pixels, mask):
     found = find_shadows(pixels, [mask], CAMERA)
     assert len(found) == 1
     assert found[0].shape == mask.shape
@@ -222,7 +222,7 @@ def test_the_papers_threshold_swallows_all_that_is_dark_and_touches():
     assert (find_shadows(pixels, [mask], CAMERA, fixed_threshold=50)[0] == (wall & ~mask)).all()
 
 
-def test_one_dark_place_between_two_objects_is_shared_by_distance():
+def test_shadow_between_objects_is_split_by_distance():
     pixels = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
     first, second, between = rectangle(60, 40, 40, 40), rectangle(60, 140, 40, 40), rectangle(90, 80, 10, 60)
     pixels[between] = 10

@@ -32,7 +32,7 @@ def test_an_outline_is_covered_by_three_pixels():
         assert hole[ndimage.binary_dilation(mask, iterations=covered)].all()
 
 
-def test_what_a_strap_encloses_goes_with_it():
+def test_background_enclosed_by_a_strap_moves_with_it():
     ring = disc(150, 120, 20) & ~disc(150, 120, 8)
     hole = object_holes([ring], [np.zeros_like(ring)], 13)[0]
     assert hole[disc(150, 120, 20)].all()

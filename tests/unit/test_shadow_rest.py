@@ -49,6 +49,6 @@ def test_faint_shadows_uneven_ground_and_specks_stay_as_they_are():
     assert (extend_hard_shadow(photo(WHOLE), speck, NOTHING) == speck).all()
 
 
-def test_nothing_is_added_on_other_objects():
+def test_no_shadow_is_added_on_other_objects():
     closed = WHOLE & (COLUMNS > 95)
     assert not (extend_hard_shadow(photo(WHOLE), FOUND, closed) & closed).any()

@@ -193,7 +193,7 @@ def test_a_body_hidden_below_is_fitted_to_what_is_seen():
     assert checked(body).volume == pytest.approx(VOLUMES["box"], rel=0.2)
 
 
-def test_what_is_seen_wears_its_own_pixels_and_the_rest_pixels_of_the_object():
+def test_visible_faces_show_their_pixels_and_others_pixels_of_the_object():
     for primitive in (BOX, CAN, BALL, None):
         mask = blob(3) if primitive is None else outline(primitive)
         body = made(mask)

@@ -40,7 +40,7 @@ def test_a_cube_on_a_table_is_put_where_it_stands():
     assert found.factor * grown == pytest.approx(1.0, rel=0.02)
 
 
-def test_what_stands_before_something_on_the_ground_stays_there():
+def test_objects_in_front_of_others_stay_on_the_ground():
     wall, faces = box((1.0, 0.1, 0.8), (0, 3.0, 0.4))
     cube, _ = box((0.2, 0.2, 0.2), (0, 2.0, 0.1))
     front = outline(cube)

@@ -56,7 +56,7 @@ def sleepers_of(*bodies, **fields) -> list[str]:
     return [body.name for body, sleeps in zip(setup.bodies, Sleepers(setup, CELL).asleep, strict=True) if sleeps]
 
 
-def test_what_stands_by_itself_sleeps_and_what_is_driven_does_not():
+def test_stable_bodies_sleep_and_driven_bodies_do_not():
     still = Track(times=np.zeros(1), values=np.zeros((1, 3)))
     assert sleepers_of(box()) == ["box"]
     for fields in (
@@ -153,7 +153,7 @@ def test_a_sleeper_wakes_when_it_is_hit_and_takes_the_momentum(matter):
     assert gap > -0.5 * CELL
 
 
-def test_what_flies_off_leaves_its_neighbour_asleep_and_a_stack_wakes_together():
+def test_departing_body_wakes_no_neighbour_but_a_stack_wakes_together():
     neighbour, top = box("neighbour"), box("top", bottom=(0, 0, 4 * CELL))
     jumps = box("jumps", bottom=(4 * CELL, 0, 0), velocity=(0.3, 0.0, 2.0))
     world = World(bodies=(neighbour, top, jumps), ground=Ground(), similarity=HERE, options=OPTIONS)
@@ -180,7 +180,7 @@ def test_a_checkpoint_goes_on_to_the_same_bytes():
         np.testing.assert_array_equal(worlds[0].positions(index), worlds[1].positions(index))
 
 
-def test_nobody_asleep_is_as_before_to_the_last_bit():
+def test_worlds_without_sleepers_are_bitwise_unchanged():
     """Bodies that may not sleep take the same substeps as bodies that are not told to."""
     falling = box("falling", bottom=(0, 0, 0.1))
     worlds = [

@@ -114,7 +114,7 @@ def test_adam_goes_down_at_its_rate_whatever_the_slope():
     assert not descent.values["colours"].any(), "no rate, no step"
 
 
-def test_what_another_object_hides_does_not_count():
+def test_pixels_of_an_occluder_have_no_loss():
     camera = orbit_camera(0, 0, 3.0, side=4, focal=1.2)
     labels = np.array([[-1, 1, 2, 2], [-1, 1, 2, 2], [-1, -1, 2, 2], [-1, -1, -1, -1]], np.int8)
     mask = np.where(labels > 0, 1.0, 0.0)
@@ -167,7 +167,7 @@ def test_frozen_fields_stay(ball, ball_views):
     assert not np.allclose(fitted.splats.colours, start.colours)
 
 
-def test_nothing_stays_before_the_company():
+def test_splats_do_not_stay_in_front_of_the_other_object():
     """A shell around the ball that no pixel there owns: unseen it stays, in company it clears away."""
     view, *_ = views_of([Ball((0, 0, 0), 0.5)], 1)
     labels = view.labels.copy()

@@ -77,7 +77,7 @@ def assert_same(found, wanted, rtol=2e-6):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=rtol, atol=1e-6, err_msg=name)
 
 
-def test_what_is_written_is_read_again(tmp_path):
+def test_splat_file_round_trip(tmp_path):
     splats = some(1000)
     write_splats(tmp_path / "a.ply", splats)
     file = read_splat_file(tmp_path / "a.ply")
@@ -276,7 +276,7 @@ ONLY_PLACES = {name: GOOD[name] for name in "xyz"}
         (packed(some(3)).replace(b"chunk 1", b"chunk 0"), "0 chunks of 256 for 3"),
     ],
 )
-def test_what_is_no_file_of_splats_is_said(tmp_path, content, said):
+def test_other_files_than_splats_are_refused(tmp_path, content, said):
     with pytest.raises(InputError, match=said):
         read(tmp_path, content)
 

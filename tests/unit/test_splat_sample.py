@@ -123,6 +123,6 @@ def test_textures_of_mesh_files():
         (plane()[0], plane()[1][:0], GREY, 5, r"give \(V, 3\) and \(T, 3\)"),
     ],
 )
-def test_what_no_splats_can_be_put_on_is_said(vertices, faces, colours, count, said):
+def test_invalid_surfaces_are_refused(vertices, faces, colours, count, said):
     with pytest.raises(InputError, match=said):
         splats_on_mesh(vertices, faces, colours, count)

@@ -178,7 +178,7 @@ CLEAR = np.zeros((12, 16))
         (lambda f, d: (f / "train/r_0.png").write_bytes(b"\x89PNG\r\n\x1a\n garbage"), "not a readable image"),
     ],
 )
-def test_what_is_wrong_with_a_folder_is_said(tmp_path, change, said):
+def test_invalid_views_folders_are_refused(tmp_path, change, said):
     folder = tmp_path / "views"
     document = {"camera_angle_x": 0.8, "frames": nerf_folder(folder)}
     picture(folder / "loose.png", CLEAR)

@@ -26,7 +26,7 @@ def make_counting(calls, **arrays):
     return make
 
 
-def test_what_was_computed_is_recalled_with_its_notices(tmp_path):
+def test_cached_results_come_with_their_notices(tmp_path):
     calls, said = [], []
     first = StageCache(tmp_path / "a", tmp_path / "none", said.append)
     first.run("cut", {"pixels": np.zeros((2, 2))}, make_counting(calls))

@@ -19,13 +19,13 @@ def rotation(angles):
     st.lists(st.floats(-5, 5), min_size=3, max_size=3),
     st.floats(1 / 1.5, 1.5),
 )
-def test_what_moves_turns_and_gives_a_little_is_whole(angles, shift, stretch):
+def test_rigid_motion_and_small_stretch_do_not_tear(angles, shift, stretch):
     moved = (BALL.vertices * [1, 1, stretch]) @ rotation(angles).T + shift
     assert first_torn([BALL.vertices, moved], BALL.faces) is None
 
 
 @given(st.integers(1, 5), st.floats(1.05, 4))
-def test_it_is_torn_from_the_first_sample_that_is_pulled_apart(at, factor):
+def test_tearing_starts_at_the_first_overstretched_sample(at, factor):
     samples = [BALL.vertices] * at + [BALL.vertices * [1, 1, TORN_STRETCH * factor]] * 2
 
     def stream():

@@ -112,7 +112,7 @@ def test_a_stripe_that_reaches_the_outline_goes_round():
         assert 0.05 < blue.sum() / (image[..., 3] > 0).sum() < 0.3, turn
 
 
-def test_what_is_seen_well_is_the_photo_bit_for_bit():
+def test_well_seen_texels_are_the_photo_bit_for_bit():
     photo = picture(TOY, eyes=True)
     surface = made(photo)
     at = VIEW.project(surface.vertices)

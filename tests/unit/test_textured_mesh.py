@@ -53,7 +53,7 @@ def packed(document, rest):
     return head + text + rest
 
 
-def test_it_reads_what_trimesh_reads(tmp_path, content):
+def test_reads_the_same_as_trimesh(tmp_path, content):
     path = tmp_path / "ball.glb"
     path.write_bytes(content)
     own, other = textured_mesh._parse(content), read_mesh(path)
@@ -201,7 +201,7 @@ def test_a_binary_ply_keeps_what_else_it_holds(tmp_path):
     assert len(source.read_bytes()) == len(target.read_bytes())
 
 
-def test_what_cannot_be_moved_is_said(tmp_path):
+def test_meshes_that_cannot_be_deformed_are_named(tmp_path):
     source = tmp_path / "a.glb"
     with pytest.raises(InputError, match="no such mesh"):
         write_moved_mesh(source, tmp_path / "b.glb", np.zeros((3, 3)), np.zeros((1, 3), int))

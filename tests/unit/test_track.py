@@ -246,7 +246,7 @@ def test_points_are_followed_to_a_tenth_of_a_pixel(tossed):
     assert found.max() < 3.0
 
 
-def test_what_is_tracked_is_a_capture_of_the_scene(cube, tossed, tmp_path):
+def test_tracking_writes_a_capture_of_the_scene(cube, tossed, tmp_path):
     stage, folder = cube
     path, tracked = tossed
     capture = track(folder, [VideoTrial(path=path)], out=tmp_path / "capture")
@@ -285,7 +285,7 @@ def test_the_pose_is_found(tossed):
         assert np.degrees(wrong.magnitude()) < 1.0
 
 
-def test_what_is_hidden_is_nan_and_nothing_is_wrong(cube, tmp_path):
+def test_hidden_points_are_nan(cube, tmp_path):
     """A textured bar sweeps over the resting cube; while it covers a point, the point is not seen, and later it is."""
     stage, folder = cube
 
@@ -474,7 +474,7 @@ def test_two_objects_one_behind_the_other(tmp_path):
     assert not tracked.trial.seen[inside > 4].any()
 
 
-def test_nothing_to_learn_from(cube, tossed):
+def test_trials_without_a_complete_frame_are_refused(cube, tossed):
     with pytest.raises(InputError, match="leave at least one complete"):
         track_videos([VideoTrial(path=tossed[0], predict_from=0.2)], cube[1])
 

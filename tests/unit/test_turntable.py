@@ -67,7 +67,7 @@ def test_there_are_no_gaps_between_triangles_and_none_beyond_the_outline(monkeyp
     assert np.abs(shown.corners.sum(axis=-1) - 1.0).max() < 1e-5
 
 
-def test_what_reaches_behind_the_viewer_is_left_out():
+def test_triangles_behind_the_viewer_are_left_out():
     behind = np.array([[-1.0, 0, -1], [1, 0, -1], [0, 1, 4]])
     assert not len(rasterise(projected(behind), np.array([[0, 1, 2]]), (20, 20)).rows)
 

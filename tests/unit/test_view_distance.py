@@ -125,7 +125,7 @@ def test_a_mirrored_face_is_worse_than_clean_fur_and_its_eyes_count():
     assert numbers["mirrored"]["front_view"] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_neither_exposure_nor_scale_count():
+def test_distance_ignores_exposure_and_scale():
     true, other = a_ball("true"), a_ball("true")
     dim = 0.7 * np.asarray(other.paint.colours)
     larger = other.vertices * 3.0

@@ -110,7 +110,7 @@ THIN_RING = trimesh.creation.torus(major_radius=0.0115, minor_radius=0.0015, maj
     ],
     ids=["ring on a tapered finger", "wide ring on a post", "ball in a bowl", "ball on a ball"],
 )  # fmt: skip
-def test_what_holds_stays_and_what_does_not_falls(background, foreground, stays):
+def test_stable_pairs_stay_and_others_fall(background, foreground, stays):
     result = check_stability(background, foreground)
     assert result.stays == stays
     assert result.stays or result.notes

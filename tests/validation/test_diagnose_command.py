@@ -95,7 +95,7 @@ def test_drag_is_found_predicted_confirmed_and_reported(capture, tmp_path, capsy
         (["--out", "ITSELF"], "is there and holds no diagnosis"),
     ],
 )
-def test_what_cannot_be_is_refused_at_once(capture, tmp_path, capsys, extra, words):
+def test_invalid_arguments_are_refused_at_once(capture, tmp_path, capsys, extra, words):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
     places = {"FOREIGN": str(tmp_path / "other"), "ITSELF": str(capture[0])}

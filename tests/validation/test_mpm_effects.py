@@ -458,7 +458,7 @@ def test_adhesion_makes_a_sliding_body_heavier(box, options, similarity):
 # ---- all together ----------------------------------------------------------------------------------------------------
 
 
-def test_what_is_absent_costs_nothing(box, options, similarity):
+def test_absent_effects_cost_nothing(box, options, similarity):
     """Without effects, and with those that need no means, the same kernel is compiled and the same arrays are made."""
     setup = WorldSetup(bodies=(box(cells=(3, 3, 3)),), ground=Ground())
     assert apply_effects(setup, []) is setup

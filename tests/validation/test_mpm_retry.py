@@ -74,7 +74,7 @@ def torn(box, options, similarity):
     return good, bad, str(error.value)
 
 
-def test_what_no_substep_can_save_is_an_error_that_names_the_body(torn):
+def test_divergence_is_an_error_that_names_the_body(torn):
     """The body, the time up to which all was well, and what to do; the frames until then stay, see ``test_bake``."""
     good, bad, message = torn
     assert "'torn'" in message and "0.05 s" in message and "cfl_elastic" in message

@@ -212,7 +212,7 @@ def test_box_turns_with_a_turntable(box_body, solids):
 
 
 @pytest.mark.parametrize("speed", [2.0, 5.0])
-def test_nothing_sinks_in(box_body, solids, speed):
+def test_bodies_do_not_penetrate(box_body, solids, speed):
     """No corner of a tumbling box deeper than 0.1 cell in the ground, at any time."""
     body = box_body(center=(0.0, 0.0, 0.25), velocity=(0.5, 0.0, -speed), spin=(3.0, 7.0, 2.0))
     world = solids(WorldSetup(bodies=(body,), ground=Ground(restitution=0.3)))

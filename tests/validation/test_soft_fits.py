@@ -130,7 +130,7 @@ def test_no_bounce_gains_energy(turn):
     assert speed[2] > 0.5
 
 
-def test_where_a_world_comes_to_nothing_the_body_goes_on_rigid(monkeypatch):
+def test_rigid_fallback_when_a_world_fails(monkeypatch):
     made, _ = capture(NOMINAL, takes=1)
     mesh = body_mesh(made.objects[0].vertices, made.objects[0].faces)
     worlds = SoftWorlds(mesh, 400.0, made.trials[0].rest_points, threads=1)
@@ -187,14 +187,14 @@ def test_a_softer_body_is_found_predicted_and_placed():
 
 
 @pytest.mark.slow
-def test_nothing_is_found_where_nothing_is():
+def test_no_effect_is_found_in_plain_motion():
     made, _ = capture(NOMINAL, seed=1)
     found = fits(made, ["stiffness", "internal_damping", "friction", "buoyancy"])
     assert found.nominal.misfit < 1.1
     assert max(c.log_evidence for c in found.candidates) < found.refitted.log_evidence + 3
 
 
-def test_what_it_cannot_do_is_said():
+def test_unsupported_captures_are_reported():
     made, _ = capture(NOMINAL, after=0.0)
     rigid = dataclasses.replace(made.objects[0].belief, stiffness="hard", youngs_modulus_pa=None)
     with pytest.raises(InputError, match="rigid"):
