@@ -13,7 +13,15 @@ from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.version import VERSION
 from . import stages
-from .commands import compose_commands, diagnosis_commands, doctor, photo_commands, render_commands, scene_commands
+from .commands import (
+    compose_commands,
+    diagnosis_commands,
+    doctor,
+    model_commands,
+    photo_commands,
+    render_commands,
+    scene_commands,
+)
 from .farm import batch_command as farm_command
 from .terminal import Terminal, stop_signals
 
@@ -72,6 +80,8 @@ def build_parser() -> argparse.ArgumentParser:
     diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
     listing = command("effects", _effects, "list physical effects with their equations and parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
+    kept = "list, install or remove models that improve the reconstruction"
+    model_commands.add_models(command("models", model_commands.run_models, kept))
     command("doctor", _doctor, "check the installation and name what is missing")
     return parser
 

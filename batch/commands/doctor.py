@@ -61,7 +61,7 @@ def examine() -> list[Finding]:
 def adapter_findings() -> list[Finding]:
     """Return the user's named adapters and their runtime, without running them. Only named ones can be missing."""
     version = onnxruntime_version()
-    text = version or "not installed; needed for .onnx models: install physgen[onnx]"
+    text = version or "not installed; needed for .onnx models: install physgen[models]"
     findings = [("onnxruntime (optional)", True, text)]
     adapters = list_adapters()
     findings += [(f"{item.stage} {item.name}", item.usable, item.text) for item in adapters]

@@ -21,7 +21,7 @@ from ..atomic import write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions
-from ..reconstruct.adapters.adapter_registry import spec_files
+from ..reconstruct.adapters.adapter_registry import chosen_segmenter, spec_files
 from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.reasoning.chat_client import ChatRequest
 from ..reconstruct.scene_output import PHYSICS_FILE
@@ -97,6 +97,8 @@ def reconstruct(
     """
     photo, out, options, physics = Path(photo), Path(out), options or ReconstructOptions(), physics or Physics()
     require_physics(len(objects), physics)
+    # The stamp has the choice itself, so that a correction keeps it, whatever is installed by then.
+    options = dataclasses.replace(options, segmenter=chosen_segmenter(options.segmenter))
     scene = _reconstruct_cached(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
     velocities = (*physics.velocities, *(item.velocity for item in objects[len(physics.velocities) :]))
     spins = (*physics.spins, *(item.spin for item in objects[len(physics.spins) :]))
@@ -303,6 +305,8 @@ def correct(
     """
     root = scene.root
     stamp = require_stamp(scene)
+    if options.segmenter is not None:
+        options = dataclasses.replace(options, segmenter=chosen_segmenter(options.segmenter))
     if not stamp.photo.is_file():
         raise InputError(f"{stamp.photo}: the photo of this scene is no longer there; put it back, or reconstruct anew")
     before, first = scene.model, parse_scene(stamp.scene, STAMP_FILE)

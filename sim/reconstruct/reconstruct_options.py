@@ -96,7 +96,9 @@ class ReconstructOptions:
     inpaint_pixels: largest number of pixels that PatchMatch searches for one hole, 1e4 to 1e8.
     seed: seed of PatchMatch; equal inputs give equal backgrounds.
     inpainter: an adapter (docs/extending.md) that replaces PatchMatch; None for the built-in inpainting. Likewise
-        segmenter: masks from boxes; depth_estimator: the depth map; mesher: meshes of single objects.
+        depth_estimator: the depth map; mesher: meshes of single objects.
+    segmenter: an adapter that makes masks from boxes; None an installed model (``physgen models``), without one the
+        weight-free way; ``none`` the weight-free way.
     mesh_vertices: target number of vertices of each object, 500 to 200000.
     friction: Coulomb coefficient of the ground, 0 to 10; None uses a model's answer, else 0.4.
     environment: .hdr or .exr file that replaces the environment estimated from the photo (sim/scene/environment).

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""LaMa through onnxruntime: real models of a few operators, written here byte by byte.
-
-The package that makes such files is 9 MB for what takes thirty lines: a model is nested protocol buffers (onnx.proto,
-field numbers below).
-"""
+"""LaMa through onnxruntime: real models of a few operators."""
 
 import struct
 
@@ -13,49 +9,9 @@ from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.adapters import resolve
 from physgen.sim.reconstruct.adapters.lama_adapter import square_around
 
+from .onnx_models import FLOAT, FLOAT16, constant, model
+
 pytest.importorskip("onnxruntime")
-FLOAT, FLOAT16 = 1, 10
-
-
-def varint(value):
-    parts = []
-    while value > 127:
-        parts.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*parts, value])
-
-
-def field(number, value):
-    """One field: a message or text, or a whole number."""
-    if isinstance(value, int):
-        return varint(number << 3) + varint(value)
-    value = value.encode() if isinstance(value, str) else value
-    return varint(number << 3 | 2) + varint(len(value)) + value
-
-
-def tensor_type(name, kind, shape):
-    dims = b"".join(field(1, field(2, d) if isinstance(d, str) else field(1, d)) for d in shape)
-    return field(1, name) + field(2, field(1, field(1, kind) + field(2, dims)))
-
-
-def constant(name, values, kind=FLOAT):
-    values = np.asarray(values, dtype=np.float32 if kind == FLOAT else np.float16)
-    dims = b"".join(field(1, d) for d in values.shape)
-    return dims + field(2, kind) + field(8, name) + field(9, values.tobytes())
-
-
-def node(operator, inputs, output):
-    return b"".join(field(1, i) for i in inputs) + field(2, output) + field(4, operator)
-
-
-def model(nodes, constants, inputs, outputs):
-    """nodes: (operator, inputs, output); inputs, outputs: (name, element kind, shape)."""
-    graph = b"".join(field(1, node(*n)) for n in nodes) + field(2, "graph")
-    graph += b"".join(field(5, c) for c in constants)
-    graph += b"".join(field(11, tensor_type(*i)) for i in inputs) + b"".join(
-        field(12, tensor_type(*o)) for o in outputs
-    )
-    return field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13))
 
 
 def mean_model(size, *, scale=1.0, kind=FLOAT, names=("image", "mask"), batch=1):

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
+from ..models.model_folder import list_models
 from .protocols import MEANINGS, STAGES
 from .python_adapter import function_problem
 
@@ -163,9 +164,11 @@ def _brief(value: Any) -> str:
 
 VARIABLE = "PHYSGEN_ADAPTERS"
 GROUP = "physgen.adapters"
-PATHS = ("command", "lama", "picture")
+PATHS = ("command", "lama", "picture", "isnet")
 """Adapter types whose target is a file."""
 ADAPTER_TYPES = (*PATHS, "python")
+OF_STAGE = {"lama": "inpainter", "picture": "inpainter", "isnet": "segmenter"}
+"""Stage of the types that serve one only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +196,10 @@ def adapters_file() -> Path | None:
 
 
 def named_adapters(path: Path | None = None) -> list[NamedAdapter]:
-    """Return all names, those of the user's file first; path: of it, else ``adapters_file()``. Raises InputError."""
+    """Return all names: those of the user's file, of packages, of installed models; the first of a name counts.
+
+    path: the user's file, else ``adapters_file()``. Raises InputError.
+    """
     path = path or adapters_file()
     found = [] if path is None else _from_file(path)
     for point in importlib.metadata.entry_points(group=GROUP):
@@ -201,6 +207,13 @@ def named_adapters(path: Path | None = None) -> list[NamedAdapter]:
         if dot and stage in STAGES:
             package = point.dist.name if point.dist is not None else "an installed package"
             found.append(NamedAdapter(stage=stage, name=name, spec=None, entry_point=point, source=package))
+    for status in list_models():
+        if status.is_installed:
+            model = status.model
+            spec = f"{model.name}:{status.path}"
+            found.append(
+                NamedAdapter(stage=model.stage, name=model.name, spec=spec, entry_point=None, source="physgen models")
+            )
     return found
 
 
@@ -221,6 +234,23 @@ def spec_files(stage: str, spec: str, names: Path | None = None) -> list[Path]:
         if kind in PATHS or path.endswith(".py"):
             found.append(Path(path).expanduser().absolute())
     return [path for path in found if path.is_file()]
+
+
+WITHOUT = "none"
+"""A segmenter's name that stands for the weight-free way, also where a model is installed."""
+
+
+def chosen_segmenter(asked: str | None) -> str | None:
+    """Return the segmenter for what a user ``asked``: by default an installed model that can be used, if there is one.
+
+    None is the weight-free way.
+    """
+    if asked is not None:
+        return None if asked == WITHOUT else asked
+    if onnxruntime_version() is None:
+        return None
+    good = [item.model for item in list_models() if item.is_installed and item.problem is None]
+    return next((model.name for model in good if model.stage == "segmenter"), None)
 
 
 def adapter_content(stage: str, spec: str | None) -> tuple[str, ...]:
@@ -308,6 +338,12 @@ def _status(adapter: NamedAdapter) -> AdapterStatus:
     return AdapterStatus(stage=adapter.stage, name=adapter.name, usable=problem is None, text=text)
 
 
+def other_stage(kind: str, stage: str) -> str:
+    """Return that adapters of the type ``kind`` are of another stage than ``stage``."""
+    article = "an" if OF_STAGE[kind][0] in "aeio" else "a"
+    return f"is {article} {OF_STAGE[kind]}, not a {stage}"
+
+
 def _problem(stage: str, kind: str, target: str) -> str | None:
     if kind == "python":
         return function_problem(target)
@@ -320,10 +356,10 @@ def _problem(stage: str, kind: str, target: str) -> str | None:
         if program.startswith("{"):
             return None
         return None if shutil.which(program) else f"there is no program {program}"
-    if stage != "inpainter":
-        return f"is an inpainter, not a {stage}"
+    if stage != OF_STAGE[kind]:
+        return other_stage(kind, stage)
     if not path.is_file():
         return "there is no such file"
-    if kind == "lama" and onnxruntime_version() is None:
-        return "needs onnxruntime; install physgen[onnx]"
+    if kind in ("lama", "isnet") and onnxruntime_version() is None:
+        return "needs onnxruntime; install physgen[models]"
     return None

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...errors import InputError
+from .onnx_session import open_session
 from .protocols import Mask, Pixels, checked_pixels
 
 CONTEXT = 2.0
@@ -28,7 +29,6 @@ LEAST_SIDE, MOST_SIDE, STEP = 256, 1024, 32
 BLEND_PX = 6.0
 """Distance from the hole's border, in the model's pixels, over which the result is corrected towards the surrounding
 colours."""
-MAX_MODEL_BYTES = 8 * 2**30
 _TYPES: dict[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 Array = NDArray[np.float32]
@@ -149,22 +149,7 @@ def blended(picture: Array, filled: Array, mask: Mask) -> Array:
 
 def load_lama(path: Path, where: str) -> LamaInpainter:
     """Return the model in ``path``, checked to be an inpainting model. Raises InputError."""
-    if not path.is_file():
-        raise InputError(f"{where}: there is no such file; bring your own model, nothing is downloaded")
-    if path.stat().st_size > MAX_MODEL_BYTES:
-        raise InputError(f"{where}: {path.stat().st_size >> 30} GiB is larger than any supported model")
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise InputError(f"{where}: needs onnxruntime ({error}); install physgen[onnx]") from None
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    # onnxruntime's exceptions have no common base class.
-    except Exception as error:
-        raise InputError(f"{where}: is not a model that onnxruntime can read ({str(error)[:300]})") from error
-    return _checked_session(session, where)
+    return _checked_session(open_session(path, where), where)
 
 
 def _checked_session(session: Any, where: str) -> LamaInpainter:

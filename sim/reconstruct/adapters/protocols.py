@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,15 @@ class Segmenter(Protocol):
     def __call__(self, pixels: Pixels, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return masks (N, H, W) bool of the objects in ``boxes`` (N, 4): x0, y0, x1, y1 in pixels, x1 and y1
         exclusive."""
+
+
+@runtime_checkable
+class SoftSegmenter(Protocol):
+    """Opacity of what stands out in a box, which the colours around it then refine (``alpha_masks``)."""
+
+    def alpha(self, pixels: Pixels, box: tuple[int, int, int, int]) -> NDArray[np.float32]:
+        """Return the opacity (H, W), 0 to 1, of the object in ``box`` (x0, y0, x1, y1 in whole pixels, x1 and y1
+        exclusive); 0 outside it."""
 
 
 class Inpainter(Protocol):

