@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Segmentation and the filled background, on drawn photos with known answers."""
 
+import cv2
 import numpy as np
 import pytest
 from physgen.sim.composite.inpaint import FillOptions, inpaint
@@ -71,6 +72,25 @@ def test_pinholes_are_filled_whatever_their_colour():
     mask = disc(150, 120, 60)
     pierced = mask & ~disc(140, 110, 2)
     assert (fill_holes(paint([]), pierced) == mask).all()
+
+
+def drawn(corners):
+    filled = np.zeros((HEIGHT, WIDTH), np.uint8)
+    cv2.fillConvexPoly(filled, np.array(corners, np.int32), 1)
+    return filled > 0
+
+
+def test_nothing_shows_through_a_box_whatever_the_colour_of_its_label():
+    box = drawn([(70, 60), (130, 40), (250, 62), (240, 180), (215, 200), (80, 170)])
+    label = drawn([(90, 80), (150, 86), (150, 130), (92, 122)])
+    # The label is exactly as the ground is.
+    photo = paint([(box & ~label, (40, 80, 190))])
+    assert (fill_holes(photo, box & ~label) == box).all()
+    # The opening of a frame is larger, and something round is no box.
+    opening = drawn([(95, 75), (225, 85), (205, 170), (100, 150)])
+    assert not fill_holes(paint([(box & ~opening, (40, 80, 190))]), box & ~opening)[opening].any()
+    ring, hole = disc(150, 120, 60), disc(150, 120, 20)
+    assert not fill_holes(paint([(ring & ~hole, (40, 80, 190))]), ring & ~hole)[hole].any()
 
 
 def test_contact_shadow_is_not_part_of_the_object():

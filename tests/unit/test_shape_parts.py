@@ -18,6 +18,7 @@ from physgen.sim.reconstruct.shape.furniture import furniture_legs
 from physgen.sim.reconstruct.shape.inflate import crop_mask
 from physgen.sim.reconstruct.shape.legs import find_legs
 from physgen.sim.reconstruct.shape.object_bodies import build_body
+from scipy import ndimage
 
 WIDTH, HEIGHT = shapes.WIDTH, shapes.HEIGHT
 
@@ -104,6 +105,19 @@ def test_furniture_stands_on_four_legs(name):
     # The seat is level and thin: hardly anything lies between it and the ground but legs.
     height = float(mesh.vertices[:, 2].max())
     assert mesh.volume < 0.2 * height * np.prod(np.ptp(mesh.vertices[:, :2], axis=0))
+
+
+def test_a_ragged_mask_of_a_chair_is_furniture_all_the_same():
+    camera, truth = seen("chair")
+    mask = truth.mask.astype(np.uint8)
+    random = np.random.default_rng(3)
+    outline = np.argwhere(truth.mask & ~ndimage.binary_erosion(truth.mask))
+    for row, column in outline[random.integers(0, len(outline), 40)]:
+        cv2.circle(mask, (int(column), int(row)), 1, int(random.integers(0, 2)), -1)
+    body = made(camera, mask > 0, vertices=6000)
+    closed(body)
+    assert body.shape == "furniture"
+    assert body.fit > 0.96
 
 
 def test_a_shelf_is_a_deep_frame():

@@ -14,6 +14,11 @@ Mask = NDArray[np.bool_]
 SHADE = (0.28, 0.9)
 """Range of a contact shadow's brightness over that of the lit ground: below is the crease itself or a black object."""
 
+BOX_CORNERS, CORNER_CUT, BOX_OVERLAP = 6, 0.015, 0.96
+"""A box' outline: most corners, how far off they may be over its length, and the least overlap with them."""
+PRINT_SHARE = 0.25
+"""Largest share of a box that is a print: the opening of a frame is larger."""
+
 
 def largest_component(mask: Mask) -> Mask:
     """The largest 8-connected part of ``mask``; an empty mask stays empty."""
@@ -51,10 +56,26 @@ def enclosed_holes(mask: Mask) -> Mask:
 def fill_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     """Return ``mask`` with pinholes and prints filled; holes stay open only where the background shows through.
 
-    pixels: (H, W, 3) sRGB.
+    A label on a carton may have the ground's colour: nothing shows through a box. pixels: (H, W, 3) sRGB.
     """
     holes = enclosed_holes(mask)
+    if not holes.any() or is_box_with_print(mask, holes):
+        return mask | holes
     return mask | (holes & ~see_through(pixels, mask, holes))
+
+
+def is_box_with_print(mask: Mask, holes: Mask) -> bool:
+    """Return whether ``mask`` with its ``holes`` (H, W), not empty, is the outline of a box, and they are too small for
+    a frame's."""
+    filled = (mask | holes).astype(np.uint8)
+    area = int(filled.sum())
+    hull = cv2.convexHull(cv2.findNonZero(filled))
+    corners = cv2.approxPolyDP(hull, CORNER_CUT * cv2.arcLength(hull, True), True)
+    if len(corners) > BOX_CORNERS or int(holes.sum()) > PRINT_SHARE * area:
+        return False
+    drawn = np.zeros_like(filled)
+    cv2.fillConvexPoly(drawn, corners, 1)
+    return bool((drawn & filled).sum() > BOX_OVERLAP * (drawn | filled).sum())
 
 
 def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:

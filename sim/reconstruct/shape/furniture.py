@@ -32,6 +32,8 @@ LONG = 3.0
 """Least length of a leg over its width."""
 TALL = 0.2
 """Least height of legs over that of the piece; a shelf's feet are shorter."""
+NUB = 0.012
+"""Width of what is noise of the mask, over the outline's longer side."""
 LEAST_LEGS = 3
 """Legs that make furniture of an unknown thing."""
 USUAL_DEPTH = 0.8
@@ -71,7 +73,12 @@ def _level(low: float, high: float) -> Slab:
 
 def furniture_legs(crop: Crop) -> list[Leg]:
     """Return the straight thin legs in ``crop``, from left to right."""
-    legs = find_legs(crop.mask, max(THIN * outline_size(crop.mask), 3.0), LONG)
+    size = outline_size(crop.mask)
+    # Nubs along a mask's edge are no feet, and end no leg.
+    nub = 2 * round(NUB * size / 2.0) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (nub, nub))
+    closed = cv2.morphologyEx(crop.mask.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    legs = find_legs(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0, max(THIN * size, 3.0), LONG)
     return [leg for leg in legs if leg.straight]
 
 
@@ -146,6 +153,11 @@ def furniture_boards(camera: Camera, crop: Crop, *, asked: bool = False) -> list
     legs = [leg for leg in furniture_legs(crop) if np.isfinite(on_ground(camera, _photo(crop, leg))).all()]
     rows = np.flatnonzero(crop.mask.any(axis=1))
     tall = [leg for leg in legs if len(leg.rows) > TALL * len(rows)]
+    if tall:
+        # What ends high up in the photo hangs there.
+        depths = [float(on_ground(camera, _photo(crop, leg))[1]) for leg in tall]
+        span = len(np.flatnonzero(crop.mask.any(axis=0))) * min(depths) / camera.fx
+        legs = [leg for leg in legs if float(on_ground(camera, _photo(crop, leg))[1]) < max(depths) + span]
     if len(tall) >= 2 and sum(1 + leg.beside for leg in legs) >= (2 if asked else LEAST_LEGS):
         return _standing(camera, crop, legs)
     return _lattice(camera, crop) if is_frame(crop) else None

@@ -27,6 +27,8 @@ BESIDE = 3.2
 """Width over a leg's own up to which a step in one of its sides is another leg beside it."""
 STEP = (2.0, 0.15)
 """Step from one row to the next that is such a step: pixels, and share of the width; the larger."""
+FOOT = 0.5
+"""Height of a foot, over a leg's width, up to which it may grow."""
 STRAIGHT = 0.16
 """Largest deviation of a straight leg's sides from lines, over its width."""
 TAPERED = 0.3
@@ -107,7 +109,8 @@ def _leg(mask: Mask, column: int, bottom: int, widest: float) -> Leg | None:
         start = int(gaps[-1]) + 1 if len(gaps) else 0
         gaps = np.flatnonzero(~line[at:])
         end = at + int(gaps[0]) if len(gaps) else len(line)
-        if len(rows) >= 6:
+        # A foot that is seen at a slant grows to its width first.
+        if len(rows) >= 6 and len(rows) >= FOOT * (right[-1] - left[-1]):
             if len(rows) < 12 or len(rows) % 8 == 0:
                 own = float(np.median(np.subtract(right, left)))
             if own > 2.0 * widest:

@@ -209,6 +209,8 @@ HANDLE = 0.13
 """Half the width of thin parts over the object's size."""
 GAIN = 0.008
 """Overlap that a curved profile has to gain over a straight one."""
+BESIDE = 0.5
+"""Least distance of a handle's middle from the axis, over the radius: a neck or a foot is at both sides."""
 SYMMETRIC = 0.955
 """Overlap from which an object of unknown kind is a surface of revolution of any profile."""
 
@@ -331,11 +333,20 @@ class _Candidates:
         curved = self._judged(None if body is None else (body, 0.0))
         if curved is None:
             return straight
-        gain = max(
-            curved.overlap - straight.overlap,
-            self.bare_overlap(curved.primitive) - self.bare_overlap(straight.primitive),
-        )
+        bare = self.bare_overlap(curved.primitive) - self.bare_overlap(straight.primitive)
+        # Beside a handle a profile gains by bulging towards it, and by a dome on a rim that is not seen well.
+        gain = bare if self._one_sided(straight.primitive) else max(bare, curved.overlap - straight.overlap)
         return curved if gain > GAIN else straight
+
+    def _one_sided(self, body: SurfaceOfRevolution) -> bool:
+        """Whether what reaches out of a well fitting ``body`` lies on one side of it, as a handle does."""
+        if self.bare_overlap(body) < WITH_PARTS:
+            return False
+        outside = self._crop.mask & ~self._drawn(body)
+        across = np.nonzero(outside)[1] + self._crop.left + 0.5
+        middle = self._camera.project(np.array([[body.x, body.y, body.height / 2.0]]))[0]
+        radius = max(body.radii) * self._camera.fx / float(middle[2])
+        return len(across) > 0 and abs(float(across.mean() - middle[0])) > BESIDE * radius
 
     @staticmethod
     def _curved(choice: PrimitiveChoice) -> bool:
@@ -369,9 +380,11 @@ class _Candidates:
         if self._bare is None:
             mask = self._crop.mask
             radius = max(2, round(HANDLE * float(np.sqrt(mask.sum()))))
-            filled = mask
+            # A slit or notch in the mask must not make a thin part of what lies beyond it.
+            slit = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (radius // 5) + 1, 2 * (radius // 5) + 1))
+            filled = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, slit)
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-            opened = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+            opened = cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel) > 0
             # Opening rounds corners: restore nearby pixels, but not the handle's roots.
             near = ndimage.binary_dilation(opened, iterations=max(1, radius // 5))
             labels, count = ndimage.label(mask & ~opened)
