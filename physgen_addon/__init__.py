@@ -23,6 +23,7 @@ MODULES = (
     "operators.python_ops",
     "operators.import_ops",
     "operators.photo_ops",
+    "operators.model_ops",
     "operators.mask_horizon_ops",
     "operators.body_ops",
     "operators.world_ops",

@@ -9,9 +9,12 @@ from typing import Any
 import bpy
 
 from ...sim.errors import PhysGenError
+from ...sim.reconstruct.models.known_models import ISNET
+from ...sim.reconstruct.models.model_folder import model_status
 from .. import text
 from ..context import TAB
 from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
+from ..operators.model_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
 from ..operators.photo_ops import (
     PHYSGEN_OT_draw_box,
     PHYSGEN_OT_open_photo,
@@ -70,6 +73,16 @@ def draw_mask(layout: bpy.types.UILayout, context: bpy.types.Context, box: Any) 
     if box.mask is not None:
         row.operator(PHYSGEN_OT_clear_mask.bl_idname, text="", icon="X")
     column.template_ID(box, "mask", open="image.open")
+
+
+def draw_cutouts(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
+    """Draw the button that installs the model for cut-outs, or the choice to use it."""
+    if not model_status(ISNET).is_installed:
+        layout.operator(PHYSGEN_OT_improve_cutouts.bl_idname, icon="IMPORT")
+        return
+    row = layout.row(align=True)
+    row.prop(state, "segmenter")
+    row.operator(PHYSGEN_OT_remove_model.bl_idname, text="", icon="TRASH")
 
 
 def draw_camera(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
@@ -165,6 +178,7 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     _draw_boxes(layout, context, state)
     if 0 <= state.box_index < len(state.boxes):
         draw_details(layout, context, state.boxes[state.box_index])
+    draw_cutouts(layout, context, state)
     draw_camera(layout, context, state)
     draw_files(layout, context, state)
     draw_asking(layout, context, state)

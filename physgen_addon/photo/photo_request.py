@@ -86,6 +86,8 @@ def arguments(state: bpy.types.PropertyGroup, *, online: bool | None = None) -> 
         found += ["--size", *sizes]
     found += _of_objects(state, known)
     found += _of_camera(state)
+    if state.segmenter != "auto":
+        found += ["--segmenter", state.segmenter]
     if state.depth.strip():
         found += ["--depth", str(_file(state.depth, "Depth Map"))]
     if state.report:

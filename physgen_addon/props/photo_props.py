@@ -173,6 +173,14 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
         "Angle of view along the photo's longer side: about 65° for a phone, 40° for a portrait",
         default=USUAL_FOV,
     )
+    segmenter: EnumProperty(
+        name="Cut-outs",
+        description="What cuts out the objects in boxes without a mask",
+        items=[
+            ("auto", "Automatic", "The installed model (Improve Cut-outs), without one colour and texture"),
+            ("none", "Without a Model", "Colour and texture"),
+        ],
+    )
     depth: StringProperty(
         name="Depth Map",
         description="Of the photo, made elsewhere: .npy, .npz, .exr, .pfm, or .png of 16 bits. Tells ground and order",

@@ -107,7 +107,7 @@ def test_the_command_understands_all_that_was_set(photo, tmp_path):
     store_mask(cup, drawn())
     photo.camera, photo.horizon, photo.roll = "HORIZON", -0.25, math.radians(-3)
     photo.use_fov, photo.fov = True, math.radians(65)
-    photo.depth, photo.report = str(tmp_path / "depth.npy"), True
+    photo.depth, photo.report, photo.segmenter = str(tmp_path / "depth.npy"), True, "none"
     objects, options = read(arguments(photo))
     first, second = objects
     assert (first.name, first.size_m, first.mesh, first.mesh_up) == ("cup_1", 0.1, tmp_path / "toy.glb", "+y")
@@ -116,7 +116,7 @@ def test_the_command_understands_all_that_was_set(photo, tmp_path):
     assert (second.thickness, second.mask, second.mesh) == (0.75, None, None)
     assert (options.horizon_y, options.pitch_deg, options.roll_deg) == (-0.25, None, pytest.approx(-3, abs=1e-5))
     assert options.fov_deg == pytest.approx(65, abs=1e-4)
-    assert options.depth == tmp_path / "depth.npy" and options.report
+    assert options.depth == tmp_path / "depth.npy" and options.report and options.segmenter == "none"
 
 
 @pytest.mark.parametrize("end", [-1e9, -1e-9, 1e9])

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Improve Cut-outs: what is agreed to is installed in the user's folder by the command, and the photo panel follows."""
+
+import gzip
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+import physgen
+from physgen.physgen_addon.panels.photo_panel import draw_cutouts
+from physgen.sim.reconstruct.models import model_folder
+from physgen.sim.reconstruct.models.known_models import ISNET
+
+ARCHIVE = os.environ.get("PHYSGEN_TEST_ISNET", "")
+
+
+@pytest.fixture(autouse=True)
+def addon(fresh_blender, tmp_path, monkeypatch):
+    monkeypatch.setenv(model_folder.VARIABLE, str(tmp_path / "models"))
+    physgen.register()
+    yield
+    physgen.unregister()
+
+
+class Layout:
+    """Keeps which operators and properties were drawn."""
+
+    def __init__(self):
+        self.drawn = []
+
+    def row(self, **_):
+        return self
+
+    def operator(self, name, **_):
+        self.drawn.append(name)
+
+    def prop(self, _, name, **__):
+        self.drawn.append(name)
+
+
+def drawn():
+    layout = Layout()
+    draw_cutouts(layout, SimpleNamespace(), bpy.context.scene.physgen_photo)
+    return layout.drawn
+
+
+def test_nothing_happens_without_agreement(tmp_path):
+    with pytest.raises(RuntimeError, match="not agreed to"):
+        bpy.ops.physgen.improve_cutouts(archive=str(tmp_path / "any.tgz"))
+    assert not (tmp_path / "models").exists()
+
+
+def test_a_bad_archive_is_reported_and_installs_nothing(tmp_path):
+    path = tmp_path / "bad.tgz"
+    path.write_bytes(gzip.compress(bytes(2048)))
+    with pytest.raises(RuntimeError, match="is not the archive of"):
+        bpy.ops.physgen.improve_cutouts(archive=str(path), agreed=True)
+    with pytest.raises(RuntimeError, match="there is no file"):
+        bpy.ops.physgen.improve_cutouts(archive=str(tmp_path / "none.tgz"), agreed=True)
+    assert not list((tmp_path / "models").glob("*"))
+
+
+def test_nothing_is_fetched_while_blender_is_to_stay_offline():
+    # As a module bpy has no network access, unless it is allowed in the preferences.
+    if bpy.app.online_access:
+        pytest.skip("this Blender may go online")
+    with pytest.raises(RuntimeError, match="offline"):
+        bpy.ops.physgen.improve_cutouts(agreed=True)
+
+
+def test_the_panel_offers_the_installation_then_the_choice(tmp_path):
+    assert drawn() == ["physgen.improve_cutouts"]
+    path = model_folder.model_file(ISNET)
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        stream.truncate(ISNET.size)
+    assert drawn() == ["segmenter", "physgen.remove_model"]
+    assert bpy.ops.physgen.remove_model() == {"FINISHED"}
+    assert drawn() == ["physgen.improve_cutouts"] and not path.exists()
+    assert not bpy.ops.physgen.remove_model.poll()
+
+
+@pytest.mark.skipif(not ARCHIVE, reason="PHYSGEN_TEST_ISNET names no archive of the model")
+def test_the_real_archive_is_installed():
+    assert bpy.ops.physgen.improve_cutouts(archive=str(Path(ARCHIVE).resolve()), agreed=True) == {"FINISHED"}
+    model_folder.check_installed(model_folder.model_file(ISNET), "test")
+    assert model_folder.model_status(ISNET).is_installed
