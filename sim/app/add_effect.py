@@ -13,7 +13,7 @@ from typing import Any
 from ..effects.registry import effect
 from ..errors import Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent, ignore, never
-from ..scene.folder import Scene, save_scene
+from ..scene.folder import Scene
 from ..scene.model import Effect, SceneModel
 
 FoundEffects = Mapping[str, Mapping[str, float]]
@@ -82,14 +82,6 @@ def with_effects(scene: SceneModel, found: FoundEffects) -> SceneModel:
 def without_effects(scene: SceneModel, names: Collection[str]) -> SceneModel:
     """Return ``scene`` without the effects called ``names``."""
     return dataclasses.replace(scene, effects=tuple(item for item in scene.effects if item.name not in names))
-
-
-def add_effects(scene: Scene, found: FoundEffects) -> Scene:
-    """Return ``scene`` with the effects ``found`` added, saved in its folder (whole or not at all).
-
-    Raises InputError as ``with_effects`` does.
-    """
-    return save_scene(scene.root, with_effects(scene.model, found))
 
 
 @dataclass(frozen=True, kw_only=True)

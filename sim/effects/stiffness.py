@@ -50,11 +50,6 @@ def youngs_modulus(body: BodyParticles, factor: float) -> float:
     return factor * _believed(body)
 
 
-def factor_for(body: BodyParticles, youngs_modulus: float) -> float:
-    """The factor that gives the body's first solid material ``youngs_modulus`` in Pa."""
-    return youngs_modulus / _believed(body)
-
-
 def _believed(body: BodyParticles) -> float:
     found = solids(body, SOLIDS)
     if not found:

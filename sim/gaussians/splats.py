@@ -148,24 +148,15 @@ def bind_splats(splats: Splats, particles: NDArray[np.floating]) -> SplatBinding
     return SplatBinding(bind(splats.centres, particles))
 
 
-def deform_splats(
-    splats: Splats, binding: SplatBinding, positions: NDArray[np.floating], gradients: NDArray[np.floating]
-) -> Splats:
-    """Return ``splats`` deformed with particles at ``positions`` (P, 3), metres, and ``gradients`` F (P, 3, 3).
-
-    Opacity and colour are unchanged. Exact for affine motion up to ``MAX_STRETCH``. Particles that have flown off, and
-    gradients that are not finite or inverted, are ignored. Raises InputError when ``binding`` belongs to other splats.
-    """
-    return from_half_axes(splats, *deformed_half_axes(splats, binding, positions, gradients))
-
-
 def deformed_half_axes(
     splats: Splats, binding: SplatBinding, positions: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[Array, Array]:
-    """Return centres (N, 3) and half axes (N, 3, 3), the columns of F R S, in metres; arguments of ``deform_splats``.
+    """Return centres (N, 3) and half axes (N, 3, 3), the columns of F R S, in metres, of ``splats`` deformed with
+    particles at ``positions`` (P, 3), metres, and ``gradients`` F (P, 3, 3).
 
-    Unlike scales and rotations they change smoothly from frame to frame, even where two axes become equally long, so
-    frames may be interpolated. Raises InputError when ``binding`` belongs to other splats.
+    Exact for affine motion up to ``MAX_STRETCH``. Particles that have flown off, and gradients that are not finite or
+    inverted, are ignored. Unlike scales and rotations, half axes change smoothly from frame to frame, even where two
+    become equally long, so frames may be interpolated. Raises InputError when ``binding`` belongs to other splats.
     """
     if len(binding) != len(splats):
         raise InputError(f"splats: there are {len(splats)}, but the binding has {len(binding)}: bind these splats")

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from physgen.sim.app.add_effect import (
     AddRequest,
     add_and_bake,
-    add_effects,
     found_effects,
     with_effects,
     without_effects,
@@ -108,7 +107,7 @@ def test_observation_effects_are_refused(name):
 def test_out_of_range_is_refused_with_both_names(folder):
     before = (folder / "scene.json").read_bytes()
     with pytest.raises(InputError, match="effect 'air_drag': drag_per_mass is -1"):
-        add_effects(load_scene(folder), {"air_drag": {"drag_per_mass": -1.0}})
+        with_effects(load_scene(folder).model, {"air_drag": {"drag_per_mass": -1.0}})
     assert (folder / "scene.json").read_bytes() == before
 
 

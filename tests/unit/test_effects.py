@@ -26,7 +26,7 @@ from physgen.sim.effects.camera_pose import true_camera
 from physgen.sim.effects.mass_offset import pellet_width
 from physgen.sim.effects.registry import KINDS, apply_effects, effect, effect_to_json, effects
 from physgen.sim.effects.schema import SECTIONS
-from physgen.sim.effects.stiffness import factor_for, youngs_modulus
+from physgen.sim.effects.stiffness import youngs_modulus
 from physgen.sim.effects.time_scale import true_times
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.bodies import BodyForces, BodyParticles
@@ -472,9 +472,9 @@ def test_stiffness_multiplies_and_knows_its_value():
     setup = put(put(world(), "stiffness", factor=0.5), "stiffness", factor=4.0)
     jelly, rigid = setup.bodies
     assert jelly.material == dataclasses.replace(JELLY, youngs_modulus=2e5) and rigid.material == die().material
-    assert youngs_modulus(body(), 2.0) == 2e5 and factor_for(body(), 2e5) == 2.0
+    assert youngs_modulus(body(), 2.0) == 2e5
     with pytest.raises(InputError, match="'die'"):
-        factor_for(die(), 1e5)
+        youngs_modulus(die(), 2.0)
 
 
 def test_damping_adds_up():

@@ -12,7 +12,6 @@ from physgen.sim.gaussians.splats import (
     MAX_STRETCH,
     Splats,
     bind_splats,
-    deform_splats,
     deformed_half_axes,
     from_half_axes,
     half_axes,
@@ -42,6 +41,10 @@ def everywhere(matrix, count):
     return np.broadcast_to(matrix, (count, 3, 3))
 
 
+def deformed(splats, *motion):
+    return from_half_axes(splats, *deformed_half_axes(splats, *motion))
+
+
 def assert_covariances(splats, wanted):
     """To rounding of each splat's own size."""
     size = np.linalg.norm(wanted, axis=(1, 2))[:, None, None]
@@ -56,7 +59,7 @@ def test_affine_motion_is_exact(seed):
     if np.linalg.det(a) <= 1e-3:
         return
     splats, rest = some(seed=seed), particles()
-    found = deform_splats(splats, bind_splats(splats, rest), rest @ a.T + shift, everywhere(a, len(rest)))
+    found = deformed(splats, bind_splats(splats, rest), rest @ a.T + shift, everywhere(a, len(rest)))
     np.testing.assert_allclose(found.centres, splats.centres @ a.T + shift, atol=1e-12)
     assert_covariances(found, a @ splats.covariances() @ a.T)
     assert np.array_equal(found.opacities, splats.opacities) and np.array_equal(found.colours, splats.colours)
@@ -67,7 +70,7 @@ def test_affine_motion_is_exact(seed):
 def test_rigid_motion_keeps_scales_in_their_order(seed):
     turn = Rotation.random(random_state=seed).as_matrix()
     splats, rest = some(seed=seed), particles()
-    found = deform_splats(splats, bind_splats(splats, rest), rest @ turn.T, everywhere(turn, len(rest)))
+    found = deformed(splats, bind_splats(splats, rest), rest @ turn.T, everywhere(turn, len(rest)))
     np.testing.assert_allclose(found.scales, splats.scales, rtol=1e-10)
     np.testing.assert_allclose(found.axes(), turn @ splats.axes(), atol=1e-10)
 
@@ -99,7 +102,7 @@ def test_bending_turns_each_splat_with_its_place():
         return places, f
 
     splats = some()
-    found = deform_splats(splats, bind_splats(splats, rest), *rolled(rest))
+    found = deformed(splats, bind_splats(splats, rest), *rolled(rest))
     places, f = rolled(splats.centres)
     spacing = 0.2 / len(rest) ** (1 / 3)
     assert np.abs(found.centres - places).max() < spacing**2 / radius * 2
@@ -118,7 +121,7 @@ def test_floaters_and_broken_gradients_do_not_count():
     gradients[lost[60:100]] = np.nan
     gradients[lost[100:130]] = -np.eye(3)
     gradients[lost[130:]] = 0.0
-    found = deform_splats(splats, bind_splats(splats, rest), positions, gradients)
+    found = deformed(splats, bind_splats(splats, rest), positions, gradients)
     assert_covariances(found, splats.covariances())
     np.testing.assert_allclose(found.centres, splats.centres, atol=2e-3)
 
@@ -126,7 +129,7 @@ def test_floaters_and_broken_gradients_do_not_count():
 @pytest.mark.parametrize("gradient", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
 def test_splats_keep_their_shape_without_valid_gradients(gradient):
     splats, rest = some(), particles()
-    found = deform_splats(splats, bind_splats(splats, rest), rest, everywhere(gradient, len(rest)))
+    found = deformed(splats, bind_splats(splats, rest), rest, everywhere(gradient, len(rest)))
     assert_covariances(found, splats.covariances())
 
 
@@ -149,4 +152,4 @@ def test_placing_stretches_shears_and_mirrors():
 
 def test_a_binding_of_other_splats_is_refused():
     with pytest.raises(InputError, match="bind these"):
-        deform_splats(some(3), bind_splats(some(4), particles()), particles(), everywhere(np.eye(3), 2000))
+        deformed(some(3), bind_splats(some(4), particles()), particles(), everywhere(np.eye(3), 2000))

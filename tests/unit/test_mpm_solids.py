@@ -99,13 +99,13 @@ def test_collider_follows_its_tracks():
     move = Track(times=np.array([0.0, 1.0]), values=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     moving = collider(rotations=turn, translations=move, pivot=(0.5, 0.0, 0.0))
     world = solids(WorldSetup(bodies=(cube(),), colliders=(moving,)))
-    world.set_segment(0, 0.125, 0.5)
+    world.set_segments({0: (0.125, 0.5)})
     pose = world.pose(0, "table")
     assert pose.spin == pytest.approx([0.0, 0.0, 4 * np.pi])
     assert pose.velocity == pytest.approx([2.0, 0.0, 0.0])
     assert pose.center == pytest.approx([0.75, 0.0, 0.0])
     assert pose.rotation @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
-    world.set_segment(0, 2.0, 3.0)
+    world.set_segments({0: (2.0, 3.0)})
     assert np.abs(world.pose(0, "table").velocity).max() == 0.0
 
 
@@ -113,11 +113,11 @@ def test_collider_turns_steadily_about_the_axis_that_leads_on():
     keys = np.array([[0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
     turning = collider(rotations=Track(times=np.array([0.0, 1.0]), values=keys))
     world = solids(WorldSetup(bodies=(cube(),), colliders=(turning,)))
-    world.set_segment(0, 0.0, 1.0)
+    world.set_segments({0: (0.0, 1.0)})
     spin = world.pose(0, "table").spin
-    world.set_segment(0, 0.5, 1.0)
+    world.set_segments({0: (0.5, 1.0)})
     assert world.pose(0, "table").spin == pytest.approx(spin)
-    world.set_segment(0, 1.0, 2.0)
+    world.set_segments({0: (1.0, 2.0)})
     assert world.pose(0, "table").rotation @ [0.0, 0.0, 1.0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
 
 
@@ -125,7 +125,7 @@ def test_body_waits_for_its_start():
     world = solids(WorldSetup(bodies=(cube(start_time=0.5, velocity=(1.0, 0.0, 0.0)),)))
     world.advance(1e-3, 10)
     assert world.pose(0, "cube").center == pytest.approx([0.0, 0.0, 0.0], abs=1e-15)
-    world.set_segment(0, 0.5, 1.0)
+    world.set_segments({0: (0.5, 1.0)})
     world.advance(1e-3, 10)
     assert world.pose(0, "cube").center[0] == pytest.approx(0.01)
 
@@ -140,7 +140,7 @@ def test_bad_input_is_named():
     with pytest.raises(InputError, match="no rigid body or collider 'cup'"):
         world.pose(0, "cup")
     with pytest.raises(InputError, match="segment is"):
-        world.set_segment(0, 1.0, 1.0)
+        world.set_segments({0: (1.0, 1.0)})
     with pytest.raises(InputError, match="dt is"):
         world.advance(0.0)
     state = world.state()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mass, centre and inertia of particles and of filled surfaces. No Taichi. World metres, kilograms."""
+"""Mass, centre and inertia of particles. No Taichi. World metres, kilograms."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ..colliders import Surface
-from .triangles import Array, bounding_box, bounding_faces, checked_places, validated
+from .triangles import Array, checked_places
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,41 +62,3 @@ def mass_properties(
             raise InputError(f"volumes have shape {size.shape}: give ({len(places)},) cubic metres above 0")
         second += np.eye(3) * (mass @ size ** (2 / 3) / 12)
     return MassProperties(mass=total, center=center, inertia=np.trace(second) * np.eye(3) - second)
-
-
-def solid_mass_properties(surface: Surface, *, density: float) -> MassProperties:
-    """Return the mass properties of a closed surface filled with a material of ``density`` kg/m³, by the divergence
-    theorem, exact for the mesh.
-
-    Hollows count as hollows, and parts inside others not again; where parts overlap in part, the overlap counts twice.
-
-    Raises InputError on a density that is not above 0 and a surface that is not closed or has no volume.
-    """
-    if not (math.isfinite(density) and density > 0):
-        raise InputError(f"density is {density!r}: give kg/m³ above 0")
-    points, triangles = validated(surface.vertices, surface.faces)
-    bounding_box(points[triangles])
-    volume, center, second = _moments(points[bounding_faces(points, triangles).triangles])
-    if volume < 0:
-        raise InputError(
-            f"mesh has a volume of {volume:g} m³, its parts lie in each other and are inside out: clean it up (in "
-            "Blender: Boolean modifier, Union, Self Intersection)"
-        )
-    return MassProperties(
-        mass=density * volume,
-        center=center,
-        inertia=density * (np.trace(second) * np.eye(3) - second),
-    )
-
-
-def _moments(corners: Array) -> tuple[float, Array, Array]:
-    """Return volume, centre (3,) and second moments (3, 3) about it of the solid inside outward faces (T, 3, 3)."""
-    middle = corners.reshape(-1, 3).mean(axis=0)
-    local = corners - middle
-    six = np.einsum("ti,ti->t", local[:, 0], np.cross(local[:, 1], local[:, 2]))
-    volume = float(six.sum() / 6)
-    total = local.sum(axis=1)
-    first = six @ total / 24
-    second = (np.einsum("t,tni,tnj->ij", six, local, local) + np.einsum("t,ti,tj->ij", six, total, total)) / 120
-    center = first / volume
-    return volume, middle + center, second - volume * np.outer(center, center)

@@ -81,7 +81,7 @@ def check_surface(surface: Surface, *, name: str, cell_size: float | None = None
             "very dense or tangled: simplify it (in Blender: Decimate or Remesh modifier)"
         )
     if cell_size is not None:
-        share = _thin_share(points, found.triangles, cell_size)
+        share = thin_share(points, found.triangles, cell_size)
         if share > THIN_SHARE:
             said.append(
                 f"{name}: {100 * share:.0f} % of the surface is thinner than a grid cell of {cell_size:g} m; contact "
@@ -184,19 +184,12 @@ def _pierces(start: Array, end: Array, corners: Array, beyond: Array, least: flo
     return result
 
 
-def thin_share(surface: Surface, cell_size: float) -> float:
+def thin_share(points: Array, outward: Faces, cell_size: float) -> float:
     """Return the share of a closed surface, 0 to 1, behind which the body is thinner than ``cell_size`` metres.
 
-    Measured straight inward from 2000 places spread evenly over the surface, or fewer where that is too much work.
-
-    Raises InputError on a cell size that is not above 0, and a surface that is not closed or has no volume.
+    points: (V, 3); outward: (T, 3), see ``bounding_faces``. Measured straight inward from 2000 places spread evenly
+    over the surface, or fewer where that is too much work. Raises InputError on a cell size that is not above 0.
     """
-    points, triangles = validated(surface.vertices, surface.faces)
-    bounding_box(points[triangles])
-    return _thin_share(points, bounding_faces(points, triangles).triangles, cell_size)
-
-
-def _thin_share(points: Array, outward: Faces, cell_size: float) -> float:
     if not (math.isfinite(cell_size) and cell_size > 0):
         raise InputError(f"cell_size is {cell_size!r}: give metres above 0")
     corners = points[outward]

@@ -73,7 +73,7 @@ class RigidBodies:
 
     scales: cells per metre of each world; origins: the world point of each that is cell (0, 0, 0).
     asleep: world and name of bodies that stay in place and touch nothing, from the next segment on.
-    Call ``set_segment`` before the first substep and wherever a track bends, gravity changes or a body starts.
+    Call ``set_segments`` before the first substep and wherever a track bends, gravity changes or a body starts.
     """
 
     def __init__(self, setups: Sequence[WorldSetup], scales: Sequence[float], origins: Sequence[Vector]) -> None:
@@ -309,10 +309,6 @@ class RigidBodies:
         return RigidContacts(*(self.arrays[name] for name in names))
 
     # ---- time ---------------------------------------------------------------------------------------------------
-
-    def set_segment(self, w: int, start: float, end: float) -> None:
-        """``set_segments`` of world ``w`` alone."""
-        self.set_segments({w: (start, end)})
 
     def set_segments(self, segments: Mapping[int, tuple[float, float]]) -> None:
         """Prepare the worlds named, each for its time from start to end in s over which all tracks are linear: gravity,
