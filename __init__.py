@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .sim.app.bake import bake
     from .sim.app.bake_options import BakeOptions
     from .sim.app.compose_scene import compose
+    from .sim.app.default_motion import DefaultMotion, default_motion
     from .sim.app.diagnose import diagnose
     from .sim.app.reconstruct import Physics, reconstruct
     from .sim.cache.bake_folder import Bake, load_bake
@@ -50,6 +51,7 @@ __all__ = [
     "Capture",
     "ChatRequest",
     "ComposeRequest",
+    "DefaultMotion",
     "DiagnoseOptions",
     "Diagnosis",
     "ObjectRequest",
@@ -64,6 +66,7 @@ __all__ = [
     "__version__",
     "bake",
     "compose",
+    "default_motion",
     "diagnose",
     "load_bake",
     "load_capture",
@@ -80,6 +83,7 @@ _HOMES = {
     "Capture": ".sim.diagnose.capture",
     "ChatRequest": ".sim.reconstruct.reasoning.chat_client",
     "ComposeRequest": ".sim.gaussians.compose.compose_options",
+    "DefaultMotion": ".sim.app.default_motion",
     "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
     "Diagnosis": ".sim.diagnose.diagnosis",
     "ObjectRequest": ".sim.reconstruct.reconstruct_options",
@@ -93,6 +97,7 @@ _HOMES = {
     "World": ".sim.mpm.world",
     "bake": ".sim.app.bake",
     "compose": ".sim.app.compose_scene",
+    "default_motion": ".sim.app.default_motion",
     "diagnose": ".sim.app.diagnose",
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 
+from ..sim.app.bake_options import BakeOptions
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled
@@ -117,7 +118,7 @@ def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``physgen``; returns the exit code (docs/cli.md)."""
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
-    expected = stages.expected_seconds(options.frames) if options.command == "run" else None
+    expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
     run: Command = options.run
     try:

@@ -100,11 +100,23 @@ def run_render(
 
 
 @dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What the program chooses, by what suits the scene (``sim/app/default_motion``).
+
+    motion: of the objects. frames, slow: with it, the clip's length and slow motion, in place of the bake's options.
+    """
+
+    motion: bool = False
+    frames: bool = False
+    slow: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunRequest:
     """A job from photo to ``video``; ``work`` holds ``scene``, ``bake`` and ``frames``.
 
-    physics: per object, in the order of ``objects``; by default ``medium`` and at rest, so that the same request
-    always gives the same video.
+    physics: per object, in the order of ``objects``; by default ``medium`` and at rest. choices: what is chosen
+    instead. The same request always gives the same video.
     """
 
     photo: Path
@@ -116,12 +128,31 @@ class RunRequest:
     ask: ChatRequest | None = None
     bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
     render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
+    choices: Choices = dataclasses.field(default_factory=Choices)
 
 
 def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
     """Return initial guesses per stage, from the coffee demo on two cores, until measured speeds replace them."""
     guesses = {"reconstruct": 15.0, "bake": 8.0 + 0.6 * frames, "render": 8.0 + 5.0 * frames}
     return {stage: guesses[stage] for stage in stages}
+
+
+def choose_motion(scene: Scene, options: BakeOptions, choices: Choices, on_event: OnEvent) -> tuple[Scene, BakeOptions]:
+    """Return ``scene`` set in motion and the options of a bake that shows it; a notice says what was chosen.
+
+    Effects that somebody added to the scene say how it moves, so the caller asks for none then.
+    """
+    # Imported here: it needs SciPy, which most commands do without.
+    from ..sim.app.default_motion import default_motion
+
+    motion = default_motion(
+        scene,
+        fps=options.fps,
+        frames=None if choices.frames else options.frames,
+        slow=None if choices.slow else options.slow,
+    )
+    on_event({"event": "notice", "stage": "motion", "message": motion.sentence})
+    return motion.applied(scene), dataclasses.replace(options, frames=motion.frames, slow=motion.slow)
 
 
 def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
@@ -143,7 +174,10 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
         on_event=on_event,
         cancelled=cancelled,
     )
-    run_bake(scene, request.work / "bake", request.bake, on_event, cancelled)
+    options = request.bake
+    if request.choices.motion and not scene.model.effects:
+        scene, options = choose_motion(scene, options, request.choices, on_event)
+    run_bake(scene, request.work / "bake", options, on_event, cancelled)
     render(
         scene,
         load_bake(request.work / "bake"),

@@ -23,7 +23,7 @@ def main(mesh: Path | None, out: Path, *, frames: int = 36, quality: str = "prev
     bake = physgen.bake(scene, out=out / "bake", options=physgen.BakeOptions(frames=frames, quality=quality))
     heights = [float(bake.vertices("thing", n)[:, 2].min()) for n in range(bake.first_frame, bake.last_frame + 1)]
     for number, height in enumerate(heights):
-        print(f"{number / bake.manifest.fps:5.2f} s {height:6.3f} m {'·' * round(100 * max(height, 0))}")
+        print(f"{number / bake.manifest.rate:5.2f} s {height:6.3f} m {'·' * round(100 * max(height, 0))}")
     return heights
 
 

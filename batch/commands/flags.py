@@ -371,6 +371,8 @@ def add_bake_flags(parser: argparse.ArgumentParser) -> None:
         "--frames", type=int, default=defaults.frames, help=f"number of frames (default {defaults.frames})"
     )
     parser.add_argument("--fps", type=float, default=defaults.fps, help=f"frames per second (default {defaults.fps:g})")
+    text = "slow motion: how many times slower than real the video shows the motion"
+    parser.add_argument("--slow", type=float, default=defaults.slow, metavar="N", help=f"{text} (default 1)")
     parser.add_argument(
         "--quality",
         default=defaults.quality,
@@ -412,5 +414,5 @@ def physics_options(options: argparse.Namespace) -> Physics:
 
 def bake_options(options: argparse.Namespace) -> BakeOptions:
     """Return the options of the bake; defaults for flags that the verb does not have."""
-    names = ("frames", "fps", "quality", "arch", "seed", "space", "points")
-    return BakeOptions(**{name: getattr(options, name) for name in names if hasattr(options, name)})
+    names = ("frames", "fps", "slow", "quality", "arch", "seed", "space", "points")
+    return BakeOptions(**{name: value for name in names if (value := getattr(options, name, None)) is not None})

@@ -7,8 +7,10 @@ import argparse
 from pathlib import Path
 
 from ...physgen_addon.render.render_options import require_video_name
+from ...sim.app.default_motion import tells_motion
 from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
 from ...sim.cache.bake_folder import load_bake
+from ...sim.errors import InputError
 from ...sim.events import IsCancelled
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 from ...sim.reconstruct.reconstruct_options import object_names
@@ -45,6 +47,10 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     add_physics_flags(parser)
     add_bake_flags(parser)
     add_render_flags(parser)
+    # None: not given, so chosen with the motion where that is chosen too.
+    parser.set_defaults(frames=None, slow=None)
+    text = "choose no motion where none is given: everything stays as in the photo"
+    parser.add_argument("--still", action="store_true", help=text)
     parser.add_argument("--out", type=Path, required=True, metavar="VIDEO.mp4", help="the video")
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="folder for scene, bake and frames (default: beside the video)"
@@ -101,17 +107,24 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
     require_video_name(options.out)
+    physics = physics_options(options)
+    told = tells_motion(physics.velocities, physics.spins, physics.overrides)
+    if options.still and told:
+        raise InputError("--still: a motion is given as well (--velocity, --spin or --set); leave one of them out")
     work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
     request = stages.RunRequest(
         photo=options.photo,
         objects=object_requests(options, work / "scene"),
         video=options.out,
         work=work,
-        physics=physics_options(options),
+        physics=physics,
         reconstruct=reconstruct_options(options),
         ask=chat_request(options),
         bake=bake_options(options),
         render=render_options(options),
+        choices=stages.Choices(
+            motion=not (options.still or told), frames=options.frames is None, slow=options.slow is None
+        ),
     )
     stages.photo_to_video(request, terminal, cancelled)
     terminal(

@@ -49,6 +49,7 @@ def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
     options = BakeOptions(
         frames=len(times.frames),
         fps=times.fps,
+        slow=times.slow,
         quality=settings.quality,
         arch=settings.device,
         seed=settings.seed,
@@ -61,7 +62,16 @@ def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
 def option_arguments(options: BakeOptions) -> list[str]:
     """Return ``options`` as arguments of ``physgen``."""
     arguments = ["--frames", str(options.frames), "--fps", repr(options.fps), "--quality", options.quality]
-    arguments += ["--arch", options.arch, "--seed", str(options.seed), "--space", options.space]
+    arguments += [
+        "--slow",
+        repr(options.slow),
+        "--arch",
+        options.arch,
+        "--seed",
+        str(options.seed),
+        "--space",
+        options.space,
+    ]
     return [*arguments, "--points" if options.points else "--no-points"]
 
 

@@ -39,6 +39,7 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         row.prop(simulation, "frame_start", text="Frames")
         row.operator(PHYSGEN_OT_frames_from_scene.bl_idname, text="", icon="TIME")
         frames.prop(simulation, "frame_end", text="To")
+        column.prop(simulation, "slow")
         column.prop(simulation, "device")
         _draw_length(layout, context, simulation)
         lacking = _lacking(scene)
@@ -55,7 +56,10 @@ def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulat
     if frames < 2:
         text.sentences(layout, context, "The last frame must come after the first.", icon="ERROR")
         return
-    text.sentences(layout, context, f"{frames} frames: {frames / rate:.2g} s at {rate:.4g} fps")
+    shown = f"{frames} frames: {frames / rate:.2g} s at {rate:.4g} fps"
+    if simulation.slow != 1.0:
+        shown += f", of {frames / rate / simulation.slow:.2g} s in the scene"
+    text.sentences(layout, context, shown)
 
 
 def _lacking(scene: bpy.types.Scene) -> str:

@@ -193,7 +193,7 @@ def _draw_entry(layout: bpy.types.UILayout, context: bpy.types.Context, entry: A
     if item.name == "sandy":
         start = next((number.value for parameter, number in lines if parameter.name == "start"), 0.0)
         simulation, render = context.scene.physgen.simulation, context.scene.render
-        frame = simulation.frame_start + start * render.fps / render.fps_base
+        frame = simulation.frame_start + start * simulation.slow * render.fps / render.fps_base
         text.sentences(box, context, f"That is frame {frame:.0f}.")
     _draw_targets(box, context, entry, of_world=item.of_world)
 

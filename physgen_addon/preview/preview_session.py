@@ -306,7 +306,7 @@ class Session:
         self._number, self._asked_at = 0, 0.0
         self._numbers: tuple[str, ...] | None = None
         self._shapes, self._shapes_at, self._exports = "", -SHAPES_S, 0
-        self._length = (0, 0.0)
+        self._length = (0, 0.0, 1.0)
 
     def start(self) -> None:
         """Start the worker; returns at once."""
@@ -370,7 +370,7 @@ class Session:
             if self._numbers is None:
                 return
             times = clock(scene)
-            length = (max(2, min(len(times.frames), MOST_FRAMES)), times.fps)
+            length = (max(2, min(len(times.frames), MOST_FRAMES)), times.fps, times.slow)
             numbers = watched_numbers(scene)
             if changed or (numbers, length) != (self._numbers, self._length):
                 self._numbers, self._length = numbers, length
@@ -382,14 +382,14 @@ class Session:
         self._number += 1
         self._asked_at = now
         self.unit = metres_per_unit(scene)
-        frames, fps = self._length
+        frames, fps, slow = self._length
         self._client.send(
             {
                 "id": self._number,
                 "scene": str(self._root / f"scene-{self._exports}"),
                 "overrides": list(self._numbers or ()),
                 "frames": frames,
-                "fps": fps,
+                "fps": fps * slow,
                 "particles": PARTICLES,
             }
         )
@@ -410,7 +410,7 @@ class Session:
             return
         elif kind == "started":
             self.notices = [str(text) for text in event["notices"]]
-            frames, fps = self._length
+            frames, fps, _ = self._length
             self._coming = Clip(Path(event["folder"]), event, frames=frames, fps=fps)
         elif kind == "frame" and self._coming is not None:
             self._coming.read(int(event["done"]))

@@ -159,6 +159,14 @@ class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
         name="Start", description="Frame that shows the scene at rest", default=1, min=0, soft_max=250
     )
     frame_end: IntProperty(name="End", description="Last simulated frame", default=48, min=0, soft_max=500)
+    slow: from_field(
+        BakeOptions,
+        "slow",
+        "Slow Motion",
+        "How many times slower than real the frames show the motion",
+        soft_min=1.0,
+        soft_max=16.0,
+    )
     device: from_field(
         BakeOptions,
         "arch",

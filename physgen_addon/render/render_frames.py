@@ -15,6 +15,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...sim.app.clip_check import Clip, clip_notices
 from ...sim.atomic import replacing
 from ...sim.cache.bake_folder import Bake
 from ...sim.cache.folder_lock import folder_lock
@@ -266,10 +267,20 @@ def render_frames(
             progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
         if traces and options.denoise and not denoised:
             progress.notice("this Blender has no OpenImageDenoise; raise the samples if frames are grainy")
-        for notice in shot.notices:
+        for notice in (*shot.notices, *_clip_notices(scene, opened, numbers, shot)):
             progress.notice(notice)
         _make(scene, opened, planned, frame_index, options, shot, progress, cancelled)
     return [frame_index.path(frame.number) for frame in planned]
+
+
+def _clip_notices(scene: Scene, bake: point_caches.OpenedBake, numbers: Sequence[int], shot: CameraMotion) -> list[str]:
+    """Return what the whole clip will not show; nothing for a part of it, of which another process is asked."""
+    samples = range(bake.last_frame - bake.first_frame + 1)
+    if numbers[0] != bake.first_frame or numbers[-1] != bake.last_frame:
+        return []
+    poses = ([cache.sample(sample) for cache in bake.caches] for sample in samples)
+    clip = Clip(first=bake.first_frame, fps=bake.manifest.fps, slow=bake.manifest.slow)
+    return clip_notices([item.name for item in scene.objects], poses, (shot.camera(n) for n in samples), clip)
 
 
 def _make(

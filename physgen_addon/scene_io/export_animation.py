@@ -51,11 +51,19 @@ def matrix_rows(matrix: NDArray[np.float64]) -> Matrix4:
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """The simulated frames. start, end: frame numbers, ``start`` at 0 s; fps: frames a second."""
+    """The simulated frames. start, end: frame numbers, ``start`` at 0 s; fps: frames a second of the clip; slow: how
+    many times slower than real it shows the motion.
+    """
 
     start: int
     end: int
     fps: float
+    slow: float = 1.0
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the simulated time."""
+        return self.fps * self.slow
 
     @property
     def frames(self) -> range:
@@ -63,8 +71,8 @@ class Clock:
         return range(self.start, self.end + 1)
 
     def seconds(self, frame: float) -> float:
-        """Return the time of ``frame`` in seconds after the first; bit-exact where a bake has a sample."""
-        return (frame - self.start) / self.fps
+        """Return the simulated time of ``frame`` in s after the first; bit-exact where a bake has a sample."""
+        return (frame - self.start) / self.rate
 
     def from_frame(self, frame: int) -> float:
         """Return the start time in seconds of what begins with ``frame``; 0 for frames before the first."""
@@ -78,7 +86,12 @@ def clock(scene: bpy.types.Scene) -> Clock:
         raise InputError(
             f"simulation: ends at frame {settings.frame_end}, before it starts at {settings.frame_start}: raise the end"
         )
-    return Clock(start=settings.frame_start, end=settings.frame_end, fps=decimal(render.fps / render.fps_base))
+    return Clock(
+        start=settings.frame_start,
+        end=settings.frame_end,
+        fps=decimal(render.fps / render.fps_base),
+        slow=decimal(settings.slow),
+    )
 
 
 def export_names(scene: bpy.types.Scene) -> dict[str, str]:

@@ -93,7 +93,8 @@ def fill_body(
     ``notes``.
     """
     body = item.physgen
-    rate, first = scene.render.fps / scene.render.fps_base, scene.physgen.simulation.frame_start
+    settings = scene.physgen.simulation
+    rate, first = settings.slow * scene.render.fps / scene.render.fps_base, settings.frame_start
     body.enabled, body.source, body.role = True, source.name, source.role
     _fill_material(body.material, source.material)
     body.fill, body.shell_thickness = source.fill, source.shell_thickness or 0.0

@@ -95,6 +95,8 @@ class _Digest:
         world = scene.physgen.world
         self._add(self._unit, settings.frame_start, settings.frame_end, settings.quality, settings.seed)
         self._add(scene.render.fps, scene.render.fps_base)
+        if settings.slow != 1.0:
+            self._add(settings.slow)
         animated = channels(scene)
         if not {path for path, _ in animated} & {"gravity", "use_gravity"}:
             self._add(scene.use_gravity, *(scene.gravity if scene.use_gravity else ()))

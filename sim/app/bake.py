@@ -152,6 +152,7 @@ def _bake_locked(
     manifest = BakeManifest(
         inputs_hash=inputs_hash(folder, options),
         fps=options.fps,
+        slow=options.slow,
         frame_start=1,
         frames=options.frames,
         frames_done=0,
@@ -248,7 +249,7 @@ class _Run:
         for part in range(1, parts + 1):
             if cancelled():
                 raise Cancelled("asked to stop")
-            target = (index - 1 + part / parts) / self.manifest.fps
+            target = (index - 1 + part / parts) / self.manifest.rate
             if target > world.time:
                 world.advance(target - world.time, cancelled)
             if part < parts and time.monotonic() - self.kept_at > KEEP_SECONDS:

@@ -26,7 +26,10 @@ class BakeOptions:
     """How a scene is simulated.
 
     frames: samples to bake, 1 to 100000; the first is the scene at rest.
-    fps: frames a second, above 0 and up to 1000.
+    fps: frames a second of the clip, above 0 and up to 1000.
+    slow: how many times slower than real the clip shows the motion, 0.01 to 100: from frame to frame 1 / (fps slow)
+        seconds go by in the scene. Motion blur and everything else follows that, as in a camera with so many frames a
+        second.
     quality: name of a preset in ``presets/qualities``.
     arch: ``cpu``, ``cuda``, ``vulkan`` or ``metal``; what is not there falls back to ``cpu`` with a notice.
     seed: of the particles' places, 0 or more; 0 is the even lattice, every other moves each a little its own way.
@@ -37,6 +40,7 @@ class BakeOptions:
 
     frames: int = quantity(48, 1, 100_000, "samples")
     fps: float = quantity(24.0, 0.0, 1000.0, "frames per second")
+    slow: float = quantity(1.0, 0.01, 100.0, "times slower than real")
     quality: str = "standard"
     arch: str = "cpu"
     seed: int = quantity(0, 0, math.inf, "a whole number")
@@ -48,10 +52,17 @@ class BakeOptions:
             raise InputError(f"frames is {self.frames}: give 1 to 100000")
         if not 0 < self.fps <= 1000:
             raise InputError(f"fps is {self.fps}: give frames a second above 0 and up to 1000")
+        if not 0.01 <= self.slow <= 100:
+            raise InputError(f"slow is {self.slow}: give 0.01 to 100 times slower than real")
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}: give a whole number, 0 or more")
         if self.space not in SPACES:
             raise InputError(f"space is {self.space!r}: choose one of {', '.join(SPACES)}")
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the scene's own time."""
+        return self.fps * self.slow
 
 
 def inputs_hash(scene: Scene, options: BakeOptions) -> str:
@@ -65,7 +76,7 @@ def inputs_hash(scene: Scene, options: BakeOptions) -> str:
 def _options_json(options: BakeOptions) -> dict[str, Any]:
     """Return the options as JSON without later ones at their former default, so that older bakes stay in use."""
     fields: dict[str, Any] = to_json(options)
-    for name, before in (("space", WORLD_SPACE), ("points", False)):
+    for name, before in (("space", WORLD_SPACE), ("points", False), ("slow", 1.0)):
         if fields[name] == before:
             del fields[name]
     return fields

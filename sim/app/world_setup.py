@@ -259,7 +259,7 @@ def prepare_world(
     )
     setup = apply_effects(setup, scene.effects)
     step = stable_step(setup.bodies, cell, solver)
-    duration = (options.frames - 1) / options.fps
+    duration = (options.frames - 1) / options.rate
     count = _soft_count(setup)
     body_index = {scene_index: index for index, scene_index in enumerate(moving)}
     collider_index = {scene_index: index for index, scene_index in enumerate(still)}

@@ -96,7 +96,8 @@ class BakeManifest:
     """The state of a bake.
 
     inputs_hash: SHA-256 of everything that the motion depends on (``inputs_hash`` in sim/app/bake_options.py).
-    fps, frame_start, frames: frame ``frame_start + i`` is sample ``i`` at ``i / fps`` seconds.
+    fps, slow, frame_start, frames: frame ``frame_start + i`` is sample ``i``: ``i / fps`` seconds into the clip, and
+        ``i / (fps slow)`` seconds into the motion (``rate``).
     frames_done: samples in every cache; during a bake, at least that many.
     particles: simulated particles of all objects together.
     geometry_hash: SHA-256 of the objects' meshes and transforms (``geometry_hash``, ibid.), which identifies bakes of
@@ -114,6 +115,12 @@ class BakeManifest:
     particles: int
     objects: tuple[BakedObject, ...]
     geometry_hash: str = ""
+    slow: float = 1.0
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the scene's own time: ``fps`` unless the clip is in slow motion."""
+        return self.fps * self.slow
 
     @property
     def files(self) -> dict[str, int]:
@@ -128,9 +135,10 @@ class BakeManifest:
     def __post_init__(self) -> None:
         if self.state not in STATES:
             raise InputError(f"state is {self.state!r}: choose one of {', '.join(STATES)}")
-        if self.fps <= 0 or self.frames < 1 or not 0 <= self.frames_done <= self.frames:
+        if self.fps <= 0 or self.slow <= 0 or self.frames < 1 or not 0 <= self.frames_done <= self.frames:
             raise InputError(
-                f"{self.frames_done} of {self.frames} frames at {self.fps} fps is not a valid frame range; bake again"
+                f"{self.frames_done} of {self.frames} frames at {self.fps} fps, slow {self.slow}, is not a valid frame "
+                "range; bake again"
             )
 
 

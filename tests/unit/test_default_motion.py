@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: MIT
+"""The motion chosen where none is given, the clip that suits it, and what is said of a clip before it is rendered."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from physgen.batch.commands import photo_commands
+from physgen.sim.app.bake_options import BakeOptions, inputs_hash
+from physgen.sim.app.clip_check import Clip, clip_notices
+from physgen.sim.app.default_motion import default_motion, tells_motion
+from physgen.sim.errors import InputError
+from physgen.sim.scene.folder import load_scene, save_scene
+from physgen.sim.scene.material import load_preset
+from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.model import Camera, SceneModel, SceneObject
+
+
+def looking_down(pitch_deg, distance, size=(600, 400), focal=550.0):
+    """A camera that sees the origin in the middle, from ``distance`` m behind and above."""
+    pitch = math.radians(pitch_deg)
+    ahead = np.array([0.0, math.cos(pitch), -math.sin(pitch)])
+    right = np.array([1.0, 0.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    pose[:3, 3] = -distance * ahead
+    return Camera(
+        width=size[0], height=size[1], fx=focal, fy=focal, cx=size[0] / 2, cy=size[1] / 2,
+        world_from_camera=tuple(map(tuple, pose.tolist())),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def table(tmp_path):
+    """A factory of scenes without a photo: boxes (x, y, z of the underside, width, depth, height) and presets."""
+
+    def make(boxes, presets=("medium",), camera=None, **changes):
+        root = tmp_path / "table"
+        (root / "meshes").mkdir(parents=True, exist_ok=True)
+        items = []
+        for number, (x, y, z, *extents) in enumerate(boxes):
+            mesh = trimesh.creation.box(extents).subdivide().subdivide()
+            mesh.apply_translation((x, y, z + extents[2] / 2))
+            mesh.export(root / f"meshes/{number}.glb")
+            preset = load_preset(presets[number % len(presets)])
+            name, file = f"box{number}", f"meshes/{number}.glb"
+            items.append(SceneObject(name=name, mesh=file, size_m=max(extents), material=preset, **changes))
+        scene = SceneModel(camera=camera or looking_down(30, 1.0), objects=tuple(items), photo=None, background=None)
+        return save_scene(root, scene)
+
+    return make
+
+
+def flight(scene, move, times):
+    """The vertices (T, V, 3) of a moved box in free flight, from the scene's own numbers."""
+    item = next(item for item in scene.objects if item.name == move.name)
+    vertices = load_object_mesh(scene, item).vertices
+    centre = vertices.mean(axis=0)
+    found = []
+    for t in times:
+        turn = trimesh.transformations.rotation_matrix(np.linalg.norm(item.spin) * t, item.spin)[:3, :3] \
+            if any(item.spin) else np.eye(3)  # fmt: skip
+        fall = np.array([0.0, 0.0, -0.5 * 9.81 * t * t])
+        found.append((vertices - centre) @ turn.T + centre + np.asarray(item.velocity) * t + fall)
+    return np.array(found)
+
+
+BOX = st.tuples(
+    st.floats(-0.15, 0.15), st.floats(-0.15, 0.15), st.just(0.0),
+    st.floats(0.02, 0.2), st.floats(0.02, 0.2), st.floats(0.02, 0.2),
+)  # fmt: skip
+
+
+@given(box=BOX, pitch=st.floats(10, 70), preset=st.sampled_from(["medium", "plush", "wood", "sand"]))
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_seen_at_rest_stays_in_the_picture(table, box, pitch, preset):
+    scene = table([box], [preset], looking_down(pitch, 0.8))
+    motion = default_motion(scene)
+    assert motion == default_motion(scene)
+    moved = motion.applied(scene)
+    size = (scene.model.camera.width, scene.model.camera.height)
+
+    def beyond(points):
+        pixels = scene.model.camera.project(points)[..., :2]
+        return max(0.0, float(-pixels.min()), float((pixels - size).max()))
+
+    rest = beyond(load_object_mesh(scene, scene.objects[0]).vertices)
+    for move in motion.moves:
+        path = flight(moved, move, np.linspace(0, move.flight_s, 40))
+        assert beyond(path) <= rest + 1e-6
+        # It peaks where the move says, and comes down where it says, as low as it stood, but for its lean.
+        rise = (path.mean(axis=1) - path[0].mean(axis=0))[:, 2]
+        assert rise.max() == pytest.approx(move.height, rel=0.01)
+        assert np.allclose(path[-1].mean(axis=0) - path[0].mean(axis=0), move.aside, atol=1e-4)
+
+
+def test_a_thing_in_the_middle_hops_and_its_clip_is_long_enough(table):
+    scene = table([(0, 0, 0, 0.07, 0.07, 0.07)])
+    motion = default_motion(scene)
+    (move,) = motion.moves
+    assert 0.3 * 0.07 < move.height < 0.07 and any(move.aside)
+    # A flight of a quarter of a second is slowed down; the clip shows it and what follows.
+    assert motion.slow >= 2 and 2.0 <= motion.frames / motion.fps <= 4.0
+    assert motion.frames / motion.fps > 1.7 * move.flight_s * motion.slow
+    assert "box0 hops" in motion.sentence and f"{motion.slow:g} times slower" in motion.sentence
+    assert default_motion(scene, slow=1.0).slow == 1.0
+    given = default_motion(scene, frames=24)
+    assert given.frames == 24 and 1.7 * move.flight_s * given.slow < 1.0
+    # Applied, it is what a scene folder says; nothing else has changed.
+    moved = motion.applied(scene)
+    assert load_scene(scene.root) == moved and moved.objects[0].velocity == move.velocity
+    still = dataclasses.replace(moved.objects[0], velocity=(0, 0, 0), spin=(0, 0, 0))
+    assert still == scene.objects[0] and inputs_hash(moved, BakeOptions()) != inputs_hash(scene, BakeOptions())
+
+
+def test_large_things_hop_less_for_their_size_and_what_flows_least(table):
+    def share(extent, preset="medium"):
+        scene = table([(0, 0, 0, extent, extent, extent)], [preset], looking_down(30, 10 * extent))
+        return default_motion(scene).moves[0].height / extent
+
+    assert share(0.05) > 1.3 * share(0.5) > 1.3 * share(2.0)
+    assert share(0.1, "sand") < 0.5 * share(0.1) and share(0.1, "wood") < share(0.1)
+    assert default_motion(table([(0, 0, 0, 0.1, 0.1, 0.1)], ["sand"])).moves[0].aside == (0.0, 0.0, 0.0)
+
+
+def test_neighbours_are_not_hit(table):
+    boxes = [(0, 0, 0, 0.1, 0.1, 0.1), (0.16, 0, 0, 0.1, 0.1, 0.3), (-0.16, 0, 0, 0.1, 0.1, 0.1)]
+    scene = table(boxes, camera=looking_down(25, 1.2))
+    motion = default_motion(scene)
+    moved = motion.applied(scene)
+    assert len(motion.moves) >= 2 and [m.start_s for m in motion.moves] == sorted(m.start_s for m in motion.moves)
+    at_rest = {item.name: load_object_mesh(scene, item).vertices for item in scene.objects}
+    for move in motion.moves:
+        path = flight(moved, move, np.linspace(0, move.flight_s, 20))
+        for name, other in at_rest.items():
+            if name != move.name:
+                apart = np.maximum(path.min(axis=1) - other.max(axis=0), other.min(axis=0) - path.max(axis=1))
+                assert (apart.max(axis=1) > 0).all(), (move.name, name)
+
+
+def test_what_carries_something_stays_and_what_it_carries_comes_down_on_it(table):
+    scene = table([(0, 0, 0, 0.2, 0.2, 0.05), (0, 0, 0.05, 0.06, 0.06, 0.06)])
+    (move,) = default_motion(scene).moves
+    assert move.name == "box1" and move.aside == (0.0, 0.0, 0.0) and move.spin == (0.0, 0.0, 0.0)
+
+
+def test_what_fills_the_picture_leaves_it_by_little(table):
+    scene = table([(0, 0, 0, 0.2, 0.2, 0.2)], camera=looking_down(30, 0.62))
+    (move,) = default_motion(scene).moves
+    path = flight(default_motion(scene).applied(scene), move, np.linspace(0, move.flight_s, 20))
+    pixels = scene.model.camera.project(path)[..., :2]
+    assert 0 < -pixels.min() < 0.12 * np.ptp(pixels[0], axis=0).max() + 1e-6
+
+
+def test_what_has_no_room_is_left_alone_and_that_is_said(table):
+    filling = looking_down(0, 0.5, focal=1000.0)
+    for scene in (
+        table([(0, 0.1, -0.1, 0.2, 0.05, 0.4)], camera=filling),
+        table([(0, 0, 0, 0.1, 0.1, 0.1)], role="collider"),
+        save_scene((t := table([(0, 0, 0, 0.1, 0.1, 0.1)])).root, dataclasses.replace(t.model, gravity=(0, 0, 0.0))),
+    ):
+        motion = default_motion(scene)
+        assert motion.moves == () and "nothing moves" in motion.sentence and motion.applied(scene) is scene
+
+
+def test_a_request_that_says_how_things_move_is_left_alone():
+    assert not tells_motion((), (), ("cup.density=300", "ground.friction=0.2"))
+    assert tells_motion(((0.0, 0.0, 0.0),), (), ()) and tells_motion((), ((0.0, 0.0, 1.0),), ())
+    assert tells_motion((), (), ("cup.velocity=0,0,1",)) and tells_motion((), (), ("scene.gravity=0,0,-1",))
+
+
+@pytest.mark.parametrize(
+    ("given", "motion", "frames", "slow"),
+    [
+        ([], True, True, True),
+        (["--frames", "30"], True, False, True),
+        (["--slow", "2"], True, True, False),
+        (["--still"], False, True, True),
+        (["--velocity", "0,0,0"], False, True, True),
+    ],
+)
+def test_run_chooses_what_is_not_given(given, motion, frames, slow, tmp_path, monkeypatch):
+    from physgen.batch import cli, stages
+
+    asked = []
+    monkeypatch.setattr(stages, "photo_to_video", lambda request, *_: asked.append(request))
+    arguments = ["run", "photo.png", "--box", "1,2,30,40", "--out", str(tmp_path / "v.mp4"), *given]
+    assert cli.main(arguments) == 0
+    assert asked[0].choices == stages.Choices(motion=motion, frames=frames, slow=slow)
+    assert asked[0].bake == BakeOptions(frames=30 if "--frames" in given else 48, slow=2.0 if "--slow" in given else 1)
+
+
+def test_still_and_a_velocity_contradict_each_other(tmp_path):
+    options = SimpleNamespace(
+        out=tmp_path / "v.mp4", still=True, preset=[], velocity=[(0, 0, 1)], spin=[], overrides=[], work=None
+    )
+    with pytest.raises(InputError, match=r"--still: a motion is given"):
+        photo_commands.run_run(options, None, None)
+
+
+CAMERA = looking_down(20, 1.0)
+CUBE = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().vertices + np.array([0.0, 0.0, 0.05])
+
+
+def said(shifts, slow=1.0, cameras=None, first=1):
+    """Notices about a cube displaced by ``shifts`` (F, 3)."""
+    poses = [[CUBE + np.asarray(shift)] for shift in shifts]
+    return clip_notices(["cube"], poses, cameras or [CAMERA] * len(poses), Clip(first=first, fps=24.0, slow=slow))
+
+
+def test_a_thing_that_leaves_is_named_with_edge_and_frame():
+    away = np.linspace(0, 2.0, 48)[:, None]
+    (text,) = said(away * (1.0, 0.0, 0.0))
+    assert text.startswith("cube leaves the picture over its right edge at frame") and "does not come back" in text
+    (text,) = said(away * (0.0, 0.0, 1.0))
+    assert "upper edge" in text
+    # Thrown up and caught again.
+    rise = np.concatenate([away[:24], away[:24][::-1]])
+    (text,) = said(rise * (0.0, 0.0, 1.0), first=10)
+    frame = int(text.partition("is back at frame ")[2].split(";")[0])
+    assert 34 < frame < 58
+    # At the very end nobody minds, and what comes from outside is not leaving.
+    assert said(np.concatenate([np.linspace(0, 0.02, 47)[:, None], [[2.0]]]) * (1.0, 0.0, 0.0)) == []
+    assert said(away[::-1] * (1.0, 0.0, 0.0)) == []
+    (text,) = said(np.tile((9.0, 0.0, 0.0), (48, 1)))[:1]
+    assert text.startswith("cube is never in the picture")
+
+
+def test_a_clip_in_which_nothing_moves_or_all_is_over_at_once_is_named():
+    assert said(np.zeros((48, 3)))[0].startswith("nothing moves in these 48 frames")
+    short = np.zeros((48, 3))
+    short[:6, 2] = (0.0, 0.02, 0.03, 0.03, 0.02, 0.0)
+    (text,) = said(short)
+    assert "over after 0.21 s of 2 s" in text and text.endswith("--slow 8")
+    assert said(short, slow=8.0) == []
+    long = 0.05 * np.sin(np.linspace(0, 9, 48))[:, None] * (0.0, 0.0, 1.0)
+    assert said(long) == []
+    # While the camera moves, something is always seen to move; one frame is no clip.
+    moving = [dataclasses.replace(CAMERA, cx=CAMERA.cx + n) for n in range(48)]
+    assert said(np.zeros((48, 3)), cameras=moving) == [] and said(np.zeros((1, 3))) == []
+
+
+def test_slow_motion_is_a_faster_clock_not_repeated_frames(ball_scene):
+    scene = ball_scene()
+    assert BakeOptions(fps=24.0, slow=4.0).rate == 96.0
+    # Bakes made before there was slow motion stay valid; others are others.
+    assert inputs_hash(scene, BakeOptions()) == inputs_hash(scene, BakeOptions(slow=1.0))
+    assert inputs_hash(scene, BakeOptions()) != inputs_hash(scene, BakeOptions(slow=2.0))
+    for wrong in (0.0, -1.0, 101.0, math.nan):
+        with pytest.raises(InputError, match="slow is"):
+            BakeOptions(slow=wrong)
+
+
+def test_a_slow_bake_holds_the_same_motion_at_more_moments(ball_scene, tmp_path):
+    import physgen
+
+    scene = ball_scene(preset="wood", velocity=(0.2, 0.0, 1.0), height=0.06)
+    options = BakeOptions(frames=4, quality="preview")
+    real = physgen.bake(scene, out=tmp_path / "real", options=options)
+    slow = physgen.bake(scene, out=tmp_path / "slow", options=dataclasses.replace(options, frames=10, slow=3.0))
+    assert (slow.manifest.fps, slow.manifest.rate, physgen.load_bake(slow.root).manifest.slow) == (24.0, 72.0, 3.0)
+    for number in range(4):
+        here, there = real.vertices("ball0", 1 + number), slow.vertices("ball0", 1 + 3 * number)
+        # In free flight, to the steps of the engine's clock.
+        assert np.abs(here - there).max() < 1e-4
+    # Between them it is on its way, as a camera with so many frames would see it: a parabola.
+    heights = np.array([slow.vertices("ball0", n)[:, 2].mean() for n in range(1, 11)])
+    times = np.arange(10) / 72.0
+    assert np.abs(heights - heights[0] - times + 0.5 * 9.81 * times**2).max() < 5e-4
