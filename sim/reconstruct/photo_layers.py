@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..scene.model import Camera
 from .adapters.adapter_registry import adapter_content
 from .background.background_inpainting import blend, fill_background
+from .background.unboxed_things import UnboxedThings, unboxed_things
 from .lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes, threshold_shadows
 from .reconstruct_options import ReconstructOptions
 from .segmentation.amodal_completion import complete_colours, complete_outline
@@ -81,23 +82,26 @@ def separate_layers(
     steps.begin("shadows")
     cast = store.run(
         "shadows",
-        {"pixels": pixels, "seen": seen, "view": view, "threshold": options.shadow_threshold},
-        lambda notice: _cast(pixels, seen, view, options.shadow_threshold),
+        {"pixels": pixels, "seen": seen, "names": names, "view": view, "threshold": options.shadow_threshold},
+        lambda notice: _cast(pixels, seen, names, view, options.shadow_threshold, notice),
     )
     shadows = [np.asarray(shadow, dtype=bool) for shadow in cast["shadows"]]
     darkened = [np.asarray(shadow, dtype=bool) for shadow in cast["darkened"]]
+    unboxed = UnboxedThings(stay=np.asarray(cast["stay"], dtype=bool), whole=np.asarray(cast["whole"], dtype=bool))
     steps.begin("order")
     order = _order(seen, names, options, depth, steps.notice)
-    fill = _filler(pixels, view, options, inpainter)
-    full, colours, uncovered = _complete(pixels, seen, shadows, boxes, names, order, view, options, fill, store, steps)
+    fill = _filler(pixels, view, options, inpainter, unboxed.whole)
+    full, colours, uncovered = _complete(
+        pixels, seen, shadows, unboxed.whole, boxes, names, order, view, options, fill, store, steps
+    )
     # Where the penumbra is known, less dilation is needed.
     share = PENUMBRA_DILATION / PAPER_DILATION if options.shadow_threshold is None else 1.0
-    holes = object_holes(seen, darkened, share * options.hole_dilation * max(pixels.shape[:2]) / 1024.0)
+    holes = object_holes(seen, darkened, share * options.hole_dilation * max(pixels.shape[:2]) / 1024.0, unboxed.stay)
     steps.begin("background")
     union, objects = np.logical_or.reduce(holes), np.logical_or.reduce(list(seen))
     made = store.run(
         "background",
-        {**_fill_inputs(pixels, view, options), "hole": union, "objects": objects},
+        {**_fill_inputs(pixels, view, options), "hole": union, "objects": objects, "barred": unboxed.whole},
         partial(_filled, fill, pixels, union, objects),
     )
     return Layers(
@@ -115,12 +119,14 @@ def separate_layers(
 Fill = Callable[[Pixels, Mask, Mask, Notice], Pixels]
 
 
-def _filler(pixels: Pixels, view: Camera, options: ReconstructOptions, inpainter: Inpainter | None) -> Fill:
+def _filler(
+    pixels: Pixels, view: Camera, options: ReconstructOptions, inpainter: Inpainter | None, unboxed: Mask
+) -> Fill:
     settings = FillOptions(radius=options.patch_radius, limit=options.inpaint_pixels, seed=options.seed)
 
     def fill(picture: Pixels, hole: Mask, objects: Mask, notice: Notice) -> Pixels:
         if inpainter is None:
-            return fill_background(picture, hole, objects, view, settings, notice)
+            return fill_background(picture, hole, objects, view, settings, notice, barred=unboxed)
         return blend(picture, inpainter(picture, hole), hole, objects) if hole.any() else picture.copy()
 
     return fill
@@ -135,13 +141,30 @@ def _fill_inputs(pixels: Pixels, view: Camera, options: ReconstructOptions) -> d
     }
 
 
-def _cast(pixels: Pixels, seen: Sequence[Mask], view: Camera, threshold: float | None) -> dict[str, NDArray[np.bool_]]:
-    """The objects' shadows, and the same with their penumbras."""
+MISSING = 0.5
+"""Share of a foreseen shadow that was not found above which a notice tells."""
+
+
+def _cast(
+    pixels: Pixels, seen: Sequence[Mask], names: Sequence[str], view: Camera, threshold: float | None, notice: Notice
+) -> dict[str, NDArray[np.bool_]]:
+    """The objects' shadows, the same with their penumbras and where one may have been missed, and unboxed things."""
+    things = unboxed_things(pixels, seen, view)
+    if things.count:
+        notice(f"{things.count} things on the ground near the objects have no box: they stay in the photo")
+    rest = {"stay": things.stay, "whole": things.whole}
     if threshold is not None:
-        shadows = np.stack(threshold_shadows(pixels, seen, threshold))
-        return {"shadows": shadows, "darkened": shadows}
-    cast = cast_shadows(pixels, seen, view)
-    return {"shadows": np.stack([c.shadow for c in cast]), "darkened": np.stack([c.penumbra for c in cast])}
+        shadows = np.stack(threshold_shadows(pixels, seen, threshold)) & ~things.stay
+        return {"shadows": shadows, "darkened": shadows, **rest}
+    cast = cast_shadows(pixels, seen, view, things.stay)
+    for name, found in zip(names, cast, strict=True):
+        if found.missing > MISSING:
+            notice(
+                f"{name}: {100 * found.missing:.0f} % of the shadow that the light should cast was not found; the "
+                "ground there is inpainted as well, in case it was missed"
+            )
+    darkened = np.stack([c.penumbra | c.expected for c in cast])
+    return {"shadows": np.stack([c.shadow for c in cast]), "darkened": darkened, **rest}
 
 
 def _filled(fill: Fill, picture: Pixels, hole: Mask, objects: Mask, notice: Notice) -> dict[str, Pixels]:
@@ -171,6 +194,7 @@ def _complete(
     pixels: Pixels,
     seen: Sequence[Mask],
     shadows: Sequence[Mask],
+    unboxed: Mask,
     boxes: Sequence[Box],
     names: Sequence[str],
     order: Sequence[int],
@@ -208,7 +232,7 @@ def _complete(
                 hole &= ~seen[other]
             made = store.run(
                 "uncover",
-                {**_fill_inputs(current, view, options), "hole": hole, "objects": seen[index]},
+                {**_fill_inputs(current, view, options), "hole": hole, "objects": seen[index], "barred": unboxed},
                 partial(_filled, fill, current, hole, seen[index]),
             )
             current = made["picture"]

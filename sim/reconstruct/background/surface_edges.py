@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Edges between two surfaces behind a hole: a wall on the floor, a table's edge.
+"""Edges between surfaces behind a hole: a wall on the floor, a skirting board, a table's or a shelf's edge.
 
-Such an edge is straight, visible on both sides of the hole, and separates different surfaces. A line is accepted only
-if two surfaces, each with its own smooth light, explain the colours much better than one.
+Such an edge is straight, visible on both sides of the hole, and separates different surfaces. The first is accepted
+only if two surfaces, each with its own smooth light, explain the colours much better than one. Further ones are lines
+across which the colour jumps alike on both sides of the hole: narrow bands, such as a skirting, have no light of their
+own to be told by.
 """
 
 from __future__ import annotations
@@ -56,29 +58,130 @@ class Edge:
 
 
 def edges_behind(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
-    """Return edges that pass behind ``part`` (H, W), none or one.
+    """Return edges that pass behind ``part`` (H, W), at most ``MOST_EDGES``, none of which cross there.
 
     logs: (H, W, 3) logarithms of the photo's values, valid where not ``closed``.
     """
     rows, columns = _window(part)
     known, inner = ~closed[rows, columns], part[rows, columns]
-    scale = min(1.0, COARSE / max(known.shape))
+    values = np.where(known[..., None], logs[rows, columns], 0.0).astype(np.float32)
+    small, seen, cut = _copy(values, known, inner, COARSE)
+    first = _best_line(small, seen, cut)
+    found: list[tuple[float, float]] = []
+    if first is not None:
+        ratio = known.shape[0] / seen.shape[0]
+        found.append(_settled(values, known, (first[0] * ratio, first[1] * ratio), first[2], ratio))
+    found = _further_lines(values, known, inner, found)
+    width = columns.stop - columns.start
+    edges = []
+    for left, right in found:
+        slope = (right - left) / width
+        length = float(np.hypot(slope, 1.0))
+        a, b = -slope / length, 1.0 / length
+        edges.append(Edge(a=a, b=b, c=a * columns.start + b * (left + rows.start)))
+    return edges
+
+
+def _copy(values: Picture, known: Mask, inner: Mask, side: int) -> tuple[Picture, Mask, Mask]:
+    """A copy (h, w, 3) of ``values`` whose longer side has ``side`` pixels, with what is known and the hole."""
+    scale = min(1.0, side / max(known.shape))
     size = (max(8, round(known.shape[1] * scale)), max(8, round(known.shape[0] * scale)))
     share, cut = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) for mask in (known, inner))
-    values = np.where(known[..., None], logs[rows, columns], 0.0).astype(np.float32)
     sums = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     small = np.asarray(sums / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
-    found = _best_line(small, np.asarray(share > 0.9), np.asarray(cut > 0.5))
-    if found is None:
-        return []
-    left, right, step = found
-    ratio = known.shape[0] / size[1]
-    ends = _settled(values, known, (left * ratio, right * ratio), step, ratio)
-    width = columns.stop - columns.start
-    slope = (ends[1] - ends[0]) / width
-    length = float(np.hypot(slope, 1.0))
-    a, b = -slope / length, 1.0 / length
-    return [Edge(a=a, b=b, c=a * columns.start + b * (ends[0] + rows.start))]
+    return small, np.asarray(share > 0.9), np.asarray(cut > 0.5)
+
+
+MOST_EDGES = 4
+FINE = 110
+"""Longer side in pixels of the copy in which further lines are looked for."""
+BAND = 2
+"""Pixels of that copy on either side of a line whose mean colours are compared: a joint is no edge."""
+STEEP = 0.35
+"""Steepest slope of a further line."""
+BESIDE = 0.8
+"""Range beside the hole in which it is looked at, over the hole's width."""
+LIKE, EVEN = 0.85, 0.8
+"""Least cosine between the jumps on either side of the hole; least share of the columns that jump by half the mean."""
+SPACE = 2.5
+"""Least distance of two lines, in pixels of that copy."""
+NEAR_FIRST = 0.12
+"""Distance below the first edge, over the window's height, up to which further ones are looked for: below it is the
+ground, whose lines are its pattern."""
+
+
+def _further_lines(
+    values: Picture, known: Mask, inner: Mask, found: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """``found`` and more lines, by the rows where they enter the window at the left and leave it at the right.
+
+    Across each, the mean colours of narrow bands differ alike on both sides of the hole.
+    """
+    small, seen, cut = _copy(values, known, inner, FINE)
+    height, width = seen.shape
+    ratio = known.shape[0] / height
+    rows, columns = np.flatnonzero(cut.any(axis=1)), np.flatnonzero(cut.any(axis=0))
+    if not len(rows) or height < 4 * BAND:
+        return found
+    over, under, valid = _bands(small, seen)
+    usual = float(np.median(np.linalg.norm(under - over, axis=-1)[valid])) if valid.any() else 0.0
+    least = max(2.0 * STEP, UNUSUAL * usual)
+    reach = max(4, round(BESIDE * (columns[-1] + 1 - columns[0])))
+    x = np.arange(max(0, columns[0] - reach), min(width, columns[-1] + 1 + reach))
+    ends = np.arange(0.0, height + 0.5, 1.0)
+    left, right = (grid.ravel() for grid in np.meshgrid(ends, ends, indexing="ij"))
+    fits = np.abs(right - left) <= STEEP * width
+    left, right = left[fits], right[fits]
+    y = left[:, None] + (right - left)[:, None] * (x + 0.5) / width
+    line = np.clip(np.rint(y).astype(int), 0, height)
+    jump = np.where(valid[line, x][..., None], (under - over)[line, x], 0.0)
+    usable = valid[line, x] & ~cut.any(axis=0)[x]
+    strength = np.full(len(left), np.inf)
+    means = []
+    for side in (x < columns[0], x > columns[-1]):
+        count = usable[:, side].sum(axis=1)
+        mean = (jump[:, side] * usable[:, side, None]).sum(axis=1) / np.maximum(count, 1)[:, None]
+        size = np.linalg.norm(mean, axis=1)
+        along = np.einsum("nxc,nc->nx", jump[:, side], mean / np.maximum(size, 1e-9)[:, None])
+        alike = ((along > 0.5 * size[:, None]) & usable[:, side]).sum(axis=1) / np.maximum(count, 1)
+        good = (count >= max(4, 0.5 * int(side.sum()))) & (alike >= EVEN) & (size >= least)
+        strength = np.minimum(strength, np.where(good, size, 0.0))
+        means.append(mean)
+    cosine = (means[0] * means[1]).sum(axis=1) / np.maximum(
+        np.linalg.norm(means[0], axis=1) * np.linalg.norm(means[1], axis=1), 1e-9
+    )
+    middle = (columns[0] + columns[-1] + 1) / 2.0
+    at = left + (right - left) * middle / width
+    strength[(cosine < LIKE) | (at < rows[0] + 1) | (at > rows[-1])] = 0.0
+    if found:
+        strength[at > sum(found[0]) / 2.0 / ratio + NEAR_FIRST * height] = 0.0
+    taken = [(a / ratio, b / ratio) for a, b in found]
+    result = list(found)
+    bounds = np.array([columns[0], columns[-1] + 1.0]) / width
+    while len(result) < MOST_EDGES:
+        for a, b in taken:
+            apart = (left - a)[:, None] + ((right - left) - (b - a))[:, None] * bounds
+            strength[(np.abs(apart).min(axis=1) < SPACE) | (apart[:, 0] * apart[:, 1] <= 0.0)] = 0.0
+        index = int(np.argmax(strength))
+        if strength[index] <= 0.0:
+            break
+        taken.append((float(left[index]), float(right[index])))
+        step = (means[0][index] + means[1][index]).astype(np.float64) / 2.0
+        ends_here = (float(left[index]) * ratio, float(right[index]) * ratio)
+        result.append(_settled(values, known, ends_here, step, ratio))
+    return result
+
+
+def _bands(small: Picture, seen: Mask) -> tuple[Picture, Picture, Mask]:
+    """Mean colours (h + 1, w, 3) of the bands over and under each line between rows, and whether both are known."""
+    height, width = seen.shape
+    total = np.concatenate([np.zeros((1, width, 3)), np.cumsum(np.where(seen[..., None], small, 0.0), axis=0)])
+    count = np.concatenate([np.zeros((1, width)), np.cumsum(seen, axis=0)])
+    rows = np.arange(height + 1)
+    top, bottom = np.maximum(rows - BAND, 0), np.minimum(rows + BAND, height)
+    full = (count[rows] - count[top] == BAND) & (count[bottom] - count[rows] == BAND)
+    over, under = (total[rows] - total[top]) / BAND, (total[bottom] - total[rows]) / BAND
+    return over.astype(np.float32), under.astype(np.float32), np.asarray(full)
 
 
 def _window(part: Mask) -> tuple[slice, slice]:

@@ -51,6 +51,7 @@ class ShadowCaster:
         """surfaces: points (M, 3) on each object. ground: points (N, 2) to evaluate."""
         surface = np.concatenate(surfaces)
         self._surface = np.column_stack([surface[:, :2], np.maximum(surface[:, 2], 0.0)])
+        self._ground = ground
         low, high = ground.min(axis=0), ground.max(axis=0)
         self._cell = max(float((high - low).max()) / CELLS, 1e-12)
         self._low = low - 2 * self._cell
@@ -61,6 +62,10 @@ class ShadowCaster:
         padded = -(-max(self._count, 1) // columns) * columns
         x, y = (np.pad(at[:, i], (0, padded - self._count)).reshape(-1, columns) for i in (0, 1))
         self._x, self._y = x, y
+
+    def thinned(self, index: NDArray[np.int64], step: int) -> ShadowCaster:
+        """Return a faster one for the ground points ``index``, with every ``step``-th surface point."""
+        return ShadowCaster([self._surface[::step]], self._ground[index])
 
     def _shadow(self, direction: Points) -> NDArray[np.float32]:
         """The shadow (rows, columns) of light from the unit vector ``direction`` (3,) on the grid: 1 inside."""
@@ -127,8 +132,9 @@ Values = NDArray[np.float64]
 
 SKY_LOSS = 0.85
 """Prior of k: objects of middling colour reflect some 15 % of the light they block."""
-MAX_SHARE = 0.952
-"""Largest share of the sun: 20 times the sky."""
+MAX_SHARE = 6.0 / 7.0
+"""Largest share of all lamps together: six times the sky, about what a clear noon gives open ground. A darker shadow
+shows its camera's tone curve and the objects' own reflections rather than a stronger lamp."""
 HUBER = 1.5
 
 
@@ -136,10 +142,11 @@ HUBER = 1.5
 class GroundLight:
     """Shares of the ground's light.
 
-    share: q, of the sun, 0 to 1. sky_loss: k. cost: misfit, 0 to 1. residual: (N,) of log brightness.
+    shares: q of each lamp, 0 to 1, together at most ``MAX_SHARE``. sky_loss: k. cost: misfit, 0 to 1. residual: (N,) of
+    log brightness.
     """
 
-    share: float
+    shares: tuple[float, ...]
     sky_loss: float
     cost: float
     residual: Values
@@ -152,38 +159,45 @@ def smooth_terms(ground: Values) -> Values:
 
 
 def fit_ground_light(
-    brightness: Values, terms: Values, sky: Values, sun: Values | None, scale: float, rounds: int = 4
+    brightness: Values, terms: Values, sky: Values, lamps: Sequence[Values], scale: float, rounds: int = 4
 ) -> GroundLight:
-    """Fit the shares of sun and sky in the light of the ground.
+    """Fit the shares of sky and lamps in the light of the ground.
 
-    brightness: (N,) natural logarithm; terms: (N, 6) of ``smooth_terms``; sky, sun: V and v (N,), None for no sun.
+    brightness: (N,) natural logarithm; terms: (N, 6) of ``smooth_terms``; sky, lamps: V and the v of each lamp, (N,).
     scale: of the residuals due to texture. rounds: Gauss-Newton steps.
     """
-    share, loss = (0.4 if sun is not None else 0.0), SKY_LOSS
-    direct = np.zeros_like(sky) if sun is None else sun
+    count, number = len(brightness), len(lamps)
+    shares, loss = np.full(number, 0.4 / max(number, 1)), SKY_LOSS
+    direct = np.stack([*lamps]) if lamps else np.zeros((0, count))
     hidden = 1.0 - sky
-    count = len(brightness)
     # A weak prior in units of points, or colour could pass for curvature.
-    prior = count * np.diag([0.0, 0.002, 0.002, 0.01, 0.01, 0.01, 0.0, 0.005])
+    prior = count * np.diag([0.0, 0.002, 0.002, 0.01, 0.01, 0.01, *np.zeros(number), 0.005])
     smooth = np.zeros(terms.shape[1])
     smooth[0] = float(np.median(brightness))
     residual = np.zeros(count)
-    for _ in range(rounds):
+
+    def light() -> tuple[Values, Values]:
         ambient = 1.0 - loss * hidden
-        bracket = np.maximum((1.0 - share) * ambient + share * direct, 1e-3)
+        return ambient, np.maximum((1.0 - shares.sum()) * ambient + shares @ direct, 1e-3)
+
+    for _ in range(rounds):
+        ambient, bracket = light()
         residual = brightness - terms @ smooth - np.log(bracket)
         weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-9))
-        rows = np.column_stack([terms, (direct - ambient) / bracket, -(1.0 - share) * hidden / bracket])
-        if sun is None:
-            rows[:, -2] = 0.0
+        rows = np.column_stack([terms, ((direct - ambient) / bracket).T, -(1.0 - shares.sum()) * hidden / bracket])
         weighted = rows * weight[:, None]
-        known = np.array([0.0, *(-smooth[1:]), 0.0, SKY_LOSS - loss])
+        known = np.array([0.0, *(-smooth[1:]), *np.zeros(number), SKY_LOSS - loss])
         left = rows.T @ weighted + prior + 1e-9 * count * np.eye(rows.shape[1])
         step = np.linalg.solve(left, weighted.T @ residual + prior @ known)
-        smooth = smooth + step[:-2]
-        share = float(np.clip(share + np.clip(step[-2], -0.3, 0.3), 0.0, MAX_SHARE))
+        smooth = smooth + step[: len(smooth)]
+        shares = np.clip(shares + np.clip(step[len(smooth) : -1], -0.3, 0.3), 0.0, MAX_SHARE)
+        shares = shares * min(1.0, MAX_SHARE / max(float(shares.sum()), 1e-9))
         loss = float(np.clip(loss + np.clip(step[-1], -0.3, 0.3), 0.2, 1.2))
-    bracket = np.maximum((1.0 - share) * (1.0 - loss * hidden) + share * direct, 1e-3)
-    residual = brightness - terms @ smooth - np.log(bracket)
+    residual = brightness - terms @ smooth - np.log(light()[1])
     off = (residual / (2.5 * scale)) ** 2
-    return GroundLight(share=share, sky_loss=loss, cost=float(np.mean(off / (1.0 + off))), residual=residual)
+    return GroundLight(
+        shares=tuple(float(share) for share in shares),
+        sky_loss=loss,
+        cost=float(np.mean(off / (1.0 + off))),
+        residual=residual,
+    )

@@ -160,11 +160,16 @@ class GroundPixels:
 
 
 def ground_pixels(
-    pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera, bodies: Sequence[ProxyBody]
+    pixels: NDArray[np.uint8],
+    masks: Sequence[Mask],
+    camera: Camera,
+    bodies: Sequence[ProxyBody],
+    stay: Mask | None = None,
 ) -> GroundPixels | None:
     """Return the ground around ``bodies`` in ``pixels`` (H, W, 3) sRGB, or None if none is in view.
 
-    masks: (H, W) of all objects; they and the pixels along their outlines are excluded.
+    masks: (H, W) of all objects; stay: (H, W) things that are no objects. Both, and the pixels along their outlines,
+    are excluded.
     """
     height, width = pixels.shape[:2]
     sides = [max(int(np.ptp(i)) + 1 for i in np.nonzero(mask)) for mask in masks if mask.any()]
@@ -175,7 +180,7 @@ def ground_pixels(
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     # Pixels along an outline mix object and ground: exclude them from the mean.
     seam = max(1, round(0.5 / shrink))
-    covered = np.logical_or.reduce(masks).astype(np.uint8)
+    covered = np.logical_or.reduce(masks if stay is None else [*masks, stay]).astype(np.uint8)
     open_ground = (cv2.dilate(covered, np.ones((2 * seam + 1,) * 2, np.uint8)) == 0).astype(np.float32)
     share = cv2.resize(open_ground, size, interpolation=cv2.INTER_AREA)
     light = cv2.resize(bytes_to_linear(pixels) * open_ground[..., None], size, interpolation=cv2.INTER_AREA)

@@ -114,19 +114,30 @@ PENUMBRA_DILATION = 20.0
 around the shadow alone the hole is as large, but more darkness stays outside it."""
 
 
-def object_holes(masks: Sequence[Mask], shadows: Sequence[Mask], dilation: float) -> list[Mask]:
-    """Return the hole of each object: mask and shadow, dilated, but never over another object.
+RIM = 5.0
+"""Pixels at 1024 beside an object's outline that are mixed with it: they leave with it even where a thing without a box
+touches it."""
+
+
+def object_holes(
+    masks: Sequence[Mask], shadows: Sequence[Mask], dilation: float, stay: Mask | None = None
+) -> list[Mask]:
+    """Return the hole of each object: mask and shadow, dilated, but never over another object or what must ``stay``.
 
     shadows: (H, W), best with their penumbras. dilation: side of the kernel in pixels of this photo; half of it covers
-    an outline. An object's hole may cover another object's shadow.
+    an outline. stay: (H, W) things without a box. An object's hole may cover another object's shadow.
     """
     side = max(1, round(dilation)) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    rim = 2 * max(1, round(RIM * max(masks[0].shape) / 1024.0)) + 1 if masks else 1
+    beside = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (min(rim, side), min(rim, side)))
     holes = []
     for index, (mask, shadow) in enumerate(zip(masks, shadows, strict=True)):
         hole = cv2.dilate((mask | shadow).astype(np.uint8), kernel) > 0
         # A rest of the photo inside a strap would remain as an island.
         hole |= enclosed_holes(hole)
+        if stay is not None:
+            hole &= ~stay | (cv2.dilate(mask.astype(np.uint8), beside) > 0)
         for other, blocked in enumerate(masks):
             if other != index:
                 hole &= ~(blocked & ~mask)
@@ -142,41 +153,63 @@ FAR = 0.25
 """Weight of a distance of one object side against the log of the blocked light, where shadows meet."""
 
 
+FORESEEN, POSSIBLE = 0.8, 0.15
+"""Share of light below which an object is expected to shade the ground; probability below which the photo says that it
+does not."""
+CONTACT_SKY = 0.4
+"""Share of the sky that an object hides around its contact, where the ground is darker under any light."""
+
+
 @dataclass(frozen=True)
 class CastShadow:
     """shadow: (H, W) where the object blocks a tenth of the ground's light or more. penumbra: (H, W) the same with its
-    soft border, which must leave the photo with the object too."""
+    soft border, which must leave the photo with the object too. expected: (H, W) ground around the contact, and where
+    the light that explains the other shadows casts one that the photo does not exclude; a missed shadow would stay
+    there as a stain. missing: share of the foreseen shadow that was not found, 0 to 1."""
 
     shadow: Mask
     penumbra: Mask
+    expected: Mask
+    missing: float = 0.0
 
 
-def cast_shadows(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera) -> list[CastShadow]:
+def cast_shadows(
+    pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera, stay: Mask | None = None
+) -> list[CastShadow]:
     """Return the shadow of each of ``masks`` (H, W), visible pixels of the objects, with its penumbra.
 
-    pixels: (H, W, 3) sRGB. camera: above the ground z = 0; pixels above the horizon are not ground. Both masks of a
-    shadow are disjoint from all objects and from other shadows. A pixel in several shadows belongs to the object that
-    blocks most of its light. An object without a pixel, or above the horizon, has no shadow.
+    pixels: (H, W, 3) sRGB. camera: above the ground z = 0; pixels above the horizon are not ground. stay: (H, W) things
+    on the ground that are no objects; no shadow is looked for on them. All masks of a shadow are disjoint from all
+    objects and from ``stay``, shadows and penumbras also from those of others. A pixel in several shadows belongs to
+    the object that blocks most of its light. An object without a pixel, or above the horizon, has no shadow.
     """
-    found = [CastShadow(*np.zeros((2, *pixels.shape[:2]), dtype=bool)) for _ in masks]
+    found = [CastShadow(*np.zeros((3, *pixels.shape[:2]), dtype=bool)) for _ in masks]
     standing = [(index, body) for index, mask in enumerate(masks) if (body := proxy_body(mask, camera)) is not None]
     if not standing:
         return found
     bodies = [body for _, body in standing]
-    ground = ground_pixels(pixels, masks, camera, bodies)
+    ground = ground_pixels(pixels, masks, camera, bodies, stay)
     if ground is None or len(ground.rows) < FEWEST:
         return found
-    total, alone, hidden = light_shares(ground, bodies, fit_light(ground, bodies))
+    light = fit_light(ground, bodies)
+    total, alone, hidden = light_shares(ground, bodies, light)
     owner = _owner(ground, alone, [masks[index] for index, _ in standing])
-    inner, outer = shadow_probability(ground, light_level_posterior(ground, total, hidden), _part(ground, alone, owner))
+    posterior = light_level_posterior(ground, total, np.minimum(hidden.sum(axis=0), 1.0))
+    inner, outer = shadow_probability(ground, posterior, _part(ground, alone, owner))
     taken = np.logical_or.reduce(masks)
+    closed = taken if stay is None else taken | stay
+    taken = closed.copy()
     for position, (index, _) in enumerate(standing):
         own = owner == position
         dark = (_full_size(ground, np.where(own, inner, 0.0), taken.shape) > 0.5) & ~taken
         dim = (_full_size(ground, np.where(own, outer, 0.0), taken.shape) > 0.5) & ~taken
         shadow = extend_hard_shadow(pixels, _connected(dark, masks[index], ground, alone[position]), taken)
         penumbra = shadow | _touching(dim, shadow)
-        found[index] = CastShadow(shadow=shadow, penumbra=penumbra)
+        foreseen = (alone[position] < FORESEEN) & (light.share > 0.0)
+        wanted = (hidden[position] > CONTACT_SKY) | (foreseen & (outer > POSSIBLE))
+        expected = (_full_size(ground, wanted, taken.shape) > 0.5) & ~closed
+        missing = float((foreseen & (inner < 0.5)).sum() / foreseen.sum()) if foreseen.sum() >= FEWEST else 0.0
+        found[index] = CastShadow(shadow=shadow, penumbra=penumbra, expected=expected, missing=missing)
         taken |= penumbra
     return found
 

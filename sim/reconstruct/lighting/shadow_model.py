@@ -125,7 +125,7 @@ def light_shares(
     ground: GroundPixels, bodies: Sequence[ProxyBody], light: ShadowLight
 ) -> tuple[Values, Values, Values]:
     """Return the share (N,) of its light that the ground keeps, (objects, N) the ratio with to without each object, and
-    the share (N,) of the sky that all of them occlude."""
+    the share (objects, N) of the sky that each of them occludes."""
     disc = sun_disc(direction_of(light.slide), light.angle, 24)
     casters = [ShadowCaster([body.points], ground.places) for body in bodies]
     hidden = np.stack([1.0 - caster.reaching(*overcast_sky(SKY)) for caster in casters])
@@ -138,7 +138,7 @@ def light_shares(
     everyone = list(range(len(bodies)))
     total = kept(everyone)
     alone = [total / kept([other for other in everyone if other != index]) for index in everyone]
-    return total, np.minimum(np.stack(alone), 1.0), np.minimum(hidden.sum(axis=0), 1.0)
+    return total, np.minimum(np.stack(alone), 1.0), hidden
 
 
 def direction_of(slide: Values) -> Values:

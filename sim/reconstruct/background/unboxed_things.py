@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""Things on the ground that nobody boxed: they stay in the photo, and are no source for inpainting.
+
+A thing is a compact region with a sharp outline and another colour than the ground around it, about as large as the
+boxed objects. A pattern of the ground is none: it covers much of the ground, or the rest of the ground predicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ...composite.srgb import bytes_to_linear
+from ...scene.model import Camera
+from ..camera.ground_camera import on_ground
+from ..lighting.ground_pixels import LUMINANCE
+from .texture_prediction import predict_texture
+
+Mask = NDArray[np.bool_]
+Values = NDArray[np.float64]
+
+OBJECT_SIDE, MOST_PIXELS = 48.0, 250_000
+"""Size in pixels of the object in the copy in which things are looked for; largest size of that copy."""
+AROUND = 1.8
+"""Range in which they are looked for, over the object's longer side."""
+APART = 3.5
+"""Difference from the ground's smooth colour, over the spread of the ground."""
+LEAST_LUMINANCE, LEAST_CHROMA = 0.07, 0.05
+"""Least spread of the ground, natural logarithms: below it is noise."""
+MODE = 0.25
+"""Width of a mode of the ground's brightness, natural logarithms."""
+SMALLEST, LARGEST = 0.06, 5.0
+"""Area of a thing over the object's."""
+SOLID = 0.75
+"""Least share of a thing in its convex hull."""
+SHARP = 0.5
+"""Least share of a thing's outline across which the colour jumps."""
+LONGEST_CUT = 1.0
+"""Length over the object's size, along the border of the range, above which it is another surface that goes on."""
+PATTERN = 0.55
+"""Share of the ground above which they are its pattern, and predictable share of variance above which they are too."""
+SHADE_TINT = 0.2
+"""Log chroma that a shadow changes at most, over its depth: shadows under a sky are bluish, black is never quite
+black."""
+HIDDEN = 0.1
+"""Share of a thing's outline along an object above which the thing continues behind it."""
+
+
+@dataclass(frozen=True)
+class UnboxedThings:
+    """stay: (H, W) pixels of things that must stay in the photo. whole: (H, W) those of them that no object hides
+    partly; they say nothing about what is behind an object. count: of separate things, as they appear."""
+
+    stay: Mask
+    whole: Mask
+
+    @property
+    def count(self) -> int:
+        """Separate regions of ``stay``."""
+        return int(cv2.connectedComponents(self.stay.astype(np.uint8), connectivity=8)[0]) - 1
+
+
+def unboxed_things(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera) -> UnboxedThings:
+    """Return things without a box on the ground near the objects.
+
+    pixels: (H, W, 3) sRGB. masks: (H, W) visible pixels of the objects. camera: above the ground z = 0; nothing is
+    looked for above the horizon.
+    """
+    stay, whole = np.zeros((2, *pixels.shape[:2]), dtype=bool)
+    objects = np.logical_or.reduce(list(masks))
+    for mask in masks:
+        if mask.any():
+            _look_around(pixels, mask, objects, camera, stay, whole)
+    return UnboxedThings(stay=stay & ~objects, whole=whole & ~objects)
+
+
+def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: Camera, stay: Mask, whole: Mask) -> None:
+    """Add the things around the object ``mask`` to ``stay`` and ``whole``, in place."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    room = round(AROUND * max(len(rows), len(columns))) + 8
+    top, left = max(0, int(rows[0]) - room), max(0, int(columns[0]) - room)
+    window = slice(top, int(rows[-1]) + 1 + room), slice(left, int(columns[-1]) + 1 + room)
+    crop, own, taken = pixels[window], mask[window], objects[window]
+    height, width = own.shape
+    scale = min(1.0, OBJECT_SIDE / float(np.sqrt(own.sum())), float(np.sqrt(MOST_PIXELS / own.size)))
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    y, x = np.meshgrid(
+        top + (np.arange(size[1]) + 0.5) * height / size[1], left + (np.arange(size[0]) + 0.5) * width / size[0],
+        indexing="ij",
+    )  # fmt: skip
+    ground = np.isfinite(on_ground(camera, np.stack([x, y], axis=-1))).all(axis=-1)
+    share = cv2.resize(taken.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    covered = cv2.dilate((share > 0.0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    light = cv2.resize(bytes_to_linear(np.ascontiguousarray(crop)), size, interpolation=cv2.INTER_AREA)
+    logs = np.log(cv2.GaussianBlur(light, (0, 0), 0.7).astype(np.float64) + 0.01)
+    area = float(own.sum()) * size[0] * size[1] / own.size
+    inner = (top > 0, window[0].stop < len(mask), left > 0, window[1].stop < mask.shape[1])
+    for thing, behind in _things(logs, ground & ~covered, covered, area, inner):
+        full = cv2.resize(thing.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.25
+        stay[window] |= full
+        if not behind:
+            whole[window] |= full
+
+
+def _things(
+    logs: Values, open_ground: Mask, covered: Mask, area: float, inner: tuple[bool, bool, bool, bool]
+) -> list[tuple[Mask, bool]]:
+    """Things (h, w) on the open ground, each with whether it continues behind an object.
+
+    logs: (h, w, 3) logarithms of linear light. covered: objects. area: of the object. inner: whether the sides (top,
+    bottom, left, right) of this copy lie inside the photo.
+    """
+    if open_ground.sum() < 200:
+        return []
+    off, within = _relative(logs, open_ground)
+    luminance = off @ LUMINANCE
+    chroma = np.linalg.norm(off - luminance[..., None], axis=-1)
+    spread, tint = (
+        max(least, 1.48 * float(np.median(values[within])))
+        for values, least in ((np.abs(luminance), LEAST_LUMINANCE), (chroma, LEAST_CHROMA))
+    )
+    apart = np.maximum(np.abs(luminance) / spread, chroma / tint) / APART
+    shade = (luminance < 0.0) & (chroma < np.maximum(APART * tint, SHADE_TINT * (0.5 - luminance)))
+    different = (apart > 1.0) & open_ground
+    different &= ~_joined(different & shade, covered, max(2, round(0.1 * np.sqrt(area))))
+    parts = _parts(different, open_ground, area)
+    found = [part for part in parts if _is_thing(part, apart, open_ground, covered, area, inner)]
+    if not found or sum(int(part.sum()) for part in found) > PATTERN * open_ground.sum():
+        return []
+    if len(found) >= 3 and _is_pattern(off, open_ground, found):
+        return []
+    return [(part, _contact(part, covered) > HIDDEN) for part in found]
+
+
+def _relative(logs: Values, known: Mask) -> tuple[Values, Mask]:
+    """``logs`` (h, w, 3) relative to the smooth colour of the ground, and the ground (h, w) among the ``known``.
+
+    The ground is the largest mode of colours, not the median: things may cover nearly half of what is seen.
+    """
+    rows, columns = np.meshgrid(*(np.linspace(-0.5, 0.5, count) for count in known.shape), indexing="ij")
+    terms = np.stack([np.ones_like(rows), columns, rows, columns**2, columns * rows, rows**2], axis=-1)
+    colours, basis = logs[known], terms[known]
+    light = colours @ LUMINANCE
+    counts, bounds = np.histogram(light, 96)
+    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), MODE / max(bounds[1] - bounds[0], 1e-9))
+    peak = float(bounds[int(np.argmax(smooth))] + 0.5 * (bounds[1] - bounds[0]))
+    middle = np.median(colours[np.abs(light - peak) < MODE], axis=0)
+    off = colours - middle
+    scale = 2.0 * MODE
+    prior = np.diag([1e-9, 0.002, 0.002, 0.01, 0.01, 0.01])
+    for _ in range(12):
+        weight = np.exp(-0.5 * np.square(np.abs(off).max(axis=1) / scale))
+        weighted = basis * weight[:, None]
+        found = np.linalg.solve(weighted.T @ basis + prior * weight.sum(), weighted.T @ (colours - middle))
+        off = colours - middle - basis @ found
+        near = np.abs(off).max(axis=1) < 2.5 * scale
+        scale = max(LEAST_LUMINANCE, 0.5 * scale, 1.48 * float(np.median(np.abs(off[near]).max(axis=1))))
+    within = np.zeros_like(known)
+    within[known] = np.abs(off).max(axis=1) < 2.5 * scale
+    return np.asarray(logs - middle - terms @ found), within
+
+
+def _joined(mask: Mask, to: Mask, reach: int) -> Mask:
+    """The connected parts of ``mask`` (h, w) within ``reach`` pixels of ``to``: shadows of the objects."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    near = cv2.dilate(to.astype(np.uint8), _disc(reach)) > 0
+    return np.asarray(np.isin(labels, np.unique(labels[near & mask])) & mask)
+
+
+def _parts(mask: Mask, open_ground: Mask, area: float) -> list[Mask]:
+    """Compact parts of ``mask`` (h, w), with their holes filled; narrow bridges between them are cut."""
+    side = float(np.sqrt(area))
+    filled = ndimage.binary_fill_holes(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(1)) > 0)
+    filled = filled & open_ground
+    least = np.sqrt(SMALLEST) * side
+    core = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, _disc(max(1, round(0.15 * least)))) > 0
+    depth = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, 5)
+    count, seeds = cv2.connectedComponents((depth > max(1.0, 0.3 * least)).astype(np.uint8), connectivity=8)
+    if count < 2:
+        return []
+    nearest = ndimage.distance_transform_edt(seeds == 0, return_distances=False, return_indices=True)
+    owner = np.where(core, seeds[nearest[0], nearest[1]], 0)
+    parts = []
+    for index in range(1, count):
+        own = owner == index
+        # Only what hangs together with its own core.
+        _, labels = cv2.connectedComponents(own.astype(np.uint8), connectivity=8)
+        parts.append(np.asarray(np.isin(labels, np.unique(labels[seeds == index])) & own))
+    return parts
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
+
+
+def _is_thing(
+    part: Mask,
+    apart: Values,
+    open_ground: Mask,
+    covered: Mask,
+    area: float,
+    inner: tuple[bool, bool, bool, bool],
+) -> bool:
+    size = int(part.sum())
+    if not SMALLEST * area <= size <= LARGEST * area:
+        return False
+    # What goes on beyond the range that was looked at is another surface.
+    sides = (part[0], part[-1], part[:, 0], part[:, -1])
+    cut = [int(side.sum()) for side, within in zip(sides, inner, strict=True) if within]
+    if max(cut, default=0) > LONGEST_CUT * np.sqrt(area):
+        return False
+    points = np.argwhere(part)[:, ::-1].astype(np.int32)
+    hull = np.zeros(part.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
+    if size < SOLID * int((hull > 0).sum() - ((hull > 0) & covered).sum()):
+        return False
+    # A jump of the colour on the way out, not a slope.
+    outside = (cv2.dilate(part.astype(np.uint8), _disc(3)) > 0) & ~(cv2.dilate(part.astype(np.uint8), _disc(2)) > 0)
+    outside &= open_ground
+    if outside.sum() < 8:
+        return False
+    return float((apart[outside] < 0.7).mean()) > SHARP and float(np.median(apart[part])) > 1.0
+
+
+def _contact(part: Mask, covered: Mask) -> float:
+    """Share of the outline of ``part`` that lies along ``covered``."""
+    outline = part & ~(cv2.erode(part.astype(np.uint8), _disc(1)) > 0)
+    near = cv2.dilate(covered.astype(np.uint8), _disc(2)) > 0
+    return float((outline & near).sum() / max(1, int(outline.sum())))
+
+
+def _is_pattern(off: Values, open_ground: Mask, parts: Sequence[Mask]) -> bool:
+    """Whether the rest of the ground predicts the largest of ``parts``."""
+    largest = max(parts, key=lambda part: int(part.sum()))
+    hole = cv2.dilate(largest.astype(np.uint8), _disc(2)) > 0
+    values = np.where(open_ground[..., None], off, 0.0).astype(np.float32)
+    known = open_ground & ~hole
+    values -= values[known].mean(axis=0)
+    found, _ = predict_texture(np.where(known[..., None], values, 0.0).astype(np.float32), known, hole)
+    truth, guess = values[hole & open_ground], found[hole & open_ground]
+    return 1.0 - float(np.square(truth - guess).sum()) / max(float(np.square(truth).sum()), 1e-9) > PATTERN

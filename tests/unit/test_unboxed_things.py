@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""Things on the ground that nobody boxed stay, and are not copied into holes."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+from physgen.sim.reconstruct.background.background_inpainting import fill_background
+from physgen.sim.reconstruct.background.unboxed_things import unboxed_things
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.lighting.shadow_masks import cast_shadows, object_holes
+
+WIDTH, HEIGHT = 240, 180
+CAMERA = camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(50.0))
+BOXED = ((102, 124, 23), (204, 125, 22), (154, 196, 21))
+"""Three coins of scikit-image's photo: x, y, radius."""
+NEIGHBOURS = ((153, 127, 15), (103, 196, 15), (212, 193, 17), (45, 124, 16))
+
+
+def disc(x, y, radius, shape=(HEIGHT, WIDTH)):
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def plain(seed=0):
+    noise = np.random.default_rng(seed).normal(scale=2.0, size=(HEIGHT, WIDTH, 1))
+    return np.full((HEIGHT, WIDTH, 3), (150.0, 120.0, 90.0)) + noise
+
+
+def test_coins_that_nobody_boxed_stay_and_are_no_source():
+    grey = skimage.data.coins()
+    pixels = np.repeat(grey[..., None], 3, axis=2)
+    masks = [disc(*coin, grey.shape) for coin in BOXED]
+    view = camera_above_ground(grey.shape[1], grey.shape[0], 410.0, math.radians(35.0))
+    found = unboxed_things(pixels, masks, view)
+    for coin in NEIGHBOURS:
+        core = disc(*coin, grey.shape)
+        assert (found.stay & core).sum() > 0.95 * core.sum()
+        assert (found.whole & core).sum() > 0.95 * core.sum()
+    assert not found.stay[np.logical_or.reduce(masks)].any()
+    cast = cast_shadows(pixels, masks, view, found.stay)
+    holes = object_holes(masks, [c.penumbra | c.expected for c in cast], 7.5, found.stay)
+    union = np.logical_or.reduce(holes)
+    assert not any((union & disc(*coin, grey.shape)).any() for coin in NEIGHBOURS)
+    for mask, hole in zip(masks, holes, strict=True):
+        assert (hole & mask).sum() == mask.sum()
+    # One hole is filled: no coin grows in it.
+    plate = fill_background(pixels, holes[0], masks[0], view, barred=found.whole | union & ~holes[0])
+    around = cv2.dilate(holes[0].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    ground = around & ~holes[0] & ~cv2.dilate(found.stay.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
+    assert np.percentile(plate[masks[0]], 99.0) < np.percentile(plate[ground], 99.0) + 15.0
+
+
+def test_a_shadow_does_not_take_a_dark_thing_beside_the_object():
+    picture = plain()
+    thing, pen = disc(100, 90, 24), disc(146, 96, 12)
+    picture[disc(122, 104, 22)] *= 0.5
+    picture[thing], picture[pen] = (200.0, 60.0, 40.0), (40.0, 45.0, 120.0)
+    found = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], CAMERA)
+    assert (found.stay & pen).sum() > 0.9 * pen.sum()
+    # The object's own shadow is no thing.
+    shade = disc(122, 104, 22) & ~disc(146, 96, 16) & ~disc(100, 90, 27)
+    assert (found.stay & shade).mean() == 0.0
+
+
+@pytest.mark.parametrize("pattern", ["checks", "stripes", "noise", "gradient"])
+def test_the_pattern_of_the_ground_is_no_thing(pattern):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    value = {
+        "checks": 60.0 * ((rows // 26 + columns // 26) % 2),
+        "stripes": 60.0 * ((rows // 22) % 2),
+        "noise": cv2.GaussianBlur(np.random.default_rng(1).normal(size=rows.shape), (0, 0), 4.0) * 150.0,
+        "gradient": 0.3 * columns,
+    }[pattern]
+    picture = plain() + value[..., None] - 30.0
+    thing = disc(120, 90, 22)
+    picture[thing] = (30.0, 160.0, 60.0)
+    assert not unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], CAMERA).stay.any()
+
+
+def test_what_an_object_hides_partly_goes_on_behind_it():
+    picture = plain()
+    saucer, cup = disc(120, 96, 40), disc(120, 84, 26)
+    picture[saucer] = (235.0, 235.0, 240.0)
+    picture[cup] = (60.0, 40.0, 160.0)
+    found = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [cup], CAMERA)
+    assert (found.stay & saucer).sum() > 0.8 * (saucer & ~disc(120, 84, 29)).sum()
+    assert not found.whole.any()
+
+
+def test_nothing_is_looked_for_without_an_object():
+    found = unboxed_things(np.clip(plain(), 0, 255).astype(np.uint8), [np.zeros((HEIGHT, WIDTH), bool)], CAMERA)
+    assert not found.stay.any()
+    assert found.count == 0
