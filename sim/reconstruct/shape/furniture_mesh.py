@@ -14,6 +14,7 @@ from ..camera.ground_camera import ground_depth
 from .furniture import OVERLAP_PX, Board
 from .inflate import Crop, signed_distance
 from .inflated_mesh import BodyMesh, standing_mesh
+from .ray_field import RayField
 from .surface_mesh import relax, surface_of_size
 
 Points = NDArray[np.float64]
@@ -26,12 +27,11 @@ FINEST_SHARE = 0.25
 """Smallest step in depth over the step in the photo's plane."""
 
 
-class BoardField:
+class BoardField(RayField):
     """φ of the union of boards, in pixels. t: pixels behind the depth of their middle."""
 
     def __init__(self, camera: Camera, crop: Crop, boards: Sequence[Board]) -> None:
         self._camera, self._crop, self._boards = camera, crop, boards
-        self._outline = crop.distance
         self._regions = [np.minimum(crop.distance, signed_distance(board.region) + OVERLAP_PX) for board in boards]
         low, high = np.inf, -np.inf
         rays = camera.rays(crop.pixels())
@@ -51,14 +51,9 @@ class BoardField:
         self._range = ((low - self._middle) / self.unit - MARGIN_PX, (high - self._middle) / self.unit + MARGIN_PX)
         self.thinnest = min((slab.high - slab.low) / self.unit for board in boards for slab in board.slabs)
 
-    def _world(self, points: Points) -> Points:
-        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
-        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
-        return np.asarray(self._camera.position + depth[:, None] * self._camera.rays(pixels))
-
     def sample(self, points: Points) -> tuple[Points, Points]:
         """Return boards and ground (n), (n) at ``points`` (n, 3), in pixels."""
-        at, world = points[:, 1::-1].T, self._world(points)
+        at, world = points[:, 1::-1].T, self.world(points[:, :2], points[:, 2])
         best = np.full(len(points), -np.inf)
         for board, region in zip(self._boards, self._regions, strict=True):
             inside = np.full(len(points), np.inf)
@@ -83,27 +78,7 @@ class BoardField:
         low, high = self._range
         first = np.array([0.25, 0.25, low])
         counts = (int((width - 1) // spacing) + 1, int((height - 1) // spacing) + 1, int((high - low) // steps[2]) + 2)
-        axes = [first[i] + steps[i] * np.arange(counts[i]) for i in range(3)]
-        flat = np.stack(np.meshgrid(axes[0], axes[1], indexing="ij"), axis=-1).reshape(-1, 2)
-        outline = ndimage.map_coordinates(self._outline, flat[:, ::-1].T, order=1, mode="nearest")
-        near = outline > -2.0 * spacing
-        points = np.column_stack([np.repeat(flat[near], counts[2], axis=0), np.tile(axes[2], int(near.sum()))])
-        columns = np.repeat(np.minimum(outline, -1.0)[:, None], counts[2], axis=1)
-        columns[near] = self.value(points).reshape(-1, counts[2])
-        field = columns.reshape(counts)
-        for axis in range(3):
-            edge = [slice(None)] * 3
-            for end in (0, -1):
-                edge[axis] = end  # type: ignore[call-overload]
-                field[tuple(edge)] = np.minimum(field[tuple(edge)], -1e-3)
-        field[np.abs(field) < 1e-4] = -1e-4
-        return field.astype(np.float32), first, steps
-
-    def depths(self, points: Points) -> tuple[Points, Points, Points]:
-        """Return photo pixels (n, 2), depth (n) and depth of the ground (n) of ``points`` (n, 3)."""
-        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
-        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
-        return pixels, depth, ground_depth(self._camera, self._camera.rays(pixels))
+        return self.sampled(first, steps, counts), first, steps
 
 
 def furniture_mesh(camera: Camera, crop: Crop, boards: Sequence[Board], target: int) -> tuple[BodyMesh, float]:

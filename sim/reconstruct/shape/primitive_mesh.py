@@ -23,6 +23,7 @@ from ..camera.ground_camera import ground_depth
 from .inflate import Crop, limb_profile, signed_distance
 from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, standing_mesh
 from .primitives import FINER, Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
+from .ray_field import RayField
 from .surface_mesh import relax, surface_of_size
 
 Mask = NDArray[np.bool_]
@@ -248,7 +249,7 @@ BEVEL_SHARE = 0.35
 """Largest rounding over the smallest extent."""
 
 
-class SolidField:
+class SolidField(RayField):
     """φ of one primitive with its parts. t: pixels behind the depth of the primitive's centre."""
 
     def __init__(
@@ -303,14 +304,12 @@ class SolidField:
         return thin if self._square is None else min(thin, 2.0 * self._half)
 
     def _world(self, points: Points, shifted: bool) -> Points:
-        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
+        places = points[:, :2]
         if shifted:
             at = points[:, 1::-1].T
-            pixels = pixels + np.stack(
-                [ndimage.map_coordinates(self._shift[..., i], at, order=1, mode="nearest") for i in (0, 1)], axis=-1
-            )
-        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
-        return np.asarray(self._camera.position + depth[:, None] * self._camera.rays(pixels))
+            moved = [ndimage.map_coordinates(self._shift[..., i], at, order=1, mode="nearest") for i in (0, 1)]
+            return self.world(places, points[:, 2], np.stack(moved, axis=-1))
+        return self.world(places, points[:, 2])
 
     def sample(self, points: Points) -> tuple[Points, Points]:
         """Return body and ground (n), (n) at ``points`` (n, 3), in pixels."""
@@ -342,28 +341,7 @@ class SolidField:
             int((height - 1) // spacing) + 1,
             int((high - low) // steps[2]) + 6,
         )
-        axes = [first[i] + steps[i] * np.arange(counts[i]) for i in range(3)]
-        flat = np.stack(np.meshgrid(axes[0], axes[1], indexing="ij"), axis=-1).reshape(-1, 2)
-        outline = ndimage.map_coordinates(self._crop.distance, flat[:, ::-1].T, order=1, mode="nearest")
-        near = outline > -2.0 * spacing
-        points = np.column_stack([np.repeat(flat[near], counts[2], axis=0), np.tile(axes[2], int(near.sum()))])
-        # Away from the outline φ is negative; its value does not matter.
-        columns = np.repeat(np.minimum(outline, -1.0)[:, None], counts[2], axis=1)
-        columns[near] = self.value(points).reshape(-1, counts[2])
-        field = columns.reshape(counts)
-        for axis in range(3):
-            edge = [slice(None)] * 3
-            for end in (0, -1):
-                edge[axis] = end  # type: ignore[call-overload]
-                field[tuple(edge)] = np.minimum(field[tuple(edge)], -1e-3)
-        field[np.abs(field) < 1e-4] = -1e-4
-        return field.astype(np.float32), first, steps
-
-    def depths(self, points: Points) -> tuple[Points, Points, Points]:
-        """Return photo pixels (n, 2), depth (n) and depth of the ground (n) of ``points`` (n, 3)."""
-        pixels = points[:, :2] + np.array([self._crop.left + 0.5, self._crop.top + 0.5])
-        depth = np.maximum(self._middle + points[:, 2] * self.unit, 0.02 * self._middle)
-        return pixels, depth, ground_depth(self._camera, self._camera.rays(pixels))
+        return self.sampled(first, steps, counts), first, steps
 
 
 def solid_mesh(
