@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .sim.app.compose_scene import compose
     from .sim.app.default_motion import DefaultMotion, default_motion
     from .sim.app.diagnose import diagnose
+    from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
     from .sim.cache.bake_folder import Bake, load_bake
     from .sim.diagnose.capture import Capture, load_capture
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from .sim.importers.mesh_scene import scene_from_meshes
     from .sim.mpm.world import World
     from .sim.reconstruct.reasoning.chat_client import ChatRequest
-    from .sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+    from .sim.reconstruct.reconstruct_options import ObjectRequest, Proposal, ReconstructOptions
     from .sim.scene.folder import Scene, load_scene
     from .sim.version import VERSION as __version__
 
@@ -57,6 +58,7 @@ __all__ = [
     "ObjectRequest",
     "PhysGenError",
     "Physics",
+    "Proposal",
     "ReconstructOptions",
     "RenderOptions",
     "Scene",
@@ -71,6 +73,7 @@ __all__ = [
     "load_bake",
     "load_capture",
     "load_scene",
+    "propose",
     "reconstruct",
     "render",
     "scene_from_meshes",
@@ -89,6 +92,7 @@ _HOMES = {
     "ObjectRequest": ".sim.reconstruct.reconstruct_options",
     "PhysGenError": ".sim.errors",
     "Physics": ".sim.app.reconstruct",
+    "Proposal": ".sim.reconstruct.reconstruct_options",
     "ReconstructOptions": ".sim.reconstruct.reconstruct_options",
     "RenderOptions": ".physgen_addon.render.render_options",
     "Scene": ".sim.scene.folder",
@@ -102,6 +106,7 @@ _HOMES = {
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",
     "load_scene": ".sim.scene.folder",
+    "propose": ".sim.app.propose",
     "reconstruct": ".sim.app.reconstruct",
     "render": ".batch.stages",
     "scene_from_meshes": ".sim.importers.mesh_scene",

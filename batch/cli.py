@@ -47,6 +47,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     photo_commands.add_run(command("run", photo_commands.run_run, "photo → video: all stages"))
     photo_commands.add_reconstruct(command("reconstruct", photo_commands.run_reconstruct, "photo → scene folder"))
+    listed = "list the objects of a photo that stand out, for --box and --pick; a numbered picture of them"
+    photo_commands.add_propose(command("propose", photo_commands.run_propose, listed))
     again = "reconstruct a scene's photo again with corrected inputs"
     photo_commands.add_correct(command("correct", photo_commands.run_correct, again))
     photo_commands.add_import(

@@ -16,7 +16,7 @@ from ...sim.cache.bake_folder import SPACES
 from ...sim.errors import InputError
 from ...sim.reconstruct import ObjectRequest, ReconstructOptions
 from ...sim.reconstruct.reasoning.chat_client import DEFAULT_KEY_VARIABLE, ChatRequest
-from ...sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES, Pixel
+from ...sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES, Pixel, Stroke
 from ...sim.scene.equirectangular import FRAMES
 from ...sim.scene.material import preset_names
 from ...sim.scene.model import Vector
@@ -42,6 +42,11 @@ def parse_box(text: str) -> tuple[float, float, float, float]:
     """Return the box in ``x0,y0,x1,y1``."""
     a, b, c, d = parse_numbers(text, 4, "a box x0,y0,x1,y1 in pixels")
     return a, b, c, d
+
+
+def box_text(box: Sequence[float]) -> str:
+    """Return ``box`` as ``parse_box`` reads it."""
+    return ",".join(f"{value:g}" for value in box)
 
 
 def parse_vector(text: str) -> Vector:
@@ -80,6 +85,13 @@ def _mesh_point(text: str) -> tuple[Vector, Pixel]:
     return parse_vector(place), (u, v)
 
 
+def parse_stroke(text: str) -> Stroke:
+    """Return the places in ``x,y,x,y,…``, a polyline; one place is a dot."""
+    count = text.count(",") + 1
+    numbers = parse_numbers(text, count + count % 2, "a stroke x,y,x,y,… in pixels")
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
+
 OBJECT_FLAGS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
     "mask": ("mask", Path, "FILE", "image that is bright where the object is visible, instead of a box"),
     "kind": ("kind", str, "WORD", "what it is (orange, book, teddy): determines material, thickness and shape"),
@@ -96,8 +108,10 @@ def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> 
     """Add properties of single objects. boxes: also boxes, and lists in their order."""
     parser.set_defaults(wrong_usage=parser.error)
     if boxes:
-        text = "bounding box x0,y0,x1,y1 in pixels of the upright photo, one per object"
+        text = "bounding box x0,y0,x1,y1 in pixels of the upright photo, one per object (default: objects are found)"
         parser.add_argument("--box", type=parse_box, nargs="+", action="extend", default=[], metavar="BOX", help=text)
+        text = "numbers of the objects to use, of those that are found without a box (physgen propose lists them)"
+        parser.add_argument("--pick", type=int, nargs="+", action="extend", default=[], metavar="N", help=text)
         text = "object names, in the order of the boxes"
         parser.add_argument("--name", nargs="+", action="extend", default=[], help=text)
         text = "largest extent in metres, one per object; the first sets the scene's scale"
@@ -129,6 +143,12 @@ def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> 
         "--mesh-point", dest="mesh_points", type=_named(_mesh_point, "x,y,z@u,v"), nargs="+", action="extend",
         default=[], metavar="OBJECT=x,y,z@u,v", help=text,
     )  # fmt: skip
+    for flag, what in (("keep", "belongs to it"), ("drop", "is background, such as what shows through a hole")):
+        text = f"stroke in its box over what {what}: a line through pixels of the upright photo; may be repeated"
+        parser.add_argument(
+            f"--{flag}", type=_named(parse_stroke, "x,y,x,y,…"), nargs="+", action="extend", default=[],
+            metavar="OBJECT=x,y,x,y,…", help=text,
+        )  # fmt: skip
 
 
 def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
@@ -295,10 +315,12 @@ def add_object_details(fields: dict[str, dict[str, Any]], options: argparse.Name
             if name not in fields:
                 raise _unknown_object(flag, name, fields)
             fields[name][field] = value
-    for name, point in options.mesh_points:
-        if name not in fields:
-            raise _unknown_object("mesh-point", name, fields)
-        fields[name]["mesh_points"] = (*fields[name].get("mesh_points", ()), point)
+    # What may be given several times for one object.
+    for flag, field in (("mesh-point", "mesh_points"), ("keep", "keep"), ("drop", "drop")):
+        for name, value in getattr(options, field):
+            if name not in fields:
+                raise _unknown_object(flag, name, fields)
+            fields[name][field] = (*fields[name].get(field, ()), value)
 
 
 def _unknown_object(flag: str, name: str, fields: dict[str, dict[str, Any]]) -> InputError:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs from a photo to its video: ``run``, ``reconstruct``, ``correct``, ``import``, ``light``, ``render``."""
+"""The verbs from a photo to its video: ``run``, ``propose``, ``reconstruct``, ``correct``, ``import``, ``light`` and
+``render``."""
 
 from __future__ import annotations
 
@@ -8,10 +9,11 @@ from pathlib import Path
 
 from ...physgen_addon.render.render_options import require_video_name
 from ...sim.app.default_motion import tells_motion
+from ...sim.app.propose import PICTURE_FILE, choose, propose
 from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
 from ...sim.cache.bake_folder import load_bake
 from ...sim.errors import InputError
-from ...sim.events import IsCancelled
+from ...sim.events import IsCancelled, never
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 from ...sim.reconstruct.reconstruct_options import object_names
 from ...sim.scene.folder import load_scene
@@ -28,6 +30,7 @@ from .flags import (
     add_reconstruction_flags,
     add_sun_flags,
     bake_options,
+    box_text,
     chat_request,
     corrected_requests,
     light_request,
@@ -65,6 +68,13 @@ def add_reconstruct(parser: argparse.ArgumentParser) -> None:
     add_reasoning_flags(parser)
     add_physics_flags(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
+
+
+def add_propose(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen propose``."""
+    parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    text = "folder for the numbered picture and the list (default: NAME_proposals in the current folder)"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=text)
 
 
 def add_correct(parser: argparse.ArgumentParser) -> None:
@@ -112,6 +122,7 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
     if options.still and told:
         raise InputError("--still: a motion is given as well (--velocity, --spin or --set); leave one of them out")
     work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
+    use_found_boxes(options, work / "proposals", terminal, cancelled)
     request = stages.RunRequest(
         photo=options.photo,
         objects=object_requests(options, work / "scene"),
@@ -137,6 +148,8 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
 def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen reconstruct``; the exit code."""
     settings, ask = reconstruct_options(options), chat_request(options)
+    beside = options.out.resolve()
+    use_found_boxes(options, beside.with_name(f"{beside.name}_proposals"), terminal, cancelled)
     requests = object_requests(options, options.out)
     physics = physics_options(options)
     require_physics(len(requests), physics)
@@ -154,6 +167,42 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
     terminal({"event": "done", "scene": str(options.out)})
     terminal.line(f"scene: {options.out}")
     return 0
+
+
+def run_propose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen propose``; the exit code."""
+    out = options.out or Path(f"{options.photo.stem}_proposals")
+    found = propose(options.photo, out=out, on_event=terminal, cancelled=cancelled)
+    terminal({"event": "done", "proposals": [to_json(item) for item in found], "out": str(out)})
+    for number, item in enumerate(found, start=1):
+        terminal.line(f"{number:>2}  --box {box_text(item.box)}  score {item.score:.2f}")
+    terminal.line(f"picture: {out / PICTURE_FILE}")
+    return 0
+
+
+def use_found_boxes(
+    options: argparse.Namespace, folder: Path, terminal: Terminal, cancelled: IsCancelled = never
+) -> None:
+    """Set the boxes in ``options`` to those of objects found in the photo, if no object was given; say so.
+
+    folder: for the numbered picture. Raises InputError where nothing stands out, and for ``--pick`` beside boxes.
+    """
+    if options.box or options.mask or options.masks is not None or options.only:
+        if options.pick:
+            raise InputError("--pick: chooses among objects that are found without a box; leave out one of the two")
+        return
+    found = propose(options.photo, out=folder, on_event=terminal, cancelled=cancelled)
+    wanted = max(len(options.name), len(options.size), len(options.velocity), len(options.spin))
+    wanted = max(wanted, len(options.preset) if len(options.preset) > 1 else 0)
+    chosen = choose(found, options.pick, wanted)
+    options.box = [item.box for item in (found[index] for index in chosen)]
+    numbers = " and ".join(str(index + 1) for index in chosen)
+    boxes = " ".join(box_text(box) for box in options.box)
+    message = (
+        f"no --box given: goes on with {numbers} of {len(found)} objects found (--box {boxes}); the picture "
+        f"{folder / PICTURE_FILE} numbers them all: choose others by --pick, or draw a --box"
+    )
+    terminal({"event": "notice", "stage": "propose", "message": message})
 
 
 def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:

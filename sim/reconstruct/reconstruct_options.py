@@ -17,6 +17,9 @@ SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
 BACKS = ("auto", "symmetric", "flat")
 UP_AXES = ("auto", "+x", "-x", "+y", "-y", "+z", "-z")
 Pixel = tuple[float, float]
+Stroke = tuple[Pixel, ...]
+MAX_STROKE_PLACES = 20_000
+"""Places of all strokes of an object together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +29,7 @@ class ObjectRequest:
     box: x0, y0, x1, y1, x1 and y1 exclusive; loose is fine. None uses the bounding box of ``mask``; one of the two is
         required.
     mask: a picture of the photo's size or aspect ratio, bright where the object is visible; replaces the segmentation.
+    keep, drop: strokes over what certainly is, or is not, the object: polylines of pixels, for a box only.
     name: names the object's files; None gives object_1, object_2, … by position.
     kind: what the object is, in a word or two ("orange", "book"); sets material, thickness and roughness where these
         are not given. None: unknown.
@@ -42,6 +46,8 @@ class ObjectRequest:
 
     box: tuple[float, float, float, float] | None = None
     mask: Path | None = None
+    keep: tuple[Stroke, ...] = ()
+    drop: tuple[Stroke, ...] = ()
     name: str | None = None
     kind: str | None = None
     size_m: float | None = quantity(None, 1e-4, 1e3, "metres")
@@ -65,12 +71,37 @@ class ObjectRequest:
                 self.box,
                 "give x0,y0,x1,y1 as four finite numbers of pixels",
             )
+        for name in ("keep", "drop"):
+            _require_strokes(name, getattr(self, name))
         require_quantities(self, "")
         for name, choices in (("shape", SHAPES), ("back", BACKS), ("mesh_up", UP_AXES)):
             require(getattr(self, name) in choices, name, getattr(self, name), f"choose {', '.join(choices)}")
         for place, pixel in self.mesh_points:
             good = len(place) == 3 and len(pixel) == 2 and all(math.isfinite(v) for v in (*place, *pixel))
             require(good, "mesh_points", (place, pixel), "give x,y,z on the mesh and x,y in the photo")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An object that was found in a photo without a box.
+
+    box: x0, y0, x1, y1 around it, loose, in pixels of the upright photo. score: 0 to 1, how likely it is an object.
+
+    >>> import physgen
+    >>> physgen.ObjectRequest(box=physgen.Proposal((215, 960, 475, 1190), 0.9).box).box
+    (215, 960, 475, 1190)
+    """
+
+    box: tuple[float, float, float, float]
+    score: float
+
+
+def _require_strokes(name: str, strokes: Sequence[Stroke]) -> None:
+    for stroke in strokes:
+        good = len(stroke) > 0 and all(len(p) == 2 and all(math.isfinite(v) for v in p) for p in stroke)
+        require(good, name, stroke if len(stroke) < 4 else "a stroke", "give finite pixels x,y,x,y,… along the stroke")
+    count = sum(map(len, strokes))
+    require(count <= MAX_STROKE_PLACES, name, f"{count} places", f"give at most {MAX_STROKE_PLACES} in all")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,6 +74,31 @@ def _label(picture: Pixels, mask: Mask, name: str, colour: Colour) -> None:
     cv2.putText(picture, ascii_name, (x, y - 1), font, scale, (255, 255, 255), thick, cv2.LINE_AA)
 
 
+def numbered_boxes(pixels: Pixels, boxes: Sequence[Sequence[float]], chosen: Sequence[int]) -> Pixels:
+    """Return the picture with ``boxes``, x0, y0, x1, y1, and their numbers from 1; those not ``chosen`` are thin and
+    grey."""
+    picture = pixels.copy()
+    size = max(picture.shape)
+    order = [*(i for i in range(len(boxes)) if i not in chosen), *chosen]
+    for index in order:
+        colour = colour_of(index) if index in chosen else (150, 150, 150)
+        thick = max(1, round(size / (320 if index in chosen else 640)))
+        x0, y0, x1, y1 = (round(v) for v in boxes[index])
+        corners = (x0, y0), (max(x0, x1 - 1), max(y0, y1 - 1))
+        cv2.rectangle(picture, *corners, (255, 255, 255), thick + 2, cv2.LINE_AA)
+        cv2.rectangle(picture, *corners, colour, thick, cv2.LINE_AA)
+    for index in order:
+        x0, y0 = (max(0, round(v)) for v in boxes[index][:2])
+        scale, text = size / 900, str(index + 1)
+        thick = max(1, round(2 * scale))
+        (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
+        corner = (x0 + width + 2 * base, y0 + height + 2 * base)
+        cv2.rectangle(picture, (x0, y0), corner, colour_of(index) if index in chosen else (150, 150, 150), cv2.FILLED)
+        place = (x0 + base, y0 + height + base)
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), thick, cv2.LINE_AA)
+    return picture
+
+
 def cut_out(pixels: Pixels, seen: Mask, full: Mask) -> Pixels:
     """Return the object alone on grey, with its completed part hatched."""
     rows, columns = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))

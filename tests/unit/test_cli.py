@@ -78,7 +78,7 @@ def test_vectors_may_start_with_a_minus():
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["run"], ["run", "p.jpg", "--out", "v.mp4"], ["run", "p.jpg", "--box", "1,2,3", "--out", "v.mp4"], ["dance"],
+    [[], ["run"], ["propose"], ["run", "p.jpg", "--box", "1,2,3", "--out", "v.mp4"], ["dance"],
      ["bake", "s"],
      ["bake", "s", "--out", "b", "--preset", "unobtainium"], ["run", "p.jpg", "--box", "0,0,nan,4", "--out", "v.mp4"]],
 )  # fmt: skip

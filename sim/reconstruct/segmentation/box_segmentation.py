@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .mask_cleanup import drop_ground_shadow, fill_holes, open_holes, settle_outline, smooth_outline
+from .mask_cleanup import drop_ground_shadow, fill_holes, open_holes, settle_outline, smooth_outline, touching
 from .mask_proposals import (
     BoxCrop,
     crop_around_box,
@@ -28,6 +28,7 @@ from .mask_proposals import (
     score,
     without_notches,
 )
+from .strokes import Strokes, no_strokes
 
 Mask = NDArray[np.bool_]
 
@@ -141,13 +142,14 @@ def segment(
     warn: Callable[[str], None] = lambda _: None,
     *,
     others: Mask | None = None,
+    strokes: Strokes | None = None,
 ) -> Mask:
     """Return the object in ``box`` as a mask (H, W).
 
     pixels: (H, W, 3) sRGB. where: names the object in messages. warn: called when the mask is a guess or incomplete.
     others: (H, W) pixels of other objects: neither this one nor background to learn from; parts separated by them stay
-    together. Holes stay open where the background shows through. Raises InputError when the mask would be empty or
-    full.
+    together. strokes: what certainly belongs to it, and what does not. Holes stay open where the background shows
+    through. Raises InputError when the mask would be empty or full.
     """
     height, width = pixels.shape[:2]
     x0, y0, x1, y1 = box
@@ -161,22 +163,33 @@ def segment(
     taken = np.zeros(crop.shape[:2], dtype=bool) if others is None else others[top:bottom, left:right]
     if taken[inner[1] : inner[3], inner[0] : inner[2]].all():
         raise InputError(f"{where}: other objects fill its whole box; draw the boxes around the visible part of each")
-    found, notices, sides = _coarse(crop, inner, taken, iterations)
-    if found.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
+    told = no_strokes(pixels.shape) if strokes is None else strokes
+    keep, drop = (np.ascontiguousarray(part[top:bottom, left:right]) for part in (told.keep, told.drop))
+    keep = keep & ~taken
+    found, notices, sides = _coarse(crop, inner, taken, iterations, keep, drop)
+    if not keep.any() and found.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
         sides = []
         notices = ["colour does not separate the object from the background; an ellipse in the box is used instead"]
         found = _ellipse(crop.shape[:2], inner)
     else:
-        found = open_holes(crop, found)
+        opened = open_holes(crop, found)
+        # What the user keeps is no hole, whatever shows there.
+        found = opened | touching(found & ~opened, keep) if keep.any() else opened
         if crop.shape[0] * crop.shape[1] <= FINE_PIXELS:
-            found = _fine(crop, inner, found, taken)
-        found = settle_outline(crop, drop_ground_shadow(crop, largest_part(found & ~taken, taken)))
-    found = fill_holes(crop, largest_part(found & ~taken, taken))
-    found = smooth_outline(found) & ~taken
+            found = _fine(crop, inner, found, taken, keep, drop)
+        found = settle_outline(crop, drop_ground_shadow(crop, _kept_part(found & ~taken, taken, keep)))
+    found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep))
+    if keep.any():
+        # Between what is kept and the rest their mixed colours look like a third one: bridge the groove.
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
+        reach = 2 * max(8, round(0.08 * float(np.sqrt(found.sum())))) + 1
+        near = cv2.dilate(keep.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
+        found |= (cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0) & near
+    found = (smooth_outline(found) | keep) & ~taken & ~drop
     found[:, : inner[0]] = found[: inner[1]] = False
     found[:, inner[2] :] = found[inner[3] :] = False
     mask = np.zeros((height, width), dtype=bool)
-    mask[top:bottom, left:right] = largest_part(found, taken)
+    mask[top:bottom, left:right] = _kept_part(found, taken, keep)
     if mask.sum() < MIN_AREA:
         raise InputError(f"{where}: nothing was found in the box; draw it closer around the object")
     for notice in notices:
@@ -189,6 +202,12 @@ def segment(
             "and its size and foot are guesses"
         )
     return mask
+
+
+def _kept_part(mask: Mask, others: Mask, keep: Mask) -> Mask:
+    """The largest part of ``mask``, and all parts with pixels of ``keep``."""
+    largest = largest_part(mask, others)
+    return largest | touching(mask, keep) if keep.any() else largest
 
 
 def photo_sides(mask: Mask, share: float = 0.1) -> list[str]:
@@ -231,7 +250,9 @@ def check_distinct(masks: Sequence[Mask], names: Sequence[str]) -> None:
                 )
 
 
-def _coarse(crop: NDArray[np.uint8], inner: Box, taken: Mask, iterations: int) -> tuple[Mask, list[str], list[str]]:
+def _coarse(
+    crop: NDArray[np.uint8], inner: Box, taken: Mask, iterations: int, keep: Mask, drop: Mask
+) -> tuple[Mask, list[str], list[str]]:
     """The best proposal (h, w) at the crop's size, notices about it, and sides of the box that may cut it."""
     height, width = crop.shape[:2]
     scale = min(1.0, COARSE_SIZE / max(height, width))
@@ -239,11 +260,19 @@ def _coarse(crop: NDArray[np.uint8], inner: Box, taken: Mask, iterations: int) -
     small = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     closed = cv2.resize(taken.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     x0, y0, x1, y1 = (round(v * scale) for v in inner)
-    view = crop_around_box(small, (x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)), closed)
+    # A stroke is thinner than a pixel of the copy: keep every pixel that it touches, unless both do.
+    own, other = (cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA) for part in (keep, drop))
+    view = crop_around_box(
+        small,
+        (x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)),
+        closed,
+        keep=(own > other) & ~closed,
+        drop=(other > own) & ~closed,
+    )
     if not view.inside.any():
         return np.zeros((height, width), dtype=bool), [], []
     raw = proposals(view, iterations)
-    guesses = [largest_part(mask, closed) for mask in raw]
+    guesses = [_kept_part(mask, closed, view.keep) for mask in raw]
     for index, mask in enumerate(list(guesses)):
         whole = without_notches(mask, view.inside)
         if whole is not None:
@@ -251,16 +280,17 @@ def _coarse(crop: NDArray[np.uint8], inner: Box, taken: Mask, iterations: int) -
             raw.append(raw[index] | whole)
     ground = ground_like(view)
     best = int(np.argmax([score(view, mask, ground) for mask in guesses]))
-    if outline_strength(view, guesses[best]) < FAINT:
+    if outline_strength(view, guesses[best]) < FAINT and not view.keep.any():
         return np.zeros((height, width), dtype=bool), [], []
     full = cv2.resize(guesses[best].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(full > 0.5), mask_warnings(view, raw[best], guesses[best]), cut_sides(view, guesses[best])
 
 
-def _fine(crop: NDArray[np.uint8], inner: Box, found: Mask, taken: Mask) -> Mask:
+def _fine(crop: NDArray[np.uint8], inner: Box, found: Mask, taken: Mask, keep: Mask, drop: Mask) -> Mask:
     """``found`` with its outline re-estimated at full resolution, within a band of a few pixels."""
     band = max(3, round(2.0 * max(crop.shape[:2]) / COARSE_SIZE))
-    refined = largest_part(refine(crop_around_box(crop, inner, taken), found, band), taken)
+    view = crop_around_box(crop, inner, taken, keep=keep, drop=drop)
+    refined = _kept_part(refine(view, found, band), taken, keep)
     # If both sides share colours the band can collapse: keep the first outline then.
     return refined if 0.9 * found.sum() < refined.sum() < 1.1 * found.sum() else found
 

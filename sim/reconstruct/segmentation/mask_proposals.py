@@ -90,12 +90,19 @@ LIMIT = 10.0
 """Log likelihood ratios are clipped here."""
 
 
-def graph_cut(ratio: NDArray[np.float32], contrast: NDArray[np.uint8], smoothness: float, *, barred: Mask) -> Mask:
+def graph_cut(
+    ratio: NDArray[np.float32],
+    contrast: NDArray[np.uint8],
+    smoothness: float,
+    *,
+    barred: Mask,
+    certain: Mask | None = None,
+) -> Mask:
     """Return the mask (H, W) of least cost.
 
     ratio: (H, W) log likelihood ratio of object to background. contrast: (H, W, 2) two channels whose differences
     attract the outline. smoothness: cost of a pixel of outline across equal colours, at least 1, in units of ``ratio``.
-    barred: certainly not the object.
+    barred: certainly not the object. certain: certainly the object.
     """
     level = (np.clip(ratio, -LIMIT, LIMIT) + LIMIT) / (2.0 * LIMIT) * LEVELS
     image = np.dstack([np.round(level).astype(np.uint8), contrast])
@@ -104,6 +111,8 @@ def graph_cut(ratio: NDArray[np.float32], contrast: NDArray[np.uint8], smoothnes
     rest, own = _single_gaussian(0.0, variance), _single_gaussian(LEVELS, variance)
     labels = np.where(ratio > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[barred] = cv2.GC_BGD
+    if certain is not None:
+        labels[certain & ~barred] = cv2.GC_FGD
     cv2.grabCut(np.ascontiguousarray(image), labels, (0, 0, 1, 1), rest, own, 1, cv2.GC_EVAL_FREEZE_MODEL)
     return np.asarray((labels & 1).astype(bool))
 
@@ -144,7 +153,8 @@ class BoxCrop:
     """A small copy of the box and its surroundings.
 
     pixels: (h, w, 3) uint8 sRGB. lab: (h, w, 3) CIELAB, slightly smoothed. texture: (h, w). box: x0, y0, x1, y1.
-    others: (h, w) pixels of other objects: neither this one nor its background.
+    others: (h, w) pixels of other objects: neither this one nor its background. keep, drop: (h, w) pixels that the user
+    says belong to the object, or to its background.
     """
 
     pixels: NDArray[np.uint8]
@@ -152,6 +162,8 @@ class BoxCrop:
     texture: NDArray[np.float32]
     box: Box
     others: Mask
+    keep: Mask
+    drop: Mask
 
     @property
     def inside(self) -> Mask:
@@ -159,7 +171,7 @@ class BoxCrop:
         x0, y0, x1, y1 = self.box
         result = np.zeros(self.others.shape, dtype=bool)
         result[y0:y1, x0:x1] = True
-        return result & ~self.others
+        return result & ~self.others & ~self.drop
 
     @property
     def outside(self) -> Mask:
@@ -167,11 +179,14 @@ class BoxCrop:
         x0, y0, x1, y1 = self.box
         result = ~self.others
         result[y0:y1, x0:x1] = False
-        return result
+        return result | self.drop
 
 
-def crop_around_box(pixels: NDArray[np.uint8], box: Box, others: Mask) -> BoxCrop:
+def crop_around_box(
+    pixels: NDArray[np.uint8], box: Box, others: Mask, *, keep: Mask | None = None, drop: Mask | None = None
+) -> BoxCrop:
     """Return the ``BoxCrop`` of a small copy ``pixels`` (h, w, 3)."""
+    empty = np.zeros(pixels.shape[:2], dtype=bool)
     smooth = cv2.GaussianBlur(pixels.astype(np.float32) / 255.0, (0, 0), 0.8)
     lab = np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), dtype=np.float32)
     light = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
@@ -179,7 +194,15 @@ def crop_around_box(pixels: NDArray[np.uint8], box: Box, others: Mask) -> BoxCro
     spread = np.sqrt(np.maximum(cv2.GaussianBlur(light**2, (0, 0), 2.0) - mean**2, 0.0))
     # An edge between two plain surfaces is not texture: use the calmest window around each pixel.
     calm = cv2.erode(spread, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9)))
-    return BoxCrop(pixels, lab, np.asarray(TEXTURE * calm, dtype=np.float32), box, others)
+    return BoxCrop(
+        pixels,
+        lab,
+        np.asarray(TEXTURE * calm, dtype=np.float32),
+        box,
+        others,
+        empty if keep is None else keep,
+        empty if drop is None else drop,
+    )
 
 
 def ground_likelihood(view: BoxCrop, where: Mask, asked: Mask, shades: Sequence[float] = SHADES) -> NDArray[np.float32]:
@@ -233,6 +256,8 @@ def proposals(view: BoxCrop, rounds: int) -> list[Mask]:
         found.append(propose(view, unlike > np.quantile(unlike[inside], 0.6), ground, shades, rounds))
         if shades:
             found.append(propose(view, inside & (by_place > 0.0), ground, shades, rounds))
+            if view.keep.any():
+                found.append(propose(view, view.keep, ground, shades, rounds))
     found.append(_grabcut(view, rounds))
     return found
 
@@ -245,10 +270,12 @@ def propose(view: BoxCrop, start: Mask, ground: NDArray[np.float32], shades: Seq
     inside = view.inside
     features = np.dstack([view.lab, view.texture])[inside]
     by_place = prior(view)
-    contrast = _contrast(view.lab)
-    found = start & inside
+    contrast = principal_contrast(view.lab)
+    keep = view.keep & inside
+    found = (start & inside) | keep
+    stroked = _stroked(view, inside)
     for turn in range(rounds):
-        if found.sum() < 20:
+        if found.sum() < 20 and not keep.any():
             return np.zeros_like(found)
         if turn == 2:
             rest = _background(view) | (inside & ~found & (by_place < 0.0))
@@ -256,19 +283,40 @@ def propose(view: BoxCrop, start: Mask, ground: NDArray[np.float32], shades: Seq
         own = learn(features[found[inside]], OBJECT_PARTS).log_likelihood(features)
         ratio = np.zeros(inside.shape, dtype=np.float32)
         ratio[inside] = np.clip(own - ground, -4.0, 4.0)
-        new = graph_cut(ratio + by_place, contrast, SMOOTHNESS, barred=~inside)
+        if stroked is not None:
+            ratio[inside] = np.clip(ratio[inside] + stroked, -4.0, 4.0)
+        new = graph_cut(ratio + by_place, contrast, SMOOTHNESS, barred=~inside, certain=keep)
         if (new == found).all() and turn > 2:
             break
         found = new
     return found
 
 
+def _stroked(view: BoxCrop, inside: Mask) -> NDArray[np.float32] | None:
+    """Log likelihood ratio (n,) of the pixels ``inside`` by the strokes alone: a stroke speaks for its own colours, the
+    louder the nearer, while nothing unlike it lies in between; None without strokes."""
+    if not view.keep.any() and not (view.drop & ~view.others).any():
+        return None
+    rows, columns = np.mgrid[: inside.shape[0], : inside.shape[1]].astype(np.float32) / max(inside.shape) * (PLACE * 2)
+    features = np.dstack([view.lab, view.texture, columns, rows])
+    result = np.zeros(int(inside.sum()), dtype=np.float32)
+    for strokes, sign in ((view.keep, 1.0), (view.drop, -1.0)):
+        if strokes.any():
+            spread = (4.0, 4.0, 4.0, 4.0, REACH * PLACE, REACH * PLACE)
+            model = learn(features[strokes], 3, spread)
+            # Above the density three standard deviations away, a pixel is like the stroke.
+            least = float(model.log_norms.max()) - 4.5
+            likeness = np.clip((model.log_likelihood(features[inside]) - least) / 4.5, 0.0, 1.0)
+            result += np.float32(sign * 8.0) * likeness.astype(np.float32)
+    return result
+
+
 def refine(view: BoxCrop, found: Mask, band: int) -> Mask:
     """Return ``found`` (h, w) with its outline re-estimated within ``band`` pixels, by the colours on both sides."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
     binary = found.astype(np.uint8)
-    core = cv2.erode(binary, kernel, borderValue=0) > 0
-    beyond = (cv2.dilate(binary, kernel) == 0) & ~view.others
+    core = ((cv2.erode(binary, kernel, borderValue=0) > 0) | view.keep) & ~view.drop
+    beyond = ((cv2.dilate(binary, kernel) == 0) & ~view.others & ~view.keep) | view.drop
     open_ = ~core & ~beyond & view.inside
     if core.sum() < 20 or beyond.sum() < 50 or not open_.any():
         return found
@@ -277,12 +325,13 @@ def refine(view: BoxCrop, found: Mask, band: int) -> Mask:
     ratio = np.full(found.shape, -LIMIT, dtype=np.float32)
     ratio[core] = LIMIT
     ratio[open_] = np.clip(own - ground_likelihood(view, beyond, open_), -4.0, 4.0)
-    return graph_cut(ratio, _contrast(view.lab), SMOOTHNESS, barred=~core & ~open_)
+    return graph_cut(ratio, principal_contrast(view.lab), SMOOTHNESS, barred=~core & ~open_)
 
 
 def _grabcut(view: BoxCrop, rounds: int) -> Mask:
     labels = np.where(view.inside, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     labels[_background(view)] = cv2.GC_BGD
+    labels[view.keep & view.inside] = cv2.GC_FGD
     return grabcut(view.pixels, labels, rounds)
 
 
@@ -388,8 +437,8 @@ def _background(view: BoxCrop) -> Mask:
     return outside | rim
 
 
-def _contrast(lab: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The first two principal components (h, w, 2) of colour."""
+def principal_contrast(lab: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return the first two principal components (h, w, 2) of colour."""
     flat = lab.reshape(-1, 3)
     away = flat - flat.mean(axis=0)
     vectors = np.linalg.eigh(away.T @ away)[1]

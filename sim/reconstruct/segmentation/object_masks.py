@@ -23,6 +23,7 @@ from ..stage_cache import Arrays, Notice, StageCache, Steps
 from .box_segmentation import Box, check_distinct, pixel_box, segment
 from .mask_proposals import largest_part
 from .model_masks import model_mask
+from .strokes import Strokes, drawn_strokes, require_apart
 
 Mask = NDArray[np.bool_]
 
@@ -124,6 +125,8 @@ def segment_objects(
         _box_of(given[i]) if item.box is None else pixel_box(item.box, picture.scale, *size, name)
         for i, (item, name) in enumerate(zip(objects, names, strict=True))
     ]
+    strokes = [drawn_strokes(item, picture, box, steps.notice) for item, box in zip(objects, boxes, strict=True)]
+    require_apart(strokes, names, picture.scale)
     wanted = [i for i in range(len(objects)) if i not in given]
     soft: SoftSegmenter | None = None
     if options.segmenter is not None and wanted:
@@ -132,7 +135,8 @@ def segment_objects(
         if isinstance(cutter, SoftSegmenter):
             soft = cutter
         else:
-            given |= dict(zip(wanted, cutter(picture.pixels, _corners(boxes, wanted)), strict=True))
+            cut_out = zip(wanted, cutter(picture.pixels, _corners(boxes, wanted)), strict=True)
+            given |= {i: (mask | strokes[i].keep) & ~strokes[i].drop for i, mask in cut_out}
     masks: dict[int, Mask] = dict(given)
     # Objects within another one's box, a toy on a chair, come first, so that the other can exclude their pixels.
     for i in sorted(range(len(names)), key=lambda i: _area(boxes[i])):
@@ -142,8 +146,9 @@ def segment_objects(
         known = [mask for j, mask in masks.items() if j in given or _within(boxes[j], boxes[i])]
         others = _near(boxes[i], np.logical_or.reduce([np.zeros(size[::-1], dtype=bool), *known]))
         if soft is not None:
-            by_model = partial(_cut_out, soft, picture.pixels, boxes[i], names[i], others)
+            by_model = partial(_cut_out, soft, picture.pixels, boxes[i], names[i], others, strokes[i])
             inputs = {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "others": others}
+            inputs |= {"keep": strokes[i].keep, "drop": strokes[i].drop}
             model = {"model": adapter_content("segmenter", options.segmenter)}
             cut = np.asarray(store.run("cut-out", inputs | model, by_model)["mask"], dtype=bool)
             if cut.any():
@@ -152,8 +157,8 @@ def segment_objects(
         made = store.run(
             "segment",
             {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "rounds": options.grabcut_iterations}
-            | {"others": others},
-            partial(_segmented, picture.pixels, boxes[i], names[i], options, others),
+            | {"others": others, "keep": strokes[i].keep, "drop": strokes[i].drop},
+            partial(_segmented, picture.pixels, boxes[i], names[i], options, others, strokes[i]),
         )
         masks[i] = np.asarray(made["mask"], dtype=bool)
     ordered = [masks[i] for i in range(len(names))]
@@ -186,15 +191,27 @@ def _within(inner: Box, outer: Box) -> bool:
 
 
 def _segmented(
-    pixels: NDArray[np.uint8], box: Box, name: str, options: ReconstructOptions, others: Mask, notice: Notice
+    pixels: NDArray[np.uint8],
+    box: Box,
+    name: str,
+    options: ReconstructOptions,
+    others: Mask,
+    strokes: Strokes,
+    notice: Notice,
 ) -> Arrays:
-    return {"mask": segment(pixels, box, name, options.grabcut_iterations, notice, others=others)}
+    return {"mask": segment(pixels, box, name, options.grabcut_iterations, notice, others=others, strokes=strokes)}
 
 
 def _cut_out(
-    soft: SoftSegmenter, pixels: NDArray[np.uint8], box: Box, name: str, others: Mask, notice: Notice
+    soft: SoftSegmenter,
+    pixels: NDArray[np.uint8],
+    box: Box,
+    name: str,
+    others: Mask,
+    strokes: Strokes,
+    notice: Notice,
 ) -> Arrays:
-    found = model_mask(soft, pixels, box, name, others, notice)
+    found = model_mask(soft, pixels, box, name, others, notice, strokes=strokes)
     return {"mask": np.zeros(pixels.shape[:2], dtype=bool) if found is None else found}
 
 

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""Photo → objects worth reconstructing, without a box: a list, and a numbered picture of them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from ..atomic import write_bytes, write_json
+from ..errors import InputError
+from ..events import IsCancelled, OnEvent, ignore, never
+from ..reconstruct.reconstruct_options import Proposal
+from ..scene.folder import file_hash
+from ..validation import parse, read_json, to_json
+
+FORMAT = "physgen-proposals/1"
+LIST_FILE, PICTURE_FILE = "proposals.json", "proposals.jpg"
+REVISION = 1
+"""Raised with every change that changes which objects are proposed."""
+SEARCHED = 1024
+"""Longest side in pixels of the photo as it is read; the search itself needs less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposalRecord:
+    """``proposals.json``: the objects found in a photo, best first; boxes in pixels of the upright photo."""
+
+    format: str = FORMAT
+    revision: int = REVISION
+    photo: str
+    photo_hash: str
+    width: int
+    height: int
+    proposals: tuple[Proposal, ...]
+
+
+def propose(
+    photo: str | Path,
+    *,
+    out: str | Path | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> tuple[Proposal, ...]:
+    """Return the objects of ``photo`` that stand out, best first: at most 20, each with a box and a score from 0 to 1.
+
+    out: folder for ``proposals.jpg``, the photo with their numbers, and ``proposals.json``; None writes nothing. The
+    same photo is not searched twice into the same folder.
+
+    >>> import physgen
+    >>> found = physgen.propose("photo.jpg", out="proposals")  # doctest: +SKIP
+    >>> cup = physgen.ObjectRequest(box=found[0].box)  # doctest: +SKIP
+
+    Raises InputError for an unreadable photo and where nothing stands out, Cancelled when cancelled; nothing is
+    written then.
+    """
+    photo = Path(photo)
+    if not photo.is_file():
+        raise InputError(f"{photo}: there is no such photo; check its name")
+    content = file_hash(photo)
+    if out is not None:
+        earlier = _earlier(Path(out), content)
+        if earlier is not None:
+            return earlier
+    # The pipeline's modules cost a second of imports that an up-to-date list does not need.
+    from ..reconstruct.photo import load_photo
+    from ..reconstruct.report_pictures import numbered_boxes
+    from ..reconstruct.segmentation.object_proposals import propose_boxes
+    from ..reconstruct.stage_cache import Steps
+
+    steps = Steps(2, on_event, cancelled)
+    steps.begin("photo")
+    picture = load_photo(photo, SEARCHED)
+    steps.begin("propose objects")
+    found = tuple(
+        Proposal(tuple(round(v / picture.scale) for v in item.box), item.score)  # type: ignore[arg-type]
+        for item in propose_boxes(picture.pixels)
+    )
+    if not found:
+        raise InputError(f"{photo}: no object stands out in it; draw a box around each one: --box x0,y0,x1,y1")
+    steps.finish()
+    if out is not None:
+        boxes = [tuple(v * picture.scale for v in item.box) for item in found]
+        shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
+        file = io.BytesIO()
+        Image.fromarray(shown).save(file, format="JPEG", quality=90)
+        write_bytes(Path(out) / PICTURE_FILE, file.getvalue())
+        width, height = picture.original_size
+        record = ProposalRecord(
+            photo=str(photo.resolve()), photo_hash=content, width=width, height=height, proposals=found
+        )
+        write_json(Path(out) / LIST_FILE, to_json(record))
+    return found
+
+
+def _earlier(folder: Path, content: str) -> tuple[Proposal, ...] | None:
+    """The proposals in ``folder`` for a photo with the hash ``content``; None without any."""
+    try:
+        record = parse(ProposalRecord, read_json(folder / LIST_FILE), LIST_FILE)
+    except InputError:
+        return None
+    same = (record.format, record.revision, record.photo_hash) == (FORMAT, REVISION, content)
+    return record.proposals if same and record.proposals and (folder / PICTURE_FILE).is_file() else None
+
+
+LEAST_CHOSEN, BELOW_BEST, MOST_CHOSEN = 0.8, 0.1, 3
+"""Score below which a proposal is not used unless it is the best, or the user says so; how much worse than the best
+those are that are used too; how many are used."""
+
+
+def best_proposals(found: Sequence[Proposal]) -> list[int]:
+    """Return the indices of the proposals, best first, with which to go on when the user says nothing."""
+    if not found:
+        return []
+    least = max(LEAST_CHOSEN, found[0].score - BELOW_BEST)
+    return [i for i, item in enumerate(found) if item.score >= least][:MOST_CHOSEN] or [0]
+
+
+def choose(found: Sequence[Proposal], picked: Sequence[int], least: int) -> list[int]:
+    """Return the indices of the proposals to go on with: the numbers ``picked`` (from 1), else the best.
+
+    least: number of objects that the request speaks of; 0 for any. Raises InputError for a number that is not there or
+    comes twice.
+    """
+    if not picked:
+        return best_proposals(found) if least == 0 else list(range(min(least, len(found))))
+    for number in picked:
+        if not 1 <= number <= len(found) or list(picked).count(number) > 1:
+            raise InputError(f"--pick {number}: give numbers from 1 to {len(found)}, each once")
+    return [number - 1 for number in picked]

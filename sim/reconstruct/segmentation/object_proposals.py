@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: MIT
+"""Objects of a photo without a box: where they are, and how likely each is an object.
+
+Candidates come from a saliency map (Zhu, Liang, Wei & Sun, "Saliency optimization from robust background detection",
+CVPR 2014), from what differs from the ground along the photo's border, and from regions inside closed contours. The
+best are segmented in their boxes as if a user had drawn these, and judged by what comes out: closed contour, contrast
+with the surroundings, standing on the ground, not cut by the photo's border. No learned weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from skimage.segmentation import felzenszwalb, slic
+
+from ..reconstruct_options import Proposal
+from .mask_cleanup import largest_component
+from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
+from .mask_proposals import proposals as mask_proposals
+from .mask_proposals import score as objectness
+
+Mask = NDArray[np.bool_]
+Pixels = NDArray[np.uint8]
+Box = tuple[float, float, float, float]
+
+SIDE = 320
+"""Longest side in pixels of the copy that is searched."""
+MOST = 20
+"""Largest number of proposals."""
+EXAMINED = 18
+"""Candidates that are segmented; a second for ten of them."""
+MARGIN = 0.06
+"""Margin of a proposed box around what was found in it, over its longer side: boxes are to be loose."""
+LEAST_AREA, MOST_AREA = 0.0025, 0.6
+"""Areas of objects over the photo's."""
+LEAST_SIDE = 0.035
+"""Least side of an object's box over the photo's shorter side."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A candidate on the copy. mask: (h, w). features: see ``FEATURES``."""
+
+    mask: Mask
+    features: NDArray[np.float64]
+
+
+def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
+    """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
+
+    Of two that overlap the better one is returned. The list is empty where nothing stands out.
+    """
+    scale = min(1.0, SIDE / max(pixels.shape[:2]))
+    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
+    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    found = [(item, _score(item.features)) for item in examined_candidates(small)]
+    # A whole goes before its parts, which often have the clearer outline.
+    found = [pair for pair in found if pair[1] >= LEAST_SCORE]
+    found.sort(key=lambda pair: -(pair[1] + WHOLE * float(np.log(pair[0].mask.mean()))))
+    across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
+    result = []
+    for item, value in sorted(_distinct(found), key=lambda pair: -pair[1])[:most]:
+        x0, y0, x1, y1 = _loose(_extent(item.mask), size)
+        box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
+        result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
+    return result
+
+
+def proposals_from_alpha(alpha: NDArray[np.floating], *, most: int = MOST) -> list[Proposal]:
+    """Return the objects in a model's ``alpha`` (H, W), 0 to 1, for a photo without a box: its connected parts.
+
+    Specks, gaps and parts below ``LEAST_AREA`` of the photo do not count. The score is the mean alpha of a part.
+    """
+    value = np.clip(np.nan_to_num(np.asarray(alpha, dtype=np.float32)), 0.0, 1.0)
+    size = (value.shape[1], value.shape[0])
+    side = max(1, round(0.004 * max(size))) * 2 + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    closed = cv2.morphologyEx((value > 0.5).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    result = []
+    for index in range(1, count):
+        part = labels == index
+        if stats[index, cv2.CC_STAT_AREA] < LEAST_AREA * value.size:
+            continue
+        x0, y0, x1, y1 = _loose(_extent(part), size)
+        result.append((int(part.sum()), Proposal((x0, y0, x1, y1), round(float(value[part].mean()), 3))))
+    return [item for _, item in sorted(result, key=lambda pair: -pair[0] * pair[1].score)][:most]
+
+
+def _extent(mask: Mask) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _loose(box: tuple[int, int, int, int], size: tuple[int, int]) -> Box:
+    x0, y0, x1, y1 = box
+    margin = MARGIN * max(x1 - x0, y1 - y0) + 1.0
+    return (
+        float(max(0.0, x0 - margin)),
+        float(max(0.0, y0 - margin)),
+        float(min(size[0], x1 + margin)),
+        float(min(size[1], y1 + margin)),
+    )
+
+
+def saliency(pixels: Pixels, segments: NDArray[np.int_]) -> NDArray[np.float32]:
+    """Return how much each pixel (h, w), 0 to 1, stands out from what is connected with the picture's border.
+
+    segments: (h, w) numbers of superpixels from 0. Zhu et al., equations 4 to 9.
+    """
+    # Half a second of imports that every bake and command would pay.
+    from scipy.sparse.csgraph import dijkstra
+    from scipy.sparse.linalg import spsolve
+
+    lab = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    count = int(segments.max()) + 1
+    flat = segments.ravel()
+    area = np.bincount(flat, minlength=count).astype(np.float64)
+    mean = np.stack([np.bincount(flat, lab[..., c].ravel(), count) for c in range(3)], axis=1) / area[:, None]
+    rows, columns = np.indices(segments.shape)
+    middle = np.stack(
+        [np.bincount(flat, (rows / max(segments.shape)).ravel(), count),
+         np.bincount(flat, (columns / max(segments.shape)).ravel(), count)], axis=1,
+    ) / area[:, None]  # fmt: skip
+    pairs = _neighbours(segments)
+    step = np.linalg.norm(mean[pairs[:, 0]] - mean[pairs[:, 1]], axis=1)
+    border = np.zeros(count, dtype=bool)
+    border[np.unique(np.concatenate([segments[0], segments[-1], segments[:, 0], segments[:, -1]]))] = True
+    # Small steps are shading: they must not add up along a floor.
+    least = np.full(count, np.inf)
+    np.minimum.at(least, pairs.ravel(), np.repeat(step, 2))
+    cut = float(least.mean())
+    graph = sparse.coo_matrix((np.maximum(step - cut, 1e-3), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    geodesic = dijkstra(graph.tocsr(), directed=False)
+    near = np.exp(-(geodesic**2) / (2.0 * 10.0**2))
+    connectivity = near[:, border].sum(axis=1) / np.sqrt(near.sum(axis=1))
+    behind = 1.0 - np.exp(-(connectivity**2) / 2.0)
+    colour = np.linalg.norm(mean[:, None] - mean[None], axis=2)
+    place = np.exp(-(np.linalg.norm(middle[:, None] - middle[None], axis=2) ** 2) / (2.0 * 0.25**2))
+    contrast = (colour * place * behind).sum(axis=1)
+    contrast = contrast / max(float(contrast.max()), 1e-9)
+    weight = np.exp(-(step**2) / (2.0 * 10.0**2)) + 0.1
+    both = sparse.coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    both = both + both.T
+    system = sparse.diags_array(behind + contrast + np.asarray(both.sum(axis=1)).ravel()) - both
+    value = np.clip(spsolve(system.tocsc(), contrast), 0.0, None)
+    value = value / max(float(value.max()), 1e-9)
+    return np.asarray(value[segments], dtype=np.float32)
+
+
+def _neighbours(segments: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Pairs (n, 2) of superpixels that touch, and those along the picture's border, each once."""
+    across = np.stack([segments[:, :-1].ravel(), segments[:, 1:].ravel()], axis=1)
+    down = np.stack([segments[:-1].ravel(), segments[1:].ravel()], axis=1)
+    pairs = np.sort(np.concatenate([across, down]), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+
+
+def _unlike_border(pixels: Pixels) -> NDArray[np.float32]:
+    """How little each pixel (h, w) looks like the photo's border, lit or shaded; log likelihood, larger is rarer."""
+    height, width = pixels.shape[:2]
+    view = crop_around_box(pixels, (0, 0, width, height), np.zeros((height, width), dtype=bool))
+    rim = np.ones((height, width), dtype=bool)
+    depth = max(3, round(0.05 * min(height, width)))
+    rim[depth:-depth, depth:-depth] = False
+    everything = np.ones_like(rim)
+    return np.asarray(-ground_likelihood(view, rim, everything).reshape(height, width), dtype=np.float32)
+
+
+def candidates(pixels: Pixels) -> list[Mask]:
+    """Return regions (h, w) of the copy that may be objects, unordered and overlapping."""
+    height, width = pixels.shape[:2]
+    smooth = np.asarray(cv2.bilateralFilter(pixels, 5, 30.0, 3.0), dtype=np.uint8)
+    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    segments = slic(lab, n_segments=300, compactness=12.0, start_label=0, convert2lab=False, channel_axis=-1)
+    stands_out = saliency(smooth, np.asarray(segments))
+    rare = _unlike_border(pixels)
+    maps = [stands_out, cv2.GaussianBlur(rare, (0, 0), 1.5)]
+    result: list[Mask] = []
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    for value in maps:
+        levels = np.quantile(value, (0.6, 0.7, 0.8, 0.87, 0.92, 0.96, 0.985))
+        for level in np.unique(levels):
+            above = cv2.morphologyEx((value > level).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+            result += _parts(above > 0)
+    for level in (0.25, 0.4, 0.55, 0.7):
+        result += _parts(stands_out > level)
+    for scale in (60.0, 180.0, 500.0):
+        regions = np.asarray(felzenszwalb(smooth, scale=scale, sigma=0.6, min_size=40))
+        result += [regions == index for index in range(int(regions.max()) + 1)]
+    result += _closed_contours(lab)
+    return [mask for mask in result if _plausible(mask, height, width)]
+
+
+def _parts(mask: Mask) -> list[Mask]:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    least = LEAST_AREA * mask.size
+    return [labels == index for index in range(1, count) if stats[index, cv2.CC_STAT_AREA] >= least]
+
+
+def _closed_contours(lab: NDArray[np.float32]) -> list[Mask]:
+    """What lies inside closed contours: strong edges with gaps bridged, filled."""
+    edges = edge_strength(lab)
+    result = []
+    for quantile, side in ((0.85, 3), (0.85, 7), (0.92, 5), (0.95, 9)):
+        strong = (edges > max(1.5, float(np.quantile(edges, quantile)))).astype(np.uint8)
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        closed = cv2.morphologyEx(strong, cv2.MORPH_CLOSE, kernel)
+        contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        for contour in contours:
+            filled = np.zeros_like(closed)
+            cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED)
+            result.append(filled > 0)
+    return result
+
+
+def _plausible(mask: Mask, height: int, width: int) -> bool:
+    area = int(mask.sum())
+    if not LEAST_AREA * mask.size <= area <= MOST_AREA * mask.size:
+        return False
+    x0, y0, x1, y1 = _extent(mask)
+    if min(x1 - x0, y1 - y0) < LEAST_SIDE * min(height, width) or (x1 - x0) * (y1 - y0) > 0.85 * mask.size:
+        return False
+    # What touches three sides of the photo is its background.
+    return (x0 == 0) + (y0 == 0) + (x1 == width) + (y1 == height) <= 2
+
+
+FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
+"""Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
+its outline on the photo's border; IoU of the candidate with what its box yields; height of its middle in the photo;
+share of its convex hull; logarithm of its share of the photo; share of it that could be ground, lit or shaded; share of
+the pixels below it that look like those beside it, as under something that stands on a floor; whether it may be nothing
+but shade on what surrounds it."""
+
+
+def examined_candidates(pixels: Pixels) -> list[Examined]:
+    """Return the most promising candidates of the copy ``pixels`` (h, w, 3), segmented in their boxes."""
+    height, width = pixels.shape[:2]
+    blurred = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.float32) / 255.0
+    lab = np.asarray(cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    edges = edge_strength(lab)
+    rough = [(mask, _promise(mask, lab, edges)) for mask in candidates(pixels)]
+    rough.sort(key=lambda pair: -pair[1])
+    chosen: list[tuple[Mask, tuple[int, int, int, int]]] = []
+    for mask, _ in rough:
+        box = _extent(mask)
+        if all(_box_iou(box, other) < 0.75 for _, other in chosen):
+            chosen.append((mask, box))
+        if len(chosen) == EXAMINED:
+            break
+    result: list[Examined] = []
+    for mask, box in chosen:
+        found, value, ground = _segmented(pixels, _loose(box, (width, height)), mask)
+        if found is not None and _plausible(found, height, width):
+            result.append(Examined(found, _features(found, mask, (value, ground), lab, edges)))
+    return result
+
+
+def _promise(mask: Mask, lab: NDArray[np.float32], edges: NDArray[np.float32]) -> float:
+    """A quick judgement of a candidate, larger is better."""
+    return (
+        1.0 * _on_edges(mask, edges)
+        + 0.6 * min(1.0, _contrast(mask, lab) / 30.0)
+        - 1.0 * _cut(mask)
+        + 0.4 * _solid(mask)
+        + 0.08 * float(np.log(mask.mean()))
+    )
+
+
+def _segmented(pixels: Pixels, box: Box, start: Mask) -> tuple[Mask | None, float, float]:
+    """The object (h, w) in ``box``, its objectness, and the share of it that could be ground, lit or shaded; None
+    where there is none."""
+    height, width = pixels.shape[:2]
+    x0, y0, x1, y1 = (round(v) for v in box)
+    pad = round(0.35 * max(x1 - x0, y1 - y0)) + 2
+    left, top, right, bottom = max(0, x0 - pad), max(0, y0 - pad), min(width, x1 + pad), min(height, y1 + pad)
+    crop = np.ascontiguousarray(pixels[top:bottom, left:right])
+    nothing = np.zeros(crop.shape[:2], dtype=bool)
+    view = crop_around_box(crop, (x0 - left, y0 - top, x1 - left, y1 - top), nothing)
+    if view.outside.sum() < 60 or view.inside.sum() < 60:
+        return None, 0.0, 1.0
+    guesses = [largest_part(mask, nothing) for mask in mask_proposals(view, 3)]
+    guesses.append(largest_component(start[top:bottom, left:right] & view.inside))
+    ground = ground_like(view)
+    values = [objectness(view, mask, ground) for mask in guesses]
+    best = int(np.argmax(values))
+    if guesses[best].sum() < 20:
+        return None, 0.0, 1.0
+    result = np.zeros((height, width), dtype=bool)
+    result[top:bottom, left:right] = guesses[best]
+    return result, float(values[best]), float(ground[guesses[best]].mean())
+
+
+def _features(
+    mask: Mask, start: Mask, judged: tuple[float, float], lab: NDArray[np.float32], edges: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    rows = np.flatnonzero(mask.any(axis=1))
+    union = float((mask | start).sum())
+    return np.array(
+        [
+            judged[0],
+            min(1.5, _contrast(mask, lab) / 30.0),
+            _on_edges(mask, edges),
+            _cut(mask),
+            float((mask & start).sum()) / union,
+            1.0 - float(rows.mean()) / mask.shape[0],
+            _solid(mask),
+            float(np.log(mask.mean())),
+            judged[1],
+            _ground_below(mask, lab),
+            float(_like_shade(mask, lab)),
+        ]
+    )
+
+
+def _ring(mask: Mask, reach: int) -> Mask:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
+
+
+def _contrast(mask: Mask, lab: NDArray[np.float32]) -> float:
+    """Distance of the mean colours of ``mask`` and of a ring around it, CIELAB."""
+    around = _ring(mask, max(3, round(0.12 * float(np.sqrt(mask.sum())))))
+    if not around.any():
+        return 0.0
+    return float(np.linalg.norm(lab[mask].mean(axis=0) - lab[around].mean(axis=0)))
+
+
+def _outline(mask: Mask) -> Mask:
+    binary = mask.astype(np.uint8)
+    kernel = np.ones((3, 3), np.uint8)
+    return np.asarray((cv2.dilate(binary, kernel) > 0) & ~(cv2.erode(binary, kernel, borderValue=0) > 0))
+
+
+def _on_edges(mask: Mask, edges: NDArray[np.float32]) -> float:
+    outline = _outline(mask)
+    # An outline may be a pixel beside its edge.
+    crest = cv2.dilate(edges, np.ones((3, 3), np.uint8))
+    return float((crest[outline] > 2.5).mean()) if outline.any() else 0.0
+
+
+def _cut(mask: Mask) -> float:
+    """Share of the box' outline along which ``mask`` lies on the photo's border."""
+    x0, y0, x1, y1 = _extent(mask)
+    touching = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())
+    return min(1.0, touching / float(x1 - x0 + y1 - y0))
+
+
+def _solid(mask: Mask) -> float:
+    points = np.argwhere(mask)[:, ::-1].astype(np.int32)
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
+    return float(mask.sum()) / max(1.0, float(hull.sum()))
+
+
+def _like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:
+    """Whether ``mask`` may be nothing but shade: darker than the ring around it, of its hue, and as even."""
+    size = float(np.sqrt(mask.sum()))
+    around = _ring(mask, max(4, round(0.2 * size)))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    if around.sum() < 20 or inner.sum() < 20:
+        return False
+    own, near = np.median(lab[inner], axis=0), np.median(lab[around], axis=0)
+    # CIELAB scales with the cube root of light but for the offset of L*.
+    factor = (own[0] + 16.0) / (near[0] + 16.0)
+    if not 0.5 < factor < 0.97:
+        return False
+    hue = float(np.linalg.norm(own[1:] - factor * near[1:]))
+    own_spread, near_spread = (lab[part][:, 0].std() for part in (inner, around))
+    return bool(hue < 6.0 + 0.12 * np.linalg.norm(near[1:]) and own_spread < 1.5 * near_spread + 5.0)
+
+
+def _ground_below(mask: Mask, lab: NDArray[np.float32]) -> float:
+    """Share of the pixels just below the lower outline whose colour, in light or shade, is that of pixels left and
+    right of the object at its base: 1 on an even floor."""
+    height, width = mask.shape
+    x0, y0, x1, y1 = _extent(mask)
+    size = max(x1 - x0, y1 - y0)
+    reach = max(2, round(0.06 * size))
+    columns = np.flatnonzero(mask.any(axis=0))
+    lowest = height - 1 - mask[::-1, columns].argmax(axis=0)
+    below = lowest + reach
+    good = below < height
+    if good.sum() < 0.5 * len(columns):
+        return 0.0
+    under = lab[below[good], columns[good]]
+    rows = slice(max(0, y1 - size // 4), min(height, y1 + reach))
+    sides = np.concatenate(
+        [
+            lab[rows, max(0, x0 - size // 2) : max(0, x0 - reach)].reshape(-1, 3),
+            lab[rows, min(width, x1 + reach) : min(width, x1 + size // 2)].reshape(-1, 3),
+        ]
+    )
+    if len(sides) < 10:
+        return 0.5
+    typical = np.median(sides, axis=0)
+    spread = max(6.0, 2.0 * float(np.median(np.linalg.norm(sides - typical, axis=1))))
+    apart = under - typical
+    # Shade changes lightness more than hue.
+    apart[:, 0] = np.where(apart[:, 0] < 0, 0.35 * apart[:, 0], apart[:, 0])
+    return float((np.linalg.norm(apart, axis=1) < spread).mean())
+
+
+WEIGHTS = np.array([2.5, 1.2, 2.0, -5.0, 1.0, -2.0, 1.5, 0.35, -3.0, 1.5, -4.0])
+OFFSET = -2.0
+"""Logistic regression of ``FEATURES`` on whether a candidate is an object."""
+WHOLE = 0.12
+"""Score that e times the area is worth when two candidates overlap."""
+LEAST_SCORE = 0.5
+"""Score below which a candidate is not proposed."""
+
+
+def _score(features: NDArray[np.float64]) -> float:
+    return float(1.0 / (1.0 + np.exp(-(features @ WEIGHTS + OFFSET))))
+
+
+def _box_iou(first: Sequence[float], second: Sequence[float]) -> float:
+    width = min(first[2], second[2]) - max(first[0], second[0])
+    height = min(first[3], second[3]) - max(first[1], second[1])
+    common = max(0.0, width) * max(0.0, height)
+    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)]
+    return float(common / max(1e-9, sum(areas) - common))
+
+
+def _distinct(found: Sequence[tuple[Examined, float]]) -> list[tuple[Examined, float]]:
+    """``found``, best first, without what is mostly one of its betters, or a part of it."""
+    result: list[tuple[Examined, float]] = []
+    for item, value in found:
+        if all(not _same_or_part(item.mask, other.mask) for other, _ in result):
+            result.append((item, value))
+    return result
+
+
+def _same_or_part(mask: Mask, better: Mask) -> bool:
+    """Whether ``mask`` is mostly ``better`` itself, a part of it, or a shadow or strap that touches it in its box."""
+    common = float((mask & better).sum())
+    if common > 0.5 * float(min(mask.sum(), better.sum())):
+        return True
+    x0, y0, x1, y1 = _extent(better)
+    inside = float(mask[y0:y1, x0:x1].sum()) / float(mask.sum())
+    kernel = np.ones((7, 7), np.uint8)
+    return inside > 0.7 and bool(((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & better).any())

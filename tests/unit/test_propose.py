@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Objects that are found without a box: on drawn photos, in a model's alpha, on the command line."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physgen.batch.cli import main
+from physgen.batch.commands import photo_commands
+from physgen.sim.app import propose as propose_module
+from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, choose, propose
+from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.reconstruct_options import Proposal
+from physgen.sim.reconstruct.segmentation.object_proposals import proposals_from_alpha
+from PIL import Image
+from scipy import ndimage
+
+WIDTH, HEIGHT = 256, 192
+THINGS = {(60, 110, 26): (190, 60, 40), (180, 90, 34): (40, 70, 150)}
+"""Discs x, y, radius, and their colours."""
+
+
+def floor(seed=0):
+    rng = np.random.default_rng(seed)
+    streaks = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), (0.7, 12)) * 50
+    return np.array([180.0, 150, 110]) + (streaks + rng.normal(scale=3, size=(HEIGHT, WIDTH)))[..., None]
+
+
+def saved(image, path):
+    Image.fromarray(np.clip(ndimage.gaussian_filter(image, (0.6, 0.6, 0)), 0, 255).astype(np.uint8)).save(path)
+    return path
+
+
+@pytest.fixture
+def photo(tmp_path):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image = floor()
+    for (x, y, radius), colour in THINGS.items():
+        image[(((columns - x) / (1.2 * radius)) ** 2 + ((rows - y - radius) / (0.3 * radius)) ** 2) < 1] *= 0.6
+        image[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = colour
+    return saved(image, tmp_path / "photo.png")
+
+
+def iou(box, other):
+    width, height = (min(box[i + 2], other[i + 2]) - max(box[i], other[i]) for i in (0, 1))
+    common = max(0, width) * max(0, height)
+    return common / (sum((b[2] - b[0]) * (b[3] - b[1]) for b in (box, other)) - common)
+
+
+def test_both_things_are_found_and_come_first(photo, tmp_path):
+    found = propose(photo, out=tmp_path / "list")
+    for x, y, radius in THINGS:
+        assert max(iou(item.box, (x - radius, y - radius, x + radius, y + radius)) for item in found[:2]) > 0.5
+    record = json.loads((tmp_path / "list" / LIST_FILE).read_text())
+    assert (record["format"], record["width"], record["height"]) == ("physgen-proposals/1", WIDTH, HEIGHT)
+    assert [tuple(item["box"]) for item in record["proposals"]] == [item.box for item in found]
+    assert Image.open(tmp_path / "list" / PICTURE_FILE).size == (WIDTH, HEIGHT)
+
+
+def test_an_equal_photo_is_searched_once_and_another_one_again(photo, tmp_path, monkeypatch):
+    first = propose(photo, out=tmp_path / "list")
+    # No search: what is read is what was found.
+    monkeypatch.setattr(propose_module, "SEARCHED", None)
+    assert propose(photo, out=tmp_path / "list") == first
+    monkeypatch.undo()
+    (tmp_path / "list" / LIST_FILE).write_text("{}")
+    assert propose(photo, out=tmp_path / "list") == first
+
+
+@pytest.mark.parametrize("image", [np.full((HEIGHT, WIDTH, 3), 120.0), floor(4)], ids=["even", "floor"])
+def test_where_nothing_stands_out_one_line_says_so_and_nothing_is_written(image, tmp_path, capsys):
+    path = saved(image, tmp_path / "photo.png")
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "scene")]) == 3
+    said = capsys.readouterr().err
+    assert "no object stands out" in said and "--box" in said and said.count("\n") == 1
+    assert [item.name for item in tmp_path.iterdir()] == ["photo.png"]
+
+
+def test_a_photo_of_one_pixel_is_refused(tmp_path, capsys):
+    Image.new("RGB", (1, 1)).save(tmp_path / "dot.png")
+    assert main(["propose", str(tmp_path / "dot.png"), "--out", str(tmp_path / "list")]) == 3
+    assert "at least 32x32" in capsys.readouterr().err
+    assert not (tmp_path / "list").exists()
+
+
+def test_the_command_lists_boxes_as_the_command_line_takes_them(photo, tmp_path, capsys):
+    assert main(["propose", str(photo), "--out", str(tmp_path / "list")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    first = next(line for line in lines if line.strip().startswith("1 "))
+    box = first.split("--box ")[1].split()[0]
+    assert [float(v) for v in box.split(",")] == list(propose(photo, out=tmp_path / "list")[0].box)
+    assert str(tmp_path / "list" / PICTURE_FILE) in lines[-1]
+
+
+def requested(arguments, monkeypatch):
+    """The boxes with which ``reconstruct`` would go on, and the notices."""
+    seen = {}
+
+    def instead(options, terminal, cancelled):
+        notices = []
+        photo_commands.use_found_boxes(options, options.out.with_name("list"), notices.append)
+        seen.update(boxes=options.box, notices=[item["message"] for item in notices if item["event"] == "notice"])
+        return 0
+
+    monkeypatch.setattr(photo_commands, "run_reconstruct", instead)
+    return main(["reconstruct", *map(str, arguments)]), seen
+
+
+def test_without_a_box_the_best_are_taken_and_a_line_says_which(photo, tmp_path, monkeypatch):
+    code, seen = requested([photo, "--out", tmp_path / "scene"], monkeypatch)
+    assert code == 0 and len(seen["boxes"]) >= 2
+    (line,) = seen["notices"]
+    assert "--pick" in line and "--box" in line and PICTURE_FILE in line and "\n" not in line
+    _, seen = requested([photo, "--out", tmp_path / "scene", "--pick", 2], monkeypatch)
+    assert seen["boxes"] == [propose(photo, out=tmp_path / "list")[1].box]
+    _, seen = requested([photo, "--out", tmp_path / "scene", "--name", "ball"], monkeypatch)
+    assert len(seen["boxes"]) == 1
+
+
+def test_picks_that_are_not_there_are_refused(photo, tmp_path, monkeypatch, capsys):
+    for extra, message in (
+        (["--pick", 99], "give numbers from 1 to"),
+        (["--pick", 1, 1], "each once"),
+        (["--pick", 1, "--box", "10,10,90,90"], "leave out one of the two"),
+    ):
+        assert requested([photo, "--out", tmp_path / "scene", *extra], monkeypatch)[0] == 3
+        assert message in capsys.readouterr().err
+
+
+def test_twenty_proposals_are_numbered_and_three_are_used():
+    found = [Proposal((i, 0.0, i + 20.0, 20.0), 0.9) for i in range(20)]
+    assert best_proposals(found) == [0, 1, 2]
+    assert choose(found, [20, 3], 0) == [19, 2]
+    assert choose(found, [], 5) == [0, 1, 2, 3, 4]
+    assert best_proposals([Proposal((0, 0, 9, 9), 0.5)]) == [0]
+    assert best_proposals([]) == []
+
+
+def test_a_model_s_alpha_becomes_boxes():
+    alpha = np.zeros((100, 200), np.float32)
+    alpha[20:60, 30:80] = 0.9
+    alpha[30:80, 120:180] = 1.0
+    alpha[5:7, 5:7] = 1.0
+    found = proposals_from_alpha(alpha)
+    assert len(found) == 2
+    assert iou(found[0].box, (120, 30, 180, 80)) > 0.7 and iou(found[1].box, (30, 20, 80, 60)) > 0.7
+    assert found[0].score > found[1].score
+    assert proposals_from_alpha(np.zeros((50, 50))) == []
+
+
+@settings(max_examples=40)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31), st.booleans())
+def test_any_alpha_gives_boxes_within_the_picture(height, width, seed, broken):
+    rng = np.random.default_rng(seed)
+    alpha = ndimage.gaussian_filter(rng.normal(size=(height, width)), 2.0) * 20
+    if broken:
+        alpha[0, 0], alpha[-1, -1] = np.nan, np.inf
+    for item in proposals_from_alpha(alpha):
+        x0, y0, x1, y1 = item.box
+        assert 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height and 0 <= item.score <= 1
+
+
+def test_a_photo_that_is_missing_is_named(tmp_path):
+    with pytest.raises(InputError, match="no such photo"):
+        propose(tmp_path / "nothing.jpg")
