@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,8 @@ import bpy
 from ..sim.errors import RenderError
 
 DENOISER = "OPENIMAGEDENOISE"
+PROBE_PIXELS = 8
+"""Side of the picture that tells whether the denoiser works."""
 OBJECT_INDEX = "Object Index.X" if bpy.app.version >= (5, 0) else "IndexOB.X"
 """Channel of the object index pass."""
 
@@ -48,13 +51,36 @@ def eevee() -> str:
     return "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
 
 
+@functools.cache
 def denoiser_available() -> bool:
-    """Return whether this build can denoise on the CPU."""
+    """Return whether this process can denoise on the CPU: the first call denoises a tiny picture.
+
+    OpenImageDenoise loads the library of its CPU device once a process. Where that fails, as on a machine without free
+    memory, every later render would end with "Failed to create OIDN CPU device".
+    """
     try:
         import _cycles
     except ImportError:
         return False
-    return bool(getattr(_cycles, "with_openimagedenoise", False))
+    if not getattr(_cycles, "with_openimagedenoise", False):
+        return False
+    enable_cycles()
+    scene = bpy.data.scenes.new("PhysGen denoiser")
+    camera = bpy.data.objects.new("PhysGen denoiser", bpy.data.cameras.new("PhysGen denoiser"))
+    try:
+        scene.collection.objects.link(camera)
+        scene.camera, scene.render.engine = camera, "CYCLES"
+        scene.render.resolution_x = scene.render.resolution_y = PROBE_PIXELS
+        scene.render.use_compositing = scene.render.use_sequencer = False
+        scene.cycles.device, scene.cycles.samples = "CPU", 1
+        scene.cycles.use_denoising, scene.cycles.denoiser, scene.cycles.denoising_use_gpu = True, DENOISER, False
+        bpy.ops.render.render(scene=scene.name)
+    except RuntimeError:
+        return False
+    finally:
+        bpy.data.cameras.remove(camera.data)
+        bpy.data.scenes.remove(scene)
+    return True
 
 
 def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:

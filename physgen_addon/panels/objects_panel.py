@@ -362,6 +362,8 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split.label(text=f"{turns:.2g} turns/s")
         column.prop(body, "start_frame")
         column.prop(body, "asleep")
+        if body.asleep:
+            column.prop(body, "held")
         row = layout.row(align=True)
         draw_arrows(row, context)
         cleared = row.row(align=True)

@@ -221,7 +221,7 @@ def watched_numbers(scene: bpy.types.Scene) -> tuple[str, ...]:
     unit, times, names = metres_per_unit(scene), clock(scene), export_names(scene)
     found = []
     for item in bodies(scene):
-        fields: dict[str, Any] = {**dict.fromkeys(UNSET), "asleep": False, **physics(item, unit, times)}
+        fields: dict[str, Any] = {**dict.fromkeys(UNSET), "asleep": False, "held": False, **physics(item, unit, times)}
         fields.pop("role")
         material = fields.pop("material", None)
         if material is not None:

@@ -180,6 +180,12 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         "Asleep until Touched",
         "Keeps its pose until something touches it, if it stands and nothing but gravity acts on it",
     )
+    held: from_field(
+        SceneObject,
+        "held",
+        "Held",
+        "Asleep where nothing carries it, too: it hangs, or leans on something that is not there",
+    )
     pins: CollectionProperty(type=PHYSGEN_PG_pin)
     pin_index: IntProperty(name="Pin", description="Active pin")
     goal_stiffness: from_field(

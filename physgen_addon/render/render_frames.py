@@ -266,7 +266,10 @@ def render_frames(
         if frames is None and opened.unfinished:
             progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
         if traces and options.denoise and not denoised:
-            progress.notice("this Blender has no OpenImageDenoise; raise the samples if frames are grainy")
+            progress.notice(
+                "OpenImageDenoise is missing in this Blender or cannot be loaded now: frames are not denoised; raise "
+                "the samples, or free memory and run again, which renders them anew"
+            )
         for notice in (*shot.notices, *_clip_notices(scene, opened, numbers, shot)):
             progress.notice(notice)
         _make(scene, opened, planned, frame_index, options, shot, progress, cancelled)

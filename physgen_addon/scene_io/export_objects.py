@@ -137,8 +137,9 @@ def physics(item: bpy.types.Object, unit: float, clock: Clock) -> dict[str, Any]
         fields["shell_thickness"] = decimal(body.shell_thickness * unit)
     fields["velocity"] = scaled(body.velocity, unit)
     fields["spin"] = scaled(body.spin)
-    if body.asleep:
-        fields["asleep"] = True
+    for name in ("asleep", "held"):
+        if getattr(body, name):
+            fields[name] = True
     fields["start_time"] = clock.from_frame(body.start_frame)
     fields["goal_stiffness"] = decimal(body.goal_stiffness)
     fields["goal_damping"] = decimal(body.goal_damping)

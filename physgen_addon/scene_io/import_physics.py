@@ -99,7 +99,7 @@ def fill_body(
     _fill_material(body.material, source.material)
     body.fill, body.shell_thickness = source.fill, source.shell_thickness or 0.0
     body.velocity, body.spin = source.velocity, source.spin
-    body.asleep = source.asleep
+    body.asleep, body.held = source.asleep, source.held
     body.start_frame = first + round(source.start_time * rate) if source.start_time > 0 else 0
     body.goal_stiffness, body.goal_damping = source.goal_stiffness, source.goal_damping
     _fill_surface(body, source, ground)
@@ -238,7 +238,7 @@ OF_BODY = (
     ("own_surface", "contact_mode", *_SURFACE),
     ("velocity",),
     ("spin",),
-    ("asleep",),
+    ("asleep", "held"),
     ("start_frame",),
     ("goal_stiffness", "goal_damping"),
     ("splats_as",),

@@ -35,7 +35,7 @@ from ..validation import parse, read_json, to_json
 T = TypeVar("T")
 
 STAMP_FILE = "reconstruct.json"
-RECONSTRUCT_REVISION = 11
+RECONSTRUCT_REVISION = 12
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 
@@ -140,7 +140,12 @@ def _reconstruct_cached(
             return folder
     from ..reconstruct import reconstruct_photo
 
-    folder = reconstruct_photo(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
+    # Imported here, because planning a farm's jobs must not pay for the engine's geometry.
+    from .rest_check import at_rest
+
+    folder = reconstruct_photo(
+        photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered, at_rest=at_rest
+    )
     stamp = Stamp(
         inputs_hash=inputs_hash,
         photo=photo.resolve(),
@@ -149,11 +154,6 @@ def _reconstruct_cached(
         scene=scene_to_json(folder.model),
     )
     write_json(out / STAMP_FILE, to_json(stamp))
-    # Imported here, because planning a farm's jobs must not pay for the engine's geometry.
-    from .rest_check import rest_notices
-
-    for text in rest_notices(folder):
-        on_event({"event": "notice", "stage": "reconstruct", "message": text})
     return folder
 
 
@@ -325,7 +325,9 @@ def correct(
             shutil.copyfile(light, target)
     previous = {item.name: (item.kind, item.preset) for item in stamp.objects}
     changed = {item.name for item in objects if previous.get(item.name) != (item.kind, item.preset)}
-    model = _as_before(folder.model, before, changed)
+    made = {item.name: item.held for item in first.objects}
+    edited = {item.name for item in before.objects if item.held != made.get(item.name)}
+    model = _as_before(folder.model, before, changed, edited)
     if keeps_light:
         model = dataclasses.replace(model, light=before.light)
     return folder if model == folder.model else save_scene(root, model)
@@ -342,8 +344,12 @@ def _answered(root: Path) -> str | None:
     return raw if isinstance(raw, str) and raw else None
 
 
-def _as_before(scene: SceneModel, before: SceneModel, changed: Collection[str | None]) -> SceneModel:
-    """Return ``scene`` with the physics of ``before``, but the new material of the objects ``changed``."""
+def _as_before(
+    scene: SceneModel, before: SceneModel, changed: Collection[str | None], edited: Collection[str]
+) -> SceneModel:
+    """Return ``scene`` with the physics of ``before``, but the new material of the objects ``changed``; whether one is
+    held follows from its new shape, but for the objects ``edited``.
+    """
     known = {item.name: item for item in before.objects}
     names = {item.name for item in scene.objects}
     return dataclasses.replace(
@@ -354,7 +360,8 @@ def _as_before(scene: SceneModel, before: SceneModel, changed: Collection[str | 
                 **{
                     name: getattr(known[item.name], name)
                     for name in PHYSICS_FIELDS
-                    if item.name not in changed or name not in MATTER_FIELDS
+                    if (item.name not in changed or name not in MATTER_FIELDS)
+                    and (item.name in edited or name != "held")
                 },
             )
             if item.name in known

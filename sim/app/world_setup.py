@@ -310,6 +310,7 @@ def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed
         spin=item.spin,
         start_time=item.start_time,
         asleep=item.asleep,
+        held=item.held,
         acceleration=_track(item.acceleration),
         velocity_keys=_track(item.velocity_keys),
         pins=_pins(item, sample),

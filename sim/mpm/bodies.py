@@ -162,6 +162,9 @@ class BodyParticles:
     """Whether the body keeps its pose until something moving reaches it, if it stands at the start and nothing but
     gravity acts on it; see ``sleeping``."""
 
+    held: bool = False
+    """Whether it does so where nothing carries it, too."""
+
     def __post_init__(self) -> None:
         positions = np.ascontiguousarray(self.positions, dtype=np.float64)
         volumes = np.ascontiguousarray(self.volumes, dtype=np.float64)

@@ -7,7 +7,9 @@ before moving matter reaches it.
 
 A body may sleep only where nothing but gravity acts on it and where it would stand: friction holds it on the ground's
 slope, and its centre of mass lies over what it rests on (the hull of its contacts, as far as the grid can tell: widened
-by a cell). A stack sleeps as far as it stands on the ground or on static colliders.
+by a cell). A stack sleeps as far as it stands on the ground or on static colliders. What is held (it hangs, or leans on
+what nobody knows) sleeps without that, unless something that it touches is awake: a thing that leans falls when its
+support is thrown.
 """
 
 from __future__ import annotations
@@ -152,7 +154,7 @@ class Sleepers:
     # ---- at the start -------------------------------------------------------------------------------------------
 
     def _standing(self, wanted: Sequence[int]) -> list[int]:
-        """Those of ``wanted`` that stand on the ground, on static colliders, or on one another."""
+        """Those of ``wanted`` that stand on the ground, on static colliders, or on one another, or are held."""
         firm = {i: self._firm_contacts(i) for i in wanted}
         mutual: dict[tuple[int, int], Touching] = {}
         for i in wanted:
@@ -160,18 +162,22 @@ class Sleepers:
                 found = None if i == j else _touching(self._shape(i), self._shape(j), TOUCH * self.cell)
                 if found is not None:
                     mutual[i, j] = found
+        awake = [j for j, body in enumerate(self.setup.bodies) if j not in wanted and body.start_time == 0.0]
+        held = {i for i in wanted if self.setup.bodies[i].held and not self._touches(i, awake)}
         left = set(wanted)
         while True:
-            grounded = {i for i in left if len(firm[i])}
+            held = {i for i in held & left if all(j in left for k, j in mutual if k == i)}
+            grounded = {i for i in left if len(firm[i])} | held
             while True:
                 more = {i for i, j in mutual if i in left and j in grounded} - grounded
                 if not more:
                     break
                 grounded |= more
-            held = {i for i in grounded if self._held(i, firm[i], [mutual[i, j] for j in grounded if (i, j) in mutual])}
-            if held == left:
+            contacts = {i: [mutual[i, j] for j in grounded if (i, j) in mutual] for i in grounded - held}
+            standing = held | {i for i, found in contacts.items() if self._balanced(i, firm[i], found)}
+            if standing == left:
                 return sorted(left)
-            left = held
+            left = standing
 
     def _firm_contacts(self, index: int) -> Array:
         """Places (K, 3) at which the ground or static colliders carry the body."""
@@ -204,7 +210,12 @@ class Sleepers:
             return None
         return _touching(shape, Shape.of(points, np.zeros(len(points))), NEAR_GROUND * self.cell)
 
-    def _held(self, index: int, firm: Array, contacts: Sequence[Touching]) -> bool:
+    def _touches(self, index: int, others: Sequence[int]) -> bool:
+        """Whether the body touches any of ``others``."""
+        shape, within = self._shape(index), TOUCH * self.cell
+        return any(_touching(shape, self._shape(j), within) is not None for j in others)
+
+    def _balanced(self, index: int, firm: Array, contacts: Sequence[Touching]) -> bool:
         """Whether the centre of mass of the body lies over its contacts."""
         places = [firm, *(found.places[found.normals @ self._up > CARRIES] for found in contacts)]
         points = np.concatenate(places)

@@ -6,7 +6,7 @@ The folder is written under a temporary name and renamed at the end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -151,11 +151,13 @@ def reconstruct_photo(
     *,
     ask: ChatRequest | None = None,
     answered: str | None = None,
+    at_rest: Callable[[Scene, Notice], SceneModel] | None = None,
 ) -> Scene:
     """Reconstruct the ``objects`` of ``photo`` into the scene folder ``out``; an existing scene there is replaced.
 
     Stages with the same inputs as in an earlier reconstruction into ``out`` are cached. The folder appears whole or not
-    at all. ask: request to a model about the objects; answered: the text of an earlier answer, used instead.
+    at all. ask: request to a model about the objects; answered: the text of an earlier answer, used instead. at_rest:
+    returns the model of a scene folder with all that it takes for its objects to stay where they are.
     ``on_event`` receives progress and notices (docs/reconstruction.md), ``cancelled`` is polled between steps. Raises
     InputError for a photo, box or option that cannot be used, and Cancelled.
     """
@@ -190,7 +192,7 @@ def reconstruct_photo(
         objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
         steps.begin("camera")
         depth = _depth(picture, options, steps)
-        estimate = estimate_camera(picture, seen, names, options, depth, steps.notice)
+        estimate = estimate_camera(picture, seen, options, depth, steps.notice)
         layers = separate_layers(
             picture.pixels,
             seen,
@@ -219,6 +221,8 @@ def reconstruct_photo(
             looks=looks,
         )
         scene = write_scene(folder, found, objects, physics, _friction(answers, options))
+        if at_rest is not None:
+            scene = at_rest(Scene(folder, scene), steps.notice)
         write_json(folder / PHYSICS_FILE, physics_record(names, physics, answers, ask))
         save_scene(folder, scene)
         if options.report:

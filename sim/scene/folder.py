@@ -75,9 +75,10 @@ class Scene:
             for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
                 del fields[irrelevant]
             fields["material"].pop("preset")
-            if not item.asleep:
-                # Older scenes have no such field either.
-                del fields["asleep"]
+            for later in ("asleep", "held"):
+                if not fields[later]:
+                    # Older scenes have no such field either.
+                    del fields[later]
             fields["mesh"] = file_hash(self.file(item.mesh))
             if item.splats is None:
                 # Older scenes have no such field, and their bakes stay valid.

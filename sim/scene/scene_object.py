@@ -165,6 +165,7 @@ class SceneObject:
     Of dynamic objects only:
     asleep: whether the object keeps the pose it has at the start until something touches it, if it stands and nothing
         but gravity acts on it; reconstructed objects do, since the photo shows them at rest.
+    held: with ``asleep``, whether it does so where nothing carries it, too: it hangs, or leans on what is not there.
     start_time: s at which the object enters the simulation; until then it stays in place and touches nothing.
     acceleration: keyframes of force over mass in m/s².
     velocity_keys: keyframes at which the object's mean velocity in m/s is set.
@@ -195,6 +196,7 @@ class SceneObject:
     motion: Motion | None = None
     splats: str | None = None
     asleep: bool = False
+    held: bool = False
     start_time: float = quantity(0.0, 0.0, 1e6, "seconds")
     acceleration: Keys = ()
     velocity_keys: Keys = ()

@@ -434,14 +434,14 @@ def test_the_numbers_of_an_object(scene, tmp_path):
     body.own_surface, body.friction, body.static_friction, body.restitution = True, 0.6, 0.5, 0.2
     body.contact_mode = "sticky"
     body.goal_stiffness, body.goal_damping = 10.0, 0.3
-    body.asleep = True
+    body.asleep = body.held = True
     folder, objects = exported(scene, tmp_path)
     cube = objects["Cube"]
     assert (cube.velocity, cube.spin) == ((0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
     assert (cube.material.preset, cube.material.law, cube.material.density) == ("clay", "von_mises", 1234.5)
     assert (cube.fill, cube.shell_thickness, cube.start_time) == (False, 0.07, 0.2)
     assert (cube.friction, cube.static_friction, cube.restitution, cube.contact_mode) == (0.6, 0.6, 0.2, "sticky")
-    assert (cube.goal_stiffness, cube.goal_damping, cube.asleep) == (10.0, 0.3, True)
+    assert (cube.goal_stiffness, cube.goal_damping, cube.asleep, cube.held) == (10.0, 0.3, True, True)
     (effect,) = folder.model.effects
     assert (effect.name, effect.objects, dict(effect.parameters)["start"]) == ("sandy", ("Cube",), 0.0)
 

@@ -72,6 +72,19 @@ def test_help_and_usage_need_no_scene(tmp_path):
     assert [ended(process)[0] for process in wrong] == [2, 2]
 
 
+def test_a_denoiser_that_cannot_be_loaded_costs_a_notice_and_no_frame(world, bake, tmp_path):
+    """OIDN_DEVICE_CPU=0 keeps OpenImageDenoise from loading its device, with which Cycles would end every render. With
+    it again, the frame is rendered anew."""
+    out = tmp_path / "out"
+    arguments = [world.folder.root, "--bake", bake(SHIFTS[:1]), "--out", out, *QUICK]
+    for device, noisy in (("0", True), ("1", False)):
+        process = start(tmp_path, sys.executable, BATCH / "render.py", *arguments, OIDN_DEVICE_CPU=device)
+        code, said, err = ended(process)
+        assert code == 0, err
+        assert ("frames are not denoised" in said) is noisy and "up to date" not in said
+        assert len(list(out.glob("*.png"))) == 1
+
+
 def test_stopped_between_frames(world, bake, tmp_path):
     out = tmp_path / "out"
     arguments = [world.folder.root, "--bake", bake(SHIFTS), "--out", out, *QUICK, "--samples", 64]

@@ -6,7 +6,6 @@ import math
 import cv2
 import numpy as np
 import pytest
-from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.camera import ground_camera as cameras
 from physgen.sim.reconstruct.camera.camera_estimate import estimate_camera
 from physgen.sim.reconstruct.camera.depth_map import DepthMap
@@ -86,7 +85,7 @@ def fov_error(estimate, truth):
 )
 def test_focal_length_and_ground_from_tiles(fov_deg, pitch_deg, roll_deg):
     truth = camera_of(fov_deg, pitch_deg, roll_deg)
-    found = estimate_camera(photo_of(tiles(truth)), [mask_at()], ["cup"], ReconstructOptions(), None, silent)
+    found = estimate_camera(photo_of(tiles(truth)), [mask_at()], ReconstructOptions(), None, silent)
     assert fov_error(found, truth) < 0.10
     assert normal_error(found, truth) < 3.0
     assert found.focal_source == found.normal_source == "straight lines"
@@ -97,7 +96,7 @@ def test_focal_length_and_ground_from_tiles(fov_deg, pitch_deg, roll_deg):
 def test_ground_from_the_edges_of_boxes(fov_deg, pitch_deg, roll_deg):
     truth = camera_of(fov_deg, pitch_deg, roll_deg)
     grey, masks = boxes(truth)
-    found = estimate_camera(photo_of(grey, truth.fx), masks, list("abc"), ReconstructOptions(), None, silent)
+    found = estimate_camera(photo_of(grey, truth.fx), masks, ReconstructOptions(), None, silent)
     assert normal_error(found, truth) < 3.0
     assert found.focal_source.startswith("EXIF")
     assert fov_error(found, truth) < 0.05
@@ -113,7 +112,7 @@ def test_without_lines_the_uncertainty_is_that_of_habit():
         cv2.line(strokes, (int(x), int(y)), end, rng.uniform(30, 220), 2, cv2.LINE_AA)
     for grey in (plain, strokes):
         said = []
-        found = estimate_camera(photo_of(grey), [mask_at()], ["cup"], ReconstructOptions(), None, said.append)
+        found = estimate_camera(photo_of(grey), [mask_at()], ReconstructOptions(), None, said.append)
         assert found.normal_sigma_deg > 8.0
         assert found.fov_sigma_deg > 8.0
         assert found.normal_source == "the usual pose"
@@ -127,7 +126,6 @@ def test_things_high_up_in_the_photo_are_below_the_horizon():
     found = estimate_camera(
         photo_of(np.full((HEIGHT, WIDTH), 130.0)),
         [mask_at(y=40, radius=20)],
-        ["cup"],
         ReconstructOptions(),
         None,
         silent,
@@ -140,33 +138,34 @@ def test_options_always_win():
     photo = photo_of(tiles(truth), focal=500.0)
     options = ReconstructOptions(fov_deg=33.0, pitch_deg=41.0, roll_deg=-7.0)
     said = []
-    found = estimate_camera(photo, [mask_at()], ["cup"], options, None, said.append)
+    found = estimate_camera(photo, [mask_at()], options, None, said.append)
     assert found.fov_deg == pytest.approx(33.0)
     pitch, roll = cameras.pitch_and_roll(cameras.up_in_camera(found.camera))
     assert (math.degrees(pitch), math.degrees(roll)) == pytest.approx((41.0, -7.0))
     assert found.fov_sigma_deg == found.normal_sigma_deg == 0.0
     assert not said
     options = ReconstructOptions(horizon_y=-0.25, fov_deg=60.0)
-    found = estimate_camera(photo, [mask_at()], ["cup"], options, None, silent)
+    found = estimate_camera(photo, [mask_at()], options, None, silent)
     assert sum(found.horizon) / 2 == pytest.approx(-0.25 * HEIGHT, abs=0.5)
     assert found.normal_source.startswith("horizon_y")
 
 
 def test_given_pitch_leaves_the_focal_length_to_the_lines():
     truth = camera_of(60, 25, 0)
-    found = estimate_camera(
-        photo_of(tiles(truth)), [mask_at()], ["cup"], ReconstructOptions(pitch_deg=25.0), None, silent
-    )
+    found = estimate_camera(photo_of(tiles(truth)), [mask_at()], ReconstructOptions(pitch_deg=25.0), None, silent)
     assert fov_error(found, truth) < 0.05
 
 
-def test_an_object_above_the_given_horizon_is_refused():
-    photo = photo_of(np.full((HEIGHT, WIDTH), 130.0))
-    with pytest.raises(InputError, match=r"kite.*horizon_y"):
-        estimate_camera(photo, [mask_at(y=100)], ["kite"], ReconstructOptions(horizon_y=0.5), None, silent)
-    with pytest.raises(InputError, match="horizon"):
-        options = ReconstructOptions(pitch_deg=2.0, roll_deg=20.0)
-        estimate_camera(photo, [mask_at(x=600, y=250, radius=10)], ["kite"], options, None, silent)
+def test_what_hangs_above_the_given_horizon_leaves_the_camera_to_the_rest():
+    """A kite above the horizon has no say: the camera is that of the floor and what stands on it, alone or not."""
+    truth = camera_of(60, 15, 0)
+    photo, options = photo_of(tiles(truth)), ReconstructOptions(horizon_y=cameras.horizon_at_edges(truth)[0] / HEIGHT)
+    alone = estimate_camera(photo, [mask_at()], options, None, silent)
+    both = estimate_camera(photo, [mask_at(), mask_at(y=50, radius=20)], options, None, silent)
+    assert both.horizon == pytest.approx([options.horizon_y * HEIGHT] * 2, abs=1.0)
+    assert both.camera.fx == pytest.approx(alone.camera.fx, rel=0.02)
+    kite = estimate_camera(photo, [mask_at(y=50, radius=20)], options, None, silent)
+    assert kite.horizon == pytest.approx([options.horizon_y * HEIGHT] * 2, abs=1.0)
 
 
 def test_a_depth_map_in_metres_gives_ground_and_scale():
@@ -178,7 +177,6 @@ def test_a_depth_map_in_metres_gives_ground_and_scale():
     found = estimate_camera(
         photo_of(np.full((HEIGHT, WIDTH), 130.0)),
         [mask_at()],
-        ["cup"],
         ReconstructOptions(),
         DepthMap(values=values, disparity=False, metric=True, focal=truth.fx),
         said.append,
@@ -192,5 +190,5 @@ def test_a_depth_map_in_metres_gives_ground_and_scale():
 
 def test_equal_photos_give_equal_cameras():
     photo = photo_of(tiles(camera_of(60, 25, 0)))
-    first, second = (estimate_camera(photo, [mask_at()], ["cup"], ReconstructOptions(), None, silent) for _ in range(2))
+    first, second = (estimate_camera(photo, [mask_at()], ReconstructOptions(), None, silent) for _ in range(2))
     assert first == second

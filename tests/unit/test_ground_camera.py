@@ -66,13 +66,10 @@ def test_angle_of_view_round_trip(fov, width, height):
     assert cameras.fov_of_focal(width, height, cameras.focal_of_fov(width, height, fov)) == pytest.approx(fov)
 
 
-def test_objects_above_a_tilted_horizon_are_refused():
+def test_objects_above_a_tilted_horizon_do_not_stand_below_it():
     camera = cameras.camera_above_ground(640, 480, 600.0, math.radians(5), math.radians(15))
     row = horizon_row(480, 600.0, math.radians(5), math.radians(15)) + 60
-    cameras.check_below_horizon(camera, np.array([320.0, row]), "cup")
-    cameras.check_below_horizon(camera, np.array([20.0, row]), "cup")
-    with pytest.raises(InputError, match=r"cup.*horizon_y"):
-        cameras.check_below_horizon(camera, np.array([620.0, row]), "cup")
+    assert [cameras.stands_below(camera, np.array([column, row])) for column in (320.0, 20.0, 620.0)] == [1, 1, 0]
 
 
 def estimate(metres=None):

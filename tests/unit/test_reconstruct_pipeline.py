@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from physgen.sim.app.reconstruct import reconstruct
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
 from physgen.sim.scene.folder import load_scene
@@ -197,11 +198,31 @@ def test_impossible_requests_leave_nothing_behind(photo, tmp_path, requests, mes
     assert list(tmp_path.iterdir()) == []
 
 
-def test_horizon_below_the_objects_is_refused(photo, tmp_path):
-    options = ReconstructOptions(horizon_y=0.9)
-    with pytest.raises(InputError, match="horizon"):
-        reconstruct_photo(photo, [ObjectRequest(box=BALL)], tmp_path / "scene", options)
-    assert list(tmp_path.iterdir()) == []
+def test_objects_above_the_given_horizon_hang_and_are_held(small_photo, tmp_path, without_trials):
+    """With a horizon below them both hang in the air at one distance, where the photo shows them, until touched."""
+    options = dataclasses.replace(SMALL, pitch_deg=None, horizon_y=0.9)
+    events = []
+    with without_trials():
+        folder = reconstruct(
+            small_photo,
+            [small_request(), small_request(SMALL_CRATE)],
+            out=tmp_path / "scene",
+            options=options,
+            on_event=events.append,
+        )
+    assert sum("hangs in the air" in event.get("message", "") for event in events) == 2
+    depths = []
+    for item in folder.model.objects:
+        vertices = load_object_mesh(folder, item).vertices
+        seen = folder.model.camera.project(vertices)
+        mask = np.array(Image.open(folder.file(item.mask))) > 0
+        rows, columns = np.nonzero(mask)
+        ends = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+        # Its 500 vertices are about 2 pixels apart.
+        assert (*seen[:, :2].min(axis=0), *seen[:, :2].max(axis=0)) == pytest.approx(ends, abs=2.0)
+        assert vertices[:, 2].min() > 0.0 and item.asleep and item.held
+        depths.append(np.median(seen[:, 2]))
+    assert depths[0] == pytest.approx(depths[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("stop_at", ["photo", "camera", "background", "write", None])

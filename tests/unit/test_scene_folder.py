@@ -92,6 +92,8 @@ def roles(draw):
         return {"role": "collider", "motion": draw(st.none() | motion | deforming)}
     pins = tuple(draw(st.lists(boxes(), max_size=2)))
     return {
+        "asleep": draw(st.booleans()),
+        "held": draw(st.booleans()),
         "start_time": draw(share),
         "acceleration": draw(tracks()),
         "velocity_keys": draw(tracks()),

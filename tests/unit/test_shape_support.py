@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, declination
+from physgen.sim.reconstruct.shape.hanging import SEEN_FROM_DEG, hung, turned_view
 from physgen.sim.reconstruct.shape.object_supports import first_hit, place_on_supports, resting_on
 
 HEIGHT, WIDTH = 300, 400
@@ -75,3 +76,45 @@ def test_first_hit_of_a_box():
     vertices, faces = box((1, 1, 1), (0, 5, 0))
     assert first_hit(np.zeros(3), np.array([0.01, 1.0, 0.02]), vertices, faces) == pytest.approx(4.5)
     assert first_hit(np.zeros(3), np.array([1.0, 0.0, 0.0]), vertices, faces) == np.inf
+
+
+@pytest.mark.parametrize("column", [40, 200, 350])
+def test_what_hangs_is_made_in_a_turned_view_and_stays_where_the_photo_shows_it(column):
+    """A ball of 1 unit whose middle lies 0.3 above the camera, 3 away: made on the turned view's ground, and hung."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+    middle = VIEW.position + 3.0 * VIEW.rays(np.array([column, 0.0])) + (0.0, 0.0, 1.2)
+    low = camera_above_ground(WIDTH, HEIGHT, 350.0, np.radians(-10.0))
+    seen = low.project(np.asarray(ball.vertices) + middle)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[20:60, column - 20 : column + 20] = True
+    turned = turned_view(low, mask)
+    foot = np.array([float(column), 60.0])
+    assert np.degrees(declination(turned, foot)) == pytest.approx(SEEN_FROM_DEG, abs=0.1)
+    assert turned_view(VIEW, mask | (np.arange(HEIGHT) > 200)[:, None]) is None, "what stands below the horizon"
+    made = turned.position + 0.5 * seen[:, 2:] * turned.rays(seen[:, :2])
+    others = [low.position + 4.0 * low.rays(np.array([[200.0, 290.0]])), np.array([[0.0, 2.0, 0.0]])]
+    placed = hung(low, turned, made, others)
+    np.testing.assert_allclose(low.project(placed)[:, :2], seen[:, :2], atol=1e-6)
+    nearest = low.project(others[1])[0, 2]
+    assert np.median(low.project(placed)[:, 2]) == pytest.approx(nearest)
+    assert placed[:, 2].min() > 0.0
+    assert np.median(low.project(hung(low, turned, made, []))[:, 2]) == pytest.approx(3.0)
+
+
+def test_what_stands_above_the_horizon_on_something_tall_is_put_there():
+    """A cube on a cupboard that is taller than the camera is high: its foot meets the cupboard's upper edge."""
+    low = camera_above_ground(WIDTH, HEIGHT, 350.0, np.radians(5.0))
+    cupboard, faces = box((0.6, 0.3, 1.1), (0, 3.0, 0.55))
+    cube, _ = box((0.2, 0.2, 0.2), (0, 2.95, 1.2))
+    masks = []
+    for vertices in (cube, cupboard):
+        corners = low.project(vertices)[:, :2]
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        inside = (columns > corners[:, 0].min()) & (columns < corners[:, 0].max())
+        masks.append(inside & (rows > corners[:, 1].min()) & (rows < corners[:, 1].max()))
+    seen = [masks[0] & ~masks[1], masks[1]]
+    assert turned_view(low, seen[0]) is not None and resting_on(seen) == {0: 1}
+    away = low.position + 1.7 * (cube - low.position)
+    (found,) = place_on_supports(low, seen, [(away, faces), (cupboard, faces)])
+    placed = low.position + found.factor * (away - low.position)
+    assert placed[:, 1].mean() == pytest.approx(2.95, abs=0.2)

@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.app.rest_check import rest_notices
+from physgen.sim.app.rest_check import at_rest
 from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.effects.registry import apply_effects
 from physgen.sim.mpm.bodies import BodyForces, BodyParticles
@@ -115,19 +115,52 @@ def test_a_static_table_carries_and_a_moving_one_keeps_awake():
     assert sleepers_of(box(bottom=(0, 0, 0.7)), box("low"), colliders=(lift,)) == ["low"]
 
 
-def test_a_scene_says_what_will_not_stay(ball_scene):
-    """On the ground a ball of 10 cm stays; 1 cm above it (over half a cell of the coarsest quality) it falls, and that
-    is said, unless it is thrown or is not marked asleep."""
-    for height, fields, said in (
+def test_a_scene_holds_what_would_not_stay_and_says_so(ball_scene):
+    """On the ground a ball of 10 cm stays; 1 cm above it (over half a cell of the coarsest quality) it would fall, is
+    held, and that is said, whether or not it is thrown afterwards; not if it is not marked asleep."""
+    for height, fields, held in (
         (0.05, {}, False),
         (0.06, {}, True),
-        (0.06, {"velocity": (0.0, 0.0, 1.0)}, False),
+        (0.06, {"velocity": (0.0, 0.0, 1.0)}, True),
         (0.06, {"asleep": False}, False),
     ):
         folder = ball_scene(height=height, velocity=(0.0, 0.0, 0.0))
         item = dataclasses.replace(folder.model.objects[0], **{"asleep": True, **fields})
-        notices = rest_notices(Scene(root=folder.root, model=dataclasses.replace(folder.model, objects=(item,))))
-        assert [text.startswith("ball0: will not stay") for text in notices] == [True] * said
+        notices: list[str] = []
+        scene = Scene(root=folder.root, model=dataclasses.replace(folder.model, objects=(item,)))
+        assert at_rest(scene, notices.append).objects == (dataclasses.replace(item, held=held),)
+        assert ["ball0.held=false" in text for text in notices] == [True] * held
+
+
+def test_what_is_held_sleeps_in_mid_air_and_leaning_until_its_support_moves():
+    """A lamp a metre up carries what stands on it; a plank that leans on a block stays, unless the block is thrown."""
+    lamp = box("lamp", bottom=(0, 0, 1), held=True)
+    assert sleepers_of(lamp, box("on it", bottom=(0, 0, 1 + 4 * CELL)), box("beside", bottom=(1, 0, 1))) == [
+        "lamp",
+        "on it",
+    ]
+    block = box("block", cells=(2, 4, 2))
+    leaning = box("leaning", bottom=(3.5 * CELL, 0, 2 * CELL), cells=(8, 4, 2), held=True)
+    assert sleepers_of(block, leaning) == ["block", "leaning"]
+    thrown = dataclasses.replace(block, velocity=(-1.0, 0.0, 0.0))
+    assert sleepers_of(thrown, leaning) == []
+    later = dataclasses.replace(thrown, start_time=1.0)
+    assert sleepers_of(later, leaning) == ["leaning"], "what is not there yet carries nothing"
+    toppling = box("toppling", bottom=(3.5 * CELL, 0, 2 * CELL), cells=(8, 4, 2))
+    on_top = box("on top", bottom=(3.5 * CELL, 0, 4 * CELL), held=True)
+    assert sleepers_of(block, toppling, on_top) == ["block"], "what it touches is awake"
+    assert sleepers_of(dataclasses.replace(lamp, velocity=(0.0, 0.0, 1.0))) == []
+
+
+def test_what_is_held_falls_when_it_is_hit():
+    lamp = box("lamp", bottom=(0, 0, 0.5), held=True)
+    thrown = box("thrown", bottom=(-8 * CELL, 0, 0.5), velocity=(2.0, 0.0, 0.0), asleep=False)
+    world = World(bodies=(lamp, thrown), ground=Ground(), similarity=HERE, options=OPTIONS)
+    world.advance(0.75 * 4 * CELL / 2.0)
+    assert world.asleep(0) and moved(world, 0) == 0.0
+    world.advance(0.25)
+    assert not world.asleep(0)
+    assert world.positions(0)[:, 2].mean() < lamp.positions[:, 2].mean() - CELL
 
 
 def moved(world: World, index: int) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +63,15 @@ class CameraEstimate:
 def estimate_camera(
     picture: Photo,
     masks: Sequence[Mask],
-    names: Sequence[str],
     options: ReconstructOptions,
     depth: DepthMap | None,
     notice: Callable[[str], None],
 ) -> CameraEstimate:
-    """Return the camera of ``picture``, whose objects ``names`` have the ``masks`` (H, W).
+    """Return the camera of ``picture``, whose objects have the ``masks`` (H, W).
 
     depth: of the same size as the photo. Values in ``options`` are fixed. ``notice`` receives each estimate, its
-    uncertainty, and the option that overrides it. Raises InputError when an object does not stand below the horizon.
+    uncertainty, and the option that overrides it. What lies above a given horizon hangs,
+    and does not count.
     """
     width, height = picture.width, picture.height
     contacts = np.array([_contact(mask) for mask in masks]).reshape(-1, 2)
@@ -82,17 +82,18 @@ def estimate_camera(
         notice(_about_plane(plane))
     prior = _prior(log_focal, plane, options, contacts - np.array([width, height]) / 2.0, height)
     if options.pitch_deg is not None or options.horizon_y is not None:
-        # Fixed values may contradict each other; no line of the photo can change that.
+        # What does not stand below a given horizon hangs, and says nothing about the ground.
         means = np.array([[prior.log_focal.mean, prior.pitch.mean, prior.roll.mean]])
         log_f, pitch, roll = (float(v) for v in prior.completed(means)[0])
-        _check(cameras.camera_above_ground(width, height, math.exp(log_f), pitch, roll), contacts, names)
+        given = cameras.camera_above_ground(width, height, math.exp(log_f), pitch, roll)
+        stands = np.array([cameras.stands_below(given, contact) for contact in contacts], dtype=bool)
+        prior = replace(prior, contacts=prior.contacts[stands])
     found = infer_pose(
         find_segments(picture.pixels, np.logical_or.reduce([*masks, np.zeros((height, width), bool)])), prior
     )
     # The mean of poses with the given horizon does not have it itself.
     averages = np.array([[math.log(found.focal), found.pitch, found.roll]])
     camera = cameras.camera_above_ground(width, height, found.focal, *map(float, prior.completed(averages)[0, 1:]))
-    _check(camera, contacts, names)
     normal_source = _normal_source(options, plane, found)
     if log_focal.sigma > 0.2 and found.log_focal_sigma < KNOWN_LOG_FOCAL:
         focal_source = "straight lines"
@@ -123,11 +124,6 @@ def _contact(mask: Mask) -> NDArray[np.float64]:
         return np.array([mask.shape[1] / 2.0, float(mask.shape[0])])
     columns = np.flatnonzero(mask[rows[-1]])
     return np.array([(columns[0] + columns[-1] + 1) / 2.0, rows[-1] + 1.0])
-
-
-def _check(camera: Camera, contacts: NDArray[np.float64], names: Sequence[str]) -> None:
-    for name, contact in zip(names, contacts, strict=True):
-        cameras.check_below_horizon(camera, contact, name)
 
 
 def _focal(picture: Photo, options: ReconstructOptions, depth: DepthMap | None) -> tuple[Gaussian, str]:

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
 from ...scene.model import Camera, Matrix4
 
 DEFAULT_FOV_DEG = 50.0
@@ -88,17 +87,9 @@ def declination(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.floa
     return np.arcsin(np.clip(-rays[..., 2] / np.linalg.norm(rays, axis=-1), -1.0, 1.0))
 
 
-def check_below_horizon(camera: Camera, contact: NDArray[np.floating], name: str) -> None:
-    """Raise InputError when the object ``name``, standing at the pixel ``contact`` (2,), is not below the horizon."""
-    if float(declination(camera, contact)) >= math.radians(MIN_DECLINATION_DEG * 0.5):
-        return
-    left, right = horizon_at_edges(camera)
-    row = left + (right - left) * float(contact[0]) / camera.width
-    raise InputError(
-        f"horizon at {row / camera.height:.2f} of the photo's height, {name} stands at "
-        f"{float(contact[1]) / camera.height:.2f}: give a smaller horizon_y or a larger pitch_deg, "
-        "the horizon must lie above the objects' feet"
-    )
+def stands_below(camera: Camera, contact: NDArray[np.floating]) -> bool:
+    """Return whether the pixel ``contact`` (2,) is far enough below the horizon for something to stand there."""
+    return float(declination(camera, contact)) >= math.radians(MIN_DECLINATION_DEG * 0.5)
 
 
 def ground_depth(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:

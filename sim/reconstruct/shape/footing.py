@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A broader base for inflated bodies: the hidden underside is lowered to the ground.
+"""A broader base for inflated bodies: low down, the side that the photo does not show is made thicker.
 
-Inflated bodies are round below and would stand on a spot, where real things have settled. The part of the underside
-that faces away from the camera sags to the ground wherever the body still hides it there. The photo shows none of it:
-neither the front nor the outline changes.
+Inflated bodies are round and would stand on a spot, where real things have settled and reach farther back. What faces
+away from the camera moves farther from it along its own ray, most at the bottom and where the body is thick, not at all
+on the outline, and no farther than the ground: the underside comes to lie on the ground, the back moves away, and the
+centre of mass with it. Neither the front nor the outline changes.
 """
 
 from __future__ import annotations
@@ -14,53 +15,68 @@ from scipy import ndimage
 
 from ...mpm.geometry.triangles import area_normals
 from ...scene.model import Camera
+from ..camera.ground_camera import ground_depth
 from .inflate import Silhouette
 from .support import support_of
 
 Points = NDArray[np.float64]
 
-FOOTINGS = (0.03, 0.06, 0.1, 0.14)
-"""Heights over the body's height up to which the underside comes down, to try until the body stands."""
-RAMP = 3.0
-"""Height, over that of the footing, above which nothing sags."""
-HIDDEN_PX = 1
-"""Pixels by which the outline encloses what has moved."""
+THICKEST = 3.0
+"""Largest thickness that is added, over the body's half thickness."""
+STEPS = 60
+"""Thicknesses to try."""
+COST = 1.0
+"""Share of the wanted margin that a body has to gain for twice its volume; less is not worth its looks."""
+WHOLE = 0.3
+"""Local half thickness, over the largest, from which all of it is added: less to limbs, ears and straps."""
+HIGHEST = 0.35
+"""Height over the body's, above which nothing is added."""
 
 
 def footed(
     camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]
 ) -> tuple[Points, NDArray[np.bool_]]:
-    """Return ``vertices`` (V, 3) with as much of the underside on the ground z = 0 as the body needs to stand safely,
-    and which of them moved (V,).
+    """Return ``vertices`` (V, 3) with the unseen side as much thicker as the body needs to stand safely, and which of
+    them moved (V,).
 
-    camera: above the ground. As safely as ``support.SupportMargin.wanted`` says, or as the hidden underside allows.
+    camera: above the ground z = 0. As safely as ``support.SupportMargin.wanted`` says, or as is worth it.
     """
-    stands = support_of(vertices, faces)
-    best, safest = vertices, stands.margin
-    for share in FOOTINGS:
-        if safest >= stands.wanted:
-            break
-        made = _settled(camera, silhouette, vertices, faces, share * stands.height)
-        margin = support_of(made, faces).margin
-        if margin > safest:
-            best, safest = made, margin
+    plain = support_of(vertices, faces)
+    best, highest = vertices, plain.share
+    if highest < 1.0:
+        thicken = _Thickening(camera, silhouette, vertices, faces)
+        for extra in THICKEST * np.arange(1, STEPS + 1) / STEPS:
+            made = thicken.by(extra)
+            stands = support_of(made, faces)
+            score = min(stands.share, 1.0) - COST * (stands.volume / plain.volume - 1.0)
+            if score > (plain.share if stands.share >= 1.0 else highest):
+                best, highest = made, score
+            if stands.share >= 1.0:
+                break
     return best, (best != vertices).any(axis=1)
 
 
-def _settled(
-    camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64], height: float
-) -> Points:
-    """``vertices`` with the hidden underside below ``height`` on the ground, and what is above it drawn after."""
-    normals = area_normals(vertices, faces)
-    unseen = np.einsum("ij,ij->i", normals, camera.position - vertices) < 0.0
-    z = vertices[:, 2]
-    sagged = vertices.copy()
-    sagged[:, 2] = np.clip((z - height) * (RAMP / (RAMP - 1.0)), 0.0, np.maximum(z, 0.0))
-    inside = ndimage.binary_erosion(silhouette.mask, iterations=HIDDEN_PX)
-    at = camera.project(sagged)[:, :2] - (silhouette.left, silhouette.top)
-    column, row = np.floor(at).astype(np.int64).T
-    known = (row >= 0) & (row < inside.shape[0]) & (column >= 0) & (column < inside.shape[1])
-    hidden = np.zeros(len(vertices), dtype=bool)
-    hidden[known] = inside[row[known], column[known]]
-    moves = (normals[:, 2] < 0.0) & unseen & hidden & (z < RAMP * height)
-    return np.asarray(np.where(moves[:, None], sagged, vertices))
+class _Thickening:
+    """The unseen vertices of one body, and how far each may move away along its ray."""
+
+    def __init__(self, camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]) -> None:
+        self._vertices = vertices
+        projected = camera.project(vertices)
+        self._rays = camera.rays(projected[:, :2])
+        # Depths, along the optical axis: what each vertex moves for one half thickness, and at most.
+        half = silhouette.half_thickness * float(np.median(projected[:, 2])) / camera.fx
+        at = projected[:, :2] - (silhouette.left + 0.5, silhouette.top + 0.5)
+        square = ndimage.map_coordinates(silhouette.square_height, at[:, ::-1].T, order=1, mode="nearest")
+        share = np.sqrt(np.maximum(square, 0.0)) / silhouette.half_thickness
+        unseen = np.einsum("ij,ij->i", area_normals(vertices, faces), camera.position - vertices) < 0.0
+        low = np.clip(1.0 - vertices[:, 2] / (HIGHEST * vertices[:, 2].max()), 0.0, 1.0)
+        self._step = np.where(unseen, half * low * np.minimum(share / WHOLE, 1.0), 0.0)
+        self._step /= np.linalg.norm(self._rays, axis=1)
+        self._room = np.maximum(ground_depth(camera, self._rays) - projected[:, 2], 0.0)
+
+    def by(self, extra: float) -> Points:
+        """Return the vertices (V, 3) with ``extra`` half thicknesses added, none below the ground."""
+        moved = extra * self._step
+        made = self._vertices + np.minimum(moved, self._room)[:, None] * self._rays
+        made[(moved > 0.0) & (moved >= self._room), 2] = 0.0
+        return np.asarray(made)

@@ -17,42 +17,16 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
 from ...scene.model import Camera
 from .footing import footed
 from .inflate import Silhouette
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
-from .support import centroid, inside_hull
+from .support import support_of
 from .surface_mesh import RELAXATION_ROUNDS, Faces, Points, relax, surface_of_size
 
 STABLE = 0.25
-"""Target ``stability`` of a body."""
-NO_BASE = -1.0
-"""``stability`` of a body that touches the ground in fewer than three points."""
-
-
-def stability(vertices: Points, faces: NDArray[np.int64]) -> float:
-    """Return how safely a closed body of uniform density stands on z = 0; negative if it topples.
-
-    The distance of its centre of mass from the edge of the convex hull of its contact points, over the distance of the
-    hull's centre from that edge; -1 for fewer than three contact points.
-    """
-    size = float(np.ptp(vertices, axis=0).max())
-    base = vertices[vertices[:, 2] < 1e-6 * size][:, :2]
-    if len(base) < 3:
-        return NO_BASE
-    try:
-        hull = ConvexHull(base)
-    except QhullError:
-        return NO_BASE
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    volumes = np.einsum("ti,ti->t", a, np.cross(b, c))
-    centre = ((a + b + c) * volumes[:, None]).sum(axis=0) / (4.0 * volumes.sum())
-
-    return inside_hull(hull, centre[:2]) / max(inside_hull(hull, centroid(base[hull.vertices])), 1e-12)
-
-
+"""Steadiness (``SupportMargin``) at which the wall moves back no farther."""
 BARE_THICKNESS = 0.8
 """Thickness of objects that are neither round nor boxes, over their widest inscribed circle: few are as deep as
 wide."""
@@ -175,9 +149,9 @@ def inflated_mesh(
 ) -> tuple[BodyMesh, float, float]:
     """Return the closed surface of the body with about ``target`` vertices, standing on the ground.
 
-    Also its stability and the share of its surface that was disconnected and removed. The first reference surface with
-    which it stands safely is used, or the best. Stability is evaluated on the mesh itself: the contact is often a
-    narrow strip, which anything coarser would miss.
+    Also its steadiness (``SupportMargin``) and the share of its surface that was disconnected and removed. The first
+    reference surface with which it stands safely is used, or the best. That is judged on the mesh itself: the contact
+    is often a narrow strip, which anything coarser would miss.
 
     flat: nothing behind the reference surface. front: (h, w) depth along the optical axis of the visible front on the
     silhouette's crop, units, NaN where unknown; None inflates about a wall, or about legs where they stand. Raises
@@ -203,11 +177,11 @@ def inflated_mesh(
         # One round brings the base onto the ground; the rest is for the one that is taken.
         points = relax(field, points, faces, 1)
         body = _to_world(silhouette, reference, points, faces)
-        margin = stability(body.vertices, body.faces)
-        if best is None or margin > best[4]:
-            best = (reference, points, faces, lost, margin)
+        steadiness = support_of(body.vertices, body.faces).steadiness
+        if best is None or steadiness > best[4]:
+            best = (reference, points, faces, lost, steadiness)
         # A relief need not stand by itself, as long as it touches the ground: moving it back only enlarges it.
-        if margin >= STABLE or (flat and margin > NO_BASE):
+        if steadiness >= STABLE or (flat and steadiness > -1.0):
             break
     assert best is not None
     reference, points, faces, lost, _ = best
@@ -215,7 +189,7 @@ def inflated_mesh(
     body = _to_world(silhouette, reference, points, faces)
     if not flat:
         body = _footed(camera, silhouette, body)
-    return body, stability(body.vertices, body.faces), lost
+    return body, support_of(body.vertices, body.faces).steadiness, lost
 
 
 def _footed(camera: Camera, silhouette: Silhouette, body: BodyMesh) -> BodyMesh:

@@ -27,13 +27,15 @@ from .body_texture import TexturedSurface, colour_pixels, crop_texture
 from .depth_front import front_of
 from .furniture import furniture_boards
 from .furniture_mesh import furniture_mesh
+from .hanging import hung, turned_view
 from .inflate import Crop, crop_mask, inflate
-from .inflated_mesh import BodyMesh, inflated_mesh, shadow_mesh, stability
+from .inflated_mesh import BodyMesh, inflated_mesh, shadow_mesh
 from .object_supports import TriangleMesh, place_on_supports
 from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import rasterize
 from .separation import PlacedBody, separate
+from .support import support_of
 from .surface_mesh import WORTH_SAYING
 from .texture_atlas import textured_body
 
@@ -41,7 +43,7 @@ Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
 
 TOPPLES = 0.05
-"""Stability below which a notice says that the body may topple."""
+"""Steadiness below which a notice says that the body may topple."""
 BENT = 0.98
 """Silhouette overlap above which the warped primitive is the body; below, the outline is cut out of it."""
 KEPT = 0.96
@@ -54,9 +56,9 @@ UNLIKELY = 0.8
 class BuiltBody:
     """The body of one object. The camera is 1 unit above the ground z = 0.
 
-    mesh: closed surface, world units. shape: ``box``, ``cylinder``, ``sphere`` or ``inflated``. stability: 1 for a
-    cube, negative if it topples; a sphere counts as standing. fit: overlap (IoU) of its silhouette in the photo's view
-    with its mask.
+    mesh: closed surface, world units. shape: ``box``, ``cylinder``, ``sphere`` or ``inflated``. stability: the
+    steadiness of its ``SupportMargin``; a sphere counts as standing. fit: overlap (IoU) of its silhouette in the
+    photo's view with its mask.
     """
 
     mesh: BodyMesh
@@ -112,7 +114,7 @@ def build_body(
         part = 1.0 if request.thickness is None or choice.primitive.name == "box" else request.thickness
         mesh, lost = _solid(camera, crop, choice, full, part, options.mesh_vertices)
         shape = choice.primitive.name
-        margin = 1.0 if shape == "sphere" else stability(mesh.vertices, mesh.faces)
+        margin = 1.0 if shape == "sphere" else support_of(mesh.vertices, mesh.faces).steadiness
     fit = silhouette_overlap(camera, mesh, full)
     if choice is not None and fit < KEPT and request.shape == "auto":
         # Reject an automatic primitive that does not keep the outline.
@@ -187,7 +189,7 @@ def _furniture(
         mesh, _ = furniture_mesh(camera, crop, boards, target)
     except InputError:
         return None
-    margin, fit = stability(mesh.vertices, mesh.faces), silhouette_overlap(camera, mesh, full)
+    margin, fit = support_of(mesh.vertices, mesh.faces).steadiness, silhouette_overlap(camera, mesh, full)
     if fit < KEPT or margin < TOPPLES:
         return None
     mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, None))
@@ -221,11 +223,12 @@ USER_MESH = "mesh"
 
 @dataclass(frozen=True)
 class Body:
-    """surface: closed, in the camera's unit, standing on z = 0 or a support. shape: a primitive's name, ``inflated`` or
-    ``USER_MESH``."""
+    """surface: closed, in the camera's unit, standing on z = 0 or a support, or hanging. shape: a primitive's name,
+    ``inflated`` or ``USER_MESH``. turned: the view in which it was made if it hangs."""
 
     surface: TexturedSurface
     shape: str
+    turned: Camera | None = None
 
     @property
     def extent(self) -> float:
@@ -253,16 +256,18 @@ def make_bodies(
     for i, item in enumerate(objects):
         steps.begin(f"mesh {item.name}")
         full, seen, colours = layers.full[i], layers.seen[i], layers.colours[i]
-        inputs = {"full": full, "seen": seen, "pixels": colours, "view": view, "name": item.name}
+        turned = turned_view(view, full)
+        own, own_depth = (view, depth) if turned is None else (turned, None)
+        inputs = {"full": full, "seen": seen, "pixels": colours, "view": own, "name": item.name}
         if item.mesh is None and mesher is None:
             fields = {name: getattr(item, name) for name in ("kind", "shape", "back", "thickness")}
             others = np.logical_or.reduce([np.zeros_like(full), *layers.seen[:i], *layers.seen[i + 1 :]])
-            if depth is not None:
-                fields |= {"depth": depth.values, "disparity": depth.disparity, "others": others}
+            if own_depth is not None:
+                fields |= {"depth": own_depth.values, "disparity": own_depth.disparity, "others": others}
             made = store.run(
                 "mesh",
                 {**inputs, **fields, "vertices": options.mesh_vertices},
-                partial(_built, view, full, seen, colours, item, options, depth, others),
+                partial(_built, own, full, seen, colours, item, options, own_depth, others),
             )
         else:
             given = {
@@ -272,10 +277,10 @@ def make_bodies(
             }
             file = None if item.mesh is None else _content(item.mesh)
             made = store.run(
-                "fit", {**inputs, **given, "file": file}, partial(_fitted, view, full, seen, colours, item, mesher)
+                "fit", {**inputs, **given, "file": file}, partial(_fitted, own, full, seen, colours, item, mesher)
             )
         surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"])
-        bodies.append(Body(surface, str(made["shape"])))
+        bodies.append(Body(surface, str(made["shape"]), turned))
     bodies = _on_supports(view, layers.seen, bodies, objects, steps.notice)
     return _separated(view, layers.front_to_back, bodies, objects, steps.notice)
 
@@ -343,14 +348,28 @@ def _fitted(
 def _on_supports(
     view: Camera, seen: Sequence[Mask], bodies: Sequence[Body], objects: Sequence[ObjectRequest], notice: Notice
 ) -> list[Body]:
-    """``bodies``, with those that stand on other bodies moved onto them."""
-    placed = list(bodies)
-    for found in place_on_supports(view, seen, [(body.surface.vertices, body.surface.faces) for body in bodies]):
-        surface = placed[found.upper].surface
-        vertices = view.position + found.factor * (surface.vertices - view.position)
-        placed[found.upper] = replace(placed[found.upper], surface=replace(surface, vertices=vertices))
-        notice(f"{objects[found.upper].name} stands on {objects[found.lower].name}; it is placed there")
+    """``bodies``, with those that stand on other bodies moved onto them, and those that stand on nothing in the air."""
+    standing = [body.surface.vertices for body in bodies if body.turned is None]
+    placed = [
+        body if body.turned is None else _moved(body, hung(view, body.turned, body.surface.vertices, standing))
+        for body in bodies
+    ]
+    found = place_on_supports(view, seen, [(body.surface.vertices, body.surface.faces) for body in placed])
+    for item in found:
+        vertices = placed[item.upper].surface.vertices
+        placed[item.upper] = _moved(placed[item.upper], view.position + item.factor * (vertices - view.position))
+        notice(f"{objects[item.upper].name} stands on {objects[item.lower].name}; it is placed there")
+    for i in {i for i, body in enumerate(bodies) if body.turned is not None} - {item.upper for item in found}:
+        notice(
+            f"{objects[i].name}: its foot lies above the horizon, so it stands on nothing and hangs in the air, at "
+            f"{'the distance of the nearest other object' if standing else 'a guessed distance'}; if it stands, give a "
+            "smaller horizon_y or a larger pitch_deg"
+        )
     return placed
+
+
+def _moved(body: Body, vertices: Points) -> Body:
+    return replace(body, surface=replace(body.surface, vertices=vertices))
 
 
 def _separated(
@@ -365,20 +384,17 @@ def _separated(
             f"{name} and {other} would share space: {name} gives way by up to {item.share:.0%} of its size, on the "
             "side that the photo does not show"
         )
-    return [
-        replace(body, surface=replace(body.surface, vertices=places))
-        for body, places in zip(bodies, vertices, strict=True)
-    ]
+    return [_moved(body, places) for body, places in zip(bodies, vertices, strict=True)]
 
 
 def shadow_casters(view: Camera, full: Sequence[Mask], bodies: Sequence[Body]) -> list[TriangleMesh]:
     """Meshes that cast the shadows: plain inflated masks for inflated bodies, the bodies' own surfaces otherwise.
 
-    An inflated body is moved back until it stands, so its shadow would be displaced.
+    An inflated body is moved back until it stands, so its shadow would be displaced; one that hangs is not.
     """
     result = []
     for mask, body in zip(full, bodies, strict=True):
-        if body.shape == "inflated":
+        if body.shape == "inflated" and body.turned is None:
             bare = shadow_mesh(view, inflate(mask))
             result.append((bare.vertices, bare.faces))
         else:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.model import Camera
+from ..camera.ground_camera import stands_below
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -31,7 +32,7 @@ NEAREST = 0.2
 
 @dataclass(frozen=True)
 class Support:
-    """``upper`` stands on ``lower`` (indices); ``factor``: its distance from the camera over that on the ground."""
+    """``upper`` stands on ``lower`` (indices); ``factor``: its distance from the camera over that where it was."""
 
     upper: int
     lower: int
@@ -79,8 +80,8 @@ def _below_foot(mask: Mask) -> Mask:
 def place_on_supports(camera: Camera, seen: Sequence[Mask], meshes: Sequence[TriangleMesh]) -> list[Support]:
     """Return how bodies must be scaled about ``camera`` to stand on the supports that the photo shows.
 
-    seen: (H, W); meshes: vertices (V, 3) and faces (T, 3) of all objects, standing on z = 0, in the camera's unit.
-    Lower ones come first. A body whose ray misses its support stays on the ground.
+    seen: (H, W); meshes: vertices (V, 3) and faces (T, 3) of all objects, standing on z = 0, or hanging where the foot
+    lies above the horizon, in the camera's unit. Lower ones come first. A body whose ray misses its support stays.
     """
     on = resting_on(seen)
     factors = [1.0] * len(seen)
@@ -92,9 +93,14 @@ def place_on_supports(camera: Camera, seen: Sequence[Mask], meshes: Sequence[Tri
         ray = camera.rays(pixel)
         depth = first_hit(camera.position, ray, vertices, meshes[lower][1])
         own = float(camera.project(meshes[upper][0])[:, 2].min())
-        ground = -camera.position[2] / ray[2] if ray[2] < -1e-6 else np.inf
-        factor = depth / ground
-        if np.isfinite(factor) and NEAREST < factor < 0.999 and own > 0:
+        if stands_below(camera, pixel):
+            factor = depth / (-camera.position[2] / ray[2])
+            placeable = NEAREST < factor < 0.999
+        else:
+            projected = camera.project(meshes[upper][0])
+            factor = depth / projected[np.linalg.norm(projected[:, :2] - pixel, axis=1).argmin(), 2]
+            placeable = bool(np.isfinite(factor))
+        if placeable and own > 0:
             factors[upper] = float(factor)
             placed.append(Support(upper, lower, float(factor)))
     return placed

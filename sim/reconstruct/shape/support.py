@@ -44,6 +44,16 @@ class SupportMargin:
     longest: float
 
     @property
+    def steadiness(self) -> float:
+        """The margin over the one that the base allows: 1 for a cube, negative for what topples, -1 without a base."""
+        return max(self.margin / self.inradius, -1.0) if self.inradius > 0.0 else -1.0
+
+    @property
+    def share(self) -> float:
+        """The margin over the one that the body should have."""
+        return self.margin / self.wanted
+
+    @property
     def cell(self) -> float:
         """Side of a grid cell when the body is simulated alone in the coarsest quality."""
         quality = load_quality(COARSEST)
