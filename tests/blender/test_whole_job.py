@@ -14,6 +14,7 @@ import pytest
 from physgen.sim.cache.bake_folder import load_manifest
 
 pytest.importorskip("bpy")
+pytestmark = pytest.mark.long
 
 FRAMES = 5
 

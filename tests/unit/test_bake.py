@@ -45,6 +45,7 @@ def test_a_thrown_ball_flies_as_it_should(ball_scene, tmp_path):
     assert [m["frame"] for m in metrics] == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.long
 def test_a_ball_of_clay_is_dented_and_its_skin_follows(ball_scene, tmp_path):
     """Thrown down at 5 m/s it stays flat at the foot: lower than 95 % of itself, wider than before, whole and above the
     ground; and it is still as flat a tenth of a second later (1 % of the diameter)."""
@@ -107,6 +108,7 @@ def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
     assert caches(tmp_path / "parts") == caches(tmp_path / "whole")
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_a_rerun_and_nothing_else(ball_scene, tmp_path):
     folder = ball_scene()
     job = bake_worker.BakeJob(
@@ -166,6 +168,7 @@ def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until
     assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
 
 
+@pytest.mark.long
 def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
     folder = ball_scene()
     asked = iter([False] * 14 + [True])
@@ -191,6 +194,7 @@ def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):
         bake(load_scene(folder.root), out=tmp_path / "file", options=QUICK)
 
 
+@pytest.mark.long
 def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, own_kernels, tmp_path):
     folder = ball_scene()
     job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)

@@ -200,6 +200,7 @@ module.bake(load_scene(Path({str(folder.root)!r})), out={str(tmp_path / "parts")
     assert left == ["ball0.pc2", "ball0.points.pc2", "manifest.json", "metrics.json"]
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_of_particles_keeps_what_was_good(ball_scene, own_kernels, tmp_path):
     folder = ball_scene(preset="sand")
     particles = estimate_bake(folder, POINTS).particle_count
@@ -258,6 +259,7 @@ def test_too_little_room_for_the_particles_is_said_before_it_starts(ball_scene, 
         bake(load_scene(folder.root), out=tmp_path / "bake", options=many)
 
 
+@pytest.mark.long
 def test_without_photo_and_floor_a_body_falls_on_for_ever(ball_scene, tmp_path, capsys):
     folder = ball_scene(velocity=(0.0, 0.0, 0.0), photo=None, background=None, ground=None)
     (folder.root / "photo.png").unlink()

@@ -82,6 +82,7 @@ def overlap(pieces):
     return sum(penetration_of_meshes(pieces[-1].surface, other.surface).volume for other in pieces[:-1])
 
 
+@pytest.mark.long
 def test_methods_do_what_they_are_for(ring, ball, reference):
     """Physics takes penetration away, pictures the distortion; Algorithm 1 both, and best."""
     begin, truth = swollen(ball), [ring, ball]

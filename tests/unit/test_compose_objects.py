@@ -17,6 +17,7 @@ def names(group):
     return [body.name for body in group.bodies]
 
 
+@pytest.mark.long
 def test_those_that_touch_hang_together_frontmost_first(tmp_path):
     meshes = {"a": ball(0), "b": ball(0.09), "far": ball(1), "c": ball(0.18), "x": ball(3), "y": ball(3.05)}
     found = contact_groups(a_scene(tmp_path / "s", meshes), (), cells=40)

@@ -140,6 +140,7 @@ def test_strangers_are_refused(tmp_path):
         run_dask(plan, FarmOptions(farm="tcp://127.0.0.1:9"), ignore, never)
 
 
+@pytest.mark.long
 def test_tls_and_a_wish_to_stop(ball_scene, tmp_path):
     ball_scene()
     security = distributed.Security.temporary()
