@@ -41,7 +41,7 @@ GAP = 0.02
 
 
 class Specimen(NamedTuple):
-    """What is dropped: shape, longest side and height of fall in m."""
+    """A body to drop: shape, longest side and height of fall in m."""
 
     shape: str
     size: float
@@ -50,7 +50,7 @@ class Specimen(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What such matter does: spans of e, of the squash in %, of the decay in s, and the largest loss of shape in %."""
+    """Expected behaviour: ranges of e, of the squash in %, of the decay in s, and the largest loss of shape in %."""
 
     restitution: Span | None = None
     squash: Span | None = None
@@ -207,7 +207,7 @@ def shape_loss(rest: Array, now: Array) -> float:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Drop:
-    """What a drop shows: coefficient of restitution, largest squash and loss of shape (shares), cost."""
+    """Result of a drop: coefficient of restitution, largest squash and loss of shape (shares), cost."""
 
     restitution: float
     squash: float

@@ -224,7 +224,7 @@ def moved(body: Body, scale: float, offset: Points) -> Body:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the camera sees of a body. mask: (H, W); front, thickness: (H, W) depths; volume."""
+    """A body as the camera sees it. mask: (H, W); front, thickness: (H, W) depths; volume."""
 
     mask: NDArray[np.bool_]
     front: Points

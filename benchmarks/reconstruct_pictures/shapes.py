@@ -19,7 +19,7 @@ PLAIN_SOLIDS = ("box", "cylinder", "sphere")
 class Body:
     """A thing that stands on the origin, Z up, metres.
 
-    parts: closed meshes and the paint that each wears (0 or 1). volume: cubic metres, None for what is hollow or has
+    parts: closed meshes and the paint of each (0 or 1). volume: cubic metres, None for what is hollow or has
     parts that overlap. smooth: whether its surface is shaded round. colours: (V, 3) linear albedo of the vertices of
     ``mesh``, instead of paints.
     """

@@ -20,7 +20,7 @@ The distance of two windows is
 whose first part is the squared 2-Wasserstein distance of two normal distributions (Dowson and Landau, 1982); the
 picture's is D = sqrt(mean over scales of the mean over windows of d²), windows weighted by the larger of both covers.
 All terms are in units of Delta E (1976): D = 0 for equal statistics, and 2.3 would be a just noticeable difference of
-plain colours. It is symmetric. Outside of both bodies everything wears their common mean colour, so that no backdrop
+plain colours. It is symmetric. Outside of both bodies everything has their common mean colour, so that no backdrop
 has a part in it; outlines count through k alone.
 """
 

@@ -153,7 +153,7 @@ def sand(item: bpy.types.Object, name: str, clock: Clock) -> list[Effect]:
         return []
     if cohesion_of(body.material.law) in (RIGID, FLUID):
         raise InputError(
-            f"object {item.name!r}: turns to sand, which {body.material.law} matter cannot: give it an elastic or "
+            f"object {item.name!r}: turns to sand, which {body.material.law} material cannot: give it an elastic or "
             "plastic behaviour, or switch Turns to Sand off"
         )
     start = clock.from_frame(body.sandy_frame)

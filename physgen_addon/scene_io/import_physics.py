@@ -344,17 +344,17 @@ def _set_pins(scene: bpy.types.Scene, body: Any, names: list[str]) -> None:
 
 def _set_effects(scene: bpy.types.Scene, world: Any, entries: list[Fields]) -> None:
     world.effects.clear()
-    for told in entries:
+    for given in entries:
         targets = [
-            _of_source(scene, name) if kind == "source" else scene.objects.get(name) for kind, name in told["targets"]
+            _of_source(scene, name) if kind == "source" else scene.objects.get(name) for kind, name in given["targets"]
         ]
-        if told["targets"] and not any(targets):
+        if given["targets"] and not any(targets):
             # Without targets it would act on all objects.
             continue
         entry = world.effects.add()
-        entry.effect, entry.enabled = told["effect"], told["enabled"]
+        entry.effect, entry.enabled = given["effect"], given["enabled"]
         entry.parameters.clear()
-        for name, value in told["parameters"].items():
+        for name, value in given["parameters"].items():
             number = entry.parameters.add()
             number.name, number.value = name, value
         for item in targets:

@@ -52,7 +52,7 @@ MANIFEST_SECONDS = 0.5
 
 LEAST_PARTS, MOST_PARTS = 4, 1000
 PART_WORK = 2e7
-"""A frame of stiff matter can take minutes. It is advanced in parts of about so many particle substeps, a few seconds,
+"""A frame of stiff material can take minutes. It is advanced in parts of about so many particle substeps, some seconds,
 between which its state can be kept; by the estimate, not by the clock, so that the same input gives the same bytes."""
 
 
@@ -216,7 +216,7 @@ class _Run:
                 self._stop(keep_state=True)
             raise
         if self.metrics and self.metrics[-1].get("outside"):
-            progress.notice("matter has left the box around the scene; it flies on, and the camera may not see it")
+            progress.notice("material has left the box around the scene; it flies on, and the camera may not see it")
         progress.report(self.manifest.frames)
         return self.save("complete")
 

@@ -67,7 +67,7 @@ class MovingSplats:
     """
 
     def __init__(self, rest: Splats, world_from_mesh: Array, vertices: Array, particles: Array | None) -> None:
-        """vertices: (V, 3) of the mesh; particles: (P, 3) of the matter, None for a collider; at rest in the world."""
+        """vertices: (V, 3) of the mesh; particles: (P, 3), None for a collider; both at rest in the world."""
         self.rest = rest
         self._world = transform_splats(rest, world_from_mesh)
         self._vertices = vertices

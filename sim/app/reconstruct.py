@@ -222,10 +222,10 @@ def require_physics(objects: int, physics: Physics) -> None:
 
 
 def set_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> Scene:
-    """Return ``scene`` with ``physics``, saved; whatever ``physics`` leaves open becomes what it is in a new scene.
+    """Return ``scene`` with ``physics``, saved; what ``physics`` leaves open gets the default of a new scene.
 
-    A new scene is as it was reconstructed, at rest; where the folder does not tell, its objects are ``medium``.
-    friction: Coulomb coefficient of the ground; None takes that of the new scene. Effects stay.
+    A new scene is as it was reconstructed, at rest; objects without a recorded material are ``medium``.
+    friction: Coulomb coefficient of the ground; None: the new scene's. Effects stay.
     """
     model = with_physics(_as_reconstructed(scene, friction), physics)
     return scene if model == scene.model else save_scene(scene.root, model)

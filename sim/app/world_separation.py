@@ -2,7 +2,7 @@
 """Bodies that share space at the start, made to share none: what overlaps is left out of one of them.
 
 Overlap of less than a grid cell is left to contact, which pushes bodies apart gently. More would throw them apart, or
-lock them into each other. Then the body that loses the smaller share of its matter is simulated without what lies in
+lock them into each other. Then the body that loses the smaller share of its material is simulated without what lies in
 the other: a chair has a hollow where a toy sits deep in it. Only the simulation knows: meshes are rendered whole, so
 the first frame is what it was.
 """

@@ -183,10 +183,10 @@ JITTER = 0.2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedWorld:
-    """All that the engine is told, and what the user should hear before it starts.
+    """Input of the engine, with notices for the user.
 
     body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
-    cost: of the whole bake, estimated for ``arch``; stable_step, duration: in s, what it was estimated from.
+    cost: of the whole bake, estimated for ``arch`` from ``stable_step`` and ``duration``, s.
     """
 
     setup: WorldSetup
@@ -330,7 +330,7 @@ def _pins(item: SceneObject, sample: InteriorSample) -> NDArray[np.bool_] | None
         if not inside.any():
             low, high = sample.positions.min(axis=0), sample.positions.max(axis=0)
             raise InputError(
-                f"object {item.name}: pins[{i}] from {box.low} to {box.high} holds none of its matter, which is "
+                f"object {item.name}: pins[{i}] from {box.low} to {box.high} holds none of its material, which is "
                 f"between {low.round(4).tolist()} and {high.round(4).tolist()}: move or enlarge the box"
             )
         pinned |= inside
@@ -377,7 +377,7 @@ def _track(keys: Keys) -> Track | None:
 
 
 def cost_text(prepared: PreparedWorld) -> str:
-    """What the bake will take, in a line for people."""
+    """Return the estimated cost of the bake as one line of text."""
     cost = prepared.cost
     return (
         f"about {_duration(cost.seconds)} of computing and {cost.bytes / 2**20:.0f} MiB: {prepared.particle_count} "

@@ -4,7 +4,7 @@
 Equation: m_i' = (1 - f) m_i + f M w_i with weights w_i >= 0, sum w_i = 1, sum w_i x_i = c + d: the mass M stays, the
     centre of mass c moves by f d exactly. The weights are m_i exp(-|x_i - c - d|² / 2 h² + b (x_i - c - d)), b
     solved for, and h half the particle spacing, or more where the pellet would be over 30 times as dense as the body:
-    that has a pellet's inertia (a tilt of all the body's density would have none) and a size that soft matter carries.
+    that has a pellet's inertia (a tilt of all the body's density would have none) and a size that soft bodies carry.
 Source: local maximum-entropy weights, Arroyo and Ortiz, Int. J. Numer. Methods Eng. 65 (2006).
 Bodies: all.
 Twice: pellets follow each other, each placed from the centre of mass that the body has then.

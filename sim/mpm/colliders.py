@@ -95,7 +95,7 @@ class Collider:
     pivot: world point about which it turns; None takes the middle of the surface's bounding box.
     vertices: Track of (V, 3) world metres for a surface that deforms, in place of translations and rotations.
     lattice: signed distances of the surface at rest in place of those that are worked out of it: finer where it is
-        thin, or with a boundary of the caller's own. What is below 0 is where matter may not be; rigid bodies touch it
+        thin, or with a boundary of the caller's own. Material may not be where it is below 0; rigid bodies touch it
         too, with their own points. Not of a surface that deforms.
     """
 

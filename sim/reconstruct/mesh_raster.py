@@ -177,7 +177,7 @@ def seen_faces(camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """What a surface wears: ``texture`` (h, w, 3) uint8 at ``uv`` (V, 2), else ``colours`` (V, 3) 0 to 255.
+    """Colours of a surface: ``texture`` (h, w, 3) uint8 at ``uv`` (V, 2), else ``colours`` (V, 3) 0 to 255.
 
     uv: first row of the texture at v = 1; values outside 0 to 1 repeat it.
     """
@@ -188,7 +188,7 @@ class Paint:
 
 
 def paint_of(mesh: trimesh.Trimesh) -> Paint:
-    """Return what ``mesh`` wears: its texture, else its vertices' colours, else plain grey."""
+    """Return the colours of ``mesh``: its texture, else its vertices' colours, else plain grey."""
     uv = getattr(mesh.visual, "uv", None)
     material = getattr(mesh.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)

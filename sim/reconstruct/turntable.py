@@ -38,7 +38,7 @@ CONTACT_SHARE = 0.06
 class Turned:
     """A body to be viewed.
 
-    vertices: (V, 3) metres. faces: (T, 3). paint: what it wears. up: (3,) unit normal of the ground. front: (3,) unit,
+    vertices: (V, 3) metres. faces: (T, 3). paint: its colours. up: (3,) unit normal of the ground. front: (3,) unit,
     level, towards the viewer at azimuth 0. ground: height of the ground along ``up``, metres. centre: (3,), radius: of
     the ball around the centre that every view contains, metres.
     """

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.segmentation.amodal_completion import complete_colours, complete_outline
 
-from .cut_scenes import HEIGHT, WIDTH, bottle, cylinder, disc, overlap, polygon
+from .segmentation_scenes import HEIGHT, WIDTH, bottle, cylinder, disc, overlap, polygon
 
 CHAIR = polygon((90, 40), (220, 40), (220, 150), (250, 180), (60, 180), (90, 150))
 

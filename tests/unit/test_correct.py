@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Corrections of a scene: what was told changes, what does not depend on it is not computed again."""
+"""Corrections of a scene: the overridden estimate changes, and only what depends on it is computed again."""
 
 import dataclasses
 import json

@@ -11,7 +11,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 from PIL import Image
 
-from .cut_scenes import HEIGHT, WIDTH, disc, overlap
+from .segmentation_scenes import HEIGHT, WIDTH, disc, overlap
 
 TRUTH = disc(120, 100, 50)
 GREY = TRUTH.astype(np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies, options and placement: what the engine is told before it computes."""
+"""Bodies, options and placement: the engine's input."""
 
 from __future__ import annotations
 

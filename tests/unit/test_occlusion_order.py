@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from physgen.sim.reconstruct.segmentation.occlusion_order import occlusion_order
 
-from .cut_scenes import HEIGHT, WIDTH, bottle, cylinder, disc, polygon
+from .segmentation_scenes import HEIGHT, WIDTH, bottle, cylinder, disc, polygon
 
 
 def in_front_of(order, index):

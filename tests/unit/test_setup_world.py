@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a scene to the engine's world, without the engine: what reaches it, and what is refused before it starts."""
+"""From a scene to the engine's world, without the engine: what is passed on, and what is refused before it starts."""
 
 import dataclasses
 import math

@@ -157,8 +157,8 @@ def ball_body() -> BoxFactory:
 
 
 @pytest.fixture
-def solids() -> Callable[..., RigidBodies]:
-    """A factory of solids: worlds of 32 cells a metre around the origin."""
+def rigid_bodies() -> Callable[..., RigidBodies]:
+    """A factory of rigid bodies: worlds of 32 cells a metre around the origin."""
 
     def make(*setups: WorldSetup) -> RigidBodies:
         runtime.ensure_started(SolverOptions(grid=GRID))

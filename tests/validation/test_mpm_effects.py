@@ -269,7 +269,7 @@ def test_stiffness_sets_the_pitch_of_a_bar(box, options, similarity, cell):
 
 def test_numbers_of_matter_reach_the_kernels(box, options, similarity):
     """Damping time, yield stress, fibres and moduli as the kernels' table and particles have them; the laws themselves
-    are validated in test_mpm_matter and unit/test_mpm_laws."""
+    are validated in test_mpm_constitutive_laws and unit/test_mpm_laws."""
     setup = WorldSetup(bodies=(box(cells=(3, 3, 3), youngs_modulus=1e5, poisson_ratio=0.25),))
     shear = 1e5 / 2.5
     plain = under(setup, [], similarity, options)[0].group._engine

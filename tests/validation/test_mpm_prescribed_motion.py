@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Motion given to single particles from outside, and colliders with distances of the caller's own."""
+"""Prescribed motion of single particles, and colliders with distances of the caller's own."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run is said to cost: the time step of theory, refusal by hours and by memory, memory found portably."""
+"""Estimated cost of a run: the theoretical time step, refusal by hours and by memory, free memory on each system."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Matter that deforms against rigid bodies and colliders: rest, friction, carrying, pushing, momentum, many worlds."""
+"""Deformable bodies against rigid bodies and colliders: rest, friction, carrying, pushing, momentum, many worlds."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def collider(name: str = "table", **motion: object) -> Collider:
     return Collider(name=name, surface=surface_of(trimesh.creation.box((1.0, 1.0, 0.2))), **motion)
 
 
-def solids(*setups: WorldSetup) -> RigidBodies:
+def rigid_bodies(*setups: WorldSetup) -> RigidBodies:
     runtime.ensure_started(SolverOptions(grid=64))
     return RigidBodies(setups, [SCALE] * len(setups), [ORIGIN] * len(setups))
 
@@ -55,7 +55,7 @@ def row(world: RigidBodies, name: str, array: str, stride: int) -> np.ndarray:
 
 def test_mass_and_inertia_come_from_the_particles():
     """A cube of side a: I = m a²/6; twice as dense above: the centre of mass moves up by a/12."""
-    plain = solids(WorldSetup(bodies=(cube(),)))
+    plain = rigid_bodies(WorldSetup(bodies=(cube(),)))
     numbers = row(plain, "cube", "solid_numbers", at.NUMBERS)
     mass = 500.0 * 0.4**3
     assert numbers[at.MASS] == pytest.approx(mass)
@@ -64,7 +64,7 @@ def test_mass_and_inertia_come_from_the_particles():
     )
     body = cube()
     heavy = cube(density_scale=np.where(body.positions[:, 2] > 0, 2.0, 1.0))
-    pose = solids(WorldSetup(bodies=(heavy,))).pose(0, "cube")
+    pose = rigid_bodies(WorldSetup(bodies=(heavy,))).pose(0, "cube")
     assert pose.center == pytest.approx([0.0, 0.0, 0.4 / 12])
     assert pose.translation == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
 
@@ -73,7 +73,7 @@ def test_units_of_forces_and_contacts():
     forces = BodyForces(drag=3.0, wind=(1.0, 0.0, 0.0), tether_stiffness=7.0, tether_anchor=(0.0, 0.0, 1.0))
     contact = SurfaceContact(friction=0.2, static_friction=0.3, rolling_resistance=0.01, adhesion=2.0, mode="sticky")
     table = ContactTable().with_pair("cube", "table", contact)
-    world = solids(WorldSetup(bodies=(cube(forces=forces),), colliders=(collider(),), contacts=table))
+    world = rigid_bodies(WorldSetup(bodies=(cube(forces=forces),), colliders=(collider(),), contacts=table))
     numbers = row(world, "cube", "solid_numbers", at.NUMBERS)
     assert numbers[at.DRAG] == pytest.approx(3.0 / SCALE)
     assert numbers[at.WIND] == pytest.approx(SCALE)
@@ -86,7 +86,7 @@ def test_units_of_forces_and_contacts():
 
 def test_colliders_do_not_meet_each_other_and_worlds_have_their_own_pairs():
     one = WorldSetup(bodies=(cube(),), ground=Ground(), colliders=(collider("a"), collider("b")))
-    world = solids(one, one)
+    world = rigid_bodies(one, one)
     spans = world.arrays["world_spans"].to_numpy().reshape(-1, at.SPANS)
     assert spans.tolist() == [[0, 3, 0, 5], [3, 6, 5, 10]]
     pairs = world.arrays["pairs"].to_numpy().reshape(-1, at.PAIRS)
@@ -98,7 +98,7 @@ def test_collider_follows_its_tracks():
     turn = Track(times=np.array([0.0, 1.0]), values=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4 * np.pi]]))
     move = Track(times=np.array([0.0, 1.0]), values=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     moving = collider(rotations=turn, translations=move, pivot=(0.5, 0.0, 0.0))
-    world = solids(WorldSetup(bodies=(cube(),), colliders=(moving,)))
+    world = rigid_bodies(WorldSetup(bodies=(cube(),), colliders=(moving,)))
     world.set_segments({0: (0.125, 0.5)})
     pose = world.pose(0, "table")
     assert pose.spin == pytest.approx([0.0, 0.0, 4 * np.pi])
@@ -112,7 +112,7 @@ def test_collider_follows_its_tracks():
 def test_collider_turns_steadily_about_the_axis_that_leads_on():
     keys = np.array([[0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
     turning = collider(rotations=Track(times=np.array([0.0, 1.0]), values=keys))
-    world = solids(WorldSetup(bodies=(cube(),), colliders=(turning,)))
+    world = rigid_bodies(WorldSetup(bodies=(cube(),), colliders=(turning,)))
     world.set_segments({0: (0.0, 1.0)})
     spin = world.pose(0, "table").spin
     world.set_segments({0: (0.5, 1.0)})
@@ -122,7 +122,7 @@ def test_collider_turns_steadily_about_the_axis_that_leads_on():
 
 
 def test_body_waits_for_its_start():
-    world = solids(WorldSetup(bodies=(cube(start_time=0.5, velocity=(1.0, 0.0, 0.0)),)))
+    world = rigid_bodies(WorldSetup(bodies=(cube(start_time=0.5, velocity=(1.0, 0.0, 0.0)),)))
     world.advance(1e-3, 10)
     assert world.pose(0, "cube").center == pytest.approx([0.0, 0.0, 0.0], abs=1e-15)
     world.set_segments({0: (0.5, 1.0)})
@@ -136,7 +136,7 @@ def test_bad_input_is_named():
         RigidBodies([setup], [1.0, 2.0], [ORIGIN])
     with pytest.raises(InputError, match=r"scale is 0\.0"):
         RigidBodies([setup], [0.0], [ORIGIN])
-    world = solids(setup)
+    world = rigid_bodies(setup)
     with pytest.raises(InputError, match="no rigid body or collider 'cup'"):
         world.pose(0, "cup")
     with pytest.raises(InputError, match="segment is"):
@@ -145,18 +145,18 @@ def test_bad_input_is_named():
         world.advance(0.0)
     state = world.state()
     with pytest.raises(InputError, match="another scene"):
-        world.restore({**state, "solids": state["solids"][:-1]})
+        world.restore({**state, "rigid_bodies": state["rigid_bodies"][:-1]})
     del state["memory"]
     with pytest.raises(InputError, match="no memory"):
         world.restore(state)
 
 
-def test_worlds_without_solids_pass():
+def test_worlds_without_rigid_bodies_pass():
     jelly = dataclasses.replace(cube(), material=ElasticMaterial(density=1e3, youngs_modulus=1e5, poisson_ratio=0.3))
-    world = solids(WorldSetup(bodies=(jelly,), ground=Ground()))
+    world = rigid_bodies(WorldSetup(bodies=(jelly,), ground=Ground()))
     world.advance(1e-3, 2)
     assert world.count == 0
-    both = solids(WorldSetup(bodies=(jelly,)), WorldSetup(bodies=(jelly, cube("rock"))))
+    both = rigid_bodies(WorldSetup(bodies=(jelly,)), WorldSetup(bodies=(jelly, cube("rock"))))
     both.advance(1e-3, 2)
     assert both.index(1, "rock") == 0
 
