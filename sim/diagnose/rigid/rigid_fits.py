@@ -49,6 +49,8 @@ from .rigid_search import (
 
 Array = NDArray[np.float64]
 
+REFITS = ("friction", "restitution")
+"""Contact parameters that are re-fitted as a candidate of their own."""
 UNEXPLAINED = 1.5
 """Misfit of the best candidate above which the capture counts as unexplained."""
 
@@ -167,10 +169,14 @@ def _wanted(capture: Capture, names: Sequence[str] | None) -> list[CandidateEffe
     return chosen
 
 
+def shown_keys(keys: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """Return ``keys`` and ``REFITS``, each once, in their order: among equally likely candidates the first decides."""
+    return tuple(dict.fromkeys((*keys, REFITS)))
+
+
 def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
-    refits = ("friction", "restitution")
     keys = _worth(bodies, [k for k in bodies[0].fits if all(k in b.fits for b in bodies)])
-    shown = {*keys, refits}
+    shown = shown_keys(keys)
     made = {}
     held = {k: [score_held_out(b.fits[k]) for b in bodies] for k in shown}
     for k in shown:
@@ -187,14 +193,14 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         # reference, and parameters re-fitted to an unexplained motion are not used.
         expects = expected < WORSE * float(np.sqrt(np.mean([b.rms_m**2 for b in believed])))
         if expects:
-            made[refits] = dataclasses.replace(made[refits], heldout_rms_m=expected)
+            made[REFITS] = dataclasses.replace(made[REFITS], heldout_rms_m=expected)
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
     return RigidFits(
         capture=capture,
         bodies=bodies,
         expects=expects,
         nominal=made[()],
-        refitted=made[refits],
+        refitted=made[REFITS],
         candidates=tuple(singles),
         floor_rms_m=floor,
         numerics_rms_m=float(np.sqrt(np.mean([step_size_error(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
