@@ -145,7 +145,7 @@ def test_bad_input_is_named():
         world.advance(0.0)
     state = world.state()
     with pytest.raises(InputError, match="another scene"):
-        world.restore({**state, "rigid_bodies": state["rigid_bodies"][:-1]})
+        world.restore({**state, "solids": state["solids"][:-1]})
     del state["memory"]
     with pytest.raises(InputError, match="no memory"):
         world.restore(state)
