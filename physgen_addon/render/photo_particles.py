@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Particles of a photo's objects: grains or a fluid's surface, in the photo's colours and light, where the skin tears.
+"""What a photo's objects of sand, snow or a liquid show when their skin tears; the surface of liquids.
 
 Until its skin tears an object is its mesh, which equals the photo at rest. Afterwards grains show where the skin is
-gone, and a fluid is the surface around its particles. A particle keeps the colour, and the reference lighting, of the
-nearest skin at rest.
+gone (``photo_grains.py``), and a liquid is the surface around its particles, each of which keeps the colour, and the
+reference lighting, of the nearest skin at rest.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,16 +25,20 @@ from ...sim.skinning import TORN_STRETCH, first_torn
 from ..playback import particles, point_caches
 from ..playback.bake_record import spacing
 from ..playback.geometry_nodes import Tree, set_input
-from .render_scene import COLOUR_LAYER, REST_LIGHT, UV, RenderObject, get_rest_light
+from .render_scene import (
+    COLOUR_LAYER,
+    REST_LIGHT,
+    UV,
+    RenderObject,
+    get_rest_light,
+    texture_colours,
+    texture_coordinates,
+)
 
-SKIN, GRAINS, SURFACE = "PhysGen photo skin", "PhysGen photo grains", "PhysGen photo surface"
+SKIN, SURFACE = "PhysGen photo skin", "PhysGen photo surface"
 REST_LENGTH = "rest_length"
 """Attribute of the skin's edges, m."""
 STEP = "Step"
-EACH, SMALLER = 8, 0.5
-"""Grains per particle, and their relative size. A particle is millimetres of sand and starts on a lattice, which single
-grains would show.
-"""
 COLOUR, MIXED = "flow_colour", "flow_mixed"
 """Attributes of particles and of a fluid's surface: texture colour, linear; and how mixed it is."""
 BLUR = 6
@@ -61,65 +64,45 @@ def find_tears(bake: point_caches.OpenedBake, folder: Scene) -> point_caches.Ope
     return dataclasses.replace(bake, flows=tuple(flows))
 
 
-def add(
-    target: RenderObject, flow: point_caches.Flow, cache: Pc2Reader, first_frame: int, *, carried: tuple[str, ...] = ()
+def add_surface(
+    target: RenderObject, flow: point_caches.Flow, first_frame: int, *, carried: tuple[str, ...] = ()
 ) -> tuple[bpy.types.Object, float]:
-    """Make ``target``, which plays ``cache`` and has reference lighting, show the particles of ``flow``.
+    """Add the surface around the particles of the liquid ``flow`` of ``target``, which has reference lighting.
 
-    carried: vector attributes of particles to transfer to the shown geometry. Returns the objects that hold the
-    particles, and the maximum distance at which they are visible around a particle's centre, m.
+    carried: vector attributes of particles to transfer to the surface. Returns the object that holds the particles, and
+    the maximum distance at which they are visible around a particle's centre, m.
     """
     assert flow.from_sample is not None
     rest = flow.cache.sample(0)
     distance = spacing(rest)
-    radius = distance * (particles.SURFACE if flow.surface else particles.GRAIN)
+    radius = distance * particles.SURFACE
     mesh = bpy.data.meshes.new(f"{target.item.name} particles")
     mesh.vertices.add(len(rest))
     mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(rest, dtype=np.float32).ravel())
     _wear(mesh, target, rest)
-    mesh.materials.append(_material(target.item.data.materials[0], mixes=flow.surface))
+    mesh.materials.append(_material(target.item.data.materials[0]))
     item = bpy.data.objects.new(mesh.name, mesh)
     for collection in target.item.users_collection:
         collection.objects.link(item)
     point_caches.attach(item, flow.cache, first_frame)
     look = item.modifiers.new(particles.MODIFIER, "NODES")
-    look.node_group = _surface_group(carried) if flow.surface else _grains_group()
+    look.node_group = _surface_group(carried)
     set_input(look, particles.RADIUS, radius)
     set_input(look, STEP, _step(mesh, rest, distance))
     set_input(look, particles.FROM, first_frame + flow.from_sample)
     set_input(look, particles.MATERIAL, mesh.materials[0])
-    _tear(target, cache, first_frame + flow.from_sample, gone=flow.surface)
-    # Grains stray by half the particle spacing along each of three axes.
-    reach = radius if flow.surface else radius * SMALLER * particles.LARGEST + math.sqrt(0.75) * distance
-    return item, reach
+    return item, radius
 
 
 def _wear(mesh: bpy.types.Mesh, target: RenderObject, rest: NDArray[np.float32]) -> None:
     """Give the vertices of ``mesh`` at ``rest`` (N, 3) the texture and light of the nearest skin."""
-    skin = target.item.data
-    corners = np.empty(len(skin.loops), dtype=np.int32)
-    skin.loops.foreach_get("vertex_index", corners)
-    by_corner = np.empty(2 * len(corners), dtype=np.float32)
-    skin.uv_layers[UV].data.foreach_get("uv", by_corner)
-    uv = np.zeros((len(target.mesh.vertices), 3), dtype=np.float32)
-    uv[corners, :2] = by_corner.reshape(-1, 2)
+    uv = texture_coordinates(target)
+    colours = srgb_to_linear(texture_colours(target, uv).astype(np.float32) / 255.0)
     _, nearest = KDTree(target.mesh.vertices).query(rest)
-    for name, values in ((UV, uv), (REST_LIGHT, get_rest_light(target)), (COLOUR, _colours(target, uv))):
+    three = np.concatenate([uv, np.zeros((len(uv), 1), np.float32)], axis=1)
+    for name, values in ((UV, three), (REST_LIGHT, get_rest_light(target)), (COLOUR, colours)):
         attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(values[nearest], dtype=np.float32).ravel())
-
-
-def _colours(target: RenderObject, uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return linear colours (V, 3) of the texture of ``target`` at the texture coordinates ``uv`` (V, 3)."""
-    material = target.item.data.materials[0]
-    image = next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
-    width, height = image.size
-    pixels = np.empty(4 * width * height, dtype=np.float32)
-    image.pixels.foreach_get(pixels)
-    columns = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
-    rows = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
-    # The pixels of an 8-bit image are as stored: sRGB.
-    return srgb_to_linear(pixels.reshape(height, width, 4)[rows, columns, :3])
 
 
 def _step(mesh: bpy.types.Mesh, rest: NDArray[np.float32], distance: float) -> float:
@@ -134,10 +117,9 @@ def _step(mesh: bpy.types.Mesh, rest: NDArray[np.float32], distance: float) -> f
     return float(np.linalg.norm(extent) / max(float(np.linalg.norm(size)), 1e-9)) * distance
 
 
-def _material(skin: bpy.types.Material, *, mixes: bool) -> bpy.types.Material:
-    """Return the material of the ``skin`` for geometry with texture coordinates as an attribute instead of a UV map.
-
-    mixes: also blend to the mixed colours.
+def _material(skin: bpy.types.Material) -> bpy.types.Material:
+    """Return the material of the ``skin`` for geometry with texture coordinates as an attribute instead of a UV map,
+    blended to the mixed colours.
     """
     material = skin.copy()
     tree = material.node_tree
@@ -150,17 +132,16 @@ def _material(skin: bpy.types.Material, *, mixes: bool) -> bpy.types.Material:
     picture = next(node for node in tree.nodes if node.type == "TEX_IMAGE")
     layer = next(node for node in tree.nodes if node.type == "OUTPUT_AOV" and node.aov_name == COLOUR_LAYER)
     tree.links.new(attribute(UV, "Vector"), picture.inputs["Vector"])
-    if mixes:
-        mix = tree.nodes.new("ShaderNodeMix")
-        mix.data_type = "VECTOR"
-        values = (attribute(MIXED, "Fac"), picture.outputs["Color"], attribute(COLOUR, "Vector"))
-        for value, socket in zip(values, [item for item in mix.inputs if item.enabled], strict=True):
-            tree.links.new(value, socket)
-        tree.links.new(next(item for item in mix.outputs if item.enabled), layer.inputs["Color"])
+    mix = tree.nodes.new("ShaderNodeMix")
+    mix.data_type = "VECTOR"
+    values = (attribute(MIXED, "Fac"), picture.outputs["Color"], attribute(COLOUR, "Vector"))
+    for value, socket in zip(values, [item for item in mix.inputs if item.enabled], strict=True):
+        tree.links.new(value, socket)
+    tree.links.new(next(item for item in mix.outputs if item.enabled), layer.inputs["Color"])
     return material
 
 
-def _tear(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool) -> None:
+def open_skin(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool) -> None:
     """Open the skin where it is stretched, from ``from_frame`` on; or remove it if it is ``gone``."""
     data = target.item.data
     ends = np.empty(2 * len(data.edges), dtype=np.int32)
@@ -183,36 +164,6 @@ def _skin_group() -> bpy.types.NodeTree:
     open_skin = tree.out("GeometryNodeDeleteGeometry", tree.inputs["Geometry"], torn, domain="EDGE", mode="EDGE_FACE")
     left = particles.switch(tree, tree.inputs["Gone"], open_skin, None)
     return tree.finish(particles.switch(tree, particles.begun(tree), tree.inputs["Geometry"], left))
-
-
-def _grains_group() -> bpy.types.NodeTree:
-    tree = Tree(GRAINS, {**_inputs(), STEP: ("Float", 0.01)})
-    radius, step = tree.inputs[particles.RADIUS], tree.inputs[STEP]
-    # Switch before the expensive part: frames without particles cost nothing.
-    shown = particles.switch(tree, particles.begun(tree), None, tree.inputs["Geometry"])
-    many = tree.out("GeometryNodeDuplicateElements", shown, None, EACH, domain="POINT")
-    half = tree.math("MULTIPLY", radius, 0.5 / particles.GRAIN)
-    place = _strayed(tree, tree.out("GeometryNodeInputPosition"), half)
-    # Each grain samples its own part of the texture.
-    where = _strayed(tree, tree.attribute(UV, "FLOAT_VECTOR"), tree.math("MULTIPLY", step, 0.5), seed=1)
-    store = "GeometryNodeStoreNamedAttribute"
-    many = tree.out(store, many, None, UV, where, data_type="FLOAT_VECTOR", domain="POINT")
-    size = tree.out("FunctionNodeRandomValue", particles.SMALLEST, particles.LARGEST, data_type="FLOAT")
-    size = tree.math("MULTIPLY", tree.math("MULTIPLY", radius, SMALLER), size)
-    grains = tree.out("GeometryNodeMeshToPoints", many, None, place, size)
-    coloured = tree.out("GeometryNodeSetMaterial", grains, None, tree.inputs[particles.MATERIAL])
-    return tree.finish(coloured)
-
-
-def _strayed(tree: Tree, value: Any, reach: Any, seed: int = 0) -> Any:
-    """Return ``value`` plus a random offset of up to ``reach`` along each axis."""
-    stray = tree.node("FunctionNodeRandomValue", data_type="FLOAT_VECTOR")
-    lowest, highest = (item for item in stray.inputs if item.enabled and item.type == "VECTOR")
-    tree.group.links.new(tree.math("MULTIPLY", reach, -1.0), lowest)
-    tree.group.links.new(reach, highest)
-    next(item for item in stray.inputs if item.name == "Seed").default_value = seed
-    moved = next(item for item in stray.outputs if item.enabled)
-    return tree.out("ShaderNodeVectorMath", value, moved, operation="ADD")
 
 
 def _surface_group(carried: tuple[str, ...]) -> bpy.types.NodeTree:

@@ -82,6 +82,31 @@ def get_rest_light(target: RenderObject) -> NDArray[np.float64]:
     return values.reshape(-1, 4)[:, :3].astype(np.float64)
 
 
+def texture_coordinates(target: RenderObject) -> NDArray[np.float32]:
+    """Return the texture coordinates (V, 2) at the vertices, origin at the bottom left."""
+    skin = target.item.data
+    corners = np.empty(len(skin.loops), dtype=np.int32)
+    skin.loops.foreach_get("vertex_index", corners)
+    by_corner = np.empty(2 * len(corners), dtype=np.float32)
+    skin.uv_layers[UV].data.foreach_get("uv", by_corner)
+    uv = np.zeros((len(target.mesh.vertices), 2), dtype=np.float32)
+    uv[corners] = by_corner.reshape(-1, 2)
+    return uv
+
+
+def texture_colours(target: RenderObject, uv: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the sRGB colours (N, 3) of the texture of ``target`` at the texture coordinates ``uv`` (N, 2)."""
+    material = target.item.data.materials[0]
+    image = next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
+    width, height = image.size
+    pixels = np.empty(4 * width * height, dtype=np.float32)
+    image.pixels.foreach_get(pixels)
+    columns = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
+    rows = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
+    # The pixels of an 8-bit image are as stored: sRGB.
+    return np.rint(pixels.reshape(height, width, 4)[rows, columns, :3] * 255.0).astype(np.uint8)
+
+
 def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[NDArray[np.float64], bpy.types.Image]:
     """Return texture coordinates (V, 2), origin at the bottom left, and the image.
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.cache.pc2 import Pc2Reader
 from ...sim.composite import compositing, floor_reflection
 from ...sim.composite.backdrop import Backdrop
 from ...sim.scene.folder import Scene
@@ -26,6 +27,7 @@ from .clean_plate import CameraMotion, CleanPlate, PlateView, make_relief
 from .image_finish import ImageFinish
 from .lighting import GroundShadow, reflections
 from .motion_blur import Moment
+from .photo_grains import PhotoGrains
 from .render_options import RenderOptions
 from .render_regions import Box, ground_depth, object_box
 from .render_scene import BlenderScene, aim, build, everything, remove
@@ -164,7 +166,9 @@ def _show_number(material: bpy.types.Material) -> None:
 
 def _set_vectors(mesh: bpy.types.Mesh, pair: tuple[Vectors, Vectors]) -> None:
     for name, values in zip(STEPS, pair, strict=True):
-        mesh.attributes[name].data.foreach_set("vector", np.ascontiguousarray(values, dtype=np.float32).ravel())
+        # Grains are new vertices in each frame.
+        attribute = mesh.attributes.get(name) or mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+        attribute.data.foreach_set("vector", np.ascontiguousarray(values, dtype=np.float32).ravel())
     mesh.update_tag()
 
 
@@ -184,6 +188,8 @@ class Renderer:
         self._relief: Backdrop | None = None
         self._built: BlenderScene | None = None
         self._data_scene: DataScene | None = None
+        self._grains: list[PhotoGrains] = []
+        self._steps: list[Pc2Reader | PhotoGrains] = []
         self._temporary = tempfile.TemporaryDirectory(prefix="physgen-render-")
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
@@ -222,6 +228,8 @@ class Renderer:
         assert self._built is not None
         view, moment = self._view(camera), self._moment(sample)
         aim(self._built, view.camera)
+        for grains in self._grains:
+            grains.show(sample, max(sample - 1, 0) if moment.shutter > 0 else sample, view.camera.position)
         seen = self._plate.seen(view, moment.now)
         rest_shadow = view.warp(self._rest_shadow)
         shadow = rest_shadow if sample == 0 else self._shadows.ratio(moment, view.camera, self._size)
@@ -254,18 +262,36 @@ class Renderer:
         return PlateView(camera, self._size, self._relief)
 
     def _add_particles(self, built: BlenderScene) -> float:
-        """Add the particles of granular and fluid objects; return the maximum visible distance around their
-        centres, m.
+        """Add what granular and fluid objects show when their skin tears; return the maximum visible distance around
+        particles' centres, m.
         """
         before, reach = everything(), 0.0
         carried = STEPS if self._data_scene is not None else ()
         objects = zip(built.objects, self._bake.flows, self._bake.caches, strict=True)
+        first = self._bake.first_frame
         for number, (target, flow, cache) in enumerate(objects, start=1):
-            if flow is not None and flow.from_sample is not None:
-                item, far = photo_particles.add(target, flow, cache, self._bake.first_frame, carried=carried)
-                reach = max(reach, far)
-                if self._data_scene is not None:
-                    self._data_scene.follow(item, number)
+            if flow is None or flow.from_sample is None:
+                continue
+            if flow.surface:
+                item, far = photo_particles.add_surface(target, flow, first, carried=carried)
+                self._steps.append(flow.cache)
+            else:
+                shown = PhotoGrains(
+                    target,
+                    flow,
+                    first,
+                    camera=self._scene.camera,
+                    scale=self._options.scale,
+                    ground=self._scene.ground_plane,
+                )
+                self._grains.append(shown)
+                self._steps.append(shown)
+                item, far = shown.item, shown.reach
+            coherent = target.source.material.law == "snow"
+            photo_particles.open_skin(target, cache, first + flow.from_sample, gone=flow.surface or not coherent)
+            reach = max(reach, far)
+            if self._data_scene is not None:
+                self._data_scene.follow(item, number)
         built.own += list(everything() - before)
         return reach
 
@@ -278,13 +304,17 @@ class Renderer:
         request layered frames.
         """
         assert self._data_scene is not None
-        shown = [flow.cache for flow in self._bake.flows if flow is not None and flow.from_sample is not None]
-        steps = []
-        for cache in (*self._bake.caches, *shown):
-            now = cache.sample(sample)
-            steps.append((cache.sample(after) - now, cache.sample(before) - now))
         assert self._built is not None
         cameras = cameras or (self._scene.camera,) * 3
+        steps = []
+        for shown in (*self._bake.caches, *self._steps):
+            if isinstance(shown, PhotoGrains):
+                shown.show(sample, sample, cameras[0].position)
+                shown.let_see(grains=True, hull=False)
+                steps.append(shown.steps(after, before))
+            else:
+                now = shown.sample(sample)
+                steps.append((shown.sample(after) - now, shown.sample(before) - now))
         aim(self._built, cameras[0])
         return self._data_scene.render(
             self._bake.first_frame + sample,
@@ -314,12 +344,19 @@ class Renderer:
         box, light_box = (self._object_box(camera, moment, size) for size in (self._size, self._built.light_size))
         if box is None or light_box is None:
             return layer
+        for each in self._grains:
+            each.let_see(grains=True, hull=False)
         self._open_shutter(self._built.colour_scene, moment, most_samples=2)
         layer.texture[box.slices], layer.alpha[box.slices] = self._built.colours(moment.number, box, self._scratch)
+        for each in self._grains:
+            each.let_see(grains=False, hull=True)
         self._open_shutter(self._built.light_scene, moment, most_samples=1)
         lit = render_engines.render_passes(self._built.light_scene, moment.number, light_box, self._scratch)
         light = np.ones((*self._built.light_size[::-1], 3), np.float32)
-        light[light_box.slices] = compositing.light_ratio(render_engines.stack(lit, "Combined"), lit["Combined.A"])
+        ratio = compositing.light_ratio(render_engines.stack(lit, "Combined"), lit["Combined.A"])
+        if any(grains.visible for grains in self._grains):
+            ratio = compositing.continued_light(ratio, lit["Combined.A"])
+        light[light_box.slices] = ratio
         layer.light[:] = cv2.resize(light, self._size, interpolation=cv2.INTER_LINEAR)
         return layer
 

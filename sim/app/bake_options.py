@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..scene.folder import Scene
 from ..validation import quantity, to_json
 
-ENGINE_REVISION = 4
+ENGINE_REVISION = 5
 """Raised with every change of the engine or the skinning that changes what a scene does."""
 
 
@@ -32,7 +32,8 @@ class BakeOptions:
         second.
     quality: name of a preset in ``presets/qualities``.
     arch: ``cpu``, ``cuda``, ``vulkan`` or ``metal``; what is not there falls back to ``cpu`` with a notice.
-    seed: of the particles' places, 0 or more; 0 is the even lattice, every other moves each a little its own way.
+    seed: of the particles' places, 0 or more; 0 is the even lattice, every other moves each a little its own way. Sand
+        and snow are scattered without a lattice by every seed.
     space: what samples are in, ``world`` (metres) or ``mesh`` (the coordinates of the object's mesh file, so that an
         object that stands by its matrix goes on standing by it).
     points: whether all particles of what flows (sand, fluid, snow) get caches of their own.

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide_to_size
 from trimesh.triangles import closest_point
 
-from ..constitutive import DeformableMaterial, RigidMaterial, model_of
+from ..constitutive import COHERENT, GRANULAR, DeformableMaterial, RigidMaterial, cohesion_of, model_of
 from ..effects.registry import apply_effects
 from ..errors import InputError
 from ..mpm.bodies import BodyParticles
@@ -177,6 +177,9 @@ _WARNINGS: WeakCache[ObjectMesh, list[str]] = WeakCache()
 JUMP = 1e-3
 """Share of its size by which a collider's motion may begin off the place of its mesh."""
 
+SANDY = "sandy"
+"""Effect that turns an object to sand."""
+
 JITTER = 0.2
 """Share of the particle spacing by which a seed other than 0 moves each particle off the lattice along each axis."""
 
@@ -244,7 +247,11 @@ def prepare_world(
     if scene.ground is not None:
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
-    bodies = tuple(_body(scene.objects[i], meshes[i], spacing, cell, options.seed) for i in moving)
+    granular = _granular(scene)
+    bodies = tuple(
+        _body(item, meshes[i], spacing, cell, options.seed, scattered=item.name in granular)
+        for i, item in ((i, scene.objects[i]) for i in moving)
+    )
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
     warnings += [text for collider in colliders for text in _jump(collider)]
     apart = separate(bodies, colliders, spacing=spacing, cell=cell)
@@ -282,7 +289,19 @@ def _soft_count(setup: WorldSetup) -> int:
     return sum(body.count for body in setup.bodies if not body.rigid)
 
 
-def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int) -> BodyParticles:
+def _granular(scene: SceneModel) -> set[str]:
+    """Names of the objects of sand or snow, or that turn to sand: on a lattice they would fall apart in rows."""
+    sandy: set[str] = set()
+    for effect in scene.effects:
+        if effect.name == SANDY:
+            sandy |= set(effect.objects or [item.name for item in scene.objects])
+    loose = {item.name for item in scene.objects if cohesion_of(item.material.law) in (COHERENT, GRANULAR)}
+    return sandy | loose
+
+
+def _body(
+    item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int, *, scattered: bool
+) -> BodyParticles:
     if item.material.law == "rigid" and (item.pins or item.goal_stiffness > 0):
         raise InputError(
             f"object {item.name}: has pins or goal_stiffness and the law 'rigid': choose another law or leave them "
@@ -291,8 +310,10 @@ def _body(item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed
     try:
         sample = _SAMPLES.get(
             mesh,
-            (spacing, seed),
-            lambda: sample_interior(mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed),
+            (spacing, seed, scattered),
+            lambda: sample_interior(
+                mesh.vertices, mesh.faces, spacing, jitter=JITTER if seed else 0.0, seed=seed, scattered=scattered
+            ),
         )
         if not item.fill:
             thickness = SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .pull_push import fill_gaps
 from .srgb import Linear
 
 MAX_RATIO = 8.0
@@ -77,6 +78,16 @@ def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:
     own = np.where(alpha[..., None] > 1e-3, premultiplied / np.maximum(alpha[..., None], 1e-3), near)
     weight = np.clip((alpha[..., None] - 0.25) / 0.5, 0.0, 1.0)
     return np.asarray(np.clip(near + (own - near) * weight, 0.0, MAX_RATIO), dtype=np.float32)
+
+
+def continued_light(ratio: Linear, alpha: NDArray[np.float32]) -> Linear:
+    """Return the light ``ratio`` (H, W, 3) with that of its surroundings where the lit surface, of coverage ``alpha``
+    (H, W), does not reach: grains fly about beyond the shell that stands for them. Unchanged where there is no surface.
+    """
+    known = (alpha > 0.5).astype(np.float32)
+    if not known.any():
+        return ratio
+    return np.stack([fill_gaps(np.ascontiguousarray(ratio[..., c]), known) for c in range(3)], axis=-1)
 
 
 def ground_layer(
