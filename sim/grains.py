@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .smoothstep import smoothstep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -259,7 +260,7 @@ class GrainCloud:
         core = np.flatnonzero(dense > CORE)
         entry = self.numbers(parents[keep], numbers[keep])
         radii = self._radius[entry]
-        shades = self._shades[entry] * (1.0 - CREVICE * _smoothstep((density[keep] - BULK) / (DEEP - BULK)))
+        shades = self._shades[entry] * (1.0 - CREVICE * smoothstep(density[keep], BULK, DEEP))
         return ShownGrains(
             parents=np.concatenate([parents[keep], core]),
             children=np.concatenate([numbers[keep], np.full(len(core), -1)]),
@@ -283,14 +284,14 @@ class GrainCloud:
             point, normal = self._ground
             below = self._radius[entry] - (places - point) @ normal
             # Matter below the plane, beyond the edge of a table, falls on.
-            caught = _smoothstep(((state.positions[parents] - point) @ normal) / (0.5 * self.spacing) + 1.0)
+            caught = smoothstep((state.positions[parents] - point) @ normal, -0.5 * self.spacing, 0.0)
             lift = np.where(children >= 0, np.maximum(below, 0.0) * caught, 0.0)
             places = places + lift[:, None] * normal
         return places
 
     def _drawn_in(self, state: CloudState, places: Array, parents: Ints) -> Array:
         """Return ``places`` with those outside the envelope of dense matter moved inward to it."""
-        weight = _smoothstep((state.density[parents] - 0.35) / 0.2)
+        weight = smoothstep(state.density[parents], 0.35, 0.55)
         which = np.flatnonzero(weight > 0)
         lack = BULK - state.field.at(places[which])
         which, lack = which[lack > 0], lack[lack > 0]
@@ -319,17 +320,12 @@ class GrainCloud:
         offset = self._offsets[who]
         moved = state.positions[self._neighbours[who]] - state.positions[who][:, None, :]
         far = np.linalg.norm(moved, axis=2) / self.spacing
-        weight = _smoothstep((GONE - far) / (GONE - STILL_NEAR))[..., None]
+        weight = smoothstep(far, GONE, STILL_NEAR)[..., None]
         ridge = RIDGE * self.spacing**2 * np.eye(3)
         product = np.einsum("nki,nkj->nij", moved * weight, offset) + ridge
         f = product @ np.linalg.inv(np.einsum("nki,nkj->nij", offset * weight, offset) + ridge)
         size = np.sqrt((f**2).sum(axis=(1, 2)) / 3.0)
         return np.asarray(f * (np.clip(size, *STRETCH) / np.maximum(size, 1e-9))[:, None, None])
-
-
-def _smoothstep(t: Array) -> Array:
-    t = np.clip(t, 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
 
 
 def _ball_sequence(count: int) -> Array:

@@ -306,7 +306,7 @@ class Renderer:
         assert self._data_scene is not None
         assert self._built is not None
         cameras = cameras or (self._scene.camera,) * 3
-        steps = []
+        steps: list[tuple[Vectors, Vectors]] = []
         for shown in (*self._bake.caches, *self._steps):
             if isinstance(shown, PhotoGrains):
                 shown.show(sample, sample, cameras[0].position)
