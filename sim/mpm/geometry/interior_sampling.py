@@ -104,8 +104,10 @@ def sample_interior(
 
     def kept_inside(moved: Array) -> Array:
         """``moved`` particles where their test points are inside, too, else where they were."""
-        index = np.clip(((moved - low) / (step / FINE)).astype(np.int64), 0, counts * FINE - 1)
-        return np.where(fine_inside[index[:, 0], index[:, 1], index[:, 2]][:, None], moved, positions)
+        index = np.floor((moved - low) / (step / FINE)).astype(np.int64)
+        boxed = ((index >= 0) & (index < counts * FINE)).all(axis=1)
+        index = np.clip(index, 0, counts * FINE - 1)
+        return np.where((boxed & fine_inside[index[:, 0], index[:, 1], index[:, 2]])[:, None], moved, positions)
 
     rng = np.random.default_rng(seed)
     if scattered:
