@@ -15,6 +15,7 @@ from ...sim.app.reconstruct import Physics
 from ...sim.cache.bake_folder import SPACES
 from ...sim.errors import InputError
 from ...sim.reconstruct import ObjectRequest, ReconstructOptions
+from ...sim.reconstruct.adapters.adapter_registry import FOLDERS, weights_folder
 from ...sim.reconstruct.reasoning.chat_client import DEFAULT_KEY_VARIABLE, ChatRequest
 from ...sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES, Pixel, Stroke
 from ...sim.scene.equirectangular import FRAMES
@@ -161,8 +162,11 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--roll", dest="roll_deg", type=float, metavar="DEGREES", help=text)
     text = "field of view of the longer side (default: EXIF, else vanishing points, else 50)"
     parser.add_argument("--fov", dest="fov_deg", type=float, metavar="DEGREES", help=text)
-    text = "depth map of the photo (.npy, .npz, .exr, .pfm, 16-bit .png), used for the ground and occlusion order"
-    parser.add_argument("--depth", type=Path, metavar="FILE", help=text)
+    text = (
+        "depth map of the photo (.npy, .npz, .exr, .pfm, 16-bit .png), used for the ground and occlusion order; or "
+        "depth-anything or depth-pro, with --weights"
+    )
+    parser.add_argument("--depth", type=Path, metavar="FILE|MODEL", help=text)
     text = "all objects from front to back (default: estimated)"
     parser.add_argument("--order", nargs="+", metavar="OBJECT", help=text)
     text = "fixed grey value below which ground is shadow, as in the paper (50), instead of the adaptive method"
@@ -175,6 +179,8 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
     ):
         text = f"adapter for {what} (docs/extending.md; default: built-in)"
         parser.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
+    text = "folder with the weights of sam, sam2, depth-anything or depth-pro, which --segmenter and --depth name"
+    parser.add_argument("--weights", type=Path, metavar="DIR", help=text)
     text = "also write SCENE/report.html, with images of every stage"
     parser.add_argument("--report", action="store_true", help=text)
     add_environment_flags(parser)
@@ -249,6 +255,7 @@ def reconstruct_options(options: argparse.Namespace, earlier: ReconstructOptions
     }
     if "order" in changes:
         changes["order"] = tuple(changes["order"])
+    _take_models(changes, options.weights)
     if changes.get("environment") is None:
         changes.pop("environment_frame", None)
     if "horizon_y" in changes and "pitch_deg" not in changes:
@@ -259,6 +266,23 @@ def reconstruct_options(options: argparse.Namespace, earlier: ReconstructOptions
     if options.no_sun:
         changes["sun"] = False
     return dataclasses.replace(earlier or ReconstructOptions(), **changes)
+
+
+def _take_models(changes: dict[str, Any], weights: Path | None) -> None:
+    """Turn a model's name in ``changes`` into an adapter with its weights. Raises InputError for weights of none."""
+    name = str(changes.get("depth"))
+    if name in FOLDERS and not Path(name).exists():
+        if "depth_estimator" in changes:
+            raise InputError(f"--depth {name} and --depth-estimator {changes['depth_estimator']}: give one of them")
+        changes["depth"] = None
+        changes["depth_estimator"] = name
+    named = [stage for stage in ("segmenter", "depth_estimator") if changes.get(stage) in FOLDERS]
+    if weights is None:
+        return
+    if not named:
+        raise InputError(f"--weights: is for {', '.join(FOLDERS)}; name one by --segmenter or --depth")
+    for stage in named:
+        changes[stage] = f"{changes[stage]}:{weights_folder(changes[stage], weights).resolve()}"
 
 
 def object_requests(options: argparse.Namespace, out: Path) -> tuple[ObjectRequest, ...]:

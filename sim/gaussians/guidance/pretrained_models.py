@@ -35,10 +35,10 @@ _WEIGHTS = re.compile(r"(?:diffusion_pytorch_model|model)(?:\.([A-Za-z0-9_]+))?(
 _PICKLED = (".bin", ".pt", ".pth", ".ckpt", ".pkl")
 
 
-def import_library(name: str, where: str) -> Any:
+def import_library(name: str, where: str, install: str = INSTALL) -> Any:
     """Return the module ``name`` of the extra, imported with its network access disabled for this process.
 
-    Raises InputError when it is not installed or cannot be imported.
+    install: the remedy. Raises InputError when it is not installed or cannot be imported.
     """
     os.environ.update(_OFFLINE)
     try:
@@ -50,7 +50,7 @@ def import_library(name: str, where: str) -> Any:
         return module
     # A broken installation fails with OSError (shared libraries) or RuntimeError as well.
     except (ImportError, OSError, RuntimeError) as error:
-        raise InputError(f"{where}: needs {name} ({str(error)[:200]}): {INSTALL}") from error
+        raise InputError(f"{where}: needs {name} ({str(error)[:200]}): {install}") from error
 
 
 def missing_packages() -> list[str]:

@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ..models.model_folder import list_models
+from ...scene.meshes import MESH_SUFFIXES
+from ..models.model_folder import list_models, models_folder
 from .protocols import MEANINGS, STAGES
 from .python_adapter import function_problem
 
@@ -37,15 +38,16 @@ PLACEHOLDERS = {
     "depth_estimator": ("input", "output"),
     "mesher": ("input", "photo", "mask", "output"),
 }
-ALWAYS = ("here", "python")
+ALWAYS = ("here", "python", "program", "program_python")
 OUTPUTS = {
     "segmenter": ("masks.npy", (".npy", ".npz", "")),
     "inpainter": ("filled.png", (".png",)),
     "depth_estimator": ("depth.npy", (".npy", ".npz")),
-    "mesher": ("mesh.glb", (".glb", ".gltf", ".obj", ".ply", ".stl")),
+    "mesher": ("mesh.glb", (".glb", ".gltf", ".obj", ".ply", ".stl", "")),
 }
 """Default file name of ``{output}``, and its allowed extensions; "": a folder of PNGs."""
-_KEYS = ("stage", "command", "output", "folder", "time_limit_s", "environment", "meaning", "description")
+_KEYS = ("stage", "command", "output", "folder", "time_limit_s", "environment", "meaning", "description", "results")
+_PATTERN = re.compile(r"(?:[A-Za-z0-9_*-][A-Za-z0-9_.*-]*/){0,4}[A-Za-z0-9_*-][A-Za-z0-9_.*-]*")
 _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
@@ -56,6 +58,8 @@ class CommandFile:
     command: arguments with placeholders such as ``{input}``. output: file name of ``{output}``. folder: working
     directory; None is the temporary folder of its files. time_limit_s: after which it is killed. environment:
     additional variables. meaning: of a depth, one of ``MEANINGS``.
+    results: of a mesher that writes a folder, names or patterns of its mesh; the first that is there counts. program:
+    folder of the program, for a file that serves any place.
     """
 
     path: Path
@@ -66,14 +70,19 @@ class CommandFile:
     time_limit_s: float
     environment: tuple[tuple[str, str], ...]
     meaning: str
+    results: tuple[str, ...] = ()
+    program: Path | None = None
 
     def arguments(self, places: dict[str, Path | str]) -> list[str]:
         """Return the command with every placeholder replaced by its value in ``places``."""
         return [_PLACEHOLDER.sub(lambda match: str(places[match[1]]), part) for part in self.command]
 
 
-def read_command_file(path: Path, stage: str) -> CommandFile:
-    """Read and validate the file ``path`` for ``stage`` without running anything. Raises InputError."""
+def read_command_file(path: Path, stage: str, program: Path | None = None) -> CommandFile:
+    """Read and validate the file ``path`` for ``stage`` without running anything. Raises InputError.
+
+    program: folder of the program that it is for, which is then its working folder.
+    """
     data = read_toml(path)
     unknown = sorted(set(data) - set(_KEYS))
     if unknown:
@@ -88,12 +97,17 @@ def read_command_file(path: Path, stage: str) -> CommandFile:
     meaning = data.get("meaning", "relative")
     if meaning not in MEANINGS:
         raise InputError(f"{path}: meaning is {_brief(meaning)}; choose one of {', '.join(MEANINGS)}")
+    command, output = _command(data.get("command"), stage, path), _output(data.get("output"), stage, path)
+    if program is None and any("{program" in part for part in command):
+        raise InputError(f"{path}: command has {{program}}: it is one of the shipped files; name yours by its place")
     return CommandFile(
         path=path,
         stage=stage,
-        command=_command(data.get("command"), stage, path),
-        output=_output(data.get("output"), stage, path),
-        folder=_folder(data.get("folder"), path),
+        command=command,
+        output=output,
+        results=_results(data.get("results"), stage, output, path),
+        program=program,
+        folder=program or _folder(data.get("folder"), path),
         time_limit_s=float(limit),
         environment=_environment(data.get("environment", {}), path),
         meaning=meaning,
@@ -137,6 +151,19 @@ def _output(value: Any, stage: str, path: Path) -> str:
     return str(value)
 
 
+def _results(value: Any, stage: str, output: str, path: Path) -> tuple[str, ...]:
+    wanted = stage == "mesher" and not Path(output).suffix
+    if value is None and not wanted:
+        return ()
+    good = isinstance(value, list) and value and all(isinstance(p, str) and _PATTERN.fullmatch(p) for p in value)
+    if not wanted or not good or any(Path(p).suffix.lower() not in MESH_SUFFIXES for p in value):
+        raise InputError(
+            f"{path}: results is {_brief(value)}; a mesher whose output is a folder has patterns of mesh files in it, "
+            "as ['mesh.glb', '*/*_textured.glb'], and nothing else has them"
+        )
+    return tuple(value)
+
+
 def _folder(value: Any, path: Path) -> Path | None:
     if value is None:
         return None
@@ -162,13 +189,54 @@ def _brief(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+PROGRAM_PYTHON = "PHYSGEN_MESHER_PYTHON"
+PRESETS = Path(__file__).resolve().parents[3] / "presets" / "meshers"
 VARIABLE = "PHYSGEN_ADAPTERS"
 GROUP = "physgen.adapters"
 PATHS = ("command", "lama", "picture", "isnet")
+FOLDERS = ("sam", "sam2", "depth-anything", "depth-pro")
+"""Adapter types whose target is a folder of weights for transformers."""
 """Adapter types whose target is a file."""
-ADAPTER_TYPES = (*PATHS, "python")
-OF_STAGE = {"lama": "inpainter", "picture": "inpainter", "isnet": "segmenter"}
+PROGRAMS = ("sam-3d-objects", "trellis", "hunyuan3d", "triposg")
+"""Adapter types whose target is the folder of a program that makes meshes; ``presets/meshers`` says how each is run."""
+ADAPTER_TYPES = (*PATHS, *FOLDERS, *PROGRAMS, "python")
+OF_STAGE = {
+    "lama": "inpainter",
+    "picture": "inpainter",
+    "isnet": "segmenter",
+    "sam": "segmenter",
+    "sam2": "segmenter",
+    "depth-anything": "depth_estimator",
+    "depth-pro": "depth_estimator",
+    **dict.fromkeys(PROGRAMS, "mesher"),
+}
 """Stage of the types that serve one only."""
+
+
+def program_command(kind: str, folder: Path) -> CommandFile:
+    """Return how the program ``kind`` of ``PROGRAMS`` in ``folder`` is run. Raises InputError where it is not there."""
+    if not folder.is_dir():
+        raise InputError(f"{kind}: there is no folder {folder}; give the one that the program was cloned into")
+    program_python(folder)
+    return read_command_file(PRESETS / f"{kind}.toml", "mesher", folder.resolve())
+
+
+def program_python(folder: Path) -> Path:
+    """Return the interpreter of the program in ``folder``: PHYSGEN_MESHER_PYTHON, else that of its environment."""
+    named = os.environ.get(PROGRAM_PYTHON, "").strip()
+    inside = ("Scripts/python.exe",) if os.name == "nt" else ("bin/python",)
+    places = [Path(named)] if named else [folder / name / part for name in (".venv", "venv") for part in inside]
+    for place in places:
+        if place.is_file():
+            # Not resolved: a link is how an environment knows its packages.
+            return place.absolute()
+    shown = ", ".join(map(str, places))
+    raise InputError(f"{folder}: no Python of its own was found ({shown}); name it in {PROGRAM_PYTHON}")
+
+
+def weights_folder(kind: str, folder: Path) -> Path:
+    """Return where the weights of ``kind`` are in ``folder``: in the part of that name if there is one, else there."""
+    return folder / kind if (folder / kind / "config.json").is_file() else folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,6 +282,11 @@ def named_adapters(path: Path | None = None) -> list[NamedAdapter]:
             found.append(
                 NamedAdapter(stage=model.stage, name=model.name, spec=spec, entry_point=None, source="physgen models")
             )
+    for kind in FOLDERS:
+        path = models_folder() / kind
+        if (path / "config.json").is_file():
+            spec, stage = f"{kind}:{path}", OF_STAGE[kind]
+            found.append(NamedAdapter(stage=stage, name=kind, spec=spec, entry_point=None, source=str(path.parent)))
     return found
 
 
@@ -228,7 +301,10 @@ def spec_files(stage: str, spec: str, names: Path | None = None) -> list[Path]:
         found = [] if table is None else [table]
         named = [a.spec for a in named_adapters(names) if (a.stage, a.name) == (stage, spec) and a.spec is not None]
         parts = split_spec(named[0]) if named else None
-    if parts is not None:
+    if parts is not None and parts[0] in FOLDERS:
+        # The weights themselves are gigabytes: their configuration stands for them.
+        found.append(Path(parts[1]).expanduser().absolute() / "config.json")
+    elif parts is not None:
         kind, target = parts
         path = target if kind in PATHS else target.rpartition(":")[0]
         if kind in PATHS or path.endswith(".py"):
@@ -286,7 +362,7 @@ def _from_file(path: Path) -> list[NamedAdapter]:
 
 
 def _absolute(kind: str, target: str, folder: Path) -> str:
-    if kind in PATHS:
+    if kind in PATHS + FOLDERS + PROGRAMS:
         return f"{kind}:{folder / Path(target).expanduser()}"
     module, colon, name = target.rpartition(":")
     return f"{kind}:{folder / Path(module).expanduser()}{colon}{name}" if module.endswith(".py") else f"{kind}:{target}"
@@ -358,6 +434,19 @@ def _problem(stage: str, kind: str, target: str) -> str | None:
         return None if shutil.which(program) else f"there is no program {program}"
     if stage != OF_STAGE[kind]:
         return other_stage(kind, stage)
+    if kind in PROGRAMS:
+        try:
+            program_command(kind, path)
+        except InputError as error:
+            return str(error)
+        return None
+    if kind in FOLDERS:
+        from .transformers_adapter import folder_problem, missing_packages
+
+        lacking = missing_packages()
+        return folder_problem(kind, path) or (
+            f"needs {', '.join(lacking)}; install physgen[models]" if lacking else None
+        )
     if not path.is_file():
         return "there is no such file"
     if kind in ("lama", "isnet") and onnxruntime_version() is None:

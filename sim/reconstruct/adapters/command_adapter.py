@@ -29,7 +29,7 @@ from ...errors import Cancelled, InputError
 from ...events import IsCancelled
 from ...npz import read_npy, read_npz
 from ...scene.meshes import MAX_MESH_BYTES
-from .adapter_registry import CommandFile
+from .adapter_registry import CommandFile, program_python
 from .protocols import Depth, Mask, Pixels, checked_depth, checked_masks, checked_mesh, checked_pixels
 
 MARGIN = 0.1
@@ -183,6 +183,8 @@ class _Command:
             files: dict[str, Path | str] = {"here": self.file.path.resolve().parent, "python": sys.executable}
             for key, content in places.items():
                 files[key] = _written(folder / key, content)
+            if self.file.program is not None:
+                files |= {"program": self.file.program, "program_python": program_python(self.file.program)}
             output = folder / self.file.output
             files["output"] = output
             if not output.suffix:
@@ -261,12 +263,23 @@ class MesherCommand(_Command):
         """As the protocol says; files beside the mesh (.mtl, .bin, textures) are copied too. Raises InputError."""
         places = {"input": object_crop(pixels, mask), "photo": pixels, "mask": mask.astype(np.uint8) * 255}
         with self.run(places, MAX_MESH_BYTES) as output:
+            if output.is_dir():
+                output = self._result(output)
             given = {f"{key}.png" for key in places}
             for beside in sorted(output.parent.iterdir()):
                 small = beside.is_file() and not beside.is_symlink() and beside.stat().st_size <= MAX_MESH_BYTES
                 if small and beside.name not in given:
                     shutil.copyfile(beside, folder / beside.name)
         return checked_mesh(output.name, folder, self.where)
+
+    def _result(self, folder: Path) -> Path:
+        """The mesh in ``folder`` that the first pattern finds; the last by name where it finds several."""
+        for pattern in self.file.results:
+            found = sorted(p for p in folder.glob(pattern) if p.is_file() and not p.is_symlink())
+            if found:
+                return found[-1]
+        there = ", ".join(sorted(p.name for p in folder.rglob("*"))[:8]) or "nothing"
+        raise InputError(f"{self.where}: wrote no {' or '.join(self.file.results)}; there is {there}")
 
 
 def _picture(path: Path, size: tuple[int, int], mode: str, where: str) -> NDArray[np.uint8]:

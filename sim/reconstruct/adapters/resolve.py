@@ -5,6 +5,8 @@ python:MODULE:FUNCTION, python:FILE.py:FUNCTION a function as in ``protocols``
 command:FILE.toml a program (``command_adapter``)
 lama:FILE.onnx inpainting by LaMa through onnxruntime (``lama_adapter``)
 isnet:FILE.onnx segmentation by IS-Net through onnxruntime (``isnet_adapter``)
+sam:FOLDER, sam2:FOLDER, depth-anything:FOLDER, depth-pro:FOLDER through transformers (``transformers_adapter``)
+sam-3d-objects:FOLDER, trellis:FOLDER, hunyuan3d:FOLDER, triposg:FOLDER programs that make meshes
 picture:FILE inpainting from a picture without the objects (``picture_adapter``)
 NAME one of these by name (``adapter_registry``)
 """
@@ -18,7 +20,18 @@ from typing import Any, Literal, overload
 from ...errors import InputError
 from ...events import IsCancelled, never
 from ..models import known_models
-from .adapter_registry import ADAPTER_TYPES, OF_STAGE, named_adapters, other_stage, read_command_file, split_spec
+from ..models.model_folder import models_folder
+from .adapter_registry import (
+    ADAPTER_TYPES,
+    FOLDERS,
+    OF_STAGE,
+    PROGRAMS,
+    named_adapters,
+    other_stage,
+    program_command,
+    read_command_file,
+    split_spec,
+)
 from .command_adapter import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
 from .isnet_adapter import load_isnet
 from .lama_adapter import load_lama
@@ -95,6 +108,11 @@ def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path |
         raise InputError(
             f"{stage} {spec!r}: is not installed; run physgen models install {spec}, or leave the option out"
         )
+    if OF_STAGE.get(spec) == stage and spec in FOLDERS:
+        place = models_folder() / spec
+        raise InputError(
+            f"{stage} {spec!r}: has no weights in {place}; name their folder by --weights DIR, or {spec}:DIR"
+        )
     shown = ", ".join(a.name for a in known if a.stage == stage) or "none"
     raise InputError(
         f"{stage} {spec!r}: there is no adapter of that name (known: {shown}); give a name, or one of "
@@ -113,4 +131,11 @@ def _of_kind(stage: str, kind: str, target: str, cancelled: IsCancelled) -> Any:
         return _COMMANDS[stage](read_command_file(path, stage), cancelled)
     if stage != OF_STAGE[kind]:
         raise InputError(f"{where}: {other_stage(kind, stage)}")
+    if kind in PROGRAMS:
+        return MesherCommand(program_command(kind, path), cancelled)
+    if kind in FOLDERS:
+        # Imported here: few have torch, and it takes seconds.
+        from .transformers_adapter import open_transformers
+
+        return open_transformers(kind, path, where)
     return _FILES[kind](path, where)

@@ -146,8 +146,10 @@ def segment_objects(
         known = [mask for j, mask in masks.items() if j in given or _within(boxes[j], boxes[i])]
         others = _near(boxes[i], np.logical_or.reduce([np.zeros(size[::-1], dtype=bool), *known]))
         if soft is not None:
-            by_model = partial(_cut_out, soft, picture.pixels, boxes[i], names[i], others, strokes[i])
-            inputs = {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "others": others}
+            # A model takes what stands out most: all that is known of others is kept from it.
+            taken = _near(boxes[i], np.logical_or.reduce([np.zeros(size[::-1], dtype=bool), *masks.values()]))
+            by_model = partial(_cut_out, soft, picture.pixels, boxes[i], names[i], taken, strokes[i])
+            inputs = {"pixels": picture.pixels, "box": boxes[i], "name": names[i], "others": taken}
             inputs |= {"keep": strokes[i].keep, "drop": strokes[i].drop}
             model = {"model": adapter_content("segmenter", options.segmenter)}
             cut = np.asarray(store.run("cut-out", inputs | model, by_model)["mask"], dtype=bool)
