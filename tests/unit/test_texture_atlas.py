@@ -12,6 +12,7 @@ from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.mesh_raster import rasterise
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured
+from physgen.sim.reconstruct.shape.even_light import light_on
 from physgen.sim.reconstruct.shape.object_bodies import build_body
 from physgen.sim.reconstruct.shape.plain_matter import plain_matter, synthesised_grain
 from physgen.sim.reconstruct.shape.texture_atlas import textured_body
@@ -237,3 +238,43 @@ def test_print_all_over_is_no_grain():
     checks = np.where(((ROWS // 5 + COLUMNS // 5) % 2)[..., None] > 0, 220, 40) + (calm.astype(int) - FUR) // 4
     assert plain_matter(calm, TOY).swatch.std() > 5
     assert plain_matter(np.clip(checks, 0, 255).astype(np.uint8), TOY).swatch.std() < 2
+
+
+def lit_from_the_right(strength=0.8):
+    """The toy as an even ball in the light of a window to its right; linear light of the whole (h, w)."""
+    across = np.clip((COLUMNS - 160) / 70.0, -1.0, 1.0)
+    level = np.exp(strength * across)
+    colour = (np.array(FUR) / 255.0) ** 2.2 * level[..., None] * 0.6
+    pixels = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.float64)
+    pixels[TOY] = 255.0 * np.clip(colour[TOY], 0, 1) ** (1 / 2.2)
+    pixels += np.random.default_rng(3).normal(0, 3, (HEIGHT, WIDTH, 1))
+    return np.clip(pixels, 0, 255).astype(np.uint8), strength * across
+
+
+def test_light_that_follows_the_shape_is_told_from_paint():
+    photo, truth = lit_from_the_right()
+    texture = crop_texture(photo, TOY)
+    height, width = texture.pixels.shape[:2]
+    window = (slice(texture.top, texture.top + height), slice(texture.left, texture.left + width))
+    inside = ndimage.binary_erosion(TOY, iterations=8)[window]
+    light = light_on(VIEW, body(), texture, TOY[window]).mean(axis=2)[inside]
+    wanted = truth[window][inside]
+    assert np.corrcoef(light, wanted)[0, 1] > 0.97
+    assert np.std(wanted - light) < 0.35 * np.std(wanted)
+    # Spots that lie anywhere are paint.
+    spotted = picture(TOY)
+    for row, column in np.random.default_rng(2).uniform((90, 110), (210, 210), (14, 2)):
+        spotted[(ROWS - row) ** 2 + (COLUMNS - column) ** 2 < 10**2] //= 2
+    light = light_on(VIEW, body(), crop_texture(spotted, TOY), TOY[window])[inside]
+    assert np.abs(light).mean() < 0.05
+
+
+def test_the_back_is_as_bright_on_both_sides():
+    photo, _ = lit_from_the_right()
+    back = seen_from(made(photo), 180.0)
+    shown = np.argwhere(back[..., 3] > 0)
+    middle, reach = shown.mean(axis=0), np.ptp(shown, axis=0)
+    rows = slice(int(middle[0] - reach[0] / 6), int(middle[0] + reach[0] / 6))
+    sides = [back[rows, int(middle[1] + turn * reach[1] / 4) - 8 :, :3][:, :16].mean() for turn in (-1, 1)]
+    # In the photo they are 1.5 times apart.
+    assert max(sides) / min(sides) < 1.15

@@ -54,7 +54,7 @@ def colour_pixels(camera: Camera, mesh: BodyMesh, crop: Crop, primitive: Primiti
     at = np.clip(mesh.pixels - corner, 0.0, last)
     look = np.where(np.abs(at + corner - mesh.pixels).max(axis=1, keepdims=True) > 1e-6, at + corner, mesh.pixels)
     beyond = ndimage.map_coordinates(crop.distance, at[:, ::-1].T, order=1, mode="nearest") < -OUTSIDE
-    hidden = ~_seen(camera, mesh) | beyond
+    hidden = ~seen_vertices(camera, mesh) | beyond
     if not hidden.any() or hidden.all():
         return look
     size = float(np.sqrt(crop.mask.sum()))
@@ -67,14 +67,14 @@ def colour_pixels(camera: Camera, mesh: BodyMesh, crop: Crop, primitive: Primiti
         look[on_it] = camera.project(_counterparts(camera, primitive, mesh.vertices[on_it]))[:, :2]
         free = hidden & ~on_it
     if free.any():
-        behind = np.minimum(_behind(mesh, ~hidden, size), DEEPEST * float(crop.distance.max()))
+        behind = np.minimum(distance_behind(mesh, ~hidden, size), DEEPEST * float(crop.distance.max()))
         target[free] = np.maximum(target[free], behind[free])
     look[hidden] = _inwards(crop, look[hidden], target[hidden])
     return look
 
 
-def _seen(camera: Camera, mesh: BodyMesh) -> NDArray[np.bool_]:
-    """Whether (V,) any face at a vertex faces the camera well enough."""
+def seen_vertices(camera: Camera, mesh: BodyMesh) -> NDArray[np.bool_]:
+    """Return whether (V,) any face at a vertex faces the camera well enough."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
     towards = camera.position - (a + b + c) / 3.0
@@ -154,8 +154,9 @@ def _on_box(camera: Camera, box: Box, points: Points) -> Points:
     return np.asarray(result @ frame + box.centre)
 
 
-def _behind(mesh: BodyMesh, seen: NDArray[np.bool_], size: float) -> Points:
-    """Distance (V,) in pixels along mesh edges from the visible part."""
+def distance_behind(mesh: BodyMesh, seen: NDArray[np.bool_], size: float) -> Points:
+    """Return the distance (V,) in pixels along mesh edges from the vertices ``seen`` (V,); ``size`` where there is no
+    way."""
     ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
     # Pixels per unit: the outline's size over the body's.

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...composite.srgb import linear_to_srgb, srgb_to_linear
 from ...mpm.geometry.triangles import area_normals
 from ...scene.model import Camera
 from ...smoothstep import smoothstep
 from ..mesh_raster import rasterise
-from .body_texture import CropTexture, TexturedSurface
+from .body_texture import CropTexture, TexturedSurface, distance_behind, seen_vertices
+from .even_light import light_on
 from .inflated_mesh import BodyMesh
 from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_grain
 from .surface_charts import surface_frame, unwrap
@@ -44,6 +46,8 @@ book's fore-edge, is a strip of several pixels, none of them mixed with the back
 BENT = (1.0, 0.4)
 """Curvature times the body's extent (2 on a ball) from which ``CLEAR`` holds not at all, and up to which fully: the
 pixels along the outline of a round side are mixed with the background, and other cameras would see them as a line."""
+EVEN = 0.12
+"""Distance behind the rim, over the root of the object's area, at which two thirds of its light are taken out."""
 DENSITY = 1.25
 """Texels of charts per pixel of the photo, per side: the photo is resampled there."""
 MOST_TEXELS = 9e5
@@ -90,12 +94,17 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     matter = plain_matter(texture.pixels, inside)
     values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
     values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
+    size_px = float(np.sqrt(inside.sum()))
+    behind = distance_behind(body, seen_vertices(camera, body), size_px)
+    # Beyond an edge, light is another one at once.
+    values = np.column_stack([values, np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), values[:, 11])])
+    light = light_on(camera, body, texture, inside)
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
     found = rasterise(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
     texel = found.interpolated(charts.faces, values[charts.source])
     below = np.zeros((charts.size[1], size[0], 3), dtype=np.uint8)
     if len(found.rows):
-        colour = _colours(camera, texel, texture, inside, matter, frame, pixels)
+        colour = _colours(camera, texel, texture, inside, matter, light, frame, pixels)
         below[found.rows, found.columns] = np.clip(colour + 0.5, 0, 255).astype(np.uint8)
         covered = np.zeros(below.shape[:2], dtype=bool)
         covered[found.rows, found.columns] = True
@@ -195,19 +204,21 @@ def _colours(
     texture: CropTexture,
     mask: Mask,
     matter: PlainMatter,
+    light: NDArray[np.float32],
     frame: Points,
     pixels: float,
 ) -> NDArray[np.float64]:
-    """Colours (P, 3) of texels (P, 12): place, normal, counterpart's pixel, own pixel, share hidden, flatness.
+    """Colours (P, 3) of texels (P, 13): place, normal, counterpart's pixel, own pixel, share hidden, flatness, share of
+    the counterpart's light that is taken out.
 
-    mask: (h, w) the object in ``texture``. pixels: of the photo per unit of length.
+    mask: (h, w) the object in ``texture``. light: (h, w, 3) its logarithm. pixels: of the photo per unit of length.
     """
     normal = texel[:, 3:6] / np.maximum(np.linalg.norm(texel[:, 3:6], axis=1, keepdims=True), 1e-12)
     corner = (texture.left + 0.5, texture.top + 0.5)
     like, own = texel[:, 6:8] - corner, texel[:, 8:10] - corner
     grain = _grain(matter, texel[:, :3] @ frame.T * pixels, normal @ frame.T)
     grain *= _sampled(matter.contrast[..., None], like)
-    plain = _sampled(matter.colours, like) + grain
+    plain = _without_light(_sampled(matter.colours, like), texel[:, 12:13] * _sampled(light, like)) + grain
     towards = camera.position - texel[:, :3]
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
     depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
@@ -233,6 +244,11 @@ def _colours(
     photo = inner + share[:, None] * (photo - inner) + added
     plain[seen] += weight[seen] * (photo - plain[seen])
     return plain
+
+
+def _without_light(colours: Points, light: Points) -> NDArray[np.float64]:
+    """sRGB ``colours`` (P, 3), 0 to 255, divided by the exponential of ``light`` (P, 3) in linear light."""
+    return 255.0 * linear_to_srgb(srgb_to_linear(colours / 255.0) * np.exp(-light)).astype(np.float64)
 
 
 def _grain(matter: PlainMatter, place: Points, normal: Points) -> NDArray[np.float64]:
