@@ -3,7 +3,7 @@
 
     import physgen
 
-    objects = [physgen.ObjectRequest(name="cup", box=(215, 960, 475, 1190), preset="medium", velocity=(0, 0, 1.5))]
+    objects = [physgen.ObjectRequest(name="cup", box=(215, 960, 475, 1190), preset="metal", velocity=(0, 0, 1.5))]
     scene = physgen.reconstruct("photo.jpg", objects, out="work/scene")
     bake = physgen.bake(scene, out="work/bake", options=physgen.BakeOptions(frames=48))
     frames = physgen.render(scene, bake, out="work/frames", video="video.mp4")

@@ -157,6 +157,9 @@ class Bake:
     root: Path
     manifest: BakeManifest
 
+    def __repr__(self) -> str:
+        return f"Bake(root={str(self.root)!r}, frames {self.first_frame} to {self.last_frame})"
+
     @property
     def first_frame(self) -> int:
         """Number of the first frame: the scene at rest."""

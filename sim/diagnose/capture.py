@@ -187,6 +187,10 @@ class Capture:
     root: Path | None = None
     warnings: tuple[str, ...] = field(default=())
 
+    def __repr__(self) -> str:
+        objects = ", ".join(item.belief.name for item in self.objects)
+        return f"Capture(root={str(self.root)!r}, objects: {objects}; trials: {', '.join(t.name for t in self.trials)})"
+
     @property
     def fit_trials(self) -> tuple[Trial, ...]:
         """Return the complete trials."""

@@ -230,6 +230,9 @@ class Diagnosis:
     seconds: float = 0.0
     confirmation: Mapping[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"Diagnosis({self.verdict.effect}, probability {self.verdict.probability:.2f})"
+
 
 def write_diagnosis(diagnosis: Diagnosis, out: Path) -> None:
     """Write ``report.json``, ``where.npz`` and ``prediction.npz`` into the folder ``out``."""

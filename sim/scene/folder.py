@@ -37,6 +37,9 @@ class Scene:
     root: Path
     model: SceneModel
 
+    def __repr__(self) -> str:
+        return f"Scene(root={str(self.root)!r}, objects: {', '.join(item.name for item in self.objects)})"
+
     @property
     def objects(self) -> tuple[SceneObject, ...]:
         """The scene's objects, in order."""

@@ -14,6 +14,7 @@ from physgen.sim.cache.bake_folder import (
     BakeManifest,
     disk_usage,
     free_bake,
+    load_bake,
     load_manifest,
     remove_leftovers,
     save_manifest,
@@ -70,6 +71,11 @@ def test_a_manifest_says_space_and_points_and_old_ones_say_neither(tmp_path):
     for changes in ({"space": "camera"}, {"points": 3}, {"points_file": "a.pc2"}):
         with pytest.raises(InputError, match="object cup"):
             BakedObject(**{"name": "cup", "file": "cup.pc2", "vertices": 2, **changes})
+
+
+def test_a_bake_prints_as_one_line(tmp_path):
+    folder = a_bake(tmp_path / "bake")
+    assert repr(load_bake(folder)) == f"Bake(root={str(folder)!r}, frames 1 to 1)"
 
 
 def test_reported_size_equals_freed_size(tmp_path):

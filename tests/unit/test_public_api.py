@@ -5,6 +5,7 @@ import csv
 import doctest
 import importlib.util
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -112,6 +113,8 @@ def test_example_csv_to_verdict(tmp_path):
                 writer.writerow([f"t{trial}", time, *place])
     found = example("csv_to_verdict").main(tmp_path / "toss.csv", tmp_path / "work", radius=0.1, density=20.0)
     assert found.verdict.effect == "air_drag"
+    assert re.fullmatch(r"Diagnosis\(air_drag, probability [01]\.\d\d\)", repr(found))
+    assert repr(physgen.load_capture(tmp_path / "work" / "capture")).count("\n") == 0
     assert (tmp_path / "work" / "diagnosis" / "report.html").is_file()
 
 

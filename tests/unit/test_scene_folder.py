@@ -185,6 +185,7 @@ def write_files(root, scene):
 def test_a_saved_folder_loads(tmp_path):
     write_files(tmp_path, a_scene())
     assert load_scene(tmp_path).model == a_scene()
+    assert repr(load_scene(tmp_path)) == f"Scene(root={str(tmp_path)!r}, objects: cup)"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 

@@ -31,7 +31,7 @@ from physgen.sim.diagnose.track.pose_estimation import (
     silhouette,
 )
 from physgen.sim.diagnose.track.track_command import add_arguments, parse_trials, run_command, track
-from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial
+from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial, belief_warnings
 from physgen.sim.diagnose.track.track_videos import track_video, track_videos, withhold
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.scene.folder import Scene, save_scene
@@ -352,6 +352,7 @@ def test_a_ball_that_deforms(tmp_path):
     folder = make_scene(tmp_path / "scene", stage, preset="soft")
     path = write_video(tmp_path / "squash.avi", film(stage, squashed, 28))
     trial = track_video(VideoTrial(path=path), folder).trial
+    assert ["deforms" in line and "rigid material" in line for line in belief_warnings(folder.model, [0])] == [True]
     found = errors(trial, squashed)
     assert trial.seen.any(axis=1).all()
     assert len(found) > 28 * 10

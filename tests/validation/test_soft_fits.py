@@ -201,5 +201,8 @@ def test_unsupported_captures_are_reported():
         fits(dataclasses.replace(made, objects=(dataclasses.replace(made.objects[0], belief=rigid),)), None)
     with pytest.raises(InputError, match="one"):
         fits(dataclasses.replace(made, objects=made.objects * 2), None)
+    filmed = [dataclasses.replace(t, points=None, pixels=t.points[..., :2]) for t in made.trials]
+    with pytest.raises(InputError, match="give it a rigid material"):
+        fits(dataclasses.replace(made, trials=tuple(filmed)), None)
     with pytest.raises(Cancelled):
         fit_soft(made, None, on_event=lambda event: None, cancelled=lambda: True, budget_s=60)

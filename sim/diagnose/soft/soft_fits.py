@@ -328,7 +328,11 @@ def fit_soft(
     if capture.objects[0].belief.youngs_modulus_pa is None:
         raise InputError("youngs_modulus_pa is null: diagnose the object as a rigid one, or give its modulus")
     if any(t.points is None for t in capture.trials):
-        raise InputError("a trial has pixels: a soft object needs 3D points")
+        name = capture.objects[0].belief.name
+        raise InputError(
+            f"object {name!r} deforms and its trials are pixels: give it a rigid material (wood, metal) before "
+            "tracking, or record 3D points"
+        )
     wanted = NAMES if names is None else tuple(n for n in NAMES if n in set(names))
     survey = Survey(capture, on_event=on_event, cancelled=cancelled, budget_s=budget_s)
     survey.run(wanted)

@@ -231,6 +231,11 @@ def belief_warnings(scene: SceneModel, chosen: Sequence[int]) -> list[str]:
         warnings.append("the scene's gravity changes over time; a capture has one gravity, 'gravity' is taken")
     for i in chosen:
         item = scene.objects[i]
+        if item.material.law != "rigid":
+            warnings.append(
+                f"object {item.name!r}: deforms, and from videos only rigid objects can be diagnosed; give it a rigid "
+                "material (wood, metal) if it keeps its shape"
+            )
         if cohesion_of(item.material.law) in (COHERENT, GRANULAR):
             warnings.append(
                 f"object {item.name!r}: is {item.material.law}; a capture has elastic and rigid materials only"
