@@ -2,6 +2,7 @@
 """Cycles takes one picture and everything that is known about it. Runs as a process of its own.
 
     python -m physgen.benchmarks.reconstruct_pictures.blender_photo SET NUMBER FOLDER [--samples 12] [--threads 0]
+                                                                    [--coverage-only]
 
 ``FORMAT.md`` says what lies in the folder.
 """
@@ -231,6 +232,34 @@ def shoot(case: Case, folder: Path, samples: int, threads: int = 0) -> None:
     partial.rename(folder)
 
 
+def shoot_coverage(case: Case, folder: Path, samples: int, threads: int = 0) -> None:
+    """Render only the photo and the true coverage of each thing into ``folder``, which appears whole or not at all:
+    ``photo.jpg``, ``alpha/NAME.png`` (0 to 255) and ``boxes.json`` (name, kind, box, tight)."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    (partial / "alpha").mkdir(parents=True)
+    everything = frozenset(item.name for item in case.items)
+    with tempfile.TemporaryDirectory(prefix="physgen-pictures-") as scratch:
+        studio = Studio(case, samples, threads, Path(scratch))
+        taken = {everything: studio.picture(set(everything))}
+        shares = studio.coverage()
+    photo = exposed(taken, everything)[everything]
+    rng = np.random.default_rng(case.seed + 1)
+    _save_photo(case, with_grain(linear_to_bytes(photo), case.noise, rng), partial / "photo.jpg")
+    for name, share in shares.items():
+        _save(np.rint(share * 255.0).astype(np.uint8), partial / "alpha" / f"{name}.png")
+    boxes = []
+    rng = np.random.default_rng(case.seed + 2)
+    for item in case.items:
+        ys, xs = np.nonzero(shares[item.name] > 0.5)
+        tight = (float(xs.min()), float(ys.min()), float(xs.max() + 1), float(ys.max() + 1))
+        box = loose_box(tight, (case.camera.width, case.camera.height), rng)
+        boxes.append({"name": item.name, "kind": item.kind, "box": box, "tight": tight})
+    (partial / "boxes.json").write_text(json.dumps(boxes, indent=1))
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
 def _wanted(names: list[str]) -> list[frozenset[str]]:
     everything = frozenset(names)
     some = [everything, frozenset[str](), *(frozenset({n}) for n in names), *(everything - {n} for n in names)]
@@ -312,8 +341,9 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--samples", type=int, default=12)
     parser.add_argument("--threads", type=int, default=0, help="of the processor; 0 takes all")
+    parser.add_argument("--coverage-only", action="store_true", help="only the photo and the true coverage")
     options = parser.parse_args()
-    shoot(draw(options.set, options.number), options.folder, options.samples, options.threads)
+    (shoot_coverage if options.coverage_only else shoot)(draw(options.set, options.number), options.folder, options.samples, options.threads)
     return 0
 
 
