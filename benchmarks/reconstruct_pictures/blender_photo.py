@@ -343,7 +343,9 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=0, help="of the processor; 0 takes all")
     parser.add_argument("--coverage-only", action="store_true", help="only the photo and the true coverage")
     options = parser.parse_args()
-    (shoot_coverage if options.coverage_only else shoot)(draw(options.set, options.number), options.folder, options.samples, options.threads)
+    (shoot_coverage if options.coverage_only else shoot)(
+        draw(options.set, options.number), options.folder, options.samples, options.threads
+    )
     return 0
 
 

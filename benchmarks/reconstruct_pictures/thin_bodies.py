@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from trimesh import Trimesh
 
 from .shapes import Body, Parts, block, ellipsoid, revolved

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from .contour_evidence import FINE, completed_by_contours, gaps_and_rods
 from .mask_cleanup import drop_ground_shadow, fill_holes, open_holes, settle_outline, smooth_outline, touching
 from .mask_proposals import (
     BoxCrop,
@@ -166,7 +167,10 @@ def segment(
     told = no_strokes(pixels.shape) if strokes is None else strokes
     keep, drop = (np.ascontiguousarray(part[top:bottom, left:right]) for part in (told.keep, told.drop))
     keep = keep & ~taken
-    found, notices, sides = _coarse(crop, inner, taken, iterations, keep, drop)
+    found, closed, notices, sides = _coarse(crop, inner, taken, iterations, keep, drop)
+    # A part that only contours speak for is as certain as a stroke: colours would drop it again.
+    keep = keep | (closed & ~drop & ~taken)
+    gaps = np.zeros_like(taken)
     if not keep.any() and found.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
         sides = []
         notices = ["colour does not separate the object from the background; an ellipse in the box is used instead"]
@@ -177,15 +181,17 @@ def segment(
         found = opened | touching(found & ~opened, keep) if keep.any() else opened
         if crop.shape[0] * crop.shape[1] <= FINE_PIXELS:
             found = _fine(crop, inner, found, taken, keep, drop)
+        gaps, rods = _details(crop, inner, found, taken, keep, drop)
+        found = (found & ~gaps) | rods
         found = settle_outline(crop, drop_ground_shadow(crop, _kept_part(found & ~taken, taken, keep)))
-    found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep))
+    found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep)) & ~gaps
     if keep.any():
         # Between what is kept and the rest their mixed colours look like a third one: bridge the groove.
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
         reach = 2 * max(8, round(0.08 * float(np.sqrt(found.sum())))) + 1
         near = cv2.dilate(keep.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
         found |= (cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0) & near
-    found = (smooth_outline(found) | keep) & ~taken & ~drop
+    found = (smooth_outline(found) | keep | _thin_parts(found)) & ~taken & ~drop
     found[:, : inner[0]] = found[: inner[1]] = False
     found[:, inner[2] :] = found[inner[3] :] = False
     mask = np.zeros((height, width), dtype=bool)
@@ -252,8 +258,10 @@ def check_distinct(masks: Sequence[Mask], names: Sequence[str]) -> None:
 
 def _coarse(
     crop: NDArray[np.uint8], inner: Box, taken: Mask, iterations: int, keep: Mask, drop: Mask
-) -> tuple[Mask, list[str], list[str]]:
-    """The best proposal (h, w) at the crop's size, notices about it, and sides of the box that may cut it."""
+) -> tuple[Mask, Mask, list[str], list[str]]:
+    """The best proposal (h, w) at the crop's size, its parts that only contours speak for, notices about it, and sides
+    of the box that may cut it."""
+    nothing = np.zeros(crop.shape[:2], dtype=bool)
     height, width = crop.shape[:2]
     scale = min(1.0, COARSE_SIZE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -270,7 +278,7 @@ def _coarse(
         drop=(other > own) & ~closed,
     )
     if not view.inside.any():
-        return np.zeros((height, width), dtype=bool), [], []
+        return nothing, nothing, [], []
     raw = proposals(view, iterations)
     guesses = [_kept_part(mask, closed, view.keep) for mask in raw]
     for index, mask in enumerate(list(guesses)):
@@ -281,9 +289,57 @@ def _coarse(
     ground = ground_like(view)
     best = int(np.argmax([score(view, mask, ground) for mask in guesses]))
     if outline_strength(view, guesses[best]) < FAINT and not view.keep.any():
-        return np.zeros((height, width), dtype=bool), [], []
-    full = cv2.resize(guesses[best].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full > 0.5), mask_warnings(view, raw[best], guesses[best]), cut_sides(view, guesses[best])
+        return nothing, nothing, [], []
+    completed = completed_by_contours(view, guesses[best])
+    notices = mask_warnings(view, raw[best], guesses[best])
+    if completed.doubtful.any():
+        away = np.argwhere(completed.doubtful).mean(axis=0) - np.argwhere(completed.mask).mean(axis=0)
+        sides = ("above", "below") if abs(away[0]) > abs(away[1]) else ("left of", "right of")
+        share = 100.0 * completed.doubtful.sum() / completed.mask.sum()
+        notices.append(
+            f"a part {sides[int(away[np.argmax(np.abs(away))] > 0)]} its middle, {share:.0f} % of its size, has a "
+            "contour of its own and may belong to it: a keep stroke over it adds it"
+        )
+    full, closed = (
+        cv2.resize(part.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+        for part in (
+            completed.mask,
+            cv2.erode(completed.added.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0),
+        )
+    )
+    return np.asarray(full), np.asarray(closed), notices, cut_sides(view, completed.mask)
+
+
+def _details(
+    crop: NDArray[np.uint8], inner: Box, found: Mask, taken: Mask, keep: Mask, drop: Mask
+) -> tuple[Mask, Mask]:
+    """Gaps and rods (h, w) at the crop's size, found on a copy that shows them."""
+    height, width = crop.shape[:2]
+    scale = min(1.0, FINE / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    masks = [
+        np.asarray(cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > share
+        for part, share in ((found, 0.5), (taken, 0.5), (keep, 0.0), (drop, 0.0))
+    ]
+    x0, y0, x1, y1 = (round(v * scale) for v in inner)
+    view = crop_around_box(small, (x0, y0, x1, y1), masks[1], keep=masks[2], drop=masks[3] & ~masks[2])
+    gaps, rods = gaps_and_rods(view, masks[0])
+    large = [cv2.resize(part.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+             for part in (gaps, rods)]  # fmt: skip
+    return large[0] & ~keep, large[1] & ~drop & ~taken
+
+
+def _thin_parts(mask: Mask) -> Mask:
+    """Rods and wires (h, w) of ``mask``, which smoothing would take away; single hairs of a few pixels are not."""
+    size = float(np.sqrt(mask.sum()))
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((mask & ~opened).astype(np.uint8), connectivity=8)
+    extent = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
+    # Longer than a jag of the outline, and not the rind that the opening peels off a corner.
+    long = (extent > max(12.0, 0.08 * size)) & (stats[:, cv2.CC_STAT_AREA] > 1.6 * extent)
+    long[0] = False
+    return np.asarray(long[labels])
 
 
 def _fine(crop: NDArray[np.uint8], inner: Box, found: Mask, taken: Mask, keep: Mask, drop: Mask) -> Mask:

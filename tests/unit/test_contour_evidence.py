@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Parts of the ground's tone, gaps and rods: on drawn photos with known answers."""
+
+import numpy as np
+import pytest
+from physgen.sim.reconstruct.segmentation.box_segmentation import segment
+from scipy import ndimage
+
+WIDTH, HEIGHT = 320, 240
+
+
+def table(seed=0):
+    """A wall of pale plaster above brown boards."""
+    rng = np.random.default_rng(seed)
+    streaks = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), (0.7, 12)) * 40
+    image = np.array([120.0, 80, 55]) + (streaks + rng.normal(scale=3, size=(HEIGHT, WIDTH)))[..., None]
+    image[:90] = np.array([208.0, 203, 192]) + rng.normal(scale=2, size=(90, WIDTH, 1))
+    return image
+
+
+def finished(image):
+    return np.clip(ndimage.gaussian_filter(image, (0.6, 0.6, 0)), 0, 255).astype(np.uint8)
+
+
+def overlap(first, second):
+    return (first & second).sum() / (first | second).sum()
+
+
+def book(spine):
+    """A dark cover, and beside it a spine of the colour ``spine``."""
+    truth = np.zeros((HEIGHT, WIDTH), bool)
+    truth[98:210, 110:230] = True
+    image = table()
+    image[98:210, 130:230] = (35, 32, 40)
+    image[98:210, 110:130] = spine
+    image[130:160, 160:200] = (180, 60, 40)
+    return finished(image), truth
+
+
+@pytest.mark.parametrize("spine", [(212.0, 205, 192), (225.0, 220, 212)])
+def test_a_spine_of_the_wall_s_colour_is_kept(spine):
+    photo, truth = book(spine)
+    told = []
+    mask = segment(photo, (95, 75, 245, 222), "book", warn=told.append)
+    assert mask[102:206, 113:128].mean() > 0.95
+    assert overlap(mask, truth) > 0.96
+    assert not any("contour of its own" in line for line in told)
+
+
+def test_a_neighbour_is_not_swallowed_and_a_shadow_neither():
+    image = table()
+    image[60:200, 130:230] = (35, 32, 40)
+    image[150:198, 100:130] = (214, 206, 195)
+    # A shadow with a sharp border beside it on the other side.
+    image[160:205, 230:262] *= 0.6
+    mask = segment(finished(image), (88, 48, 275, 215), "book")
+    assert mask[155:195, 103:126].mean() < 0.1
+    assert mask[165:200, 236:258].mean() < 0.1
+    assert mask[64:196, 134:226].mean() > 0.97
+
+
+def chair():
+    """A frame with slats; the wall and the boards show between them."""
+    truth = np.zeros((HEIGHT, WIDTH), bool)
+    truth[40:210, 100:108] = truth[40:210, 212:220] = True
+    truth[40:50, 100:220] = truth[120:135, 100:220] = True
+    for x in range(122, 210, 18):
+        truth[50:120, x : x + 6] = True
+    image = table(2)
+    image[truth] = (70, 95, 130)
+    return finished(image), truth
+
+
+def test_the_gaps_between_slats_stay_open():
+    photo, truth = chair()
+    mask = segment(photo, (85, 28, 235, 222), "chair")
+    between = ndimage.binary_erosion(~truth[54:116, 110:210], iterations=2)
+    below = ~truth[140:205, 112:208]
+    assert mask[54:116, 110:210][between].mean() < 0.1
+    assert mask[140:205, 112:208][below].mean() < 0.05
+    assert overlap(mask, truth) > 0.85
+    assert mask[ndimage.binary_erosion(truth)].mean() > 0.95
+
+
+def test_letters_of_the_ground_s_colour_are_no_gaps():
+    image = table(3)
+    image[60:200, 110:230] = (45, 60, 110)
+    for row in range(5):
+        for column in range(6):
+            y, x = 80 + 22 * row, 122 + 17 * column
+            image[y : y + 10, x : x + 4] = (122, 82, 57)
+    mask = segment(finished(image), (95, 48, 245, 212), "poster")
+    assert mask[64:196, 114:226].mean() > 0.98
+
+
+def test_a_thin_rod_survives():
+    truth = np.zeros((HEIGHT, WIDTH), bool)
+    truth[150:205, 120:200] = True
+    truth[60:150, 158:162] = True
+    image = table(4)
+    image[truth] = (40, 110, 60)
+    mask = segment(finished(image), (100, 45, 220, 218), "lamp")
+    assert mask[64:148, 159:161].mean() > 0.9
+    assert overlap(mask, truth) > 0.93
