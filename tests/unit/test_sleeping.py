@@ -8,7 +8,10 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.app.rest_check import at_rest
+from physgen.sim.app.simulation import start_world
+from physgen.sim.app.world_setup import prepare_world
 from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.effects.registry import apply_effects
 from physgen.sim.mpm.bodies import BodyForces, BodyParticles
@@ -18,6 +21,7 @@ from physgen.sim.mpm.solver_options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
 from physgen.sim.mpm.world_setup import WorldSetup
 from physgen.sim.scene.folder import Scene
+from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect
 from physgen.sim.scene.units import Similarity
 
@@ -130,6 +134,24 @@ def test_a_scene_holds_what_would_not_stay_and_says_so(ball_scene):
         scene = Scene(root=folder.root, model=dataclasses.replace(folder.model, objects=(item,)))
         assert at_rest(scene, notices.append).objects == (dataclasses.replace(item, held=held),)
         assert ["ball0.held=false" in text for text in notices] == [True] * held
+
+
+def test_a_jelly_deep_in_another_stays_where_it_is(ball_scene):
+    """Two balls of 10 cm whose middles are 7 cm apart share a third of themselves. One is simulated with a hollow, and
+    neither moves, though awake the upper one would slide down the hollow."""
+    folder = ball_scene(preset="jelly", height=0.05, velocity=(0.0, 0.0, 0.0), count=2)
+    low, high = (dataclasses.replace(item, asleep=True) for item in folder.model.objects)
+    moved_by = np.eye(4)
+    moved_by[:3, 3] = (-0.12, 0.0, 0.06)
+    high = dataclasses.replace(high, world_from_mesh=tuple(map(tuple, moved_by.tolist())))
+    scene = Scene(root=folder.root, model=dataclasses.replace(folder.model, objects=(low, high)))
+    resting = Scene(root=folder.root, model=at_rest(scene, lambda text: None))
+    meshes = [load_object_mesh(resting, item) for item in resting.model.objects]
+    prepared = prepare_world(resting, meshes, BakeOptions(frames=2, quality="preview"))
+    assert any("hollow" in text for text in prepared.warnings)
+    world = start_world(prepared).world
+    world.advance(0.1)
+    assert [moved(world, i) for i in range(2)] == [0.0, 0.0]
 
 
 def test_what_is_held_sleeps_in_mid_air_and_leaning_until_its_support_moves():
