@@ -21,16 +21,17 @@ from .support import support_of
 
 Points = NDArray[np.float64]
 
-THICKEST = 3.0
+THICKEST = 1.5
 """Largest thickness that is added, over the body's half thickness."""
-STEPS = 60
+STEPS = 30
 """Thicknesses to try."""
 COST = 1.0
 """Share of the wanted margin that a body has to gain for twice its volume; less is not worth its looks."""
 WHOLE = 0.3
 """Local half thickness, over the largest, from which all of it is added: less to limbs, ears and straps."""
-HIGHEST = 0.35
-"""Height over the body's, above which nothing is added."""
+LOWEST, RISE = 0.2, 0.6
+"""Height over the body's, above which nothing is added, for hardly any thickness, and how much higher for each half
+thickness: a low and thick addition would be a wedge behind the body."""
 
 
 def footed(
@@ -69,14 +70,14 @@ class _Thickening:
         square = ndimage.map_coordinates(silhouette.square_height, at[:, ::-1].T, order=1, mode="nearest")
         share = np.sqrt(np.maximum(square, 0.0)) / silhouette.half_thickness
         unseen = np.einsum("ij,ij->i", area_normals(vertices, faces), camera.position - vertices) < 0.0
-        low = np.clip(1.0 - vertices[:, 2] / (HIGHEST * vertices[:, 2].max()), 0.0, 1.0)
-        self._step = np.where(unseen, half * low * np.minimum(share / WHOLE, 1.0), 0.0)
+        self._height = vertices[:, 2] / vertices[:, 2].max()
+        self._step = np.where(unseen, half * np.minimum(share / WHOLE, 1.0), 0.0)
         self._step /= np.linalg.norm(self._rays, axis=1)
         self._room = np.maximum(ground_depth(camera, self._rays) - projected[:, 2], 0.0)
 
     def by(self, extra: float) -> Points:
         """Return the vertices (V, 3) with ``extra`` half thicknesses added, none below the ground."""
-        moved = extra * self._step
+        moved = extra * self._step * np.clip(1.0 - self._height / (LOWEST + RISE * extra), 0.0, 1.0)
         made = self._vertices + np.minimum(moved, self._room)[:, None] * self._rays
         made[(moved > 0.0) & (moved >= self._room), 2] = 0.0
         return np.asarray(made)
