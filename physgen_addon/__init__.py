@@ -25,6 +25,7 @@ MODULES = (
     "operators.photo_ops",
     "operators.model_ops",
     "operators.mask_horizon_ops",
+    "operators.photo_object_ops",
     "operators.body_ops",
     "operators.world_ops",
     "operators.bake_ops",

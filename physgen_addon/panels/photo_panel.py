@@ -15,6 +15,11 @@ from .. import text
 from ..context import TAB
 from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
 from ..operators.model_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
+from ..operators.photo_object_ops import (
+    PHYSGEN_OT_clear_strokes,
+    PHYSGEN_OT_draw_strokes,
+    PHYSGEN_OT_find_objects,
+)
 from ..operators.photo_ops import (
     PHYSGEN_OT_draw_box,
     PHYSGEN_OT_open_photo,
@@ -65,7 +70,7 @@ def draw_details(layout: bpy.types.UILayout, context: bpy.types.Context, box: An
 
 
 def draw_mask(layout: bpy.types.UILayout, context: bpy.types.Context, box: Any) -> None:
-    """Draw buttons to paint, choose and remove a mask."""
+    """Draw buttons to paint, choose and remove a mask, and to draw and remove strokes."""
     column = layout.column(align=True)
     column.use_property_split = False
     row = column.row(align=True)
@@ -73,6 +78,10 @@ def draw_mask(layout: bpy.types.UILayout, context: bpy.types.Context, box: Any) 
     if box.mask is not None:
         row.operator(PHYSGEN_OT_clear_mask.bl_idname, text="", icon="X")
     column.template_ID(box, "mask", open="image.open")
+    row = column.row(align=True)
+    row.operator(PHYSGEN_OT_draw_strokes.bl_idname, icon="GREASEPENCIL")
+    if box.keep or box.drop:
+        row.operator(PHYSGEN_OT_clear_strokes.bl_idname, text="", icon="X")
 
 
 def draw_cutouts(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
@@ -206,6 +215,9 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
     buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
     layout.operator(PHYSGEN_OT_draw_box.bl_idname, icon="SELECT_SET")
+    row = layout.row(align=True)
+    row.operator(PHYSGEN_OT_find_objects.bl_idname, icon="VIEWZOOM").every = False
+    row.operator(PHYSGEN_OT_find_objects.bl_idname, text="All").every = True
     if not state.boxes:
         text.sentences(layout, context, "Draw a box around each object that is to move.")
         return

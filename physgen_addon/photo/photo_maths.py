@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +100,24 @@ def stamp(mask: Mask, start: Place, end: Place, radius: float, *, value: bool) -
     share = np.clip((x * along_x + y * along_y) / length, 0.0, 1.0) if length > 0 else 0.0
     near = (x - share * along_x) ** 2 + (y - share * along_y) ** 2 <= radius**2
     mask[top:bottom, left:right][near] = value
+
+
+def box_overlap(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return the intersection over union of two boxes x0, y0, x1, y1."""
+    width, height = (min(first[i + 2], second[i + 2]) - max(first[i], second[i]) for i in (0, 1))
+    common = max(0.0, width) * max(0.0, height)
+    return common / max(1e-9, sum((b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)) - common)
+
+
+def simplified(places: Sequence[Place], least: float = 3.0) -> list[Place]:
+    """Return ``places`` of a stroke without those nearer than ``least`` to the one before; the last one stays."""
+    result = [places[0]]
+    for place in places[1:]:
+        if math.dist(place, result[-1]) >= least:
+            result.append(place)
+    if places[-1] != result[-1]:
+        result.append(places[-1])
+    return result
 
 
 def ellipse(width: int, height: int, box: tuple[float, float, float, float]) -> Mask:

@@ -100,6 +100,10 @@ def _of_objects(state: bpy.types.PropertyGroup, known: list[tuple[str, bpy.types
     given = {"mask": [f"{name}={path}" for name, (path, _) in masks.items()]}
     for flag in OF_OBJECTS:
         given[flag] = [f"{name}={value}" for name, box in known if (value := _flag_value(box, flag))]
+    for flag in ("keep", "drop"):
+        # A mask replaces the segmentation that strokes would refine.
+        strokes = [(name, text) for name, box in known if box.mask is None for text in getattr(box, flag).split()]
+        given[flag] = [f"{name}={text}" for name, text in strokes]
     return [word for flag, values in given.items() if values for word in (f"--{flag}", *values)]
 
 

@@ -74,6 +74,16 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         type=bpy.types.Image,
         update=_on_box,
     )
+    keep: StringProperty(
+        name="Keep",
+        description="Strokes over what belongs to the object: x,y,x,y,… in pixels of the upright photo",
+        update=_on_box,
+    )
+    drop: StringProperty(
+        name="Drop",
+        description="Strokes over what does not belong to the object, such as the floor in a hole",
+        update=_on_box,
+    )
     shape: from_field(
         ObjectRequest,
         "shape",

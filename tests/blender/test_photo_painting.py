@@ -16,6 +16,7 @@ bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon.operators import mask_horizon_ops
 from physgen.physgen_addon.operators.mask_horizon_ops import PHYSGEN_OT_paint_mask
+from physgen.physgen_addon.operators.photo_object_ops import PHYSGEN_OT_draw_strokes, add_found, stroke_lines
 from physgen.physgen_addon.operators.photo_ops import (
     add_box,
     set_photo,
@@ -31,11 +32,13 @@ from physgen.physgen_addon.photo.photo_image import (
 )
 from physgen.physgen_addon.photo.photo_maths import Painting, ellipse, extent
 from physgen.physgen_addon.photo.photo_request import (
+    arguments,
     mask_files,
     scene_folder,
     take_camera,
 )
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -375,3 +378,42 @@ def test_overlays_are_drawn_at_the_right_place_on_the_photo(tmp_path):
         angles = np.arctan2(rows - 200, columns - 260)[ring]
         assert len(np.unique((angles * 4).astype(int))) >= 24
     assert (seen[away < 18] == seen[0, 0]).all()
+
+
+def test_strokes_become_flags_and_yield_to_a_mask(window, photo):
+    operator, box = operate(PHYSGEN_OT_draw_strokes), photo.boxes[0]
+    operator.invoke(window, event("NONE"))
+    modal = partial(operator.modal, window)
+    assert modal(event("ESC")) == {"CANCELLED"} and not box.keep
+    operator.invoke(window, event("NONE"))
+    for one in (
+        event("LEFTMOUSE", 0.4, 0.4),
+        event("MOUSEMOVE", 0.5, 0.4, "NOTHING"),
+        event("LEFTMOUSE", 0.5, 0.4, "RELEASE"),
+        event("LEFTMOUSE", 0.45, 0.5, ctrl=True),
+        event("LEFTMOUSE", 0.45, 0.5, "RELEASE"),
+        event("LEFTMOUSE", 0.6, 0.6),
+        event("LEFTMOUSE", 0.6, 0.6, "RELEASE"),
+        event("Z", ctrl=True),
+    ):
+        assert modal(one) == {"RUNNING_MODAL"}
+    assert modal(event("MIDDLEMOUSE")) == {"PASS_THROUGH"}
+    assert modal(event("RET")) == {"FINISHED"}
+    assert (stroke_lines(box.keep), stroke_lines(box.drop)) == ([[(128, 96), (160, 96)]], [[(144, 120)]])
+    words = arguments(photo, online=False)
+    assert words[words.index("--keep") + 1] == "ball=128,96,160,96"
+    assert words[words.index("--drop") + 1] == "ball=144,120"
+    store_mask(box, np.ones((240, 320), bool))
+    assert "--keep" not in arguments(photo, online=False)
+    assert PHYSGEN_OT_draw_strokes.why_not(window).startswith("Clear the mask")
+    assert stroke_lines("1,2,x 3,4 5") == [[(3.0, 4.0)]]
+
+
+def test_found_objects_become_boxes_once(photo):
+    found = [Proposal((10.0, 20.0, 90.0, 100.0), 0.95), Proposal((116.0, 56.0, 212.0, 156.0), 0.94)]
+    found.append(Proposal((220.0, 100.0, 300.0, 200.0), 0.6))
+    # The second is the box that is there; the third is far worse than the best.
+    assert add_found(bpy.context.scene, found, every=False) == 1
+    assert tuple(getattr(photo.boxes[1], side) for side in ("x0", "y0", "x1", "y1")) == (10, 20, 90, 100)
+    assert add_found(bpy.context.scene, found, every=True) == 1
+    assert add_found(bpy.context.scene, found, every=True) == 0

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: find the objects of a photo, and draw strokes over what belongs to one and what does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty
+
+from ...sim.app.propose import best_proposals
+from ...sim.app.stage_process import run_stage
+from ...sim.errors import InputError
+from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.reconstruct.reconstruct_options import Proposal
+from ..background_jobs import JobOperator, Work
+from ..context import redraw, scene_with
+from ..interpreter import cli_command, find_python
+from ..photo.photo_image import PhotoTool, on_screen, place_under, region_under, shows_photo
+from ..photo.photo_maths import box_overlap, simplified
+from ..photo.photo_request import photo_file, scene_folder
+from ..props.preferences import python
+from .mask_horizon_ops import chosen_box
+from .photo_ops import add_box
+
+SAME = 0.5
+"""Overlap (intersection over union) with a box that is there, above which a found one is not added."""
+KEEP_COLOUR, DROP_COLOUR = (0.2, 1.0, 0.3, 1.0), (1.0, 0.25, 0.2, 1.0)
+STROKE_HELP = (
+    "Left: belongs to the object    Ctrl or Shift + Left: does not    Ctrl + Z: undo stroke    "
+    "Enter, Esc, right click: done"
+)
+_handlers: list[Any] = []
+
+
+def add_found(scene: bpy.types.Scene, found: list[Proposal], *, every: bool) -> int:
+    """Add boxes around the best objects ``found``, or around ``every`` one, unless one is there; return how many."""
+    state = scene.physgen_photo
+    chosen = range(len(found)) if every else best_proposals(found)
+    added = 0
+    for index in chosen:
+        box = found[index].box
+        there = [(other.x0, other.y0, other.x1, other.y1) for other in state.boxes]
+        if all(box_overlap(box, other) < SAME for other in there):
+            x0, y0, x1, y1 = (round(value) for value in box)
+            add_box(scene, (x0, y0, x1, y1))
+            added += 1
+    return added
+
+
+class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
+    """Find the objects of the photo that stand out, and add a box around the best of them"""
+
+    bl_idname = "physgen.find_objects"
+    bl_label = "Find Objects"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Finding objects"
+
+    every: BoolProperty(name="All", description="Add a box around every object found, up to 20", options={"SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled with a photo."""
+        if context.scene.physgen_photo.image is None:
+            cls.poll_message_set("Open a photo first")
+            return False
+        return super().poll(context)
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the search as a child process; its numbered picture lies beside the scene folder."""
+        state = context.scene.physgen_photo
+        path, scene = photo_file(state), scene_folder(state)
+        if not path.is_file():
+            raise InputError("there is no photo; open one first")
+        out, preferred = scene.with_name(f"{scene.name}_proposals"), python(context)
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            command = cli_command(find_python(preferred), "propose", str(path), "--out", str(out))
+            return run_stage(command, on_event, cancelled)
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Add the boxes."""
+        found = []
+        for item in final["proposals"]:
+            x0, y0, x1, y1 = (float(value) for value in item["box"])
+            found.append(Proposal((x0, y0, x1, y1), float(item["score"])))
+        added = add_found(scene, found, every=self.every)
+        redraw("IMAGE_EDITOR")
+        return f"{len(found)} objects found, {added} boxes added; {Path(str(final['out'])).name} has a numbered picture"
+
+
+class PHYSGEN_OT_draw_strokes(PhotoTool, bpy.types.Operator):
+    """Draw strokes over what belongs to the active object, and over what does not: a lost part, the floor in a hole"""
+
+    bl_idname = "physgen.draw_strokes"
+    bl_label = "Draw Strokes"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    tool_cursor = "PAINT_CROSS"
+    tool_help = STROKE_HELP
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        """Return why no stroke can be drawn: no active box, one with a mask, or no visible photo."""
+        box = chosen_box(context)
+        if box is None:
+            return "Choose a box first"
+        return "Clear the mask first: strokes refine a box" if box.mask is not None else super().why_not(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Wait for strokes."""
+        state = context.scene.physgen_photo
+        self._scene, self._box = context.scene.session_uid, state.box_index
+        self._region: bpy.types.Region | None = None
+        self._places: list[tuple[float, float]] = []
+        self._field, self._drawn = "", list[str]()
+        return self.begin(context)
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Handle strokes until finished."""
+        scene = scene_with(self._scene)
+        if scene is None or scene.physgen_photo.image is None or self._box >= len(scene.physgen_photo.boxes):
+            return self.end(context, "CANCELLED")
+        state = scene.physgen_photo
+        box = state.boxes[self._box]
+        if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
+            return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            self._region = region_under(context, state.image, event)
+            if self._region is None:
+                # A click elsewhere ends the tool and is passed on.
+                return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
+            self._field = "drop" if event.ctrl or event.shift else "keep"
+            self._places = [self._place(state, event)]
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE" and self._places:
+            text = ",".join(f"{x:.0f},{y:.0f}" for x, y in simplified(self._places))
+            setattr(box, self._field, f"{getattr(box, self._field)} {text}".strip())
+            self._drawn.append(self._field)
+            self._places = []
+        elif event.type in ("MOUSEMOVE", "INBETWEEN_MOUSEMOVE") and self._places:
+            self._places.append(self._place(state, event))
+        elif event.type == "Z" and event.ctrl:
+            if event.value == "PRESS" and self._drawn:
+                field = self._drawn.pop()
+                setattr(box, field, getattr(box, field).rpartition(" ")[0])
+        else:
+            # Zooming and panning stay available.
+            return {"PASS_THROUGH"}
+        redraw("IMAGE_EDITOR", "WINDOW")
+        return {"RUNNING_MODAL"}
+
+    def _place(self, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> tuple[float, float]:
+        """Return the upright photo's pixel under the mouse, within the photo."""
+        u, v = place_under(self._region, event)
+        return min(max(u, 0.0), 1.0) * state.width, min(max(v, 0.0), 1.0) * state.height
+
+
+class PHYSGEN_OT_clear_strokes(bpy.types.Operator):
+    """Remove the strokes of the active box"""
+
+    bl_idname = "physgen.clear_strokes"
+    bl_label = "Clear Strokes"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if the active box has strokes."""
+        box = chosen_box(context)
+        if box is None or not (box.keep or box.drop):
+            cls.poll_message_set("Active box has no strokes")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Clear them."""
+        box = chosen_box(context)
+        if box is not None:
+            box.keep = box.drop = ""
+        return {"FINISHED"}
+
+
+def stroke_lines(text: str) -> list[list[tuple[float, float]]]:
+    """Return the polylines in a box' property ``keep`` or ``drop``; nonsense in an edited file is left out."""
+    lines = []
+    for stroke in text.split():
+        try:
+            numbers = [float(part) for part in stroke.split(",")]
+        except ValueError:
+            continue
+        if len(numbers) >= 2 and len(numbers) % 2 == 0:
+            lines.append(list(zip(numbers[::2], numbers[1::2], strict=True)))
+    return lines
+
+
+def _draw_strokes() -> None:
+    """Draw callback of image editors; in pixels of the region."""
+    import gpu
+    from gpu_extras.batch import batch_for_shader
+
+    context = bpy.context
+    if not shows_photo(context):
+        return
+    state = context.scene.physgen_photo
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    gpu.state.line_width_set(3.0 * context.preferences.system.ui_scale)
+    for box in state.boxes if state.width and state.height else ():
+        for text, colour in ((box.keep, KEEP_COLOUR), (box.drop, DROP_COLOUR)):
+            shader.uniform_float("color", colour)
+            for line in stroke_lines(text):
+                places = [(*on_screen(context.region, x / state.width, y / state.height), 0.0) for x, y in line]
+                kind = "LINE_STRIP" if len(places) > 1 else "POINTS"
+                batch_for_shader(shader, kind, {"pos": places}).draw(shader)
+    gpu.state.line_width_set(1.0)
+
+
+def register_stroke_drawing() -> None:
+    """Add the draw callback of the strokes."""
+    _handlers.append(bpy.types.SpaceImageEditor.draw_handler_add(_draw_strokes, (), "WINDOW", "POST_PIXEL"))
+
+
+def unregister_stroke_drawing() -> None:
+    """Remove the draw callback of the strokes."""
+    for handler in _handlers:
+        bpy.types.SpaceImageEditor.draw_handler_remove(handler, "WINDOW")
+    _handlers.clear()
