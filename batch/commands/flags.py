@@ -181,6 +181,8 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
     text = "folder with the weights of sam, sam2, depth-anything or depth-pro, which --segmenter and --depth name"
     parser.add_argument("--weights", type=Path, metavar="DIR", help=text)
+    text = "fetch the weights that --segmenter or --depth names, after showing size, source and licence; agrees to them"
+    parser.add_argument("--download", action="store_true", help=text)
     text = "also write SCENE/report.html, with images of every stage"
     parser.add_argument("--report", action="store_true", help=text)
     add_environment_flags(parser)

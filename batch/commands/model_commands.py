@@ -11,7 +11,7 @@ from pathlib import Path
 from ...sim.errors import Cancelled, InputError
 from ...sim.events import IsCancelled
 from ...sim.reconstruct.models import model_folder
-from ...sim.reconstruct.models.known_models import KnownModel, PackagedModel, known_model
+from ...sim.reconstruct.models.known_models import KnownModel, known_model
 from ..terminal import Terminal
 
 ACTIONS = ("list", "install", "remove")
@@ -40,7 +40,6 @@ def run_models(options: argparse.Namespace, terminal: Terminal, cancelled: IsCan
     if options.name is None:
         options.wrong_usage(f"{options.action} needs the NAME of a model; physgen models list shows them")
     model = known_model(options.name)
-    assert isinstance(model, PackagedModel)
     if options.action == "remove":
         if options.archive is not None:
             options.wrong_usage("remove takes no --archive")

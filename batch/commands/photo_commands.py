@@ -15,6 +15,9 @@ from ...sim.cache.bake_folder import load_bake
 from ...sim.errors import InputError
 from ...sim.events import IsCancelled, never
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
+from ...sim.reconstruct.adapters.adapter_registry import FOLDERS
+from ...sim.reconstruct.models import model_folder
+from ...sim.reconstruct.models.known_models import known_model
 from ...sim.reconstruct.reconstruct_options import object_names
 from ...sim.scene.folder import load_scene
 from ...sim.scene.overrides import check_overrides
@@ -114,6 +117,24 @@ def add_render(parser: argparse.ArgumentParser) -> None:
     add_render_flags(parser)
 
 
+def fetch_models(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> None:
+    """Install the models that the command names, as ``--download`` asks for. Raises InputError where it names none."""
+    if not options.download:
+        return
+    named = [name for name in (options.segmenter, str(options.depth)) if name in FOLDERS]
+    if not named or options.weights is not None:
+        raise InputError(
+            f"--download: is for {', '.join(FOLDERS)} without --weights; name one by --segmenter or --depth"
+        )
+    for model in map(known_model, named):
+        status = model_folder.model_status(model)
+        if status.is_installed and status.problem is None:
+            continue
+        for line in model.description():
+            terminal({"event": "notice", "stage": "models", "message": line})
+        model_folder.install(model, on_event=terminal, cancelled=cancelled)
+
+
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
     require_video_name(options.out)
@@ -121,6 +142,7 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
     told = tells_motion(physics.velocities, physics.spins, physics.overrides)
     if options.still and told:
         raise InputError("--still: a motion is given as well (--velocity, --spin or --set); leave one of them out")
+    fetch_models(options, terminal, cancelled)
     work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
     use_found_boxes(options, work / "proposals", terminal, cancelled)
     request = stages.RunRequest(
@@ -148,6 +170,7 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
 def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen reconstruct``; the exit code."""
     settings, ask = reconstruct_options(options), chat_request(options)
+    fetch_models(options, terminal, cancelled)
     beside = options.out.resolve()
     use_found_boxes(options, beside.with_name(f"{beside.name}_proposals"), terminal, cancelled)
     requests = object_requests(options, options.out)
@@ -209,6 +232,7 @@ def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
     """Run ``physgen correct``; the exit code."""
     scene = load_scene(options.scene)
     stamp = require_stamp(scene)
+    fetch_models(options, terminal, cancelled)
     requests, settings = corrected_requests(options, stamp.objects), reconstruct_options(options, stamp.options)
     correct(scene, objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
     terminal({"event": "done", "scene": str(options.scene)})

@@ -26,7 +26,8 @@ from typing import Any
 
 from ...errors import InputError
 from ...scene.meshes import MESH_SUFFIXES
-from ..models.model_folder import list_models, models_folder
+from ..models.known_models import PackagedModel
+from ..models.model_folder import list_models
 from .protocols import MEANINGS, STAGES
 from .python_adapter import function_problem
 
@@ -282,11 +283,6 @@ def named_adapters(path: Path | None = None) -> list[NamedAdapter]:
             found.append(
                 NamedAdapter(stage=model.stage, name=model.name, spec=spec, entry_point=None, source="physgen models")
             )
-    for kind in FOLDERS:
-        path = models_folder() / kind
-        if (path / "config.json").is_file():
-            spec, stage = f"{kind}:{path}", OF_STAGE[kind]
-            found.append(NamedAdapter(stage=stage, name=kind, spec=spec, entry_point=None, source=str(path.parent)))
     return found
 
 
@@ -326,7 +322,8 @@ def chosen_segmenter(asked: str | None) -> str | None:
     if onnxruntime_version() is None:
         return None
     good = [item.model for item in list_models() if item.is_installed and item.problem is None]
-    return next((model.name for model in good if model.stage == "segmenter"), None)
+    # What runs through transformers takes minutes on a CPU, so that it is for those who name it.
+    return next((model.name for model in good if isinstance(model, PackagedModel)), None)
 
 
 def adapter_content(stage: str, spec: str | None) -> tuple[str, ...]:

