@@ -29,7 +29,9 @@ GRAIN_PX, GRAIN_M, FINEST = 2.0, 0.5e-3, 40
 Smaller grains would be averaged to an even colour; real grains of sand are 0.06 to 2 mm [ISO 14688-1]."""
 HULL, HULL_PARTICLES = 0.45, 6
 """Density at which the hull lies, and particles that tell a vertex's reference lighting."""
-SKIN_SAMPLES = 150_000
+SKIN_SAMPLES, FEW_SAMPLES, SHALLOW, NEARLY = 150_000, 2_000, 3.0, 0.25
+"""Points of the skin that tell colours; a few of them, which do so for what is deeper than so many of their distances;
+and how much farther than the nearest, in shares, the one taken may be."""
 KEPT_STATES = 3
 
 Positions = NDArray[np.float64]
@@ -198,13 +200,22 @@ class _Skin:
         def spread(values: NDArray[np.floating]) -> Positions:
             return np.asarray(np.einsum("sk,skc->sc", weights, values[faces[which]]))
 
-        self._tree = KDTree(spread(vertices))
+        places = spread(vertices)
+        self._tree, self._few = KDTree(places), KDTree(places[:FEW_SAMPLES])
+        self._shallow = SHALLOW * float(np.sqrt(area.sum() / FEW_SAMPLES))
         self.colours = texture_colours(target, spread(texture_coordinates(target)))
         self.light = spread(get_rest_light(target))
 
     def nearest(self, points: Positions) -> NDArray[np.int64]:
-        """Return the index of the nearest point to each of ``points`` (N, 3)."""
-        return np.asarray(self._tree.query(points)[1])
+        """Return the index of about the nearest point to each of ``points`` (N, 3).
+
+        Of few for what lies deep: from the middle of a ball all its skin is equally far, and an exact search would go
+        through all of it.
+        """
+        distance, found = self._few.query(points, eps=NEARLY)
+        near = np.flatnonzero(distance < self._shallow)
+        found[near] = self._tree.query(points[near], eps=NEARLY)[1]
+        return np.asarray(found)
 
 
 def _material(skin: bpy.types.Material) -> bpy.types.Material:
