@@ -124,7 +124,14 @@ class CleanPlate:
         self._shares = disocclusion.influence(
             [mask | self._mask(item.shadow) for mask, item in zip(masks, self._scene.objects, strict=True)]
         )
-        self._rims = self._around([disocclusion.rim_strength(mask, self.masks) for mask in masks])
+        edges = [disocclusion.inner_rim(mask) for mask in masks]
+        self._rims = self._around(
+            [
+                np.maximum(disocclusion.rim_strength(mask, self.masks), edge.astype(np.float32))
+                for mask, edge in zip(masks, edges, strict=True)
+            ]
+        )
+        self._cores: NDArray[np.bool_] = self.masks & ~np.logical_or.reduce(edges)
 
     def seen(self, view: PlateView, now: Sequence[NDArray[np.float32]]) -> Seen:
         """Return the plate as seen by ``view`` with the objects' vertices at ``now`` (V, 3)."""
@@ -132,7 +139,7 @@ class CleanPlate:
         if view.relief is None:
             for rim, positions in zip(self._rims, now, strict=True):
                 rim.apply(at_rest, self._pixels(positions))
-            return Seen(self.photo, self.background, at_rest, self.masks)
+            return Seen(self.photo, self.background, at_rest, self._cores)
         extended = self.extended(view.relief.borders)
         keep = np.where(self.masks, np.float32(0.0), np.float32(1.0))
         for halo, positions in zip(extended.halos, now, strict=True):

@@ -38,7 +38,7 @@ from .motion_blur import Pose
 from .render_options import RenderOptions
 from .renderer import DataLayers, Renderer
 
-RENDER_REVISION = 4
+RENDER_REVISION = 5
 """Increased with every change of rendering that affects frames."""
 
 

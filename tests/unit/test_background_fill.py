@@ -81,6 +81,22 @@ def test_a_floor_ends_at_its_wall_behind_the_object():
     assert edges_behind(logarithms(plain), hole, hole) == []
 
 
+def test_both_edges_of_a_skirting_go_on_behind_the_object():
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    lower, upper = 90.0 + 0.08 * columns, 81.0 + 0.07 * columns
+    rng = np.random.default_rng(4)
+    boards = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), sigmaX=12, sigmaY=1)[..., None] * 60.0
+    photo = np.where((rows > lower)[..., None], np.array((150.0, 112.0, 76.0)) + boards, (176.0, 182.0, 190.0))
+    photo = np.where(((rows > upper) & (rows <= lower))[..., None], (232.0, 230.0, 224.0), photo)
+    photo = photo * (0.9 + 0.2 * columns / WIDTH)[..., None] + rng.normal(scale=1.5, size=photo.shape)
+    hole = disc(120, 92, 34)
+    edges = edges_behind(logarithms(np.clip(photo, 0, 255).astype(np.float32)), hole, hole)
+    found = sorted(edges, key=lambda edge: edge.c)
+    assert len(found) == 2
+    for edge, line in zip(found, (upper, lower), strict=True):
+        assert (edge.below(hole.shape) != (rows > line))[hole].mean() < 0.02
+
+
 def test_excluded_pixels_are_not_copied():
     view = camera()
     photo = np.full((HEIGHT, WIDTH, 3), 150, np.uint8)

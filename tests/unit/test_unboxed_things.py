@@ -90,6 +90,18 @@ def test_what_an_object_hides_partly_goes_on_behind_it():
     assert not found.whole.any()
 
 
+@pytest.mark.parametrize("horizon", [-60.0, 20.0])
+def test_a_wall_is_no_thing_even_below_a_wrong_horizon(horizon):
+    picture = plain()
+    wall = np.mgrid[:HEIGHT, :WIDTH][0] < 62
+    picture[wall] = (90.0, 110.0, 160.0)
+    thing = disc(120, 80, 30)
+    picture[thing] = (30.0, 160.0, 60.0)
+    pitch = math.atan((90.0 - horizon) / 260.0)
+    view = camera_above_ground(WIDTH, HEIGHT, 260.0, pitch)
+    assert not unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], view).stay.any()
+
+
 def test_nothing_is_looked_for_without_an_object():
     found = unboxed_things(np.clip(plain(), 0, 255).astype(np.uint8), [np.zeros((HEIGHT, WIDTH), bool)], CAMERA)
     assert not found.stay.any()

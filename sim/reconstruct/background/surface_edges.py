@@ -71,7 +71,7 @@ def edges_behind(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
     if first is not None:
         ratio = known.shape[0] / seen.shape[0]
         found.append(_settled(values, known, (first[0] * ratio, first[1] * ratio), first[2], ratio))
-    found = _further_lines(values, known, inner, found)
+    found = _further_lines(values, known, inner, found, 0.0 if first is None else float(np.linalg.norm(first[2])))
     width = columns.stop - columns.start
     edges = []
     for left, right in found:
@@ -105,17 +105,20 @@ LIKE, EVEN = 0.85, 0.8
 """Least cosine between the jumps on either side of the hole; least share of the columns that jump by half the mean."""
 SPACE = 2.5
 """Least distance of two lines, in pixels of that copy."""
+WEAKEST = 0.25
+"""Least jump of a line over the strongest one: the lines of wood are weaker than the edges of a skirting on it."""
 NEAR_FIRST = 0.12
 """Distance below the first edge, over the window's height, up to which further ones are looked for: below it is the
 ground, whose lines are its pattern."""
 
 
 def _further_lines(
-    values: Picture, known: Mask, inner: Mask, found: list[tuple[float, float]]
+    values: Picture, known: Mask, inner: Mask, found: list[tuple[float, float]], strongest: float
 ) -> list[tuple[float, float]]:
     """``found`` and more lines, by the rows where they enter the window at the left and leave it at the right.
 
-    Across each, the mean colours of narrow bands differ alike on both sides of the hole.
+    Across each, the mean colours of narrow bands differ alike on both sides of the hole. strongest: jump of those
+    found.
     """
     small, seen, cut = _copy(values, known, inner, FINE)
     height, width = seen.shape
@@ -163,8 +166,9 @@ def _further_lines(
             apart = (left - a)[:, None] + ((right - left) - (b - a))[:, None] * bounds
             strength[(np.abs(apart).min(axis=1) < SPACE) | (apart[:, 0] * apart[:, 1] <= 0.0)] = 0.0
         index = int(np.argmax(strength))
-        if strength[index] <= 0.0:
+        if strength[index] <= WEAKEST * strongest:
             break
+        strongest = max(strongest, float(strength[index]))
         taken.append((float(left[index]), float(right[index])))
         step = (means[0][index] + means[1][index]).astype(np.float64) / 2.0
         ends_here = (float(left[index]) * ratio, float(right[index]) * ratio)

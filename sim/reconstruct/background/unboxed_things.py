@@ -38,10 +38,11 @@ SMALLEST, LARGEST = 0.06, 5.0
 """Area of a thing over the object's."""
 SOLID = 0.75
 """Least share of a thing in its convex hull."""
-SHARP = 0.5
+SHARP = 0.6
 """Least share of a thing's outline across which the colour jumps."""
 LONGEST_CUT = 1.0
-"""Length over the object's size, along the border of the range, above which it is another surface that goes on."""
+"""Length over the object's size, along the horizon or the border of the photo or of the range, above which it is
+another surface that goes on."""
 PATTERN = 0.55
 """Share of the ground above which they are its pattern, and predictable share of variance above which they are too."""
 SHADE_TINT = 0.2
@@ -99,21 +100,17 @@ def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: C
     light = cv2.resize(bytes_to_linear(np.ascontiguousarray(crop)), size, interpolation=cv2.INTER_AREA)
     logs = np.log(cv2.GaussianBlur(light, (0, 0), 0.7).astype(np.float64) + 0.01)
     area = float(own.sum()) * size[0] * size[1] / own.size
-    inner = (top > 0, window[0].stop < len(mask), left > 0, window[1].stop < mask.shape[1])
-    for thing, behind in _things(logs, ground & ~covered, covered, area, inner):
+    for thing, behind in _things(logs, ground & ~covered, covered, area):
         full = cv2.resize(thing.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.25
         stay[window] |= full
         if not behind:
             whole[window] |= full
 
 
-def _things(
-    logs: Values, open_ground: Mask, covered: Mask, area: float, inner: tuple[bool, bool, bool, bool]
-) -> list[tuple[Mask, bool]]:
+def _things(logs: Values, open_ground: Mask, covered: Mask, area: float) -> list[tuple[Mask, bool]]:
     """Things (h, w) on the open ground, each with whether it continues behind an object.
 
-    logs: (h, w, 3) logarithms of linear light. covered: objects. area: of the object. inner: whether the sides (top,
-    bottom, left, right) of this copy lie inside the photo.
+    logs: (h, w, 3) logarithms of linear light. covered: objects. area: of the object.
     """
     if open_ground.sum() < 200:
         return []
@@ -129,7 +126,7 @@ def _things(
     different = (apart > 1.0) & open_ground
     different &= ~_joined(different & shade, covered, max(2, round(0.1 * np.sqrt(area))))
     parts = _parts(different, open_ground, area)
-    found = [part for part in parts if _is_thing(part, apart, open_ground, covered, area, inner)]
+    found = [part for part in parts if _is_thing(part, apart, open_ground, covered, area)]
     if not found or sum(int(part.sum()) for part in found) > PATTERN * open_ground.sum():
         return []
     if len(found) >= 3 and _is_pattern(off, open_ground, found):
@@ -198,21 +195,15 @@ def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _is_thing(
-    part: Mask,
-    apart: Values,
-    open_ground: Mask,
-    covered: Mask,
-    area: float,
-    inner: tuple[bool, bool, bool, bool],
-) -> bool:
+def _is_thing(part: Mask, apart: Values, open_ground: Mask, covered: Mask, area: float) -> bool:
     size = int(part.sum())
     if not SMALLEST * area <= size <= LARGEST * area:
         return False
     # What goes on beyond the range that was looked at is another surface.
     sides = (part[0], part[-1], part[:, 0], part[:, -1])
-    cut = [int(side.sum()) for side, within in zip(sides, inner, strict=True) if within]
-    if max(cut, default=0) > LONGEST_CUT * np.sqrt(area):
+    beyond = cv2.dilate((~open_ground & ~covered).astype(np.uint8), _disc(2)) > 0
+    cut = [*(int(side.sum()) for side in sides), int((_outline(part) & beyond).sum())]
+    if max(cut) > LONGEST_CUT * np.sqrt(area):
         return False
     points = np.argwhere(part)[:, ::-1].astype(np.int32)
     hull = np.zeros(part.shape, np.uint8)
@@ -227,9 +218,13 @@ def _is_thing(
     return float((apart[outside] < 0.7).mean()) > SHARP and float(np.median(apart[part])) > 1.0
 
 
+def _outline(part: Mask) -> Mask:
+    return np.asarray(part & ~(cv2.erode(part.astype(np.uint8), _disc(1), borderValue=1) > 0))
+
+
 def _contact(part: Mask, covered: Mask) -> float:
     """Share of the outline of ``part`` that lies along ``covered``."""
-    outline = part & ~(cv2.erode(part.astype(np.uint8), _disc(1)) > 0)
+    outline = _outline(part)
     near = cv2.dilate(covered.astype(np.uint8), _disc(2)) > 0
     return float((outline & near).sum() / max(1, int(outline.sum())))
 
