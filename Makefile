@@ -1,6 +1,6 @@
 # make demo | test | test-all | test-explore | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
 # PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
-# WORKERS=… how many processes share the tests,
+# BEST=1 renders the demo as the documentation shows it, WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
 # ZIPS=… which zips `make extension` builds (all, or names), BLENDER=… the program that `make test-blender-app` drives.
 SHELL := /bin/sh
@@ -25,7 +25,7 @@ setup:
 	@setup/venv.sh "$(PYTHON)" "$(VENV)"
 
 demo: setup
-	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT)
+	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT) $(if $(BEST),--best)
 
 test: setup
 	$(PYTEST) -m "$(MARKS)" $(TESTS)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..physgen_addon.render.render_options import RenderOptions
+from ..sim.app.add_drops import Drop
 from ..sim.app.bake_options import BakeOptions
 from ..sim.app.reconstruct import Physics
 from ..sim.errors import InputError, PhysGenError
@@ -24,8 +25,25 @@ CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml
 
 
 @dataclass(frozen=True, kw_only=True)
+class ClipConfig:
+    """How the demo is rendered. rate: times as many frames a second. samples, scale, orbit, dolly, motion_blur: as of
+    ``RenderOptions``.
+    """
+
+    rate: int = 1
+    samples: int
+    scale: float = 1.0
+    orbit: float = 0.0
+    dolly: float = 0.0
+    motion_blur: float = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
 class DemoConfig:
-    """A photo from scikit-image and its physics; units as on the command line (docs/cli.md)."""
+    """A photo from scikit-image and its physics; units as on the command line (docs/cli.md).
+
+    drops: what falls into the picture. clip: the render of ``make demo``; best: of ``make demo BEST=1``.
+    """
 
     description: str
     photo: str
@@ -35,9 +53,13 @@ class DemoConfig:
     presets: tuple[str, ...]
     velocities: tuple[Vector, ...]
     pitch: float | None = None
+    drops: tuple[Drop, ...] = ()
     frames: int
     fps: float
-    samples: int
+    slow: float = 1.0
+    quality: str = "standard"
+    clip: ClipConfig
+    best: ClipConfig
 
 
 def load_config(path: Path = CONFIG) -> DemoConfig:
@@ -58,8 +80,9 @@ def shipped_photo(name: str) -> Path:
     return path
 
 
-def request(config: DemoConfig, out: Path) -> stages.RunRequest:
-    """Return the demo as a request from photo to video."""
+def request(config: DemoConfig, out: Path, *, best: bool = False) -> stages.RunRequest:
+    """Return the demo as a request from photo to video; best: the clip that the documentation shows."""
+    clip = config.best if best else config.clip
     objects = tuple(
         ObjectRequest(box=box, name=name, size_m=size)
         for box, name, size in zip(config.boxes, config.names, config.sizes, strict=True)
@@ -67,12 +90,17 @@ def request(config: DemoConfig, out: Path) -> stages.RunRequest:
     return stages.RunRequest(
         photo=shipped_photo(config.photo),
         objects=objects,
-        video=out / f"{config.photo}.mp4",
+        video=out / f"{config.photo}{'_best' if best else ''}.mp4",
         work=out,
         physics=Physics(presets=config.presets, velocities=config.velocities),
         reconstruct=ReconstructOptions(pitch_deg=config.pitch),
-        bake=BakeOptions(frames=config.frames, fps=config.fps),
-        render=RenderOptions(samples=config.samples),
+        bake=BakeOptions(
+            frames=clip.rate * config.frames, fps=clip.rate * config.fps, slow=config.slow, quality=config.quality
+        ),
+        render=RenderOptions(
+            samples=clip.samples, scale=clip.scale, orbit=clip.orbit, dolly=clip.dolly, motion_blur=clip.motion_blur
+        ),
+        drops=config.drops,
     )
 
 
@@ -80,6 +108,7 @@ def main() -> int:
     """Entry point of ``python -m physgen.batch.demo``; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("demo_out"))
+    parser.add_argument("--best", action="store_true", help="the clip of the documentation: slower, better")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     started = time.monotonic()
@@ -88,7 +117,7 @@ def main() -> int:
     terminal.line(config.description)
     try:
         with stop_signals() as stopped:
-            video = stages.photo_to_video(request(config, options.out), terminal, stopped)
+            video = stages.photo_to_video(request(config, options.out, best=options.best), terminal, stopped)
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ..physgen_addon.render.render_options import RenderOptions, render_arguments, require_video_name
 from ..sim.app import bake_worker
+from ..sim.app.add_drops import Drop, add_drops
 from ..sim.app.bake_options import BakeOptions, inputs_hash
 from ..sim.app.reconstruct import Physics, reconstruct, require_physics
 from ..sim.app.stage_process import own_command, run_stage
@@ -116,7 +117,7 @@ class RunRequest:
     """A job from photo to ``video``; ``work`` holds ``scene``, ``bake`` and ``frames``.
 
     physics: per object, in the order of ``objects``; by default ``medium`` and at rest. choices: what is chosen
-    instead. The same request always gives the same video.
+    instead. drops: what falls into the picture. The same request always gives the same video.
     """
 
     photo: Path
@@ -129,6 +130,7 @@ class RunRequest:
     bake: BakeOptions = dataclasses.field(default_factory=BakeOptions)
     render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
     choices: Choices = dataclasses.field(default_factory=Choices)
+    drops: tuple[Drop, ...] = ()
 
 
 def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
@@ -175,6 +177,8 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
         cancelled=cancelled,
     )
     options = request.bake
+    if request.drops:
+        scene = add_drops(scene, request.drops)
     if request.choices.motion and not scene.model.effects:
         scene, options = choose_motion(scene, options, request.choices, on_event)
     run_bake(scene, request.work / "bake", options, on_event, cancelled)

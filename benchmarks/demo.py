@@ -21,6 +21,7 @@ from typing import Any
 
 from physgen.batch import demo, stages
 from physgen.benchmarks.common import benchmark_parser
+from physgen.sim.app.add_drops import add_drops
 from physgen.sim.app.reconstruct import reconstruct
 from physgen.sim.cache.bake_folder import load_bake, load_manifest
 from physgen.sim.events import ignore, never
@@ -50,7 +51,7 @@ def run(frames: int | None, out: Path, *, quick: bool = False) -> dict[str, Any]
         "reconstruct": lambda: reconstruct(
             job.photo, job.objects, out=scene, options=job.reconstruct, physics=job.physics
         ),
-        "bake": lambda: stages.run_bake(load_scene(scene), bake, job.bake, ignore, never),
+        "bake": lambda: stages.run_bake(add_drops(load_scene(scene), job.drops), bake, job.bake, ignore, never),
         "render": lambda: stages.render(
             load_scene(scene), load_bake(bake), out=images, options=job.render, video=job.video
         ),
@@ -65,7 +66,7 @@ def run(frames: int | None, out: Path, *, quick: bool = False) -> dict[str, Any]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = benchmark_parser("demo", __doc__, frames=2)
-    parser.add_argument("--frames", type=int, help="instead of the demo's 48")
+    parser.add_argument("--frames", type=int, help="instead of the demo's own")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="physgen-benchmark-") as folder:
         result = run(options.frames, Path(folder), quick=options.quick)

@@ -8,12 +8,13 @@ import argparse
 from pathlib import Path
 
 from ...physgen_addon.render.render_options import require_video_name
+from ...sim.app.bake_options import BakeOptions
 from ...sim.app.default_motion import tells_motion
 from ...sim.app.propose import PICTURE_FILE, choose, propose
 from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
 from ...sim.cache.bake_folder import load_bake
 from ...sim.errors import InputError
-from ...sim.events import IsCancelled, never
+from ...sim.events import Event, IsCancelled, never
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 from ...sim.reconstruct.adapters.adapter_registry import FOLDERS
 from ...sim.reconstruct.models import model_folder
@@ -70,6 +71,8 @@ def add_reconstruct(parser: argparse.ArgumentParser) -> None:
     add_reconstruction_flags(parser)
     add_reasoning_flags(parser)
     add_physics_flags(parser)
+    text = "where no motion is given, choose the one that `physgen run` would (default: everything is at rest)"
+    parser.add_argument("--default-motion", action="store_true", help=text)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
 
 
@@ -177,7 +180,7 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
     physics = physics_options(options)
     require_physics(len(requests), physics)
     check_overrides(object_names(requests), physics.overrides)
-    reconstruct(
+    scene = reconstruct(
         options.photo,
         requests,
         out=options.out,
@@ -187,7 +190,12 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
         on_event=terminal,
         cancelled=cancelled,
     )
-    terminal({"event": "done", "scene": str(options.out)})
+    done: Event = {"event": "done", "scene": str(options.out)}
+    if options.default_motion and not tells_motion(physics.velocities, physics.spins, physics.overrides):
+        choices = stages.Choices(motion=True, frames=True, slow=True)
+        _, clip = stages.choose_motion(scene, BakeOptions(), choices, terminal)
+        done["clip"] = {"frames": clip.frames, "slow": clip.slow}
+    terminal(done)
     terminal.line(f"scene: {options.out}")
     return 0
 

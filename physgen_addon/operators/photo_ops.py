@@ -315,6 +315,10 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)
+        if clip := final.get("clip"):
+            # The length and slow motion that suit the chosen motion.
+            simulation = scene.physgen.simulation
+            simulation.frame_end, simulation.slow = simulation.frame_start + clip["frames"] - 1, clip["slow"]
         return sentence
 
 

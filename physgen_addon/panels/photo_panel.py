@@ -197,6 +197,7 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             text.sentences(layout, context, f"Makes {scene_folder(state).name} beside the {_beside()}.")
         except PhysGenError as error:
             text.sentences(layout, context, str(error), icon="ERROR")
+    layout.prop(state, "default_motion")
     row = layout.row()
     row.scale_y = 1.4
     again = made_folder(state) is not None

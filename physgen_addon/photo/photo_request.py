@@ -92,6 +92,8 @@ def arguments(state: bpy.types.PropertyGroup, *, online: bool | None = None) -> 
         found += ["--depth", str(_file(state.depth, "Depth Map"))]
     if state.report:
         found.append("--report")
+    if state.default_motion:
+        found.append("--default-motion")
     return found + _asking(state, bpy.app.online_access if online is None else online)
 
 

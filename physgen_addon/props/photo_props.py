@@ -198,6 +198,10 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
         options=RELATIVE,
     )
     report: BoolProperty(name="Write Report", description="Also write a report with images of every stage")
+    default_motion: BoolProperty(
+        name="Default Motion",
+        description="Let the objects hop where they have room in the picture; off: everything is at rest",
+    )
     has_found: BoolProperty()
     found_horizon: FloatProperty()
     found_roll: FloatProperty()

@@ -114,8 +114,20 @@ def measure_reference_light(built: BlenderScene, folder: Path) -> None:
     for _ in range(CALIBRATION_ROUNDS):
         _calibrate(built, seen, ambient, folder)
     for target, graph, visible in zip(built.objects, graphs, seen, strict=True):
+        if not _in_photo(built, target):
+            # Its texture has its own colours, without a photo's light: they are what open white ground would make them.
+            set_rest_light(target, np.full_like(target.mesh.vertices, ambient / AMBIENT + ambient), ambient)
+            continue
         # The texture of what the photo hides has colours, and with them the light, of what it shows.
         set_rest_light(target, np.maximum(graph.continued(get_rest_light(target), visible), ambient), ambient)
+
+
+def _in_photo(built: BlenderScene, target: RenderObject) -> bool:
+    """Return whether the photo's frame holds any vertex of ``target`` at rest, or it has a mask in it."""
+    camera = built.folder.model.camera
+    x, y, depth = camera.project(target.mesh.vertices).T
+    inside = (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height) & (depth > 0)
+    return target.source.mask is not None or bool(inside.any())
 
 
 def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:

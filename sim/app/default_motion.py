@@ -50,8 +50,9 @@ MOMENTS = 12
 LEAST_RISE_PX = 0.01
 """Peak below which a hop is not worth showing, over the frame's shorter side."""
 
-LEAN, MOST_LEAN = 0.35, math.radians(14.0)
-"""Turn of a flight over the angle at which the object would tip over, and at most, so that it lands on an edge."""
+LEAN, MOST_LEAN = 0.2, math.radians(8.0)
+"""Turn of a flight over the angle at which the object would tip over, and at most, so that it lands on an edge. More
+makes it bounce onto its back, which the photo does not show."""
 
 CLIP_S, LONGEST_S = 2.4, 4.0
 """Wanted and greatest length of the clip in seconds."""
@@ -66,7 +67,10 @@ ROLL = 0.5
 """Spin of what rolls, over that of rolling where it comes down: the ground makes up the rest."""
 
 STEADY = math.radians(20.0)
-"""Angle of tipping over below which a thing only hops straight up."""
+"""Angle of tipping over, in the worst direction, below which a thing only hops straight up, and less high."""
+
+UNSTEADY = 0.4
+"""Share of the usual peak of what falls over easily: a book on its edge shows its blank back when it does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,6 +234,8 @@ class _Stage:
         ahead = ahead if abs(ahead @ self.up) < 0.999 else -np.asarray(self.camera.world_from_camera)[:3, 1]
         self.away = _unit(ahead - (ahead @ self.up) * self.up)
         self.right = np.cross(self.away, self.up)
+        turns = np.arange(8) * math.pi / 4.0
+        self.ways = [math.cos(turn) * self.right + math.sin(turn) * self.away for turn in turns]
         self.things = _with_supports([_thing(scene, item, self.ground) for item in scene.objects], self.up)
         self.plate = _Plate(scene)
 
@@ -255,16 +261,16 @@ class _Stage:
         return next(thing for thing in self.things if thing.item.name == name)
 
     def _tries(self, thing: _Thing, share: float, begin: float) -> Iterator[Move]:
-        height = share * _peak(thing)
+        steady = thing.round or min(thing.tips(way, self.up) for way in self.ways) >= STEADY
+        height = share * _peak(thing) * (1.0 if steady else UNSTEADY)
         rise = math.sqrt(2.0 * self.gravity * height)
         flight = 2.0 * rise / self.gravity
-        for aside in (0.0,) if thing.carried or _flows(thing.item) else ASIDE:
+        for aside in (0.0,) if thing.carried or _flows(thing.item) or not steady else ASIDE:
             for right, away in DIRECTIONS if aside else ((1.0, 0.0), (-1.0, 0.0)):
                 way = right * self.right + away * self.away
-                if aside and not thing.round and thing.tips(way, self.up) < STEADY:
-                    continue
                 shift = aside * thing.extent(way) * way
-                spin = self._spin(thing, way, float(np.linalg.norm(shift)), flight)
+                lean = self._spin(thing, way, float(np.linalg.norm(shift)), flight)
+                spin = lean if steady else np.zeros(3)
                 yield Move(
                     name=thing.item.name,
                     height=height,
@@ -282,8 +288,9 @@ class _Stage:
         axis = np.cross(self.up, way)
         if thing.round:
             return np.asarray(ROLL * axis * (shift / flight) / max(0.5 * thing.tall, 1e-9))
-        tips = thing.tips(way, self.up)
-        return np.asarray(axis * (min(LEAN * tips, MOST_LEAN) if tips >= STEADY else 0.0) / flight)
+        # Leaning in the picture's plane shows most and turns nothing unseen to the camera.
+        aslant = abs(float(way @ self.right)) / float(np.linalg.norm(way))
+        return np.asarray(aslant * axis * min(LEAN * thing.tips(way, self.up), MOST_LEAN) / flight)
 
     def _path(self, thing: _Thing, move: Move) -> Array:
         """Return the hull of ``thing`` (MOMENTS, K, 3) at instants of its flight, the last one where it comes down."""

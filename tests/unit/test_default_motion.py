@@ -143,6 +143,12 @@ def test_neighbours_are_not_hit(table):
                 assert (apart.max(axis=1) > 0).all(), (move.name, name)
 
 
+def test_what_falls_over_easily_hops_straight_up(table):
+    (book,) = default_motion(table([(0, 0, 0, 0.15, 0.02, 0.2)])).moves
+    (crate,) = default_motion(table([(0, 0, 0, 0.15, 0.2, 0.2)])).moves
+    assert book.aside == book.spin == (0.0, 0.0, 0.0) and book.height < 0.5 * crate.height
+
+
 def test_what_carries_something_stays_and_what_it_carries_comes_down_on_it(table):
     scene = table([(0, 0, 0, 0.2, 0.2, 0.05), (0, 0, 0.05, 0.06, 0.06, 0.06)])
     (move,) = default_motion(scene).moves
