@@ -318,6 +318,16 @@ def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
 # -- panels -----------------------------------------------------------------------------------------------------------
 
 
+class Settings:
+    """Takes what a panel sets of an operator, and asks Blender whether it has such a property."""
+
+    def __init__(self, kind):
+        object.__setattr__(self, "_kind", kind)
+
+    def __setattr__(self, name, value):
+        assert name in self._kind.properties, name
+
+
 class Layout:
     """Takes what a panel draws, and asks Blender whether there are such properties and operators."""
 
@@ -345,6 +355,7 @@ class Layout:
         kind = getattr(getattr(bpy.ops, group), operator).get_rna_type()
         assert icon in bpy.types.UILayout.bl_rna.functions["operator"].parameters["icon"].enum_items
         self.words.append(text or kind.name)
+        return Settings(kind)
 
     def template_list(self, kind, name, data, items, active, index, rows=5):
         assert hasattr(bpy.types, kind) and items in data.bl_rna.properties and index in active.bl_rna.properties
