@@ -37,6 +37,7 @@ from .reasoning.material_decision import (
     DEFAULT_PRESET,
     ObjectPhysics,
     decide_materials,
+    decided_by_shape,
     describe_decision,
     ground_friction,
     physics_record,
@@ -186,8 +187,6 @@ def reconstruct_photo(
         else:
             answers = _asked(picture, seen, names, ask, store, steps)
         physics = decide_materials(objects, names, answers, shipped_names())
-        for name, decided in zip(names, physics, strict=True):
-            steps.notice(describe_decision(name, decided))
         # The kind of an object determines its shape as well.
         objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
         steps.begin("camera")
@@ -206,6 +205,9 @@ def reconstruct_photo(
             steps=steps,
         )
         bodies = make_bodies(layers, estimate.camera, objects, options, store, steps, depth=depth)
+        physics = tuple(decided_by_shape(item, body.shape) for item, body in zip(physics, bodies, strict=True))
+        for name, decided in zip(names, physics, strict=True):
+            steps.notice(describe_decision(name, decided))
         (folder / "light").mkdir()
         steps.begin("light")
         radiance, light = _light(folder, picture, layers, estimate.camera, bodies, options, steps)

@@ -14,6 +14,7 @@ from physgen.sim.reconstruct.reasoning.answer_parser import Answers, read_answer
 from physgen.sim.reconstruct.reasoning.chat_client import ChatRequest
 from physgen.sim.reconstruct.reasoning.material_decision import (
     decide_materials,
+    decided_by_shape,
     describe_decision,
     ground_friction,
     physics_record,
@@ -183,6 +184,17 @@ def test_without_anything_it_is_medium():
     physics = decided()
     assert (physics.source, physics.preset, physics.size_m, physics.roughness) == ("default", "medium", None, None)
     assert to_material(physics) == load_preset("medium") and physics.fill
+
+
+def test_shape_decides_where_nothing_else_did():
+    unknown = decided()
+    assert decided_by_shape(unknown, "sphere") == unknown
+    for shape in ("box", "cylinder", "inflated"):
+        physics = decided_by_shape(unknown, shape)
+        assert to_material(physics) == load_preset("wood") and to_material(physics).law == "rigid"
+        assert describe_decision("it", physics).startswith("it: wood, 550 kg/m³, by default for its shape")
+    for known in (decided(name="orange"), decided(ObjectRequest(box=BOX, preset="jelly"))):
+        assert decided_by_shape(known, "box") == known
 
 
 def test_a_modulus_of_real_matter_becomes_a_class():

@@ -22,6 +22,13 @@ from .material_names import NamedPhysics, NameTable
 
 DEFAULT_PRESET = "medium"
 
+UNIDENTIFIED = {"sphere": DEFAULT_PRESET}
+RIGID_PRESET = "wood"
+"""Presets of what could not be identified, by the shape of its body. Fruit and balls are round and yield; most else
+that stands on a table or a floor keeps its shape in a small fall, and a camera or a book that folds like rubber is not
+believed.
+"""
+
 LEAST_MODULUS = {"hard": 1e9, "medium": 1e6}
 """Least Young's modulus of each class in Pa, for real materials. Thresholds lie between foams and cloth, rubber and
 soft plastics, and hard plastics, wood, metal (Ashby, Materials Selection in Mechanical Design, chart of modulus and
@@ -66,8 +73,9 @@ def decide_materials(
     """Return material and size of each of the ``requests``.
 
     Priority: the user's preset and size, then ``answers``, then ``table`` by the object's kind, its name in ``names``,
-    or the answered name, then the preset "medium". Each missing number comes from the next source, except that the
-    numbers of a chosen preset stay as they are. Raises InputError for a preset that does not exist.
+    or the answered name, then the preset "medium", which ``decided_by_shape`` may change. Each missing number comes
+    from the next source, except that the numbers of a chosen preset stay as they are. Raises InputError for a preset
+    that does not exist.
     """
     said = answers.objects if answers is not None else ()
     decided = []
@@ -120,6 +128,15 @@ def _decided(
     )
 
 
+def decided_by_shape(physics: ObjectPhysics, shape: str) -> ObjectPhysics:
+    """Return ``physics`` with the preset that suits ``shape`` (``BuiltBody.shape``) if nothing else decided it."""
+    if physics.source != "default":
+        return physics
+    preset = UNIDENTIFIED.get(shape, RIGID_PRESET)
+    material = load_preset(preset)
+    return replace(physics, preset=preset, density=material.density, youngs_modulus=material.youngs_modulus)
+
+
 def to_material(physics: ObjectPhysics) -> Material:
     """Return the material of ``physics``: its preset with its own density and Young's modulus."""
     material = load_preset(physics.preset)
@@ -142,7 +159,7 @@ def describe_decision(name: str, physics: ObjectPhysics) -> str:
         "chosen": "as you chose",
         "asked": "by the model's answer",
         "named": f"as usual for {physics.name!r}",
-        "default": "by default, as it could not be identified; give its kind or preset",
+        "default": "by default for its shape, as it could not be identified; give its kind or preset",
     }[physics.source]
     size = "" if physics.size_m is None else f", {physics.size_m:.3g} m"
     return f"{name}: {physics.preset}, {physics.density:.4g} kg/m³{size}, {who}"
