@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
-
 from ..atomic import write_bytes, write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
@@ -65,7 +63,9 @@ def propose(
         earlier = _earlier(Path(out), content)
         if earlier is not None:
             return earlier
-    # The pipeline's modules cost a second of imports that an up-to-date list does not need.
+    # The pipeline's modules cost a second of imports that an up-to-date list does not need, and Blender has no Pillow.
+    from PIL import Image
+
     from ..reconstruct.photo import load_photo
     from ..reconstruct.report_pictures import numbered_boxes
     from ..reconstruct.segmentation.object_proposals import propose_boxes

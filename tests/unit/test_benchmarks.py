@@ -10,6 +10,7 @@ import pytest
 from physgen.benchmarks.__main__ import benchmarks, main
 
 FAST = (
+    "cutouts",
     "diagnosis",
     "farm",
     "farm_dask",
