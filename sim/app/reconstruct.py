@@ -35,7 +35,7 @@ from ..validation import parse, read_json, to_json
 T = TypeVar("T")
 
 STAMP_FILE = "reconstruct.json"
-RECONSTRUCT_REVISION = 15
+RECONSTRUCT_REVISION = 16
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 

@@ -3,7 +3,9 @@
 
 import numpy as np
 import pytest
+from physgen.batch.demo import shipped_photo
 from physgen.sim.reconstruct.segmentation.box_segmentation import segment
+from PIL import Image
 from scipy import ndimage
 
 WIDTH, HEIGHT = 320, 240
@@ -80,6 +82,13 @@ def test_the_gaps_between_slats_stay_open():
     assert mask[140:205, 112:208][below].mean() < 0.05
     assert overlap(mask, truth) > 0.85
     assert mask[ndimage.binary_erosion(truth)].mean() > 0.95
+
+
+def test_the_inside_of_a_cup_is_no_gap_though_it_has_the_tables_colour():
+    photo = np.asarray(Image.open(shipped_photo("coffee")).convert("RGB"))
+    mask = segment(photo, (70, 12, 488, 392), "cup")
+    assert not (ndimage.binary_fill_holes(mask) & ~mask).any()
+    assert mask[40:180, 190:390].mean() > 0.97
 
 
 def test_letters_of_the_ground_s_colour_are_no_gaps():

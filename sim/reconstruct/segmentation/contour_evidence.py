@@ -8,6 +8,7 @@ colour and place, and edges surround them; rods are thin, unlike the ground, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -156,6 +157,10 @@ LONG = 0.12
 """Least length of a gap over the object's size: letters printed on a cover are shorter."""
 THIN = 0.05
 """Largest width of a rod over the object's size."""
+SOLID, SOLID_SHARE = 0.16, 0.25
+"""Width over the object's size from which a part of it is no slat or post, and the share of such parts around a gap
+above which it is none: the inside of a cup and a shade on it have the ground's colours, too.
+"""
 
 
 def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
@@ -185,7 +190,8 @@ def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
     ratio[window] = np.clip(likely - ground[window], -4.0, 4.0)
     cut = graph_cut(ratio, principal_contrast(view.lab), 1.0, barred=~window)
     crest = np.asarray(cv2.dilate(edge_strength(view.lab), np.ones((3, 3), np.uint8)), dtype=np.float32)
-    gaps, rods = nothing.copy(), nothing.copy()
+    rods = nothing.copy()
+    candidates = []
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     for part, box in _parts((mask | enclosed_holes(mask)) & ~cut, 24):
         length = float(np.hypot(box[2], box[3]))
@@ -194,7 +200,8 @@ def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
         rim = _around(part, 1) & core
         if (rim.any() and (crest[rim] > CREST).mean() < 0.6) or not _shows_ground(view, part, box, mask):
             continue
-        gaps |= part
+        candidates.append(part)
+    gaps = _between_slats(mask, candidates, size)
     for part, box in _parts(cut & ~mask & view.inside, 16):
         length = float(np.hypot(box[2], box[3]))
         inwards = cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3)
@@ -209,6 +216,22 @@ def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
         return nothing, rods
     # What only a gap's edge held in place goes with it.
     return gaps, rods & touching(rods | (mask & ~gaps), mask & ~gaps)
+
+
+def _between_slats(mask: Mask, candidates: Sequence[Mask], size: float) -> Mask:
+    """Return those of ``candidates`` (h, w), joined, around which the object ``mask`` of ``size`` pixels is thin."""
+    gaps = np.zeros_like(mask)
+    if not candidates:
+        return gaps
+    solid = mask & ~np.logical_or.reduce(candidates)
+    width = max(3, round(SOLID * size))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    thick = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
+    for part in candidates:
+        beside = _around(part, max(2, width // 4)) & solid
+        if beside.any() and thick[beside].mean() <= SOLID_SHARE:
+            gaps |= part
+    return gaps
 
 
 def _shows_ground(view: BoxCrop, part: Mask, box: tuple[int, int, int, int], mask: Mask) -> bool:
