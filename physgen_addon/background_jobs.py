@@ -157,6 +157,14 @@ def wait_for(others: list[Job], on_event: OnEvent, cancelled: IsCancelled) -> No
         time.sleep(STEP_S)
 
 
+def no_job_runs(operator: type[bpy.types.Operator]) -> bool:
+    """Return whether a job may start; otherwise set the poll message of ``operator``."""
+    job = running()
+    if job is not None:
+        operator.poll_message_set(f"{job.title} is running; wait for it or cancel it")
+    return job is None
+
+
 class JobOperator(OperatorMixin):
     """Mixin of operators that run a job: modal with a timer (INVOKE_DEFAULT), blocking from scripts.
 
@@ -185,11 +193,7 @@ class JobOperator(OperatorMixin):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Allow one job at a time."""
-        job = running()
-        if job is not None:
-            cls.poll_message_set(f"{job.title} is running; wait for it or cancel it")
-            return False
-        return True
+        return no_job_runs(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Run blocking, for scripts and background mode."""

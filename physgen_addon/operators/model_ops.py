@@ -12,7 +12,7 @@ from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.reconstruct.models import model_folder
 from ...sim.reconstruct.models.known_models import ISNET
 from .. import text
-from ..background_jobs import JobOperator, Work, running, start_chosen
+from ..background_jobs import JobOperator, Work, no_job_runs, start_chosen
 from ..interpreter import cli_command, find_python
 from ..props.preferences import python
 from ..text import report_errors
@@ -46,11 +46,7 @@ class PHYSGEN_OT_improve_cutouts(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Enabled unless a job runs."""
-        job = running()
-        if job is not None:
-            cls.poll_message_set(f"{job.title} is running; wait for it or cancel it")
-            return False
-        return True
+        return no_job_runs(cls)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show what would be installed; its button is the agreement."""
