@@ -23,6 +23,14 @@ def parse_duration(text: str) -> float:
     return float(match[1]) * _UNITS[match[2] or "s"]
 
 
+def parse_steps(text: str) -> int:
+    """Return the number of steps in ``250000`` or ``3e8``."""
+    try:
+        return int(float(text))
+    except (ValueError, OverflowError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of steps: write 3e8") from None
+
+
 def parse_names(text: str) -> tuple[str, ...]:
     """Return the names in a comma-separated list."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
@@ -45,8 +53,10 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen diagnose``."""
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
-    budget = "time limit that the fits aim for, such as 90s or 5min (default 5min)"
+    budget = "time for the fits on one idle core, such as 90s or 5min, counted as simulated work (default 5min)"
     parser.add_argument("--budget", type=parse_duration, default=300.0, metavar="TIME", help=budget)
+    work = "the same as simulated steps, such as 3e8, instead of --budget"
+    parser.add_argument("--work", type=parse_steps, metavar="STEPS", help=work)
     only = "candidate effects, such as air_drag,wind (default: all that can act on the objects)"
     parser.add_argument("--effects", type=parse_names, metavar="NAMES", help=only)
     parser.add_argument("--no-confirm", action="store_true", help="skip the verification run in the particle engine")
@@ -58,7 +68,9 @@ def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     from ...sim.diagnose.capture import load_capture
     from ...sim.diagnose.run_diagnosis import DiagnoseOptions
 
-    settings = DiagnoseOptions(budget_s=options.budget, effects=options.effects, confirm=not options.no_confirm)
+    settings = DiagnoseOptions(
+        budget_s=options.budget, work=options.work, effects=options.effects, confirm=not options.no_confirm
+    )
     found = diagnose(
         load_capture(options.capture), out=options.out, options=settings, on_event=terminal, cancelled=cancelled
     )

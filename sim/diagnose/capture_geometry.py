@@ -12,6 +12,14 @@ from .capture import Array, Camera, Capture, Trial
 from .diagnosis import CandidateFit
 
 
+def mean_known(values: Array, axis: int | tuple[int, ...] | None = None) -> Array:
+    """Return the mean of the finite numbers along ``axis``; NaN, without a warning, where there are none."""
+    good = np.isfinite(values)
+    count = good.sum(axis=axis)
+    total = np.where(good, values, 0.0).sum(axis=axis)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
 def nearest_rotation(moment: Array, *, hand: float = 1.0) -> Array:
     """Return the rotation (3, 3) nearest to ``moment`` (3, 3), the sum of seen times rest points about their means.
 
@@ -82,6 +90,4 @@ def observed_distance(
     """
     residual = observed_residual(capture, trial, points, fit)[frames]
     squares = np.square(residual).sum(axis=-1)
-    if not np.isfinite(squares).any():
-        return math.nan
-    return float(math.sqrt(np.nanmean(squares))) * metres_per_unit(capture, trial, points[frames])
+    return float(np.sqrt(mean_known(squares))) * metres_per_unit(capture, trial, points[frames])

@@ -19,6 +19,7 @@ from ..atomic import write_json
 from ..errors import InputError
 from ..validation import read_json, to_json
 from .capture import read_arrays
+from .work import WorkRecord
 
 Array = NDArray[np.float64]
 PHASES = ("flight", "impact", "contact", "rest")
@@ -211,6 +212,7 @@ class Diagnosis:
     effects: all tested candidates, ``none`` and ``unknown``, most probable first; probabilities sum to 1.
     controls: ``wrong_effect_rms_m`` and ``last_residual_rms_m``.
     summary: the verdict in a sentence. warnings: of the capture and of the diagnosis. confirmation: verification runs.
+    seconds: wall time, the only number that differs when the same capture is diagnosed again. work: budget and use.
 
     >>> import physgen
     >>> found = physgen.diagnose(physgen.load_capture("capture"), out="diagnosis")  # doctest: +SKIP
@@ -228,6 +230,7 @@ class Diagnosis:
     summary: str
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
+    work: WorkRecord | None = None
     confirmation: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -274,6 +277,7 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "confirmation": dict(diagnosis.confirmation),
             "warnings": list(diagnosis.warnings),
             "seconds": diagnosis.seconds,
+            "work": None if diagnosis.work is None else to_json(diagnosis.work),
         }
     )
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .capture import Capture
-from .capture_geometry import metres_per_unit, observed_residual
+from .capture_geometry import mean_known, metres_per_unit, observed_residual
 from .diagnosis import (
     DIRECTIONS,
     NONE,
@@ -66,7 +66,7 @@ def bootstrap_interval(
     for trial in capture.fit_trials:
         unit = metres_per_unit(capture, trial, nominal[trial.name])
         squares = [
-            float(np.nanmean(np.square(observed_residual(capture, trial, points, which)).sum(axis=-1))) * unit**2
+            float(mean_known(np.square(observed_residual(capture, trial, points, which)).sum(axis=-1))) * unit**2
             for points, which in ((nominal[trial.name], None), (found[trial.name], fit))
         ]
         if all(math.isfinite(s) for s in squares):

@@ -22,6 +22,7 @@ from .model_comparison import ComparisonSettings, ModelComparison, compare_model
 from .report.wording import verdict_summary
 from .suggested_experiments import next_experiment
 from .verification_run import VerificationRun, run_verification
+from .work import RIGID_RATE, SOFT_RATE, Work, WorkRecord
 
 CONFIRMED_TAKES = 2
 """Trials of the verification run: each costs seconds, and the second separates chance from confirmation."""
@@ -31,18 +32,23 @@ CONFIRMED_TAKES = 2
 class DiagnoseOptions:
     """How a capture is diagnosed.
 
-    budget_s: time in s that the fits aim to stay below, 10 to 86400; the verification run comes on top.
+    budget_s: time in s that the fits may take on one idle core, 10 to 86400, turned into work at a fixed rate
+        (``sim.diagnose.work``), so that no verdict depends on the machine; the verification run comes on top.
+    work: the same as simulated steps, 10⁵ to 10¹³, instead of ``budget_s``; None: what ``budget_s`` stands for.
     effects: names of the candidates; None for all that can act on these objects.
     confirm: whether to verify the verdict in the particle engine.
     """
 
     budget_s: float = 300.0
+    work: int | None = None
     effects: tuple[str, ...] | None = None
     confirm: bool = True
 
     def __post_init__(self) -> None:
         if not 10 <= self.budget_s <= 86400:
             raise InputError(f"budget is {self.budget_s!r} s: give 10 s to 24 h")
+        if self.work is not None and not 1e5 <= self.work <= 1e13:
+            raise InputError(f"work is {self.work!r} steps: give 1e5 to 1e13")
         known = [n for n, e in effects().items() if n != "sandy"]
         for name in self.effects or ():
             if name not in known:
@@ -64,9 +70,12 @@ def diagnose(
     """
     options = options or DiagnoseOptions()
     started = time.monotonic()
-    fits = _fit(capture, options, on_event, cancelled)
+    work = _budget(capture, options)
+    fits = _fit(capture, options, work, on_event, cancelled)
     weighed = compare_models(fits, ComparisonSettings())
-    warnings = list(capture.warnings)
+    warnings = [*capture.warnings, *_left_out(fits, options, work)]
+    for warning in warnings[len(capture.warnings) :]:
+        on_event({"event": "notice", "stage": "diagnose", "message": warning})
     verdict, found = weighed.verdict, _found(fits, weighed)
     gap = measure_gap(capture, fits, found)
     nominal_points, found_points = fits.simulate(fits.nominal), fits.simulate(found)
@@ -94,17 +103,44 @@ def diagnose(
         summary=verdict_summary(verdict, gap),
         warnings=tuple(warnings),
         seconds=round(time.monotonic() - started, 2),
+        work=WorkRecord(
+            budget=int(work.limit),
+            spent=work.spent,
+            per_second=int(work.rate),
+            skipped=dict(sorted(work.skipped.items())),
+        ),
         confirmation=_confirmation_json(confirmations),
     )
 
 
-def _fit(capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelled: IsCancelled) -> Fits:
+def _budget(capture: Capture, options: DiagnoseOptions) -> Work:
+    """Return the work that ``options`` allow for ``capture``."""
+    rate = RIGID_RATE if all(item.belief.rigid for item in capture.objects) else SOFT_RATE
+    return Work(limit=options.budget_s * rate if options.work is None else options.work, rate=rate)
+
+
+def _left_out(fits: Fits, options: DiagnoseOptions, work: Work) -> list[str]:
+    """Return sentences on effects that were not tried or not to the end, and why."""
+    said = []
+    tried = {name for fit in fits.candidates for name in fit.effects}
+    absent = [n for n in options.effects or () if n not in tried and n not in work.skipped]
+    if absent:
+        said.append(f"{', '.join(absent)}: asked for and not tried, because it cannot act or show in this capture")
+    by_kind: dict[str, list[str]] = {}
+    for name, what in sorted(work.skipped.items()):
+        by_kind.setdefault(what, []).append(name)
+    for what, names in by_kind.items():
+        said.append(f"{', '.join(names)}: not {what}, because the budget was spent; give a larger --budget or --work")
+    return said
+
+
+def _fit(capture: Capture, options: DiagnoseOptions, work: Work, on_event: OnEvent, cancelled: IsCancelled) -> Fits:
     # Taichi is imported only here.
     rigid = [item.belief.rigid for item in capture.objects]
     if all(rigid):
         from .rigid.rigid_fits import fit_rigid
 
-        return fit_rigid(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
+        return fit_rigid(capture, options.effects, on_event=on_event, cancelled=cancelled, work=work)
     if len(capture.objects) > 1:
         soft = capture.objects[rigid.index(False)].name
         raise InputError(
@@ -113,7 +149,7 @@ def _fit(capture: Capture, options: DiagnoseOptions, on_event: OnEvent, cancelle
         )
     from .soft.soft_fits import fit_soft
 
-    return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, budget_s=options.budget_s)
+    return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, work=work)
 
 
 def _found(fits: Fits, weighed: ModelComparison) -> CandidateFit:

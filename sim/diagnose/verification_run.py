@@ -9,7 +9,6 @@ resolutions: the difference between them is numerical error and no finding.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ from ..mpm.solver_options import Ground, SolverOptions, fit_similarity
 from ..mpm.world_setup import WorldSetup
 from ..scene.model import Effect as SceneEffect
 from .capture import Array, Capture, CaptureObject, Trial
-from .capture_geometry import nearest_pose, observed_distance
+from .capture_geometry import mean_known, nearest_pose, observed_distance
 from .diagnosis import CandidateFit
 
 HORIZON_S = 1.0
@@ -284,4 +283,4 @@ def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
 
 def _rms(difference: Array) -> float:
     squares = np.square(difference).sum(axis=-1)
-    return float(math.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else math.nan
+    return float(np.sqrt(mean_known(squares)))

@@ -88,8 +88,8 @@ def capture(world, *, takes=3, after=0.15, seed=0):
     return made, points[-1][shown:]
 
 
-def fits(made, names, budget=120.0):
-    return fit_soft(made, names, on_event=lambda event: None, cancelled=lambda: False, budget_s=budget)
+def fits(made, names):
+    return fit_soft(made, names, on_event=lambda event: None, cancelled=lambda: False)
 
 
 def test_the_surface_gives_its_lattice_away():
@@ -205,4 +205,4 @@ def test_unsupported_captures_are_reported():
     with pytest.raises(InputError, match="give it a rigid material"):
         fits(dataclasses.replace(made, trials=tuple(filmed)), None)
     with pytest.raises(Cancelled):
-        fit_soft(made, None, on_event=lambda event: None, cancelled=lambda: True, budget_s=60)
+        fit_soft(made, None, on_event=lambda event: None, cancelled=lambda: True)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ...html import Markup, Picture, element, join, label, shortened, side_by_side
 from ..capture import Capture, Trial
+from ..capture_geometry import mean_known
 from ..diagnosis import Diagnosis, TrialArrays
 from .diagnosis_charts import Scale, curve, is_root, ranking_picture, timeline_picture
 from .object_heatmaps import object_pictures
-from .trajectory_plots import MAX_TAKES, camera_plane, mean_where, tracks_legend, tracks_pictures
+from .trajectory_plots import MAX_TAKES, camera_plane, tracks_legend, tracks_pictures
 from .wording import axis_unit, found_effects, found_label, quantity_text, tick_text
 
 Array = NDArray[np.float64]
@@ -111,7 +112,7 @@ def growth(diagnosis: Diagnosis, capture: Capture) -> Growth:
     for trial, arrays in chosen:
         for name, kept in curves.items():
             kept.append(_resampled(times, trial, _errors(name, trial, arrays, capture)))
-    means = {name: mean_where(np.stack(kept), 0) if kept else np.full(_STEPS, np.nan) for name, kept in curves.items()}
+    means = {name: mean_known(np.stack(kept), 0) if kept else np.full(_STEPS, np.nan) for name, kept in curves.items()}
     return Growth(
         times=times,
         nominal=means["nominal"],
@@ -136,7 +137,7 @@ def _errors(name: str, trial: Trial, arrays: TrialArrays, capture: Capture) -> A
         apart = np.full(shape, np.nan)
     with np.errstate(over="ignore"):
         squares = (apart**2).sum(axis=2)
-    return np.sqrt(mean_where(np.where(np.isfinite(squares), squares, np.nan), 1))
+    return np.sqrt(mean_known(np.where(np.isfinite(squares), squares, np.nan), 1))
 
 
 def _resampled(times: Array, trial: Trial, errors: Array) -> Array:

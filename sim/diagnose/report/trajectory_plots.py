@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ...html import Markup, Picture, element, join, label, short_number, shortened
 from ..capture import Camera, Capture, Trial
+from ..capture_geometry import mean_known
 from ..diagnosis import Diagnosis, TrialArrays
 from .diagnosis_charts import curve
 from .wording import axis_unit, found_effects, found_label, quantity_text, tick_text, with_unit
@@ -108,14 +109,6 @@ def camera_plane(camera: Camera) -> Plane:
     return project
 
 
-def mean_where(values: Array, axis: int) -> Array:
-    """Return the mean of the finite numbers along ``axis``; NaN where there are none."""
-    good = np.isfinite(values)
-    count = good.sum(axis=axis)
-    total = np.where(good, values, 0.0).sum(axis=axis)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
 def _shaped(array: Array | None, shape: tuple[int, ...]) -> Array:
     if array is None or np.shape(array) != shape:
         return np.full(shape, np.nan)
@@ -125,12 +118,12 @@ def _shaped(array: Array | None, shape: tuple[int, ...]) -> Array:
 
 def _main_direction(*places: Array) -> Array:
     """Return the (2,) horizontal unit vector of the main direction of motion."""
-    ways = np.concatenate([mean_where(p, 1)[:, :2] for p in places if len(p)])
+    ways = np.concatenate([mean_known(p, 1)[:, :2] for p in places if len(p)])
     ways = ways[np.isfinite(ways).all(axis=1)]
     if len(ways) < 2 or float(np.ptp(ways, axis=0).max()) < 1e-9:
         return np.array([1.0, 0.0])
     axis: Array = np.linalg.svd(ways - ways.mean(axis=0), full_matrices=False)[2][0]
-    first = mean_where(places[0], 1)[:, :2]
+    first = mean_known(places[0], 1)[:, :2]
     first = first[np.isfinite(first).all(axis=1)]
     leads = float((first[-1] - first[0]) @ axis) if len(first) > 1 else float(axis[0])
     return axis if leads >= 0 else -axis
@@ -142,10 +135,10 @@ def _observed_centres(observed: Array, reference: Array) -> Array:
     The plain mean would jump whenever a point is lost.
     """
     if not np.isfinite(reference).any():
-        return mean_where(observed, 1)
-    shift = mean_where(observed - reference, 1)
-    moved = mean_where(reference, 1) + shift
-    return np.where(np.isfinite(moved), moved, mean_where(observed, 1))
+        return mean_known(observed, 1)
+    shift = mean_known(observed - reference, 1)
+    moved = mean_known(reference, 1) + shift
+    return np.where(np.isfinite(moved), moved, mean_known(observed, 1))
 
 
 def _moments(seen: NDArray[np.bool_], wanted: int) -> list[int]:
@@ -160,7 +153,7 @@ def _moments(seen: NDArray[np.bool_], wanted: int) -> list[int]:
 
 def _path(places: Array, moments: list[int]) -> ProjectedPath:
     outlines = [_outline(places[i]) for i in moments if i < len(places)]
-    return ProjectedPath(centres=mean_where(places, 1), outlines=tuple(o for o in outlines if len(o)))
+    return ProjectedPath(centres=mean_known(places, 1), outlines=tuple(o for o in outlines if len(o)))
 
 
 def _outline(places: Array) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, Trial
 from ..diagnosis import CandidateFit, Discrepancy, Estimate
+from ..work import Work
 from .multiple_shooting import Fit
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect
 from .rigid_localisation import localise_discrepancies
@@ -113,19 +113,19 @@ def fit_rigid(
     *,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
-    budget_s: float = 120.0,
+    work: Work | None = None,
 ) -> RigidFits:
     """Return the effects ``names`` (None: all that apply to rigid bodies) fitted to ``capture``.
 
-    budget_s: time in s after which no further candidate is started. Raises InputError where no body is rigid or a name
-    is unknown, Cancelled when ``cancelled()`` becomes True.
+    work: budget, of which every body gets an equal part; None for no limit. Raises InputError where no body is rigid or
+    a name is unknown, Cancelled when ``cancelled()`` becomes True.
     """
-    started = time.monotonic()
+    work = Work() if work is None else work
     wanted = _wanted(capture, names)
     bodies = []
     for index, item in enumerate(capture.objects):
         if item.belief.rigid and any((t.object_index == index).any() for t in capture.trials):
-            bodies.append(BodyFits(problem=body_problem(capture, index)))
+            bodies.append(BodyFits(problem=body_problem(capture, index, work), work=work))
     if not bodies:
         raise InputError("capture: no object is rigid and tracked; fit it as deformable")
     progress = StageProgress(on_event, "fit", len(bodies) * (len(wanted) + 2))
@@ -138,22 +138,26 @@ def fit_rigid(
         if cancelled():
             raise Cancelled("cancelled while fitting; nothing was written")
 
-    for body in bodies:
+    whole = work.limit
+    for number, body in enumerate(bodies):
+        work.limit = whole * (number + 1) / len(bodies)
         fit_nominal(body)
         tick("nominal")
         for candidate in wanted:
-            if time.monotonic() - started < budget_s:
+            if work.left():
                 begin_search(body, (candidate,))
                 if candidate.name == "camera_pose":
                     fit_camera_pose(body)
+            else:
+                work.skip((candidate.name,), "tried")
             tick(candidate.name)
-        finish_best(body, started + budget_s)
+        finish_best(body)
         refit_beliefs(body)
         tick("refitted")
-        refit_best(body, started + budget_s)
-        refine_promising(body, started + budget_s)
-        reconsider_nominal(body, started + budget_s)
-        search_pairs(body, wanted, started + budget_s)
+        refit_best(body)
+        refine_promising(body)
+        reconsider_nominal(body)
+        search_pairs(body, wanted)
     return _assemble(capture, bodies)
 
 

@@ -84,6 +84,9 @@ class RunArrays(NamedTuple):
     out: Cube
     """(W, M, RECORD) written: state of the reference point, and sums over contacts."""
 
+    steps: Counts
+    """(W,) written: steps taken."""
+
 
 @ti.func
 def vec(table: Table, w, i):
@@ -149,6 +152,7 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
             # A body that rests, slides or rolls without an impact takes longer steps, with springs solved for
             # at their end, which holds them still at any step.
             calm = False
+            taken = 0
             for m in range(runs.counts[w]):
                 while t < runs.times[w, m] - 1e-9:
                     left = runs.times[w, m] - t
@@ -293,6 +297,7 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                         spin = r @ (mobility @ (r.transpose() @ momentum))
                     arm = r @ center
                     t += h
+                    taken += 1
                 at = x - arm
                 speed = v - spin.cross(arm)
                 for c in ti.static(range(3)):
@@ -305,3 +310,4 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                 runs.out[w, m, 14] = rubbed
                 runs.out[w, m, 15] = touched
                 runs.out[w, m, 16] = slid
+            runs.steps[w] = taken

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture_geometry import mean_known
 from .multiple_shooting import Fit, Model, Problem, SegmentedTrial
 from .observed_poses import as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
@@ -196,7 +197,7 @@ def score_held_out(fit: Fit) -> HeldOutScore:
         ] - points
         off = off[max(0, shown_frames(fit, trial) - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
-    rms = float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("nan")
+    rms = float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("nan")
     return HeldOutScore(log_score=np.array(scores), rms_m=rms)
 
 
@@ -259,7 +260,7 @@ def marginal_rms(fit: Fit) -> float:
         squares.append(
             np.sum((trial.observations.seen[late:] - _expected(fit, trial, state, clock)) ** 2, axis=-1).ravel()
         )
-    return float(np.sqrt(np.nanmean(np.concatenate(squares)))) if squares else float("inf")
+    return float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("inf")
 
 
 def _expected(fit: Fit, trial: SegmentedTrial, state: Array, clock: Array) -> Array:

@@ -7,13 +7,13 @@ defects at contacts."""
 from __future__ import annotations
 
 import dataclasses
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
+from ..work import Work
 from .multiple_shooting import CONTACT_DEGREES_OF_FREEDOM, Fit, Model, Problem, Segment, SegmentedTrial, solve
 from .observed_poses import frame_pose, observe_body
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings
@@ -132,15 +132,16 @@ class BodyFits:
     """
 
     problem: Problem
+    work: Work
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
     flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
     begun: dict[tuple[str, ...], list[Fit]] = field(default_factory=dict)
 
 
-def body_problem(capture: Capture, index: int) -> Problem:
+def body_problem(capture: Capture, index: int, work: Work) -> Problem:
     """Return the trials of object ``index`` of ``capture``, with nodes and initial states."""
     body = rigid_body(capture.objects[index])
-    simulator = RigidWorlds(body=body)
+    simulator = RigidWorlds(body=body, work=work)
     seen = [observe_body(capture, t, index, body.center) for t in capture.trials if (t.object_index == index).any()]
     seen = [s for s in seen if np.isfinite(s.seen).all(axis=2).any()]
     places = []
@@ -167,7 +168,7 @@ def fit_nominal(body: BodyFits) -> None:
     body.fits[()] = fit
 
 
-def reconsider_nominal(body: BodyFits, until: float) -> None:
+def reconsider_nominal(body: BodyFits) -> None:
     """Restart the nominal model from the states of the best effects; keep it where it is better.
 
     Every effect contains the nominal model. One that gains with zero amount has only found better states, which the
@@ -175,7 +176,8 @@ def reconsider_nominal(body: BodyFits, until: float) -> None:
     """
     singles = [f for k, f in body.fits.items() if len(k) == 1 and f.problem is body.problem]
     for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
-        if time.monotonic() > until:
+        if not body.work.left():
+            body.work.skip(("none",), "restarted from the best effects' states")
             return
         again = solve(body.problem, Model(candidates=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
         if again.evidence > body.fits[()].evidence:
@@ -219,14 +221,18 @@ def finish(body: BodyFits, key: tuple[str, ...]) -> Fit:
     return body.fits[key]
 
 
-def finish_best(body: BodyFits, until: float) -> None:
+def finish_best(body: BodyFits) -> None:
     """Finish every single effect that may still become the best."""
     nominal = body.fits[()].evidence
     for key in sorted(body.begun, key=lambda k: -body.fits[k].evidence):
         best = max(f.evidence for f in body.fits.values())
         near = best - max(BEHIND, BEHIND_SHARE * (best - nominal))
-        if body.fits[key].evidence >= near and time.monotonic() < until:
+        if body.fits[key].evidence < near:
+            continue
+        if body.work.left():
             finish(body, key)
+        else:
+            body.work.skip(key, "fitted to convergence")
 
 
 def _keep(body: BodyFits, key: tuple[str, ...], fit: Fit) -> None:
@@ -317,15 +323,16 @@ def _loosened(problem: Problem) -> Problem:
     return dataclasses.replace(problem, trials=trials)
 
 
-def refine_promising(body: BodyFits, until: float) -> None:
+def refine_promising(body: BodyFits) -> None:
     """Refine the promising fits by a few steps with their own Jacobians."""
     best = max(f.evidence for f in body.fits.values())
     nominal = body.fits[()]
     far = [f for k, f in body.fits.items() if k and f.evidence > max(best - PROMISING, nominal.evidence - 3)]
     for fit in sorted(far, key=lambda f: -f.evidence)[:3]:
-        if time.monotonic() > until:
-            return
         key = tuple(f.name for f in fit.model.candidates)
+        if not body.work.left():
+            body.work.skip(key, "refined")
+            continue
         new = solve(fit.problem, fit.model, fit.z, fit.states, rounds=4)
         if new.evidence > fit.evidence:
             body.fits[key] = new
@@ -341,19 +348,22 @@ def refit_beliefs(body: BodyFits) -> None:
         del body.fits["friction",]
 
 
-def refit_best(body: BodyFits, until: float) -> None:
+def refit_best(body: BodyFits) -> None:
     """Fit the best effects again with their own nodes, where those of the nominal model may be unsuitable."""
     nominal = body.fits[()]
     singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:2]
     for fit in singles:
-        if time.monotonic() > until or fit.evidence < singles[0].evidence - BEHIND:
+        if fit.evidence < singles[0].evidence - BEHIND:
             return
         gained = fit.evidence - nominal.evidence
         if fit.problem is body.problem and gained > FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
-            _followed(body, fit.model, fit.z)
+            if body.work.left():
+                _followed(body, fit.model, fit.z)
+            else:
+                body.work.skip((fit.model.candidates[0].name,), "followed through its own contacts")
 
 
-def search_pairs(body: BodyFits, wanted: list[CandidateEffect], until: float) -> None:
+def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     """Fit pairs of effects: the best one or two with each other one, where a single effect leaves too much."""
     singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1]
     if not singles:
@@ -365,14 +375,17 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect], until: float) ->
     tried = []
     for name, fit in singles[:2]:
         for candidate in wanted:
-            if time.monotonic() > until:
-                break
             if candidate.name == name or tuple(sorted((name, candidate.name))) in {tuple(sorted(k)) for k in body.fits}:
                 continue
             if {name, candidate.name} == {"air_drag", "wind"}:
                 continue
+            if not body.work.left():
+                body.work.skip((name, candidate.name), "tried")
+                continue
             begin_search(body, (CANDIDATE_EFFECTS[name], candidate), fit)
             tried.append((name, candidate.name))
     for key in sorted(tried, key=lambda k: -body.fits[k].evidence)[:PAIRS_FINISHED]:
-        if time.monotonic() < until:
+        if body.work.left():
             finish(body, key)
+        else:
+            body.work.skip(key, "fitted to convergence")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -17,6 +17,7 @@ from ...errors import InputError
 from ...mpm.kernels.runtime import ensure_started
 from ...mpm.solver_options import SolverOptions
 from ..capture import CaptureObject
+from ..work import LAUNCH, Work
 
 Array = NDArray[np.float64]
 
@@ -193,11 +194,12 @@ def six_components(matrix: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigidWorlds:
-    """Runs many worlds of one body. longest: step in flight in s. threads: 0 for all."""
+    """Runs many worlds of one body. longest: step in flight in s. threads: 0 for all. work: counts the steps."""
 
     body: RigidBody
     longest: float = LONGEST
     threads: int = 0
+    work: Work = field(default_factory=Work)
 
     def run(self, starts: Array, numbers: Array, times: list[Array] | Array) -> Array:
         """Return states (W, M, RECORD) of the centre of volume at ``times`` of every world, in s since its start.
@@ -213,11 +215,15 @@ class RigidWorlds:
             row[: len(t)] = t
         out = np.zeros((len(count), padded.shape[1], RECORD))
         if len(count) and count.max() > 0:
+            steps = np.zeros(len(count), dtype=np.int32)
             body, corners = self.body, np.ascontiguousarray(self.body.corners)
             rigid_kernel.advance(
                 len(count),
                 self.longest,
                 rigid_kernel.BodyPoints(len(corners), body.radius, body.bound, corners),
-                rigid_kernel.RunArrays(np.ascontiguousarray(starts), np.ascontiguousarray(numbers), count, padded, out),
+                rigid_kernel.RunArrays(
+                    np.ascontiguousarray(starts), np.ascontiguousarray(numbers), count, padded, out, steps
+                ),
             )
+            self.work.add(LAUNCH + int(steps.sum(dtype=np.int64)))
         return out

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..capture_geometry import mean_known
 from .multiple_shooting import Model, Problem, Segment, SegmentedTrial, eliminate_states
 from .observed_poses import ObservedBody, as_matrix, frame_pose, perturbed
 from .resting_contact import resting_state
@@ -164,10 +165,8 @@ def used_frames(observations: ObservedBody) -> int:
     """Return the number of frames until the body is finally at rest; later ones carry no information."""
     seen, count = observations.seen, len(observations.times)
     tail = max(4, count // 12)
-    with np.errstate(all="ignore"):
-        last = np.nanmean(seen[-tail:], axis=0)
-        off = seen - last
-        size = np.sqrt(np.nanmean(np.sum(off**2, axis=-1), axis=1))
+    off = seen - mean_known(seen[-tail:], axis=0)
+    size = np.sqrt(mean_known(np.sum(off**2, axis=-1), axis=1))
     limit = 1.7 * observations.sigma * np.sqrt(seen.shape[-1])
     moving = np.flatnonzero(~(size <= limit))
     end = (int(moving[-1]) + 1 if len(moving) else 0) + max(3, count // 40)

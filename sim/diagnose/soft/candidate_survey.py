@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress
 from ..capture import Capture
+from ..capture_geometry import mean_known
+from ..work import Work
 from .body_mesh import body_mesh, coarser
 from .contact_search import LOST, CandidateSearch, ContactFit, ContactProblem, ModelError, Window, model_error_between
 from .flight_fits import FlightEstimate, Flights, GroundFrame, fit_in_flight, soft_trial
@@ -80,8 +81,9 @@ class Survey:
     plain: FoundFit
     found: list[FoundFit]
 
-    def __init__(self, capture: Capture, *, on_event: OnEvent, cancelled: IsCancelled, budget_s: float) -> None:
-        self._begin, self._budget, self._cancelled = time.monotonic(), budget_s, cancelled
+    def __init__(self, capture: Capture, *, on_event: OnEvent, cancelled: IsCancelled, work: Work) -> None:
+        self._work, self._cancelled = work, cancelled
+        self._names: tuple[str, ...] = ()
         self._progress = StageProgress(on_event, "diagnose", 100)
         self.frame = GroundFrame(capture)
         item = capture.objects[0]
@@ -92,7 +94,7 @@ class Survey:
         rest = capture.trials[0].rest_points
         if any(t.rest_points.shape != rest.shape or np.abs(t.rest_points - rest).max() > 1e-9 for t in capture.trials):
             raise InputError("rest_points differ between trials: track the same points in all trials of a soft object")
-        self.worlds = SoftWorlds(mesh, belief.density_kg_m3, rest)
+        self.worlds = SoftWorlds(mesh, belief.density_kg_m3, rest, work=work)
         self.flights = Flights(self.trials, self.worlds, capture.noise_sigma)
         x, y, z = (float(c) for c in self.frame.direction(np.asarray(capture.gravity)))
         self.base = WorldParameters(
@@ -105,7 +107,8 @@ class Survey:
         self.fit_trials = [i for i, t in enumerate(self.trials) if t.role == "fit"]
         self._check()
         coarse_mesh = coarser(mesh, item.vertices, item.faces, factor=COARSER)
-        self._coarse = Flights(self.trials, SoftWorlds(coarse_mesh, belief.density_kg_m3, rest), capture.noise_sigma)
+        rough_worlds = SoftWorlds(coarse_mesh, belief.density_kg_m3, rest, work=work)
+        self._coarse = Flights(self.trials, rough_worlds, capture.noise_sigma)
         windows = [w for w in map(self._window, self.fit_trials) if w is not None]
         self.numerics_rms_m, model_error = self._measure_grain(windows)
         self.problem = ContactProblem(self.flights, windows, self.base, model_error=model_error, size=self._size)
@@ -116,7 +119,7 @@ class Survey:
     def run(self, names: Sequence[str]) -> None:
         """Search all candidates of ``names``."""
         base, problem = self.base, self.problem
-        middle = np.mean([np.nanmean(t.points[: t.flying], axis=(0, 1)) for t in self.trials], axis=0)
+        middle = mean_known(np.stack([mean_known(t.points[: t.flying], axis=(0, 1)) for t in self.trials]), axis=0)
         known = candidates(base, self._size, middle)
         neutral = CandidateSearch(problem, None)
         rough = CandidateSearch(self._rough, None)
@@ -167,7 +170,7 @@ class Survey:
                 moved = [np.concatenate([e.free[:-2], self._common]) for e in ends[:DESCENTS]]
                 ends = sorted(ends + search.try_all(moved), key=lambda f: f.cost)
             begun.append((candidate, search, ends))
-        # Most promising first, in case time runs out.
+        # Most promising first, in case the budget ends.
         begun.sort(key=lambda entry: entry[2][0].cost)
         found: list[tuple[float, Candidate, ContactFit]] = []
         least = math.inf
@@ -176,6 +179,8 @@ class Survey:
             if not self._late(0.45):
                 rounds = [HOPELESS_ROUNDS if e.cost > least + HOPELESS else ROUNDS for e in followed]
                 followed = [search.descend(e, n, self._stop) for e, n in zip(followed, rounds, strict=True)]
+            else:
+                self._work.skip((*self._names, candidate.name), "searched beyond its starting values")
             least = min(least, *(f.cost for f in followed))
             end = min(followed, key=lambda f: f.cost)
             found.append((end.cost, candidate, end))
@@ -194,6 +199,8 @@ class Survey:
             elif rank < FULL_SEARCHES and not self._late(0.6):
                 fit = search.descend(fit, FINE_ROUNDS, self._stop)
             else:
+                if rank < FULL_SEARCHES:
+                    self._work.skip((*self._names, candidate.name), "refined on the fine lattice")
                 fit = dataclasses.replace(fit, jacobians=end.jacobians)
             self._report(50 + 30 * (rank + 1) // len(found), candidate.name)
             out.append(FoundFit(search=search, fit=fit))
@@ -202,10 +209,13 @@ class Survey:
     def _pairs(self, tried: list[Candidate]) -> list[FoundFit]:
         """Return pairs of an effect visible in flight and one that acts in contact, where neither alone suffices."""
         flying = [f for f in self.found if f.in_flight is not None and self._gain(f) > SEEN_IN_FLIGHT * 3]
-        if not flying or self._late(0.6):
+        if not flying:
             return []
         best = max(flying, key=self.evidence)
         if self.contact_misfit(best) < UNEXPLAINED:
+            return []
+        if self._late(0.6):
+            self._work.skip((*best.effects, "contact effects"), "tried")
             return []
         assert best.search.candidate is not None and best.in_flight is not None
         values = best.search.candidate.values(best.in_flight.free)
@@ -214,6 +224,7 @@ class Survey:
         problem = ContactProblem(self.flights, windows, base, model_error=self.problem.model_error, size=size)
         rough = ContactProblem(self._coarse, windows, base, model_error=self._rough.model_error, size=size)
         before = ((best.search.candidate.name, values, best.in_flight),)
+        self._names = best.effects
         return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, rough, tried)]
 
     # Quality of a fit
@@ -287,10 +298,10 @@ class Survey:
                     "start the recording earlier"
                 )
 
-    # Time
+    # Work
 
     def _late(self, share: float) -> bool:
-        return time.monotonic() - self._begin > share * self._budget
+        return not self._work.left(share)
 
     def _stop(self) -> bool:
         self._leave()

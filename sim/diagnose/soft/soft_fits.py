@@ -15,6 +15,7 @@ from ...errors import InputError
 from ...events import IsCancelled, OnEvent
 from ..capture import Capture
 from ..diagnosis import DIRECTIONS, CandidateFit, Discrepancy, Estimate, PhaseInterval
+from ..work import Work
 from .candidate_survey import FoundFit, Survey
 from .contact_search import LOST, ContactFit
 from .flight_fits import Flights, SoftTrial
@@ -315,12 +316,17 @@ def _estimates(name: str, draws: list[dict[str, float]], values: dict[str, float
 
 
 def fit_soft(
-    capture: Capture, names: Sequence[str] | None, *, on_event: OnEvent, cancelled: IsCancelled, budget_s: float
+    capture: Capture,
+    names: Sequence[str] | None,
+    *,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+    work: Work | None = None,
 ) -> SoftFits:
     """Return the effects ``names`` (None: all that apply) fitted to a capture of one deformable object.
 
-    budget_s: time limit of the search in s; the most promising candidates are refined first. Body directions among the
-    parameters are in the mesh's rest frame, those of the environment (wind, anchor, tilt) in the ground's frame.
+    work: budget of the search, None for no limit; the most promising candidates are refined first. Body directions
+    among the parameters are in the mesh's rest frame, those of the environment (wind, anchor, tilt) in the ground's.
     Raises InputError for captures of pixels, of several objects or of a rigid one, ``Cancelled`` on request.
     """
     if len(capture.objects) != 1:
@@ -334,6 +340,6 @@ def fit_soft(
             "tracking, or record 3D points"
         )
     wanted = NAMES if names is None else tuple(n for n in NAMES if n in set(names))
-    survey = Survey(capture, on_event=on_event, cancelled=cancelled, budget_s=budget_s)
+    survey = Survey(capture, on_event=on_event, cancelled=cancelled, work=Work() if work is None else work)
     survey.run(wanted)
     return SoftFits(survey)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...mpm.kernels.runtime import ensure_started
 from ...mpm.solver_options import SolverOptions
+from ..work import Work
 from .body_mesh import BodyMesh
 from .free_flight import Inertia, State
 from .soft_candidates import WorldParameters
@@ -66,9 +67,11 @@ class NodeHistory:
 
 
 class SoftWorlds:
-    """Batched worlds of the body ``mesh`` of ``density`` with tracked ``rest_points`` (K, 3)."""
+    """Batched worlds of the body ``mesh`` of ``density`` with tracked ``rest_points`` (K, 3). work: counts steps."""
 
-    def __init__(self, mesh: BodyMesh, density: float, rest_points: Array, *, threads: int = 0) -> None:
+    def __init__(
+        self, mesh: BodyMesh, density: float, rest_points: Array, *, threads: int = 0, work: Work | None = None
+    ) -> None:
         self.mesh = mesh
         self.density = density
         self.masses = density * mesh.node_volumes()
@@ -77,6 +80,7 @@ class SoftWorlds:
         self.holders, self.weights = mesh.locate(rest_points)
         self._cell = float(np.cbrt(6 * np.median(mesh.volumes)))
         self._options = SolverOptions(threads=threads)
+        self._work = Work() if work is None else work
         self._shares = _spared(mesh, self.masses)
         self._rate = _fastest(mesh, self.masses, self._shares)
         half = np.ptp(mesh.nodes, axis=0) / 2
@@ -225,8 +229,12 @@ class SoftWorlds:
         tracked = np.zeros((count, frames, len(self.holders), 3))
         kept = (count, frames, nodes, 3) if keep else (1, 1, 1, 3)
         kept_x, kept_f = np.zeros(kept), np.zeros(kept)
+        rows = np.stack([self._row(job, shorter) for job in jobs])
+        for job, row in zip(jobs, rows, strict=True):
+            spans = np.diff(job.times, prepend=row[kernels.START]) / row[kernels.STEP]
+            self._work.add(len(mesh.cells) * int(np.maximum(np.ceil(spans - 1e-9), 1).sum()))
         kernels.advance_worlds(
-            np.stack([self._row(job, shorter) for job in jobs]),
+            rows,
             damped,
             yields,
             keep,
