@@ -53,7 +53,7 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen diagnose``."""
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
-    budget = "time for the fits on one idle core, such as 90s or 5min, counted as simulated work (default 5min)"
+    budget = "time for the fits on two idle cores, such as 90s or 5min, counted as simulated work (default 5min)"
     parser.add_argument("--budget", type=parse_duration, default=300.0, metavar="TIME", help=budget)
     work = "the same as simulated steps, such as 3e8, instead of --budget"
     parser.add_argument("--work", type=parse_steps, metavar="STEPS", help=work)

@@ -32,7 +32,7 @@ CONFIRMED_TAKES = 2
 class DiagnoseOptions:
     """How a capture is diagnosed.
 
-    budget_s: time in s that the fits may take on one idle core, 10 to 86400, turned into work at a fixed rate
+    budget_s: time in s that the fits may take on two idle cores, 10 to 86400, turned into work at a fixed rate
         (``sim.diagnose.work``), so that no verdict depends on the machine; the verification run comes on top.
     work: the same as simulated steps, 10⁵ to 10¹³, instead of ``budget_s``; None: what ``budget_s`` stands for.
     effects: names of the candidates; None for all that can act on these objects.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The budget of a diagnosis, counted in simulated steps: the clock decides nothing, so a verdict can be repeated.
 
-A time is turned into work at a fixed rate, measured once on an idle core and written into the report: the same
+A time is turned into work at a fixed rate, measured once (docs/measurements.md) and written into the report: the same
 ``--budget`` is the same work on any machine and at any load.
 """
 
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 RIGID_RATE = 1_000_000
 """Work per second of a diagnosis of rigid bodies: steps of all worlds, and ``LAUNCH`` for every launch."""
 
-SOFT_RATE = 10_000_000
-"""Work per second of a diagnosis of a deformable body: steps of all worlds times their cells."""
+SOFT_RATE = 30_000_000
+"""Work per second of a diagnosis of a deformable body on two cores: steps of all worlds times their cells."""
 
 LAUNCH = 10_000
 """Work that a launch of rigid worlds costs beside its steps: what the fit does with its results."""
