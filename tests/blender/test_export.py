@@ -757,6 +757,7 @@ def test_the_fingerprint_never_raises(scene):
 # The whole way
 
 
+@pytest.mark.long
 def test_an_export_bakes(scene, tmp_path):
     item = add("Würfel.001", (0, 0, 0.7))
     item.scale = (0.4, 0.4, -0.4)

@@ -17,13 +17,14 @@ from physgen.benchmarks.light import WANTED_DEG, WANTED_SHARE, Case, measure
     ],
     ids=lambda case: case.shape,
 )
-def test_a_known_sun_is_found_again(tmp_path, case):
+def test_a_known_sun_is_found_again(first_fill, tmp_path, case):
     found = measure(case, tmp_path, (320, 240), 8)
     assert found["direction_deg"] < WANTED_DEG
     assert abs(found["ratio_share"]) < WANTED_SHARE
     assert found["angle_deg"] < 20
 
 
-def test_a_shadow_all_around_is_no_sun(tmp_path):
+@pytest.mark.long
+def test_a_shadow_all_around_is_no_sun(first_fill, tmp_path):
     found = measure(Case(azimuth=0, elevation=90, strength=0.0), tmp_path, (320, 240), 8)
     assert found["light"]["sun_direction"] is None

@@ -556,6 +556,7 @@ def test_every_choice_of_the_panel_reaches_the_command(world, bake, tmp_path, mo
     assert render_options(flags_of(scene, monkeypatch)) == chosen
 
 
+@pytest.mark.long
 def test_layers_of_a_still_are_shown_and_another_format_wants_another_folder(world, bake, tmp_path):
     state = a_photo_scene(world, bake([(0, 0, 0), (-0.02, 0, 0)]), tmp_path)
     state.rendering.format, state.rendering.video = "exr_layers", "webm"

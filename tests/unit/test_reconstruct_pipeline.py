@@ -78,14 +78,15 @@ def old_scene(small_scene, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def result(photo, tmp_path_factory):
+def result(photo, tmp_path_factory, without_trials):
     events = []
     out = tmp_path_factory.mktemp("scenes") / "deep" / "scene"
     requests = [
         ObjectRequest(box=BALL, name="ball", size_m=0.2, preset="soft", velocity=(1.0, 0.0, 0.5)),
         ObjectRequest(box=CRATE),
     ]
-    folder = reconstruct_photo(photo, requests, out, QUICK, events.append)
+    with without_trials():
+        folder = reconstruct_photo(photo, requests, out, QUICK, events.append)
     return folder, events, out
 
 

@@ -98,7 +98,11 @@ def sample_interior(
     centres = fine_inside[FINE // 2 :: FINE, FINE // 2 :: FINE, FINE // 2 :: FINE]
     positions = low + (np.argwhere(centres) + 0.5) * step
     fine = low + (np.argwhere(fine_inside) + 0.5) * (step / FINE)
-    positions = _cover_thin_parts(positions, fine, low, step, counts)
+    # Number of the particle in each test point's own cell, -1 without one: most points need no search for the nearest.
+    own = np.where(centres, np.cumsum(centres).reshape(centres.shape) - 1, -1)
+    own = own.repeat(FINE, axis=0).repeat(FINE, axis=1).repeat(FINE, axis=2)[fine_inside]
+    on_lattice = len(positions)
+    positions = _cover_thin_parts(positions, fine[own < 0], low, step, counts)
     if len(positions) < MIN_PARTICLES:
         raise _too_few(len(positions), spacing, extent)
 
@@ -120,7 +124,10 @@ def sample_interior(
             sums = np.stack([np.bincount(owners, strewn[:, c], minlength=len(positions)) for c in range(3)], axis=1)
             middle = np.where(size[:, None] > 0, sums / np.maximum(size, 1)[:, None], positions)
             positions = kept_inside(middle)
-    owners = cKDTree(positions / step).query(fine / step)[1]
+    owners, unknown = own.copy(), own < 0
+    if scattered or len(positions) > on_lattice:
+        unknown[:] = True
+    owners[unknown] = cKDTree(positions / step).query(fine[unknown] / step)[1]
     shares = np.maximum(np.bincount(owners, minlength=len(positions)), 1).astype(np.float64)
     volume = abs(signed) if oriented else float(step.prod()) * len(fine) / FINE**3
     if jitter and not scattered:
@@ -142,7 +149,7 @@ def _too_few(count: int, spacing: float, extent: Array) -> InputError:
 
 
 def _cover_thin_parts(positions: Array, fine: Array, low: Array, step: Array, counts: NDArray[np.int64]) -> Array:
-    """Return the particles with one more in each lattice cell whose inside test points have none nearby."""
+    """Return the particles with one more in each lattice cell whose inside test points ``fine`` have none nearby."""
     if len(positions):
         distance = cKDTree(positions / step).query(fine / step, distance_upper_bound=COVERED)[0]
         fine = fine[~np.isfinite(distance)]

@@ -63,6 +63,7 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
 def _start(arguments: dict[str, object]) -> None:
     """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
     _leave_source_lines_out()
+    _leave_call_stacks_out()
     with contextlib.redirect_stdout(io.StringIO()) as said:
         ti.init(**arguments)
     logger.debug("%s", said.getvalue().strip())
@@ -93,6 +94,22 @@ def _leave_source_lines_out() -> None:
 
     named.leaves_lines_out = True  # type: ignore[attr-defined]
     ASTTransformerContext.get_pos_info = named
+
+
+def _leave_call_stacks_out() -> None:
+    """Let Taichi allocate arrays without formatting the Python call stack of each.
+
+    A world has more than two hundred arrays, and each stack takes a millisecond or two; it is shown when an allocation
+    fails, where Python prints the same one. Private, too: a version without this function stays as it is.
+    """
+    for name in ("_ndarray", "matrix"):
+        module = getattr(ti.lang, name, None)
+        if module is not None and hasattr(module, "get_traceback"):
+            module.get_traceback = _no_stack
+
+
+def _no_stack(stacklevel: int = 1) -> str:
+    return ""
 
 
 def generation() -> int:
