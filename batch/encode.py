@@ -31,10 +31,10 @@ def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[di
 
 def give_up(options: argparse.Namespace) -> Cancelled:
     """Remove incomplete files when Blender does not stop in time; return the error to report."""
-    from ..sim.atomic import remove_partials
+    from ..sim.atomic import remove_unfinished
     from ..sim.errors import Cancelled
 
-    remove_partials(options.out.parent)
+    remove_unfinished()
     return Cancelled(f"encoding cancelled; {options.out} was not written")
 
 

@@ -82,13 +82,12 @@ def _encode(
 
 def give_up(options: argparse.Namespace) -> Cancelled:
     """Remove incomplete files when Blender does not stop in time; return the error to report."""
-    from ..sim.atomic import remove_partials
-    from ..sim.cache.folder_lock import release_lock
+    from ..sim.atomic import remove_unfinished
+    from ..sim.cache.folder_lock import release_all
     from ..sim.errors import Cancelled
 
-    for folder in {options.out, *([options.video.parent] if options.video else [])}:
-        remove_partials(folder)
-    release_lock(options.out)
+    remove_unfinished()
+    release_all()
     return Cancelled("cancelled within a frame; complete frames are kept, run it again to continue")
 
 

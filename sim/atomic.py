@@ -1,22 +1,43 @@
 # SPDX-License-Identifier: MIT
-"""Atomic writes: files and folders are written under a temporary name and renamed at the end."""
+"""Atomic writes: files and folders are written under a temporary name and take their place in one step at the end.
+
+A temporary name holds the mark of its process (``sim/process_identity.py``): ``.NAME.partial-MARK.SUFFIX`` of what is
+being written, ``.NAME.old-MARK`` of a folder that is being replaced where it cannot be exchanged. ``recover`` puts back
+or removes what dead processes left, and nothing else.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import json
 import os
+import re
 import shutil
+import stat
+import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .process_identity import MARK, Mark, own_mark, parse_mark
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
 """Seconds between attempts: Windows refuses to replace a file that another process is reading."""
+
+_TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK})(?P<suffix>(?:\.[^/]*)?)", re.DOTALL)
+_SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
+
+MOST_DEPTH, MOST_ENTRIES = 3, 100_000
+"""How deep, and at how many names, ``recover`` looks in a folder: ours are not deeper."""
+
+_unfinished: set[Path] = set()
+"""What this process is writing, to be removed by an exit that skips ``finally`` blocks."""
 
 
 @contextmanager
@@ -26,7 +47,8 @@ def replacing(path: Path) -> Iterator[Path]:
     The suffix stays, because image writers choose the format by it. Raises InputError when the disk is full or the
     folder cannot be written.
     """
-    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    partial = path.with_name(f".{path.stem}.partial-{own_mark()}{path.suffix}")
+    _unfinished.add(partial)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -36,19 +58,105 @@ def replacing(path: Path) -> Iterator[Path]:
             f"{path}: cannot be written ({error.strerror or error}); free space or choose another folder"
         ) from error
     finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
+        _remove(partial)
+        _unfinished.discard(partial)
+
+
+@contextmanager
+def replacing_tree(out: Path) -> Iterator[Path]:
+    """Yield a fresh folder beside the folder ``out``; on success it becomes ``out``, on failure it is removed.
+
+    ``out`` is at every moment the whole earlier folder or the whole new one, whatever kills the process: the two are
+    exchanged in one call, where the system has one. Elsewhere the earlier one is moved aside first, and a process that
+    dies between the two calls leaves it as ``.NAME.old-MARK``, from where ``recover`` puts it back. The caller holds a
+    lock of ``out``. Raises OSError.
+    """
+    partial, old = (out.with_name(f".{out.name}.{role}-{own_mark()}") for role in ("partial", "old"))
+    _unfinished.add(partial)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _remove(partial)
+        partial.mkdir()
+        yield partial
+        _sync_tree(partial)
+        if out.exists() and not _exchange(partial, out):
+            _move_aside(partial, out, old)
+        elif not out.exists():
+            _replace(partial, out)
+        _sync(out.parent)
+    finally:
+        # After an exchange this is the earlier folder.
+        _remove(partial)
+        if out.exists():
+            _remove(old)
+        _unfinished.discard(partial)
+
+
+def _move_aside(partial: Path, out: Path, old: Path) -> None:
+    out.rename(old)
+    _sync(out.parent)
+    try:
+        partial.rename(out)
+    except OSError:
+        old.rename(out)
+        raise
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchange two folders of one file system in one step; False where the system cannot, with nothing changed."""
+    names = os.fsencode(first), os.fsencode(second)
+    try:
+        library = ctypes.CDLL(None, use_errno=True)
+        if sys.platform == "linux":
+            # AT_FDCWD is -100, RENAME_EXCHANGE is 2.
+            code = library.renameat2(-100, names[0], -100, names[1], ctypes.c_uint(2))
+        elif sys.platform == "darwin":
+            # RENAME_SWAP is 2.
+            code = library.renamex_np(*names, ctypes.c_uint(2))
         else:
-            # The parent may be a file, or gone.
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
+            return False
+    except (OSError, AttributeError, TypeError):
+        return False
+    if code == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EPERM):
+        return False
+    raise OSError(number, os.strerror(number), str(second))
 
 
-def remove_partials(folder: Path) -> None:
-    """Remove this process's unfinished files in ``folder``, for an exit that skips ``finally`` blocks."""
-    for partial in folder.glob(f".*.partial-{os.getpid()}*"):
-        with contextlib.suppress(OSError):
-            partial.unlink()
+def _sync(path: Path) -> None:
+    """Have the system write ``path``, a file or the names in a folder, to the disk."""
+    if os.name == "nt" and path.is_dir():
+        return
+    with contextlib.suppress(OSError):
+        file = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+
+def _sync_tree(folder: Path) -> None:
+    for root, _, names in os.walk(folder):
+        for name in names:
+            _sync(Path(root) / name)
+        _sync(Path(root))
+
+
+def _remove(path: Path) -> None:
+    """Remove ``path``, a file, link or whole folder, if it is there and can be."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISDIR(path.lstat().st_mode):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def remove_unfinished() -> None:
+    """Remove all that this process has not finished writing, for an exit that skips ``finally`` blocks."""
+    for path in list(_unfinished):
+        _remove(path)
 
 
 def _replace(partial: Path, path: Path) -> None:
@@ -63,9 +171,104 @@ def _replace(partial: Path, path: Path) -> None:
     partial.replace(path)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` atomically as indented UTF-8 JSON. Raises ValueError for NaN and infinity."""
+def recover(path: Path) -> list[str]:
+    """Put back or remove what dead processes of this machine left of the file or folder ``path``; say what was done.
+
+    Looks at temporary names of ``path`` beside it, and, where it is a folder, at all in it; never at others, through a
+    link, or at what a living process or another machine's is writing. Each sentence is for the user.
+    """
+    said: list[str] = []
+    path = path.parent.resolve() / path.name
+    for left in _dead_beside(path):
+        found = _TEMPORARY.fullmatch(left.name)
+        if found is not None and found["role"] == "old" and found["name"] == path.name and not path.exists():
+            with contextlib.suppress(OSError):
+                left.rename(path)
+                said.append(f"{path}: was put back, as a run that replaced it was killed in the middle")
+                continue
+        _remove(left)
+        said.append(f"{left}: removed, left by a run that was killed")
+    if path.is_dir() and not path.is_symlink():
+        for left in _dead_within(path):
+            _remove(left)
+            said.append(f"{left}: removed, left by a run that was killed")
+    return said
+
+
+def recover_scratch(folder: Path | None = None) -> list[str]:
+    """Remove the folders that this user's dead processes left among the system's temporary files; say so.
+
+    folder: in place of the system's, for tests.
+    """
+    place, said = folder or Path(tempfile.gettempdir()), []
+    for left in _entries(place):
+        found = _SCRATCH.fullmatch(left.name)
+        mark = parse_mark(found["mark"]) if found else None
+        if mark is not None and mark.is_dead and _is_ours(left):
+            _remove(left)
+            said.append(f"{left}: removed, left by a run that was killed")
+    return said
+
+
+def scratch_prefix(what: str = "") -> str:
+    """Return the start of the name of a temporary folder of this process, by which ``recover_scratch`` knows it."""
+    return f"physgen-{what + '-' if what else ''}{own_mark()}-"
+
+
+def _entries(folder: Path) -> Iterable[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return ()
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        return os.name == "nt" or path.lstat().st_uid == os.getuid()
+    except OSError:
+        return False
+
+
+def _dead_mark(name: str) -> Mark | None:
+    """Return whose ``name`` is, if it is a temporary name of a dead process; the innermost of several counts."""
+    found = _TEMPORARY.fullmatch(name)
+    mark = parse_mark(found["mark"]) if found else None
+    return mark if mark is not None and mark.is_dead else None
+
+
+def _dead_beside(path: Path) -> Iterator[Path]:
+    for left in _entries(path.parent):
+        if _dead_mark(left.name) and _is_ours(left) and path.name in _names(left.name):
+            yield left
+
+
+def _names(name: str) -> Iterator[str]:
+    """Yield what a temporary ``name`` is of: a temporary name may be of another one."""
+    while found := _TEMPORARY.fullmatch(name):
+        yield found["name"]
+        yield found["name"] + found["suffix"]
+        name = found["name"]
+
+
+def _dead_within(folder: Path) -> Iterator[Path]:
+    seen = 0
+    for root, folders, names in os.walk(folder):
+        seen += len(folders) + len(names)
+        if seen > MOST_ENTRIES:
+            return
+        for name in sorted([*folders, *names]):
+            path = Path(root) / name
+            if _dead_mark(name) and _is_ours(path):
+                yield path
+        deep = len(Path(root).relative_to(folder).parts) >= MOST_DEPTH - 1
+        folders[:] = [] if deep else [name for name in folders if not _TEMPORARY.fullmatch(name)]
+
+
+def write_json(path: Path, value: Any, *, mode: int | None = None) -> None:
+    """Write ``value`` atomically as indented UTF-8 JSON; ``mode``: permissions. Raises ValueError for NaN, infinity."""
     with replacing(path) as partial:
+        if mode is not None:
+            os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
         partial.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
 
 

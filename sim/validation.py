@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .errors import InputError
+from .trust import UntrustedSpec
 
 
 def require(condition: bool, field_name: str, value: object, remedy: str) -> None:
@@ -135,11 +136,20 @@ def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
         raise InputError(f"{path}: expected a finite number, found {_brief(value)}")
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
         return value
+    if hint is UntrustedSpec and isinstance(value, str):
+        return UntrustedSpec(value)
     if hint in (str, bool) and isinstance(value, hint):
         return value
     if hint is Path and isinstance(value, str) and value and "\0" not in value:
         return Path(value)
-    names = {float: "a number", int: "a whole number", str: "a text", Path: "the path of a file", bool: "true or false"}
+    names = {
+        UntrustedSpec: "a text",
+        float: "a number",
+        int: "a whole number",
+        str: "a text",
+        Path: "the path of a file",
+        bool: "true or false",
+    }
     raise InputError(f"{path}: expected {names.get(hint, hint)}, found {_brief(value)}")
 
 

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import shutil
+import tempfile
 from pathlib import Path
 
 # What a user of this machine has installed must not change what tests see.
 os.environ["PHYSGEN_MODELS"] = str(Path(__file__).with_name("no_models"))
+# Nor do tests agree to anything in the user's name.
+os.environ["PHYSGEN_CONFIG"] = tempfile.mkdtemp(prefix="physgen-tests-")
 # Workers share the cores: threads of OpenBLAS that wait for one another took 40 % of a reconstruction's time. Children
 # inherit it. It has to be set before NumPy is there.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -24,6 +28,8 @@ from physgen.sim.reconstruct.background.inpainting_methods import MethodChoice
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.model import Camera, SceneModel, SceneObject
+
+atexit.register(shutil.rmtree, os.environ["PHYSGEN_CONFIG"], ignore_errors=True)
 
 # Every run draws the same examples, so that none fails for what it did not touch; `make test-explore` draws new ones.
 settings.register_profile("ci", derandomize=True, deadline=None)

@@ -334,6 +334,16 @@ def corrected_requests(options: argparse.Namespace, earlier: Sequence[ObjectRequ
     return tuple(dataclasses.replace(item, **fields[item.name or ""]) for item in earlier)
 
 
+def given_anew(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the flags of ``correct`` put in place of paths and adapters in the scene's record, by its fields."""
+    fresh = reconstruct_options(options)
+    names = ("inpainter", "segmenter", "depth_estimator", "mesher", "depth", "environment")
+    found = {f"options.{name}": value for name in names if (value := getattr(fresh, name)) is not None}
+    return found | {
+        f"objects.{name}.{part}": path for part in ("mask", "mesh") for name, path in getattr(options, part)
+    }
+
+
 def add_object_details(fields: dict[str, dict[str, Any]], options: argparse.Namespace) -> None:
     """Add the flags of ``OBJECT_FLAGS`` to ``fields`` by object name. Raises InputError for an unknown name."""
     for flag, (field, *_) in OBJECT_FLAGS.items():

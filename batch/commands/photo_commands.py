@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from ...physgen_addon.render.render_options import require_video_name
 from ...sim.app.bake_options import BakeOptions
 from ...sim.app.default_motion import tells_motion
 from ...sim.app.propose import PICTURE_FILE, choose, propose
-from ...sim.app.reconstruct import correct, reconstruct, require_physics, require_stamp
+from ...sim.app.reconstruct import correct, reconstruct, require_physics
+from ...sim.app.reconstruct_record import require_request
 from ...sim.cache.bake_folder import load_bake
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, never
@@ -22,6 +24,7 @@ from ...sim.reconstruct.models.known_models import known_model
 from ...sim.reconstruct.reconstruct_options import object_names
 from ...sim.scene.folder import load_scene
 from ...sim.scene.overrides import check_overrides
+from ...sim.trust import Agreed, Claim
 from ...sim.validation import to_json
 from .. import stages
 from ..terminal import Terminal
@@ -37,6 +40,7 @@ from .flags import (
     box_text,
     chat_request,
     corrected_requests,
+    given_anew,
     light_request,
     object_requests,
     physics_options,
@@ -88,6 +92,11 @@ def add_correct(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder reconstructed from a photo")
     add_object_flags(parser, boxes=False)
     add_reconstruction_flags(parser)
+    text = (
+        "agree to what the scene's record asks for beyond its folder: adapters that run, files that are read; each is "
+        "shown first, and remembered (docs/security.md). Scenes of your own need no word"
+    )
+    parser.add_argument("--trust", action="store_true", help=text)
 
 
 def add_import(parser: argparse.ArgumentParser) -> None:
@@ -239,13 +248,24 @@ def use_found_boxes(
 def run_correct(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen correct``; the exit code."""
     scene = load_scene(options.scene)
-    stamp = require_stamp(scene)
+    earlier = require_request(scene, shown_first(terminal) if options.trust else None, given_anew(options))
     fetch_models(options, terminal, cancelled)
-    requests, settings = corrected_requests(options, stamp.objects), reconstruct_options(options, stamp.options)
-    correct(scene, objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
+    requests, settings = corrected_requests(options, earlier.objects), reconstruct_options(options, earlier.options)
+    correct(scene, earlier=earlier, objects=requests, options=settings, on_event=terminal, cancelled=cancelled)
     terminal({"event": "done", "scene": str(options.scene)})
     terminal.line(f"scene: {options.scene}")
     return 0
+
+
+def shown_first(terminal: Terminal) -> Agreed:
+    """Return the answer of ``--trust``: yes, once every line was shown."""
+
+    def agreed(source: Path, claims: Sequence[Claim]) -> bool:
+        for line in (f"{source} asks for this, and --trust agrees to it:", *(claim.line() for claim in claims)):
+            terminal({"event": "notice", "stage": "trust", "message": line})
+        return True
+
+    return agreed
 
 
 def run_import(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import os
 import shlex
 import signal
-import socket
 import stat
 import subprocess
 import threading
@@ -33,7 +31,7 @@ from ...sim.app.stage_process import (
 )
 from ...sim.atomic import write_json
 from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
-from ...sim.cache.folder_lock import LOCK_FILE, is_locked
+from ...sim.cache.folder_lock import is_held
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
 from ...sim.scene.folder import file_hash, inside
@@ -351,22 +349,13 @@ def _await_folders(task: Task, root: Path, cancelled: IsCancelled, on_event: OnE
     folders = {inside(root, name).parent for name in task.produces}
     deadline = time.monotonic() + FOLDER_WAIT_S
     said = False
-    while any(_is_held(folder) for folder in folders) and time.monotonic() < deadline:
+    while any(is_held(folder) for folder in folders) and time.monotonic() < deadline:
         if not said:
             on_event({"event": "notice", "task": task.id, "stage": task.stage, "message": "waiting for another run"})
             said = True
         if cancelled():
             raise Cancelled("cancelled while waiting for another run's folder")
         time.sleep(LOOK_S)
-
-
-def _is_held(folder: Path) -> bool:
-    """Return whether a living process of this machine, or any of another machine, holds ``folder``."""
-    try:
-        owner = json.loads((folder / LOCK_FILE).read_bytes())
-        return is_locked(folder) or str(owner["host"]) != socket.gethostname()
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError):
-        return False
 
 
 def _run_command(task: Task, root: Path, cancelled: IsCancelled, on_event: OnEvent, threads: int) -> _Ended:

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
-from ..atomic import replacing
+from ..atomic import replacing_tree
+from ..cache.folder_lock import lock_beside
 from ..diagnose import run_diagnosis
 from ..diagnose.capture import Capture
 from ..diagnose.diagnosis import REPORT_FILE, Diagnosis, write_diagnosis
@@ -44,10 +44,12 @@ def diagnose(
     for warning in capture.warnings:
         on_event({"event": "notice", "stage": "diagnose", "message": warning})
     diagnosis = run_diagnosis.diagnose(capture, options, on_event, cancelled)
-    with replacing(out) as partial:
-        partial.mkdir()
-        write_diagnosis(diagnosis, partial)
-        write_report(diagnosis, capture, partial)
-        if out.is_dir():
-            shutil.rmtree(out)
+    try:
+        with lock_beside(out), replacing_tree(out) as partial:
+            write_diagnosis(diagnosis, partial)
+            write_report(diagnosis, capture, partial)
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
+        ) from error
     return diagnosis

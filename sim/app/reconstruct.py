@@ -11,13 +11,12 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
 
-from ..atomic import write_json
+from ..atomic import recover, write_json
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions
@@ -30,28 +29,12 @@ from ..scene.folder import Scene, file_hash, load_scene, parse_scene, save_scene
 from ..scene.material import load_preset
 from ..scene.model import Ground, SceneModel, Vector
 from ..scene.overrides import PHYSICS_FIELDS, apply_overrides, without_physics
-from ..validation import parse, read_json, to_json
+from ..trust import trusted_spec
+from ..validation import read_json, to_json
+from .reconstruct_record import STAMP_FILE, Request, read_stamp, require_stamp, stamp_to_json
 
-T = TypeVar("T")
-
-STAMP_FILE = "reconstruct.json"
 RECONSTRUCT_REVISION = 16
 """Raised with every change of reconstruction that changes what a photo becomes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stamp:
-    """Record of what a scene folder was reconstructed from (``reconstruct.json``).
-
-    inputs_hash: of all that the scene depends on. photo, objects, options: the request, paths absolute.
-    scene: ``scene.json`` as reconstructed, before physics or light were edited.
-    """
-
-    inputs_hash: str
-    photo: Path
-    objects: tuple[ObjectRequest, ...]
-    options: ReconstructOptions
-    scene: Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,37 +82,52 @@ def reconstruct(
     require_physics(len(objects), physics)
     # The stamp has the choice itself, so that a correction keeps it, whatever is installed by then.
     options = dataclasses.replace(options, segmenter=chosen_segmenter(options.segmenter))
-    scene = _reconstruct_cached(photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered)
     velocities = (*physics.velocities, *(item.velocity for item in objects[len(physics.velocities) :]))
     spins = (*physics.spins, *(item.spin for item in objects[len(physics.spins) :]))
     asked = dataclasses.replace(physics, velocities=velocities, spins=spins)
-    return set_all_physics(scene, asked, friction=options.friction)
+    request = Request(photo=photo, objects=tuple(objects), options=options)
+    with lock_beside(out):
+        return _reconstruct_cached(
+            request,
+            out,
+            lambda scene: with_all_physics(scene, asked, friction=options.friction),
+            on_event,
+            cancelled,
+            ask=ask,
+            answered=answered,
+        )
 
 
 def _reconstruct_cached(
-    photo: Path,
-    objects: Sequence[ObjectRequest],
+    request: Request,
     out: Path,
-    options: ReconstructOptions,
+    settle: Callable[[Scene], SceneModel],
     on_event: OnEvent,
     cancelled: IsCancelled,
     *,
     ask: ChatRequest | None = None,
     answered: str | None = None,
 ) -> Scene:
-    """Return the scene folder ``out``, reconstructed unless cached; its physics may be of an earlier request."""
+    """Return the scene folder ``out``, reconstructed unless cached; the caller holds its lock.
+
+    settle: returns what to save of the scene as reconstructed, or as it was found; of a new one before it takes the
+    place of an earlier one, so that at every moment one of the two is there, with all that was set in it.
+    """
+    photo, objects, options = request.photo, request.objects, request.options
     if not photo.is_file():
         raise InputError(f"{photo}: there is no such photo; check its name")
     if options.environment is not None:
         # Before anything is hashed or segmented: a bad file should not be reported only after the last stage.
         read_environment(options.environment)
+    for sentence in recover(out):
+        on_event({"event": "notice", "stage": "reconstruct", "message": sentence})
     inputs_hash = _inputs_hash(photo, objects, options, ask, answered)
     stamp = read_stamp(out)
     if (
         stamp is not None
         and stamp.inputs_hash == inputs_hash
         # What an object is made of is decided with its shape; motion is not, and is set afterwards.
-        and [item.preset for item in stamp.objects] == [item.preset for item in objects]
+        and stamp.presets == tuple(item.preset for item in objects)
     ):
         try:
             folder = load_scene(out)
@@ -137,38 +135,26 @@ def _reconstruct_cached(
             pass
         else:
             on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
-            return folder
+            model = settle(folder)
+            return folder if model == folder.model else save_scene(out, model)
     from ..reconstruct import reconstruct_photo
 
     # Imported here, because planning a farm's jobs must not pay for the engine's geometry.
     from .rest_check import at_rest
 
+    def stamped(folder: Scene) -> SceneModel:
+        record = stamp_to_json(inputs_hash, request, scene_to_json(folder.model))
+        write_json(folder.root / STAMP_FILE, record)
+        return settle(folder)
+
     folder = reconstruct_photo(
-        photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered, at_rest=at_rest
+        photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered, at_rest=at_rest, settle=stamped
     )
-    stamp = Stamp(
-        inputs_hash=inputs_hash,
-        photo=photo.resolve(),
-        objects=tuple(_resolved(item, ("mask", "mesh")) for item in objects),
-        options=_resolved(options, ("environment", "depth")),
-        scene=scene_to_json(folder.model),
-    )
-    write_json(out / STAMP_FILE, to_json(stamp))
+    made = read_stamp(out)
+    if made is not None:
+        # What this user's own command wrote needs no further word of theirs.
+        made.request.remember()
     return folder
-
-
-def read_stamp(root: Path) -> Stamp | None:
-    """Return the record of what the folder ``root`` was reconstructed from; None without one, or of another version."""
-    try:
-        return parse(Stamp, read_json(root / STAMP_FILE), STAMP_FILE)
-    except InputError:
-        return None
-
-
-def _resolved(value: T, names: Sequence[str]) -> T:
-    """Return the dataclass ``value`` with the paths in its fields ``names`` absolute."""
-    paths = {name: path.resolve() for name in names if (path := getattr(value, name)) is not None}
-    return dataclasses.replace(value, **paths)  # type: ignore[type-var]
 
 
 def _inputs_hash(
@@ -193,7 +179,7 @@ def _inputs_hash(
             [stage, file_hash(path)]
             for stage in STAGES
             if (spec := getattr(options, stage)) is not None
-            for path in spec_files(stage, spec)
+            for path in spec_files(stage, trusted_spec(spec))
         ],
         "asked": answered if ask is None else [ask.url, ask.model],
     }
@@ -222,13 +208,18 @@ def require_physics(objects: int, physics: Physics) -> None:
 
 
 def set_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> Scene:
-    """Return ``scene`` with ``physics``, saved; what ``physics`` leaves open gets the default of a new scene.
+    """Return ``scene`` changed as ``with_all_physics`` does, saved."""
+    model = with_all_physics(scene, physics, friction=friction)
+    return scene if model == scene.model else save_scene(scene.root, model)
+
+
+def with_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> SceneModel:
+    """Return the content of ``scene`` with ``physics``; what that leaves open gets the default of a new scene.
 
     A new scene is as it was reconstructed, at rest; objects without a recorded material are ``medium``.
     friction: Coulomb coefficient of the ground; None: the new scene's. Effects stay.
     """
-    model = with_physics(_as_reconstructed(scene, friction), physics)
-    return scene if model == scene.model else save_scene(scene.root, model)
+    return with_physics(_as_reconstructed(scene, friction), physics)
 
 
 def _as_reconstructed(folder: Scene, friction: float | None) -> SceneModel:
@@ -280,20 +271,10 @@ MATTER_FIELDS = ("material", "fill", "roughness")
 """Fields that follow from an object's kind."""
 
 
-def require_stamp(scene: Scene) -> Stamp:
-    """Return the record of what ``scene`` was reconstructed from. Raises InputError when it has none."""
-    stamp = read_stamp(scene.root)
-    if stamp is None:
-        raise InputError(
-            f"{scene.root}: has no record of its reconstruction ({STAMP_FILE} is missing or of another version); "
-            "reconstruct it from the photo again"
-        )
-    return stamp
-
-
 def correct(
     scene: Scene,
     *,
+    earlier: Request,
     objects: Sequence[ObjectRequest],
     options: ReconstructOptions,
     on_event: OnEvent = ignore,
@@ -301,36 +282,42 @@ def correct(
 ) -> Scene:
     """Return ``scene`` reconstructed again, in place, with other ``objects`` or ``options``, from the same photo.
 
-    Objects keep their physics by name. Raises what ``reconstruct`` raises, and InputError when the photo has moved.
+    earlier: what it was reconstructed from (``require_request``). Objects keep their physics by name. What was set in
+    the scene since is never lost: killed at any moment, this leaves the scene as it was, or the corrected one with it.
+    Raises what ``reconstruct`` raises, and InputError when the photo has moved.
     """
     root = scene.root
-    stamp = require_stamp(scene)
     if options.segmenter is not None:
         options = dataclasses.replace(options, segmenter=chosen_segmenter(options.segmenter))
-    if not stamp.photo.is_file():
-        raise InputError(f"{stamp.photo}: the photo of this scene is no longer there; put it back, or reconstruct anew")
-    before, first = scene.model, parse_scene(stamp.scene, STAMP_FILE)
-    lights = ("environment", "environment_frame", "sun")
-    light_changed = any(getattr(options, name) != getattr(stamp.options, name) for name in lights)
-    keeps_light = before.light != first.light and not light_changed
-    with TemporaryDirectory(dir=root.resolve().parent, prefix=f".{root.name}.light-") as place:
-        light = None
-        if keeps_light and before.light.environment is not None:
-            light = Path(place) / "environment.exr"
-            shutil.copyfile(scene.file(before.light.environment), light)
-        folder = _reconstruct_cached(stamp.photo, objects, root, options, on_event, cancelled, answered=_answered(root))
-        if light is not None and before.light.environment is not None:
-            target = folder.file(before.light.environment)
-            target.parent.mkdir(exist_ok=True)
-            shutil.copyfile(light, target)
-    previous = {item.name: (item.kind, item.preset) for item in stamp.objects}
-    changed = {item.name for item in objects if previous.get(item.name) != (item.kind, item.preset)}
-    made = {item.name: item.held for item in first.objects}
-    edited = {item.name for item in before.objects if item.held != made.get(item.name)}
-    model = _as_before(folder.model, before, changed, edited)
-    if keeps_light:
-        model = dataclasses.replace(model, light=before.light)
-    return folder if model == folder.model else save_scene(root, model)
+    if not earlier.photo.is_file():
+        raise InputError(
+            f"{earlier.photo}: the photo of this scene is no longer there; put it back, or reconstruct anew"
+        )
+    with lock_beside(root):
+        # Not as it was when the command began to wait.
+        scene = load_scene(root)
+        before, first = scene.model, parse_scene(require_stamp(scene).scene, STAMP_FILE)
+        lights = ("environment", "environment_frame", "sun")
+        light_changed = any(getattr(options, name) != getattr(earlier.options, name) for name in lights)
+        keeps_light = before.light != first.light and not light_changed
+        previous = {item.name: (item.kind, item.preset) for item in earlier.objects}
+        changed = {item.name for item in objects if previous.get(item.name) != (item.kind, item.preset)}
+        made = {item.name: item.held for item in first.objects}
+        edited = {item.name for item in before.objects if item.held != made.get(item.name)}
+
+        def settle(folder: Scene) -> SceneModel:
+            model = _as_before(folder.model, before, changed, edited)
+            if not keeps_light:
+                return model
+            name = before.light.environment
+            if name is not None and folder.root != root:
+                target = folder.file(name)
+                target.parent.mkdir(exist_ok=True)
+                shutil.copyfile(scene.file(name), target)
+            return dataclasses.replace(model, light=before.light)
+
+        request = Request(photo=earlier.photo, objects=tuple(objects), options=options)
+        return _reconstruct_cached(request, root, settle, on_event, cancelled, answered=_answered(root))
 
 
 def _answered(root: Path) -> str | None:

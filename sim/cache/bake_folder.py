@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..errors import InputError
+from ..process_identity import is_running
 from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 from ..version import VERSION
-from .folder_lock import LOCK_FILE, folder_lock, process_alive
+from .folder_lock import folder_lock
 from .pc2 import Pc2Reader
 
 MANIFEST_FORMAT = "physgen-bake/1"
@@ -225,9 +226,10 @@ def save_manifest(folder: Path, manifest: BakeManifest) -> None:
     write_json(folder / MANIFEST_FILE, {"format": MANIFEST_FORMAT, **to_json(manifest)})
 
 
-_PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-\d+\.(?:json|npz)")
-_PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+\.ply")
-_LOCK_LEFTOVER = re.compile(re.escape(LOCK_FILE) + r"-(?:dead-)?(\d+)-[0-9a-f]{8}")
+_PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-[\d]+(?:-[0-9a-f]+){0,2}\.(?:json|npz)")
+_LOCK_LEFTOVER = re.compile(r"\.lock-(?:dead-)?(\d+)-[0-9a-f]{8}")
+"""What earlier versions left."""
+_PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
 
 
 def listed_files(manifest: BakeManifest) -> list[str]:
@@ -299,7 +301,7 @@ def remove_leftovers(folder: Path) -> None:
             continue
         for path in place.iterdir():
             lock = _LOCK_LEFTOVER.fullmatch(path.name)
-            if _PARTIAL.fullmatch(path.name) or (lock and not process_alive(int(lock[1]))):
+            if _PARTIAL.fullmatch(path.name) or (lock and not is_running(int(lock[1]))):
                 path.unlink(missing_ok=True)
     for place in _splat_folders(folder):
         for path in place.glob(".*.ply"):

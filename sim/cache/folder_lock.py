@@ -1,133 +1,248 @@
 # SPDX-License-Identifier: MIT
-"""One writer per folder: a lock file that names its process, so that a crash never blocks the next run."""
+"""One writer per folder. The kernel holds the lock, so that it ends with its process, whatever that ends by.
+
+The lock file's text, process, start, machine, is for people and for whoever looks without taking it (``is_locked``).
+The file is locked by ``flock``, or by ``msvcrt.locking`` on Windows; where a file system has no locks (some network
+disks), its text decides. Locks of another machine are respected by the kernel where the disk passes them on, and
+otherwise by the text that a run leaves there until its end.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import socket
-import uuid
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
+from ..process_identity import UNKNOWN_START, Mark, own_mark, parse_mark
 
 LOCK_FILE = ".lock"
+MOST_BYTES = 4096
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EINVAL, getattr(errno, "ENOTSUP", errno.ENOSYS), errno.EOPNOTSUPP)
+_UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+@dataclass
+class _Held:
+    """A lock of this process: its open file, the thread that holds it, and how many times."""
+
+    file: int
+    thread: int
+    times: int = 1
+
+
+_held: dict[str, _Held] = {}
+_guard = threading.Lock()
 
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold ``folder`` for this process.
+    """Hold ``folder`` for this thread, by a file in it; it is made if it is not there.
 
-    Raises InputError when a living process on this machine, or any process of another machine, holds it. The lock of a
-    dead process is taken over.
+    Raises InputError when another process or thread holds it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / LOCK_FILE
-        _acquire(path)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder") from error
+        raise _unwritable(folder, error) from error
+    with _locked(folder / LOCK_FILE, folder):
+        yield
+
+
+@contextmanager
+def lock_beside(folder: Path) -> Iterator[None]:
+    """Hold ``folder``, which may be replaced meanwhile, by a file beside it; the thread that holds it may do so again.
+
+    A folder that cannot be written at all needs no lock. Raises InputError when another process or thread holds it.
+    """
+    folder = folder.resolve()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    with _locked(folder.with_name(f".{folder.name}{LOCK_FILE}"), folder, may_lack=True):
+        yield
+
+
+def _unwritable(folder: Path, error: OSError) -> InputError:
+    return InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder")
+
+
+@contextmanager
+def _locked(path: Path, folder: Path, *, may_lack: bool = False) -> Iterator[None]:
+    key = os.path.realpath(path)
+    with _guard:
+        held = _held.get(key)
+        if held is not None and held.thread == threading.get_ident():
+            held.times += 1
+        elif held is not None:
+            raise InputError(f"{folder}: in use by another job of this process ({os.getpid()}); wait for it")
+        else:
+            try:
+                _held[key] = _Held(_acquired(path, folder), threading.get_ident())
+            except OSError as error:
+                if not (may_lack and error.errno in _UNWRITABLE):
+                    raise _unwritable(folder, error) from error
+                key = ""
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)
+        if key:
+            with _guard:
+                held = _held[key]
+                held.times -= 1
+                if held.times == 0:
+                    _release(path, _held.pop(key).file)
 
 
-def release_lock(folder: Path) -> None:
-    """Release ``folder`` if this process holds it, for when it must end without leaving ``folder_lock``."""
-    path = folder / LOCK_FILE
+def _acquired(path: Path, folder: Path) -> int:
+    """Return the open and locked file at ``path``. Raises InputError where it is held, OSError."""
+    for _ in range(100):
+        file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        good = False
+        try:
+            by_kernel = _take(file)
+            owner = _owner(path)
+            if by_kernel is False:
+                raise InputError(_in_use(folder, path, owner))
+            # Whoever had it may have removed it meanwhile: then this is no longer the file of that name.
+            if not _is_at(file, path):
+                continue
+            if owner is not None and not owner.is_here:
+                raise InputError(_in_use(folder, path, owner))
+            if by_kernel is None and owner is not None and owner != own_mark() and not owner.is_dead:
+                raise InputError(_in_use(folder, path, owner))
+            _write_owner(file)
+            good = True
+            return file
+        finally:
+            if not good:
+                os.close(file)
+    raise InputError(f"{folder}: another run took this folder just now; wait for it or choose another folder")
+
+
+def _take(file: int) -> bool | None:
+    """Lock the open ``file``; False if it is taken, None where the file system has no locks."""
     try:
-        owner = json.loads(path.read_bytes())
-        if (owner["pid"], owner["host"]) == (os.getpid(), socket.gethostname()):
+        if os.name == "nt":
+            import msvcrt
+
+            windows: Any = msvcrt
+            # Far behind the text, which others may then still read.
+            os.lseek(file, 2**30, os.SEEK_SET)
+            windows.locking(file, windows.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return None
+        if os.name == "nt" and error.errno in (errno.EACCES, errno.EDEADLK):
+            return False
+        raise
+    return True
+
+
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), path.lstat())
+    except FileNotFoundError:
+        return False
+
+
+def _write_owner(file: int) -> None:
+    mark = own_mark()
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    text = json.dumps({"pid": mark.pid, "host": socket.gethostname(), "since": since, "mark": str(mark)})
+    os.lseek(file, 0, os.SEEK_SET)
+    os.ftruncate(file, 0)
+    os.write(file, text.encode())
+
+
+def _release(path: Path, file: int) -> None:
+    """Remove the lock file while it is held, so that nobody else's is removed, then let it go."""
+    with contextlib.suppress(OSError):
+        if os.name != "nt" and _is_at(file, path):
             path.unlink()
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return
+    os.close(file)
+    if os.name == "nt":
+        # An open file cannot be removed there; where somebody else has opened it meanwhile, this fails.
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def release_all() -> None:
+    """Release what this process holds, for when it must end without leaving its ``with`` statements."""
+    for path, held in list(_held.items()):
+        with contextlib.suppress(OSError):
+            _release(Path(path), held.file)
+    _held.clear()
+
+
+def remove_dead_lock(path: Path) -> bool:
+    """Remove the lock file at ``path`` if the process that it names is dead and nobody holds it; whether it did."""
+    owner = _owner(path)
+    if owner is None or not owner.is_dead:
+        return False
+    try:
+        file = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return False
+    if _take(file) is False or not _is_at(file, path):
+        os.close(file)
+        return False
+    _release(path, file)
+    return True
 
 
 def is_locked(folder: Path) -> bool:
-    """Return whether another living process of this machine holds ``folder``."""
+    """Return whether another living process of this machine holds ``folder``; judged by the text, taking nothing."""
+    owner = _owner(folder / LOCK_FILE)
+    return owner is not None and owner.pid != os.getpid() and owner.is_here and not owner.is_dead
+
+
+def is_held(folder: Path) -> bool:
+    """The same, also for a run on another machine, of which it is not known whether it lives."""
+    owner = _owner(folder / LOCK_FILE)
+    return is_locked(folder) or (owner is not None and not owner.is_here)
+
+
+def _owner(path: Path) -> Mark | None:
+    """Return who the text at ``path`` names; None for none, or no such text."""
     try:
-        owner = json.loads((folder / LOCK_FILE).read_bytes())
-        pid, host = int(owner["pid"]), str(owner["host"])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        return False
-    return host == socket.gethostname() and pid != os.getpid() and process_alive(pid)
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            data = json.loads(file.read(MOST_BYTES))
+        mark = parse_mark(str(data.get("mark", "")))
+        if mark is not None:
+            return mark
+        if str(data["host"]) != socket.gethostname():
+            return Mark(int(data["pid"]), UNKNOWN_START, "another!")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, AttributeError):
+        pass
+    return None
 
 
-def _acquire(path: Path) -> None:
-    """Create the lock at ``path``: written beside it and linked, so that a partial one is never read."""
-    mine = path.with_name(f"{LOCK_FILE}-{os.getpid()}-{uuid.uuid4().hex[:8]}")
-    mine.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
+def _in_use(folder: Path, path: Path, owner: Mark | None) -> str:
+    if owner is None:
+        return f"{folder}: in use by another process; wait for it, stop it, or choose another folder"
+    if owner.is_here:
+        return f"{folder}: in use by process {owner.pid}; wait for it, stop it, or choose another folder"
     try:
-        for _ in range(3):
-            try:
-                _publish(mine, path)
-            except FileExistsError:
-                _drop_if_dead(path)
-                continue
-            return
-    finally:
-        mine.unlink(missing_ok=True)
-    raise InputError(f"{path.parent}: another run took this folder just now; wait for it or choose another folder")
-
-
-def _publish(mine: Path, path: Path) -> None:
-    """Make ``path`` a lock with the content of ``mine``. Raises FileExistsError if there is one."""
-    try:
-        os.link(mine, path)
-    except FileExistsError:
-        raise
-    except OSError:
-        # exFAT and some network file systems have no hard links.
-        with path.open("xb") as file:
-            file.write(mine.read_bytes())
-
-
-def _drop_if_dead(path: Path) -> None:
-    """Remove the lock of a dead process. Raises InputError if it is alive or on another machine."""
-    content = b""
-    try:
-        content = path.read_bytes()
-        owner = json.loads(content)
-        pid, host = int(owner["pid"]), str(owner["host"])
-    except FileNotFoundError:
-        return
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        pid, host = 0, socket.gethostname()
-    if host != socket.gethostname():
-        raise InputError(f"{path.parent}: in use by process {pid} on {host}; if that run is gone, delete {path}")
-    if pid != os.getpid() and process_alive(pid):
-        raise InputError(f"{path.parent}: in use by process {pid}; wait for it, stop it, or choose another folder")
-    # Renamed to a unique name: of two processes that find it dead, one gets it, and checks that it is unchanged.
-    taken = path.with_name(f"{LOCK_FILE}-dead-{os.getpid()}-{uuid.uuid4().hex[:8]}")
-    try:
-        path.rename(taken)
-        if taken.read_bytes() != content:
-            _publish(taken, path)
-    except (FileNotFoundError, FileExistsError):
-        return
-    finally:
-        taken.unlink(missing_ok=True)
-
-
-def process_alive(pid: int) -> bool:
-    """Return whether a process ``pid`` runs on this machine."""
-    if pid <= 0:
-        return False
-    if os.name == "nt":
-        import ctypes
-
-        handle = ctypes.windll.kernel32.OpenProcess(0x1000, False, pid)  # type: ignore[attr-defined]
-        if handle:
-            ctypes.windll.kernel32.CloseHandle(handle)  # type: ignore[attr-defined]
-        return bool(handle)
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        # OverflowError: no system has process numbers this large.
-        return False
-    except PermissionError:
-        return True
-    return True
+        host = str(json.loads(path.read_bytes())["host"])[:100]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        host = "another machine"
+    return f"{folder}: in use by process {owner.pid} on {host}; if that run is gone, delete {path}"

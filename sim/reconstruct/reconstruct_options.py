@@ -11,6 +11,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..scene.equirectangular import FRAMES
 from ..scene.model import SceneObject, Vector
+from ..trust import UntrustedSpec
 from ..validation import quantity, require, require_quantities
 
 SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
@@ -129,7 +130,8 @@ class ReconstructOptions:
     inpainter: an adapter (docs/extending.md) that replaces PatchMatch; None for the built-in inpainting. Likewise
         depth_estimator: the depth map; mesher: meshes of single objects.
     segmenter: an adapter that makes masks from boxes; None an installed model (``physgen models``), without one the
-        weight-free way; ``none`` the weight-free way.
+        weight-free way; ``none`` the weight-free way. Adapters that came with a file (``UntrustedSpec``) are not run
+        (docs/security.md).
     mesh_vertices: target number of vertices of each object, 500 to 200000.
     friction: Coulomb coefficient of the ground, 0 to 10; None uses a model's answer, else 0.4.
     environment: .hdr or .exr file that replaces the environment estimated from the photo (sim/scene/environment).
@@ -153,10 +155,10 @@ class ReconstructOptions:
     patch_radius: int = quantity(4, 1, 10, "pixels")
     inpaint_pixels: int = quantity(2_800_000, 1e4, 1e8, "pixels")
     seed: int = quantity(0, 0, 2**32 - 1, "a whole number")
-    inpainter: str | None = None
-    segmenter: str | None = None
-    depth_estimator: str | None = None
-    mesher: str | None = None
+    inpainter: UntrustedSpec | str | None = None
+    segmenter: UntrustedSpec | str | None = None
+    depth_estimator: UntrustedSpec | str | None = None
+    mesher: UntrustedSpec | str | None = None
     mesh_vertices: int = quantity(12_000, 500, 200_000, "vertices")
     friction: float | None = quantity(None, 0, 10, "a coefficient")
     environment: Path | None = None

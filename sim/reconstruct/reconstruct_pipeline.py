@@ -23,6 +23,7 @@ from ..scene.equirectangular import Radiance
 from ..scene.folder import Scene, save_scene
 from ..scene.material import load_preset
 from ..scene.model import Camera, Ground, Light, SceneModel, SceneObject
+from ..trust import trusted_spec
 from .adapters.resolve import resolve
 from .appearance.appearance_estimate import ObjectAppearance, estimate_appearances
 from .camera import ground_camera as cameras
@@ -153,12 +154,14 @@ def reconstruct_photo(
     ask: ChatRequest | None = None,
     answered: str | None = None,
     at_rest: Callable[[Scene, Notice], SceneModel] | None = None,
+    settle: Callable[[Scene], SceneModel] | None = None,
 ) -> Scene:
     """Reconstruct the ``objects`` of ``photo`` into the scene folder ``out``; an existing scene there is replaced.
 
     Stages with the same inputs as in an earlier reconstruction into ``out`` are cached. The folder appears whole or not
     at all. ask: request to a model about the objects; answered: the text of an earlier answer, used instead. at_rest:
-    returns the model of a scene folder with all that it takes for its objects to stay where they are.
+    returns the model of a scene folder with all that it takes for its objects to stay where they are. settle: called
+    with the whole folder before it takes its place; writes into it what belongs to it, and returns the scene to save.
     ``on_event`` receives progress and notices (docs/reconstruction.md), ``cancelled`` is polled between steps. Raises
     InputError for a photo, box or option that cannot be used, and Cancelled.
     """
@@ -200,7 +203,9 @@ def reconstruct_photo(
             estimate.camera,
             options,
             depth=None if depth is None else 1.0 / depth.nearness,
-            inpainter=None if options.inpainter is None else resolve("inpainter", options.inpainter, cancelled),
+            inpainter=None
+            if options.inpainter is None
+            else resolve("inpainter", trusted_spec(options.inpainter), cancelled),
             store=store,
             steps=steps,
         )
@@ -240,6 +245,9 @@ def reconstruct_photo(
                 },
             )
             write_report(folder / REPORT_FILE, Scene(folder, scene), report)
+        if settle is not None:
+            scene = settle(Scene(folder, scene))
+            save_scene(folder, scene)
         steps.finish()
     return Scene(root=out, model=scene)
 
@@ -278,7 +286,7 @@ def _depth(picture: Photo, options: ReconstructOptions, steps: Steps) -> DepthMa
         return read_depth(options.depth, picture.width, picture.height)
     if options.depth_estimator is None:
         return None
-    found = resolve("depth_estimator", options.depth_estimator, steps.cancelled)(picture.pixels)
+    found = resolve("depth_estimator", trusted_spec(options.depth_estimator), steps.cancelled)(picture.pixels)
     return DepthMap(
         values=found.values,
         disparity=found.meaning == "inverse",

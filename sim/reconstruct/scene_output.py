@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ..atomic import recover, replacing_tree
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..scene.folder import SCENE_FILE
 from ..validation import read_json
@@ -61,33 +60,21 @@ def _require_own(out: Path) -> None:
 def replacing_folder(out: Path) -> Iterator[Path]:
     """Yield a fresh temporary folder beside ``out``; on success it becomes ``out``, on failure it is removed.
 
-    An existing ``out`` is only replaced when it is empty or a scene folder, so that a mistyped path cannot destroy
-    files. Raises InputError otherwise, or when the location cannot be written.
+    ``out`` is held by this thread meanwhile (``lock_beside``), and exchanged at the end (``replacing_tree``). An
+    existing ``out`` is only replaced when it is empty or a scene folder, so that a mistyped path cannot destroy files.
+    Raises InputError otherwise, or when the location cannot be written.
     """
     out = out.resolve()
-    if out.is_dir():
-        _require_own(out)
-    elif out.exists() or out.is_symlink():
-        raise InputError(f"{out}: is a file; choose a folder")
-    tag = f"{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    partial, old = out.with_name(f".{out.name}.partial-{tag}"), out.with_name(f".{out.name}.old-{tag}")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial.mkdir()
-        yield partial
-        if out.exists():
-            out.rename(old)
-        try:
-            partial.rename(out)
-        except OSError:
-            if old.exists():
-                old.rename(out)
-            raise
+        with lock_beside(out):
+            recover(out)
+            if out.is_dir():
+                _require_own(out)
+            elif out.exists() or out.is_symlink():
+                raise InputError(f"{out}: is a file; choose a folder")
+            with replacing_tree(out) as partial:
+                yield partial
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
         ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        if out.exists():
-            shutil.rmtree(old, ignore_errors=True)

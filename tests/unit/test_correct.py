@@ -8,7 +8,8 @@ import shutil
 import numpy as np
 import pytest
 from physgen.batch.cli import main
-from physgen.sim.app.reconstruct import STAMP_FILE, Physics, correct, reconstruct, require_stamp, set_physics
+from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
+from physgen.sim.app.reconstruct_record import STAMP_FILE, require_request
 from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -55,8 +56,10 @@ def scene(reconstructed, tmp_path):
     """A scene that came from the photo beside it."""
     shutil.copytree(reconstructed, tmp_path, dirs_exist_ok=True)
     stamp = tmp_path / "scene" / STAMP_FILE
-    assert require_stamp(load_scene(tmp_path / "scene")).photo == reconstructed / "photo.png"
+    assert require_request(load_scene(tmp_path / "scene")).photo == reconstructed / "photo.png"
     stamp.write_text(json.dumps(json.loads(stamp.read_text()) | {"photo": str(tmp_path / "photo.png")}))
+    # The record was changed by another hand than PhysGen's, and the user agrees to it.
+    require_request(load_scene(tmp_path / "scene"), lambda source, claims: True)
     return tmp_path / "scene"
 
 
@@ -75,9 +78,10 @@ def changed(scene, before):
 
 def corrected(scene, **changes):
     """Correct fields of the object ``left``; the stages that were computed again."""
-    before, stamp = stages(scene), require_stamp(load_scene(scene))
-    first = dataclasses.replace(stamp.objects[0], **changes)
-    correct(load_scene(scene), objects=[first, *stamp.objects[1:]], options=stamp.options)
+    before, earlier = stages(scene), require_request(load_scene(scene))
+    first = dataclasses.replace(earlier.objects[0], **changes)
+    objects = [first, *earlier.objects[1:]]
+    correct(load_scene(scene), earlier=earlier, objects=objects, options=earlier.options)
     return changed(scene, before)
 
 
@@ -93,11 +97,12 @@ def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_
     again = corrected(scene, mask=tmp_path / "mask.png")
     assert {"background", "mesh", "shadows"} <= again
     assert (np.asarray(Image.open(scene / "masks" / "left.png")) > 0).sum() == mask.sum()
-    before, stamp = stages(scene), require_stamp(load_scene(scene))
+    before, earlier = stages(scene), require_request(load_scene(scene))
     correct(
         load_scene(scene),
-        objects=stamp.objects,
-        options=dataclasses.replace(stamp.options, pitch_deg=None, horizon_y=-0.2),
+        earlier=earlier,
+        objects=earlier.objects,
+        options=dataclasses.replace(earlier.options, pitch_deg=None, horizon_y=-0.2),
     )
     assert changed(scene, before) >= {"mesh", "shadows", "background"} and "segment" not in changed(scene, before)
 
@@ -132,10 +137,10 @@ def test_on_the_command_line(scene, capsys):
 
 def test_a_scene_that_cannot_say_where_it_comes_from_is_refused(scene, tmp_path):
     (tmp_path / "photo.png").rename(tmp_path / "gone.png")
-    stamp = require_stamp(load_scene(scene))
+    earlier = require_request(load_scene(scene))
     with pytest.raises(InputError, match="no longer there"):
-        correct(load_scene(scene), objects=stamp.objects, options=stamp.options)
+        correct(load_scene(scene), earlier=earlier, objects=earlier.objects, options=earlier.options)
     for garbage in ("{}", "[1]", "nonsense", json.dumps({"inputs_hash": "x", "photo": 3})):
         (scene / STAMP_FILE).write_text(garbage, encoding="utf-8")
         with pytest.raises(InputError, match=STAMP_FILE):
-            require_stamp(load_scene(scene))
+            require_request(load_scene(scene))

@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.app.reconstruct import Stamp, reconstruct
+from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.app.reconstruct_record import require_request
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.adapters import resolve
@@ -25,7 +26,7 @@ from physgen.sim.reconstruct.adapters.adapter_registry import chosen_segmenter, 
 from physgen.sim.reconstruct.models import known_models, model_folder
 from physgen.sim.reconstruct.models.known_models import PackagedModel
 from physgen.sim.reconstruct.models.model_archive import ArchiveReader
-from physgen.sim.validation import parse, read_json
+from physgen.sim.scene.folder import load_scene
 from PIL import Image
 
 from .onnx_models import colour_segmenter, constant_segmenter
@@ -348,8 +349,8 @@ def test_a_reconstruction_uses_it_tells_and_can_do_without(model, archive, tmp_p
         said.clear()
         told = lambda event: said.append(str(event.get("message")))  # noqa: E731
         reconstruct(tmp_path / "photo.png", requests, out=out, options=replace(options, **changes), on_event=told)
-        stamp = parse(Stamp, read_json(out / "reconstruct.json"), "")
-        return np.asarray(Image.open(out / "masks" / "ball.png")) > 127, stamp.options.segmenter
+        used = require_request(load_scene(out)).options.segmenter
+        return np.asarray(Image.open(out / "masks" / "ball.png")) > 127, used
 
     mask, used = run()
     assert used == "isnet" and (mask & truth).sum() / (mask | truth).sum() > 0.97

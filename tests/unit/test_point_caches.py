@@ -7,14 +7,17 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from physgen.sim.cache import folder_lock as folder_lock_module
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_manifest, save_manifest
-from physgen.sim.cache.folder_lock import LOCK_FILE, folder_lock
+from physgen.sim.cache.folder_lock import LOCK_FILE, folder_lock, is_held, is_locked
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 
@@ -122,18 +125,98 @@ def test_no_bake_says_what_to_run(tmp_path):
         load_manifest(tmp_path)
 
 
-def test_a_living_process_keeps_its_folder(tmp_path):
-    other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    try:
-        (tmp_path / LOCK_FILE).write_text(json.dumps({"pid": other.pid, "host": socket.gethostname()}))
-        with pytest.raises(InputError, match=f"in use by process {other.pid}"), folder_lock(tmp_path):
-            pass
-    finally:
+HOLDER = """
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from physgen.sim.cache.folder_lock import folder_lock
+with folder_lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that holds ``tmp_path``."""
+    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        yield other
         other.kill()
-        other.wait()
+
+
+def test_a_living_process_keeps_its_folder(tmp_path, holder):
+    with pytest.raises(InputError, match=f"in use by process {holder.pid}"), folder_lock(tmp_path):
+        pass
+    assert is_locked(tmp_path)
+    holder.kill()
+    holder.wait()
+    # Its file is still there; the lock went with it.
+    assert (tmp_path / LOCK_FILE).exists() and not is_locked(tmp_path)
     with folder_lock(tmp_path):
         assert json.loads((tmp_path / LOCK_FILE).read_text())["pid"] == os.getpid()
     assert not (tmp_path / LOCK_FILE).exists()
+
+
+def test_a_number_that_another_process_has_by_now_blocks_nobody(tmp_path, holder):
+    """As after a reboot: the text names a living process, which started at another time than it says."""
+    left = json.loads((tmp_path / LOCK_FILE).read_text())
+    holder.kill()
+    holder.wait()
+    pid, started, machine = left["mark"].split("-")
+    for mark in (f"{os.getppid()}-{started}-{machine}", f"1-{started}-{machine}", f"{pid}-0-{machine}"):
+        (tmp_path / LOCK_FILE).write_text(json.dumps({**left, "pid": int(mark.split("-")[0]), "mark": mark}))
+        with folder_lock(tmp_path):
+            pass
+
+
+def test_another_machines_run_is_respected(tmp_path):
+    (tmp_path / LOCK_FILE).write_text(json.dumps({"pid": 7, "host": "elsewhere", "mark": "7-abc-00000000"}))
+    words = r"process 7 on elsewhere; if that run is gone, delete .*\.lock"
+    with pytest.raises(InputError, match=words), folder_lock(tmp_path):
+        pass
+    assert (tmp_path / LOCK_FILE).exists() and is_held(tmp_path) and not is_locked(tmp_path)
+
+
+def test_looking_at_a_lock_takes_nothing(tmp_path, holder):
+    """Blender's timer looks twice a second: no run may be refused for that."""
+    holder.stdin.close()
+    holder.wait()
+    stop = threading.Event()
+    looks = [0]
+
+    def look():
+        while not stop.is_set():
+            is_locked(tmp_path)
+            looks[0] += 1
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    for _ in range(200):
+        with folder_lock(tmp_path):
+            assert not is_locked(tmp_path)
+    stop.set()
+    watcher.join()
+    assert looks[0] > 10
+
+
+def test_of_two_threads_one_holds_the_folder(tmp_path):
+    words = f"in use by another job of this process .{os.getpid()}."
+    with folder_lock(tmp_path), ThreadPoolExecutor(1) as other, pytest.raises(InputError, match=words):
+        other.submit(lambda: folder_lock(tmp_path).__enter__()).result()
+
+
+def test_without_locks_of_the_kernel_the_text_decides(tmp_path, holder, monkeypatch):
+    """As on a network disk that has none."""
+    monkeypatch.setattr(folder_lock_module, "_take", lambda file: None)
+    with pytest.raises(InputError, match=f"in use by process {holder.pid}"), folder_lock(tmp_path):
+        pass
+    holder.kill()
+    holder.wait()
+    with folder_lock(tmp_path):
+        pass
 
 
 @pytest.mark.parametrize("content", ["", "garbage", "[]", '{"pid": "x"}'])

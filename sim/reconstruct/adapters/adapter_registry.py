@@ -26,6 +26,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...scene.meshes import MESH_SUFFIXES
+from ...trust import Spec, trusted_spec
 from ..models.known_models import PackagedModel
 from ..models.model_folder import list_models
 from .protocols import MEANINGS, STAGES
@@ -312,13 +313,13 @@ WITHOUT = "none"
 """A segmenter's name that stands for the weight-free way, also where a model is installed."""
 
 
-def chosen_segmenter(asked: str | None) -> str | None:
+def chosen_segmenter(asked: Spec | None) -> str | None:
     """Return the segmenter for what a user ``asked``: by default an installed model that can be used, if there is one.
 
     None is the weight-free way.
     """
     if asked is not None:
-        return None if asked == WITHOUT else asked
+        return None if asked == WITHOUT else trusted_spec(asked)
     if onnxruntime_version() is None:
         return None
     good = [item.model for item in list_models() if item.is_installed and item.problem is None]
@@ -326,10 +327,11 @@ def chosen_segmenter(asked: str | None) -> str | None:
     return next((model.name for model in good if isinstance(model, PackagedModel)), None)
 
 
-def adapter_content(stage: str, spec: str | None) -> tuple[str, ...]:
+def adapter_content(stage: str, spec: Spec | None) -> tuple[str, ...]:
     """Return the specification and the hashes of its files, as a cache key; () for none."""
     if spec is None:
         return ()
+    spec = trusted_spec(spec)
     try:
         return (
             spec,

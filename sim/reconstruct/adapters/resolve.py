@@ -19,6 +19,7 @@ from typing import Any, Literal, overload
 
 from ...errors import InputError
 from ...events import IsCancelled, never
+from ...trust import TrustedSpec, UntrustedSpec, trusted_spec
 from ..models import known_models
 from ..models.model_folder import models_folder
 from .adapter_registry import (
@@ -63,19 +64,21 @@ _FILES: dict[str, Callable[[Path, str], Any]] = {"lama": load_lama, "picture": l
 
 @overload
 def resolve(
-    stage: Literal["segmenter"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+    stage: Literal["segmenter"], spec: TrustedSpec, cancelled: IsCancelled = ..., names: Path | None = ...
 ) -> Segmenter: ...
 @overload
 def resolve(
-    stage: Literal["inpainter"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+    stage: Literal["inpainter"], spec: TrustedSpec, cancelled: IsCancelled = ..., names: Path | None = ...
 ) -> Inpainter: ...
 @overload
 def resolve(
-    stage: Literal["depth_estimator"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...
+    stage: Literal["depth_estimator"], spec: TrustedSpec, cancelled: IsCancelled = ..., names: Path | None = ...
 ) -> DepthEstimator: ...
 @overload
-def resolve(stage: Literal["mesher"], spec: str, cancelled: IsCancelled = ..., names: Path | None = ...) -> Mesher: ...
-def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path | None = None) -> Any:
+def resolve(
+    stage: Literal["mesher"], spec: TrustedSpec, cancelled: IsCancelled = ..., names: Path | None = ...
+) -> Mesher: ...
+def resolve(stage: str, spec: TrustedSpec, cancelled: IsCancelled = never, names: Path | None = None) -> Any:
     """Return the adapter ``spec`` for ``stage``, as in ``protocols``; nothing is run yet.
 
     cancelled: polled while a program runs; a Python function is not interrupted. names: the user's file of names, in
@@ -86,6 +89,9 @@ def resolve(stage: str, spec: str, cancelled: IsCancelled = never, names: Path |
     """
     if stage not in STAGES:
         raise InputError(f"stage {stage!r}: is unknown; choose one of {', '.join(STAGES)}")
+    if isinstance(spec, UntrustedSpec):
+        # Types keep it out of this tree's code; this keeps it out of everybody's.
+        trusted_spec(spec)
     parts = split_spec(spec)
     if parts is not None:
         return _of_kind(stage, *parts, cancelled)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ...errors import InputError
+from ...trust import trusted_spec
 from ..adapters.adapter_registry import adapter_content
 from ..adapters.protocols import SoftSegmenter
 from ..adapters.resolve import resolve
@@ -130,7 +131,7 @@ def segment_objects(
     wanted = [i for i in range(len(objects)) if i not in given]
     soft: SoftSegmenter | None = None
     if options.segmenter is not None and wanted:
-        cutter = resolve("segmenter", options.segmenter, steps.cancelled)
+        cutter = resolve("segmenter", trusted_spec(options.segmenter), steps.cancelled)
         steps.notice(f"cut-outs: by {options.segmenter}; --segmenter none cuts out by colour and texture instead")
         if isinstance(cutter, SoftSegmenter):
             soft = cutter

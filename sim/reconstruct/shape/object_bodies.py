@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...scene.model import Camera
+from ...trust import trusted_spec
 from ..adapters.adapter_registry import adapter_content
 from ..adapters.protocols import Mesher
 from ..adapters.resolve import resolve
@@ -251,7 +252,7 @@ def make_bodies(
     depth: a depth map of the photo, which shapes the fronts of inflated bodies. Raises InputError for an outline or
     mesh that no body can be made from.
     """
-    mesher = None if options.mesher is None else resolve("mesher", options.mesher, steps.cancelled)
+    mesher = None if options.mesher is None else resolve("mesher", trusted_spec(options.mesher), steps.cancelled)
     bodies = []
     for i, item in enumerate(objects):
         steps.begin(f"mesh {item.name}")

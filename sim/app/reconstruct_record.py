@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: MIT
+"""``reconstruct.json``: what a scene folder was reconstructed from; to whoever reads it, a stranger's wishes.
+
+Its paths and adapters reach beyond the folder, so it is ``Untrusted`` (``sim/trust.py``): a folder that this user made
+is in their list, any other counts after their word.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import InputError
+from ..reconstruct import ObjectRequest, ReconstructOptions
+from ..reconstruct.adapters.protocols import STAGES
+from ..reconstruct.adapters.spec_claims import spec_claim
+from ..scene.folder import Scene
+from ..trust import NOTHING, READS, Agreed, Claim, Replaced, Untrusted, UntrustedSpec, trusted_spec
+from ..validation import MAX_JSON_BYTES, parse, to_json
+
+T = TypeVar("T")
+
+STAMP_FILE = "reconstruct.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What a scene was reconstructed from: ``photo``, ``objects`` and ``options``, with absolute paths."""
+
+    photo: Path
+    objects: tuple[ObjectRequest, ...]
+    options: ReconstructOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stamp:
+    """Record of what a scene folder was reconstructed from.
+
+    inputs_hash: of all that the scene depends on. presets: material presets asked for, by object. scene: ``scene.json``
+    as reconstructed, before physics or light were edited. request: what was asked for.
+    """
+
+    inputs_hash: str
+    presets: tuple[str | None, ...]
+    scene: Any
+    request: Untrusted[Request]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    inputs_hash: str
+    photo: Path
+    objects: tuple[ObjectRequest, ...]
+    options: ReconstructOptions
+    scene: Any
+
+
+def stamp_to_json(inputs_hash: str, request: Request, scene: Any) -> dict[str, Any]:
+    """Return the content of ``reconstruct.json``; ``scene`` is that of ``scene.json``. Paths become absolute."""
+    file = _File(
+        inputs_hash=inputs_hash,
+        photo=request.photo.resolve(),
+        objects=tuple(_resolved(item, ("mask", "mesh")) for item in request.objects),
+        options=_resolved(request.options, ("environment", "depth")),
+        scene=scene,
+    )
+    return to_json(file)  # type: ignore[no-any-return]
+
+
+def _resolved(value: T, names: Sequence[str]) -> T:
+    """Return the dataclass ``value`` with the paths in its fields ``names`` absolute."""
+    paths = {name: path.resolve() for name in names if (path := getattr(value, name)) is not None}
+    return dataclasses.replace(value, **paths)  # type: ignore[type-var]
+
+
+def read_stamp(root: Path) -> Stamp | None:
+    """Return the record of what the folder ``root`` was reconstructed from; None without one, or of another version."""
+    path = root / STAMP_FILE
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(MAX_JSON_BYTES + 1)
+        if len(content) > MAX_JSON_BYTES:
+            return None
+        file = parse(_File, json.loads(content), STAMP_FILE)
+    except (OSError, ValueError, RecursionError, InputError):
+        return None
+    return Stamp(
+        inputs_hash=file.inputs_hash,
+        presets=tuple(item.preset for item in file.objects),
+        scene=file.scene,
+        request=Untrusted(
+            path,
+            content,
+            lambda: list(_claims(file, root)),
+            lambda replaced: _released(file, replaced),
+        ),
+    )
+
+
+def require_stamp(scene: Scene) -> Stamp:
+    """Return the record of what ``scene`` was reconstructed from. Raises InputError when it has none."""
+    stamp = read_stamp(scene.root)
+    if stamp is None:
+        raise InputError(
+            f"{scene.root}: has no record of its reconstruction ({STAMP_FILE} is missing or of another version); "
+            "reconstruct it from the photo again"
+        )
+    return stamp
+
+
+def require_request(scene: Scene, agreed: Agreed | None = None, replaced: Replaced = NOTHING) -> Request:
+    """Return what ``scene`` was reconstructed from, for a correction.
+
+    agreed: asked about paths and adapters of a folder that this user has neither made nor agreed to. replaced:
+    values that are given anew, by fields such as ``options.segmenter`` and ``objects.cup.mask``. Raises InputError
+    without a record, and ``NotTrusted``.
+    """
+    return require_stamp(scene).request.opened(agreed, replaced)
+
+
+def _claims(file: _File, root: Path) -> Iterator[Claim]:
+    """Yield all that the record asks for beyond the folder ``root``: every path and every adapter in it."""
+    for where, path in _paths(file):
+        try:
+            within = path.resolve().is_relative_to(root.resolve())
+        except (OSError, ValueError, RuntimeError):
+            within = False
+        if not within:
+            yield Claim(READS, where, str(path))
+    for stage in STAGES:
+        spec = getattr(file.options, stage)
+        if spec is not None:
+            text = spec.claimed() if isinstance(spec, UntrustedSpec) else str(spec)
+            claim = spec_claim(stage, text, f"options.{stage}")
+            if claim is not None:
+                yield claim
+
+
+def _paths(file: _File) -> Iterator[tuple[str, Path]]:
+    """Yield every field that is a path: by its type, so that none can be forgotten."""
+    yield "photo", file.photo
+    for number, item in enumerate(file.objects, start=1):
+        for field in dataclasses.fields(item):
+            value = getattr(item, field.name)
+            if isinstance(value, Path):
+                yield f"objects.{item.name or f'object_{number}'}.{field.name}", value
+    for field in dataclasses.fields(file.options):
+        value = getattr(file.options, field.name)
+        if isinstance(value, Path):
+            yield f"options.{field.name}", value
+
+
+def _released(file: _File, replaced: Replaced) -> Request:
+    """Return the request for use; called by ``Untrusted.opened`` alone."""
+    options: dict[str, Any] = {}
+    for stage in STAGES:
+        spec = getattr(file.options, stage)
+        options[stage] = trusted_spec(spec.claimed()) if isinstance(spec, UntrustedSpec) else spec
+    fields = [field.name for field in dataclasses.fields(ReconstructOptions)]
+    options |= {name: replaced[f"options.{name}"] for name in fields if f"options.{name}" in replaced}
+    objects = []
+    for number, item in enumerate(file.objects, start=1):
+        start = f"objects.{item.name or f'object_{number}'}."
+        given = {name.removeprefix(start): value for name, value in replaced.items() if name.startswith(start)}
+        objects.append(dataclasses.replace(item, **given))
+    return Request(
+        photo=file.photo,
+        objects=tuple(objects),
+        options=dataclasses.replace(file.options, **options),
+    )
