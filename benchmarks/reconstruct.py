@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Accuracy of the reconstruction on rendered photos of known truth. Needs bpy.
 
-    python -m physgen.benchmarks.reconstruct [--set test|dev|turntable] [--sample] [--only CASE …] [--pictures DIR]
-                                             [--scenes DIR] [--report FILE] [--sheet FILE.png] [--turntables DIR]
+    python -m physgen.benchmarks.reconstruct [--set test|dev|turntable|held_out] [--sample] [--only CASE …]
+                                             [--pictures DIR] [--scenes DIR] [--report FILE]
+                                             [--sheet FILE.png] [--turntables DIR]
 
 Each picture and its boxes follow from a seed (``reconstruct_pictures/cases.py``; what is known of it:
 ``reconstruct_pictures/FORMAT.md``). ``test`` is for measuring; tune on ``dev`` only. The reconstruction runs in its own
@@ -19,7 +20,7 @@ within 3° where there are vanishing points.
 is known all around. Views of the reconstruction at ±90° and 180° are compared with the true ones
 (``reconstruct_pictures/view_distance.py``), and marks seen from behind that are not there are counted
 (``salient_marks.py``; required: none). A failed case counts as a distance of 100. ``--turntables`` writes the true body
-beside the found one.
+beside the found one. ``--set held_out`` is the same for five other bodies on which nothing is tuned.
 
 ``--quick`` is one case of ``turntable`` with one sample per pixel.
 """
@@ -39,7 +40,8 @@ import numpy as np
 from numpy.typing import NDArray
 from physgen.benchmarks.common import benchmark_parser
 from physgen.benchmarks.reconstruct_pictures import attempt, contact_sheet, scoring, turntable_scoring
-from physgen.benchmarks.reconstruct_pictures.picture_sets import SETS, draw
+from physgen.benchmarks.reconstruct_pictures.cases import Case
+from physgen.benchmarks.reconstruct_pictures.picture_sets import SETS, SHOTS, draw
 from physgen.benchmarks.reconstruct_pictures.scoring import Truth, load_truth
 from physgen.sim.scene.folder import load_scene
 from PIL import Image
@@ -141,13 +143,13 @@ def summary_text(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def viewed(number: int, truth: Truth, scene: Path, row: dict[str, Any], sheets: Path | None) -> None:
-    """Add to ``row`` what the turntable of case ``number`` shows; write the true body beside the found one."""
+def viewed(case: Case, truth: Truth, scene: Path, row: dict[str, Any], sheets: Path | None) -> None:
+    """Add to ``row`` what the turntable of ``case`` shows; write the true body beside the found one."""
     item = truth.objects[0]
     if row["error"] is not None:
         row["objects"][item.name] |= turntable_scoring.FAILED
         return
-    true = turntable_scoring.true_body(draw("turntable", number))
+    true = turntable_scoring.true_body(case)
     found = turntable_scoring.found_body(load_scene(scene), scoring.alias(truth)[item.name])
     row["objects"][item.name] |= turntable_scoring.compared(true, found).numbers
     if sheets is not None:
@@ -160,14 +162,14 @@ def measure(
     scenes: Path,
     lines: list[NDArray[np.uint8]] | None,
     *,
-    turntables: bool = False,
+    turntables: str | None = None,
     sheets: Path | None = None,
     judge: bool = False,
 ) -> list[dict[str, Any]]:
     """Return the rows of all cases, given by number and folder; append the contact sheet's rows to ``lines``.
 
-    turntables: whether the cases are of that set. sheets: folder of their sheets. judge: scenes that are there are
-    judged as they are.
+    turntables: their set if it is one of bodies known all around. sheets: folder of their sheets. judge: scenes that
+    are there are judged as they are.
     """
     rows = []
     for number, folder in cases:
@@ -176,8 +178,8 @@ def measure(
         answer = place / attempt.ANSWER
         said = json.loads(answer.read_text()) if judge and answer.is_file() else attempted(truth, place)
         row = scoring.judge(truth, place / attempt.SCENE, said)
-        if turntables:
-            viewed(number, truth, place / attempt.SCENE, row, sheets)
+        if turntables is not None:
+            viewed(draw(turntables, number), truth, place / attempt.SCENE, row, sheets)
         sys.stderr.write(table([row]).split("\n", 1)[1] + "\n")
         rows.append(row)
         if lines is not None:
@@ -208,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             numbers = [n for n in numbers if (pictures / f"case_{n:02}" / "truth.json").is_file()]
         cases = [(number, rendered(options.set, number, pictures, options.samples)) for number in numbers]
         lines: list[NDArray[np.uint8]] | None = [] if options.sheet else None
-        turntables = options.set == "turntable"
+        turntables = options.set if options.set in SHOTS else None
         rows = measure(
             cases,
             options.scenes or Path(scratch) / "scenes",

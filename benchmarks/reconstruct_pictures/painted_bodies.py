@@ -8,7 +8,7 @@ along -y.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import trimesh
@@ -31,7 +31,15 @@ WAVES = 28
 
 def make_painted(kind: str, size: float) -> Body:
     """A body of ``kind`` that stands on the origin; ``size``: its largest extent along an axis, metres."""
-    parts = [(fine(part), painter) for part, painter in _MAKERS[kind]()]
+    return painted_body(_MAKERS[kind](), size, smooth=kind not in ("chair", "carton"))
+
+
+def painted_body(painted: Sequence[Painted], size: float, *, smooth: bool) -> Body:
+    """The body of ``painted`` parts that stands on the origin; ``size``: its largest extent along an axis, metres.
+
+    smooth: whether its surface is shaded round.
+    """
+    parts = [(fine(part), painter) for part, painter in painted]
     colours = np.concatenate([np.clip(painter(np.asarray(part.vertices)), 0.01, 0.9) for part, painter in parts])
     low = np.min([part.bounds[0] for part, _ in parts], axis=0)
     high = np.max([part.bounds[1] for part, _ in parts], axis=0)
@@ -44,7 +52,7 @@ def make_painted(kind: str, size: float) -> Body:
     return Body(
         parts=tuple((part, 0) for part, _ in parts),
         volume=None,
-        smooth=kind not in ("chair", "carton"),
+        smooth=smooth,
         colours=colours,
     )
 

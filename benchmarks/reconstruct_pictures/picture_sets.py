@@ -4,62 +4,98 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from . import cases, thin_bodies
 from .cases import Case, Item
+from .held_out_bodies import KINDS as HELD_OUT
+from .held_out_bodies import make_held_out
 from .painted_bodies import KINDS, make_painted
 
-SETS = {**cases.SETS, "turntable": (len(KINDS), 900), "thin": (len(thin_bodies.KINDS), 950)}
-"""Pictures of a set, and the first of their seeds. ``turntable`` has one painted thing each (``painted_bodies.py``),
-``thin`` one with holes and thin parts, or of its ground's tone (``thin_bodies.py``)."""
 
-TURNS_DEG = {"plush": 12.0, "mug": -15.0, "chair": 28.0, "dog": 18.0, "carton": 24.0}
-"""How far each is turned to the left from facing the camera."""
-GROUNDS = ("boards", "plain", "concrete", "cloth", "marble")
-LIGHTS = ("window", "overcast", "sun", "two", "window")
-SIZES_M = (0.3, 0.1, 0.85, 0.35, 0.4)
+class Shot(NamedTuple):
+    """How a painted thing is photographed.
+
+    turn: how far it is turned to the left from facing the camera; pitch, view: of the camera, all degrees.
+    """
+
+    kind: str
+    turn: float
+    ground: str
+    light: str
+    size_m: float
+    pitch: float = 15.0
+    view: float = 50.0
+    roughness: float = 0.8
+    size_px: tuple[int, int] = (640, 480)
+
+
+SHOTS = {
+    "turntable": (
+        Shot("plush", 12.0, "boards", "window", 0.3),
+        Shot("mug", -15.0, "plain", "overcast", 0.1, roughness=0.35),
+        Shot("chair", 28.0, "concrete", "sun", 0.85),
+        Shot("dog", 18.0, "cloth", "two", 0.35),
+        Shot("carton", 24.0, "marble", "window", 0.4, pitch=22.0),
+    ),
+    "held_out": (
+        Shot("teapot", 8.0, "boards", "window", 0.25, pitch=20.0, view=40.0, roughness=0.5),
+        Shot("bird", -14.0, "concrete", "two", 0.2, pitch=12.0, view=55.0),
+        Shot("stool", 10.0, "boards", "overcast", 0.7, pitch=18.0, view=45.0, size_px=(480, 640)),
+        Shot("sock", -20.0, "plain", "window", 0.3, pitch=26.0, view=60.0, size_px=(480, 640)),
+        Shot("radio", 22.0, "cloth", "sun", 0.3, pitch=16.0, view=38.0, roughness=0.45),
+    ),
+}
+"""Pictures of single painted things, one set for changes to be guided by, one kept aside."""
+SETS = {
+    **cases.SETS,
+    "turntable": (len(KINDS), 900),
+    "held_out": (len(HELD_OUT), 930),
+    "thin": (len(thin_bodies.KINDS), 950),
+}
+"""Pictures of a set, and the first of their seeds. ``turntable`` and ``held_out`` have one painted thing each
+(``painted_bodies.py``, ``held_out_bodies.py``), ``thin`` one with holes and thin parts, or of its ground's tone
+(``thin_bodies.py``)."""
 
 
 def draw(set_name: str, number: int) -> Case:
     """Picture ``number`` (from 0) of the set. Raises ValueError where there is none."""
-    if set_name == "turntable":
-        return _turntable(number)
+    if set_name in SHOTS:
+        return _painted(set_name, number)
     return _thin(number) if set_name == "thin" else cases.draw(set_name, number)
 
 
-def _turntable(number: int) -> Case:
-    count, first = SETS["turntable"]
+def _painted(set_name: str, number: int) -> Case:
+    count, first = SETS[set_name]
     if not 0 <= number < count:
-        raise ValueError(f"picture {number}: the set turntable has 0 to {count - 1}")
-    kind, seed = KINDS[number], first + number
+        raise ValueError(f"picture {number}: the set {set_name} has 0 to {count - 1}")
+    shot, seed = SHOTS[set_name][number], first + number
     rng = np.random.default_rng(seed)
-    turn = math.radians(-TURNS_DEG[kind])
+    turn = math.radians(-shot.turn)
     matrix = np.eye(4)
     matrix[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-    body = make_painted(kind, SIZES_M[number])
-    item = Item(f"{kind}_1", kind, body, matrix, np.full((2, 3), 0.3), "painted", 0.35 if kind == "mug" else 0.8)
+    body = (make_painted if set_name == "turntable" else make_held_out)(shot.kind, shot.size_m)
+    item = Item(f"{shot.kind}_1", shot.kind, body, matrix, np.full((2, 3), 0.3), "painted", shot.roughness)
     camera = None
-    pitch = math.radians(22.0 if kind == "carton" else 15.0)
     while camera is None:
-        camera = cases.aim([item], (640, 480), math.radians(50.0), pitch, 0.0, rng)
+        camera = cases.aim([item], shot.size_px, math.radians(shot.view), math.radians(shot.pitch), 0.0, rng)
     reach = float(np.abs(item.vertices).max())
-    ground = GROUNDS[number]
-    lamps, sky = cases.lights(LIGHTS[number], True, reach, rng)
+    lamps, sky = cases.lights(shot.light, True, reach, rng)
     return Case(
         name=f"case_{number:02}",
         seed=seed,
         camera=camera,
         items=(item,),
-        ground=ground,
-        ground_paint=cases.paint_of_ground(ground, rng),
+        ground=shot.ground,
+        ground_paint=cases.paint_of_ground(shot.ground, rng),
         ground_turn=float(rng.uniform(0, math.pi)),
         grain=0.6 * reach,
         wall=float(item.vertices[:, 1].max()) + 1.2 * reach,
         wall_turn=0.0,
         wall_paint=np.array([0.5, 0.52, 0.55]),
-        light=LIGHTS[number],
+        light=shot.light,
         lamps=lamps,
         sky=sky,
         sky_gradient=0.5,

@@ -278,3 +278,26 @@ def test_the_back_is_as_bright_on_both_sides():
     sides = [back[rows, int(middle[1] + turn * reach[1] / 4) - 8 :, :3][:, :16].mean() for turn in (-1, 1)]
     # In the photo they are 1.5 times apart.
     assert max(sides) / min(sides) < 1.15
+
+
+def test_a_ball_is_as_bright_behind_as_in_front_at_the_same_height():
+    """Light from above on a saturated colour, whose light is not told from paint: mirrored about the camera, which
+    looks down, the back would be pale."""
+    mask = ((COLUMNS - 160) ** 2 + (ROWS - 150) ** 2) < 80**2
+    pixels = np.full((HEIGHT, WIDTH, 3), (90, 110, 150), np.float64)
+    right, up = (COLUMNS[mask] - 160) / 80.0, (150 - ROWS[mask]) / 80.0
+    height = up * math.cos(math.radians(30.0)) + np.sqrt(1 - right**2 - up**2) * math.sin(math.radians(30.0))
+    pixels[mask] = np.array([1.0, 0.7, 0.02]) * (180 + 70 * height)[:, None]
+    pixels = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.uint8)
+    view = camera_above_ground(WIDTH, HEIGHT, 380.0, math.radians(30.0))
+    request = ObjectRequest(box=(0, 0, 9, 9), name="ball", shape="sphere")
+    ball = build_body(view, mask, request, ReconstructOptions(mesh_vertices=3000), lambda said: None).mesh
+    surface = textured_body(view, ball, crop_texture(pixels, mask), mask)
+    front, back = (seen_from(surface, turn).astype(int) for turn in (0, 180))
+    for row in (60, 90, 130, 170):
+        difference = front[row, 100:160, :3].mean(axis=0) - back[row, 100:160, :3].mean(axis=0)
+        assert np.abs(difference).max() < 4, f"row {row}"
+    # The blue of the background in the photo's outermost pixels is seen from no side.
+    for turn in (40, 60, 80, 100, 120):
+        image = seen_from(surface, turn).astype(int)
+        assert (image[..., 2] < 0.12 * image[..., 0])[image[..., 3] > 0].all(), turn

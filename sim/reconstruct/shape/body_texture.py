@@ -90,18 +90,7 @@ def _counterparts(camera: Camera, primitive: Primitive, points: Points) -> Point
     if isinstance(primitive, Box):
         return _on_box(camera, primitive, points)
     if isinstance(primitive, Sphere):
-        # In units of its semi-axes it is a unit sphere.
-        axis = (camera.position - primitive.centre) / primitive.axes
-        distance = float(np.linalg.norm(axis))
-        axis = axis / distance
-        offset = (points - primitive.centre) / primitive.axes
-        along = offset @ axis
-        across = offset - along[:, None] * axis
-        span = np.linalg.norm(across, axis=1)
-        angle = _folded(np.arctan2(span, along), float(np.arccos(min(1.0 / distance, 0.999))))
-        side = across / np.maximum(span, 1e-12)[:, None]
-        ball = np.cos(angle)[:, None] * axis + np.sin(angle)[:, None] * side
-        return np.asarray(primitive.centre + primitive.axes * ball)
+        return _on_sphere(camera, primitive, points)
     assert isinstance(primitive, SurfaceOfRevolution)
     foot = np.array([primitive.x, primitive.y])
     axis2 = camera.position[:2] - foot
@@ -121,9 +110,38 @@ def _counterparts(camera: Camera, primitive: Primitive, points: Points) -> Point
     return np.column_stack([foot + radius[:, None] * turned, z])
 
 
-def _folded(angle: Points, rim: float) -> Points:
+def _on_sphere(camera: Camera, sphere: Sphere, points: Points) -> Points:
+    """Points (n, 3) on the visible side of ``sphere`` at the height of ``points`` (n, 3), where light from above falls
+    alike; at another height where none of it is visible."""
+    # In units of its semi-axes it is a unit sphere.
+    axis = (camera.position - sphere.centre) / sphere.axes
+    distance = float(np.linalg.norm(axis))
+    axis = axis / distance
+    rim = float(np.arccos(min(1.0 / distance, 0.999)))
+    offset = (points - sphere.centre) / sphere.axes
+    offset = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
+    level = float(np.hypot(axis[0], axis[1]))
+    ahead = axis[:2] / max(level, 1e-12)
+    left = np.array([-ahead[1], ahead[0]])
+    wide = np.hypot(offset[:, 0], offset[:, 1])
+    # How far around each height is visible, and the point as far from the middle of that.
+    limit = (np.cos(rim) - offset[:, 2] * axis[2]) / np.maximum(wide * level, 1e-12)
+    turn = np.arctan2(offset[:, :2] @ left, offset[:, :2] @ ahead)
+    turn = np.sign(turn) * _folded(np.abs(turn), np.arccos(np.clip(limit, -1.0, 1.0)))
+    ball = np.column_stack(
+        [wide[:, None] * (np.cos(turn)[:, None] * ahead + np.sin(turn)[:, None] * left), offset[:, 2]]
+    )
+    along = ball @ axis
+    across = ball - along[:, None] * axis
+    span = np.linalg.norm(across, axis=1)
+    angle = _folded(np.arctan2(span, along), rim)
+    side = across / np.maximum(span, 1e-12)[:, None]
+    return np.asarray(sphere.centre + sphere.axes * (np.cos(angle)[:, None] * axis + np.sin(angle)[:, None] * side))
+
+
+def _folded(angle: Points, rim: float | Points) -> Points:
     """Angles from the line of sight, 0 to π, folded at ``rim`` so that π maps to 0; a little of the rim is avoided."""
-    rim = max(rim - np.radians(8.0), np.radians(20.0))
+    rim = np.maximum(rim - np.radians(8.0), np.radians(20.0))
     return np.asarray(np.clip(np.where(angle > rim, rim - (angle - rim) * rim / (np.pi - rim), angle), 0.0, rim))
 
 
