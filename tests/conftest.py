@@ -61,7 +61,6 @@ LONGEST = (
     "test_headless.py",
     "test_camera_moves.py",
     "test_rigid_contact.py",
-    "test_raster.py",
     "test_import_splats.py",
     "test_correct.py",
     "test_photo_layers.py",
@@ -74,11 +73,15 @@ LONGEST = (
 )
 """Files that take longest, in this order: workers begin with them, so that none of them is the last one running."""
 
+ONE_THREAD = ("test_raster.py", "test_diagnose_rigid.py", "test_diagnose_rigid_resting.py", "test_diagnose_work.py")
+ONE_THREAD += ("test_soft_elements.py", "test_soft_fits.py")
+"""Files that ask Taichi for another number of threads, at which its process drops all kernels: they come first."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the files, but not the tests of a file, which may share what a fixture made."""
     rank = {name: index for index, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+    items.sort(key=lambda item: (item.path.name not in ONE_THREAD, rank.get(item.path.name, len(rank))))
 
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))

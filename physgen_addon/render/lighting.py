@@ -89,7 +89,9 @@ and avoids division by zero in crevices: (L + k) / (L₀ + k) is 1 at rest for e
 """
 
 BAKE_BUDGET = 2_000_000
-"""Light samples of one object's bake, divided among its vertices."""
+"""Light samples of one object's bake, divided among its corners of faces."""
+BAKE_SHARE = 16
+"""Largest number of them at a corner, over a frame's samples a pixel: a draft's frames are noisier than its bake."""
 SMOOTHING_STEPS = 2
 CALIBRATION_ROUNDS = 2
 MAX_CORRECTION = 4.0
@@ -137,7 +139,8 @@ def _bake(built: BlenderScene, target: RenderObject) -> NDArray[np.float64]:
     for other in built.objects:
         other.item.select_set(other is target, view_layer=layer)
     layer.objects.active = item
-    scene.cycles.samples = int(np.clip(BAKE_BUDGET / max(len(item.data.loops), 1), 4, 256))
+    most = min(BAKE_SHARE * built.options.samples, 256)
+    scene.cycles.samples = int(np.clip(BAKE_BUDGET / max(len(item.data.loops), 1), 4, most))
     render_engines.set_denoising(scene, False)
     context = {"scene": scene, "view_layer": layer, "active_object": item, "object": item, "selected_objects": [item]}
     try:

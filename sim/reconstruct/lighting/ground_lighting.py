@@ -50,7 +50,7 @@ class ShadowCaster:
     def __init__(self, surfaces: Sequence[Points], ground: Points) -> None:
         """surfaces: points (M, 3) on each object. ground: points (N, 2) to evaluate."""
         surface = np.concatenate(surfaces)
-        self._surface = np.column_stack([surface[:, :2], np.maximum(surface[:, 2], 0.0)])
+        self._surface = np.stack([surface[:, 0], surface[:, 1], np.maximum(surface[:, 2], 0.0)])
         self._ground = ground
         low, high = ground.min(axis=0), ground.max(axis=0)
         self._cell = max(float((high - low).max()) / CELLS, 1e-12)
@@ -65,16 +65,18 @@ class ShadowCaster:
 
     def thinned(self, index: NDArray[np.int64], step: int) -> ShadowCaster:
         """Return a faster one for the ground points ``index``, with every ``step``-th surface point."""
-        return ShadowCaster([self._surface[::step]], self._ground[index])
+        return ShadowCaster([self._surface[:, ::step].T], self._ground[index])
 
     def _shadow(self, direction: Points) -> NDArray[np.float32]:
         """The shadow (rows, columns) of light from the unit vector ``direction`` (3,) on the grid: 1 inside."""
+        rows, columns = self._shape
+        x, y, z = self._surface
         slide = direction[:2] / direction[2]
-        flat = (self._surface[:, :2] - self._surface[:, 2:] * slide - self._low) / self._cell
-        column, row = np.floor(flat).astype(np.int64).T
-        inside = (row >= 0) & (row < self._shape[0]) & (column >= 0) & (column < self._shape[1])
+        column = np.floor((x - z * slide[0] - self._low[0]) / self._cell)
+        row = np.floor((y - z * slide[1] - self._low[1]) / self._cell)
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         grid = np.zeros(self._shape, dtype=np.uint8)
-        grid[row[inside], column[inside]] = 1
+        grid.reshape(-1)[(row * columns + column)[inside].astype(np.int64)] = 1
         closed = cv2.morphologyEx(grid, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         # Smooth the stair-steps of the cells.
         return np.asarray(cv2.blur(closed.astype(np.float32), (3, 3)))
