@@ -19,6 +19,7 @@ from ..atomic import write_json
 from ..errors import InputError
 from ..validation import read_json, to_json
 from .capture import read_arrays
+from .provenance import Provenance
 from .work import WorkRecord
 
 Array = NDArray[np.float64]
@@ -92,14 +93,18 @@ class Fits(Protocol):
 
     nominal: the model as given. refitted: the same with its own parameters fitted. candidates: one or two effects each.
     floor_rms_m: noise floor, distance in m that noise alone leaves on held-out data.
-    numerics_rms_m: change in m of the nominal model's prediction when its resolution or time step changes.
+    grain_rms_m: distance in m by which the simulator's own uncertainty, at contacts and in its steps, moves the nominal
+        model's prediction of held-out data.
     """
 
     nominal: CandidateFit
     refitted: CandidateFit
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
-    numerics_rms_m: float
+    grain_rms_m: float
+
+    def numerics_rms_m(self, fit: CandidateFit) -> float:
+        """Return the distance in m by which predictions of ``fit`` change with resolution or time step."""
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """Return points (P, K, 3) in m at the ``predict_times`` of every predict trial, by its name."""
@@ -115,6 +120,9 @@ FORMAT = "physgen-diagnosis/1"
 REPORT_FILE, WHERE_FILE, PREDICTION_FILE, PAGE_FILE = "report.json", "where.npz", "prediction.npz", "report.html"
 
 NONE, UNKNOWN = "none", "unknown"
+
+SAME = "the same motion as without it"
+"""``RankedEffect.reason`` of an effect that changes nothing in this capture."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +140,10 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class RankedEffect:
-    """One candidate as listed in the report; NaN for missing numbers."""
+    """One candidate as listed in the report; NaN for missing numbers.
+
+    misfit: as of its fit. reason: why it is not the verdict, in a few words; "" for the verdict.
+    """
 
     name: str
     kind: str
@@ -140,13 +151,17 @@ class RankedEffect:
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
     heldout_rms_m: float = math.nan
     closed_fraction: float = math.nan
+    misfit: float = math.nan
+    reason: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """RMS distances in m on held-out data; closed_fraction with its 95 % bootstrap interval.
+    """RMS distances in m on held-out data; closed_fraction, at most 1, with its 95 % bootstrap interval around it.
 
-    numerics_rms_m: numerical error of the simulator (two resolutions).
+    numerics_rms_m: change of the prediction behind ``after`` with resolution or time step.
+    noise_rms_m: tracking noise of a point alone; the floor also has what it makes of a prediction from first frames.
+    grain_rms_m: how far the simulator's own uncertainty, at contacts and in its steps, moves the nominal prediction.
     """
 
     before_rms_m: float
@@ -157,6 +172,8 @@ class Gap:
     closed_fraction_ci95: tuple[float, float]
     resolvable: bool
     numerics_rms_m: float = math.nan
+    noise_rms_m: float = math.nan
+    grain_rms_m: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,6 +230,7 @@ class Diagnosis:
     controls: ``wrong_effect_rms_m`` and ``last_residual_rms_m``.
     summary: the verdict in a sentence. warnings: of the capture and of the diagnosis. confirmation: verification runs.
     seconds: wall time, the only number that differs when the same capture is diagnosed again. work: budget and use.
+    provenance: capture, command, version.
 
     >>> import physgen
     >>> found = physgen.diagnose(physgen.load_capture("capture"), out="diagnosis")  # doctest: +SKIP
@@ -231,6 +249,7 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
     work: WorkRecord | None = None
+    provenance: Provenance | None = None
     confirmation: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -278,6 +297,7 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "warnings": list(diagnosis.warnings),
             "seconds": diagnosis.seconds,
             "work": None if diagnosis.work is None else to_json(diagnosis.work),
+            "provenance": None if diagnosis.provenance is None else to_json(diagnosis.provenance),
         }
     )
 

@@ -23,30 +23,37 @@ from .diagnosis import (
     Localisation,
     ObjectShare,
 )
-from .model_comparison import ModelComparison
-
-RESOLVABLE = 1.5
-"""Gap over noise floor below which gap closure is not resolvable."""
+from .model_comparison import RESOLVABLE, ModelComparison, closed_fraction
 
 RESAMPLES = 400
+
+KNOWN_SHARE = 0.9
+"""Share of the resamples whose gap must be resolvable."""
 
 SHOWN_S = 0.15
 """Seconds counted as the first frames of a trial where no predict trial defines them."""
 
 
-def measure_gap(capture: Capture, fits: Fits, found: CandidateFit) -> Gap:
-    """Return distances on held-out trials, each predicted from its first frames, without the confidence interval."""
-    before, after, floor = fits.nominal.heldout_rms_m, found.heldout_rms_m, fits.floor_rms_m
-    room = before - floor
+def measure_gap(capture: Capture, fits: Fits, found: CandidateFit, nominal: Mapping[str, Array]) -> Gap:
+    """Return distances on held-out trials, each predicted from its first frames, without the confidence interval.
+
+    nominal: (T, K, 3) m by trial. The floor is an estimate: an error below it is the better one.
+    """
+    before, after = fits.nominal.heldout_rms_m, found.heldout_rms_m
+    floor = min(fits.floor_rms_m, before, after)
+    units = [metres_per_unit(capture, t, nominal[t.name]) for t in capture.fit_trials]
+    coordinates = 3 if capture.fit_trials[0].points is not None else 2
     return Gap(
         before_rms_m=before,
         refitted_rms_m=fits.refitted.heldout_rms_m,
         after_rms_m=after,
         noise_floor_rms_m=floor,
-        closed_fraction=(before - after) / room if room > 0 else math.nan,
+        closed_fraction=closed_fraction(before, after, floor),
         closed_fraction_ci95=(math.nan, math.nan),
         resolvable=bool(before > RESOLVABLE * floor),
-        numerics_rms_m=fits.numerics_rms_m,
+        numerics_rms_m=fits.numerics_rms_m(found),
+        grain_rms_m=fits.grain_rms_m,
+        noise_rms_m=float(math.sqrt(coordinates) * capture.noise_sigma * np.median(units)),
     )
 
 
@@ -60,7 +67,8 @@ def bootstrap_interval(
     """Return the 95 % interval of the closed fraction by bootstrap over trials (Efron, Ann. Statist. 7 (1979)).
 
     nominal, found: (T, K, 3) m by trial. Complete trials are resampled; the spread of their fraction is centred on the
-    fraction measured on held-out trials. (NaN, NaN) with fewer than two trials.
+    fraction measured on held-out trials, and both ends are fractions, from -1 to 1. (NaN, NaN) with fewer than two
+    trials, or where the gap of resampled trials is not resolvable.
     """
     rows = []
     for trial in capture.fit_trials:
@@ -77,11 +85,15 @@ def bootstrap_interval(
     picks = np.random.default_rng(0).integers(0, len(table), size=(RESAMPLES, len(table)))
     left = np.sqrt(table[picks].mean(axis=1))
     floor = gap.noise_floor_rms_m
-    fractions = (left[:, 0] - left[:, 1]) / np.maximum(left[:, 0] - floor, 1e-12)
-    whole = np.sqrt(table.mean(axis=0))
-    shift = gap.closed_fraction - (whole[0] - whole[1]) / max(whole[0] - floor, 1e-12)
-    low, high = np.quantile(fractions + shift, (0.025, 0.975))
-    return float(low), float(high)
+    before, after = np.sqrt(table.mean(axis=0))
+    whole = closed_fraction(float(before), float(after), floor)
+    fractions = np.array([closed_fraction(float(a), float(b), floor) for a, b in left])
+    fractions = fractions[np.isfinite(fractions)]
+    if not math.isfinite(whole) or len(fractions) < KNOWN_SHARE * RESAMPLES:
+        return math.nan, math.nan
+    value = gap.closed_fraction
+    low, high = (float(q) for q in np.quantile(fractions, (0.025, 0.975)) + value - whole)
+    return max(min(low, value), -1.0), min(max(high, value), 1.0)
 
 
 def carried_residual(capture: Capture, nominal: Mapping[str, Array]) -> float:

@@ -9,8 +9,10 @@ every extra parameter. Whether the best one explains them at all follows from it
 with the log evidence L_c in nats relative to the nominal model, a threshold d that only effects pay (chance gains of
 the search), a temperature T > 1 because trials of one recording share model errors, the misfit m_c of the fit, and
 a(m), the probability that the right candidate leaves a misfit of m (logistic in ln m). An effect that does not predict
-held-out trials better has no gain, whatever its evidence. The constants were set on captures of known cause made by
-other simulators (docs/diagnosis.md).
+held-out trials better has no gain, whatever its evidence; where one predicts them down to the noise, unknown yields to
+it, whatever its misfit. ``none`` is never said while the nominal model's held-out error is many times noise and grain
+(the simulator's own uncertainty): what it would get goes to ``unknown``. The constants were set on captures of known
+cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..effects.registry import effects
-from .diagnosis import NONE, UNKNOWN, CandidateFit, Fits, Verdict
+from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, Fits, Verdict
+from .report.wording import effect_label
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,8 @@ class ComparisonSettings:
     prior_none: prior probability that nothing is missing; the effects share the rest.
     second_gain, second_misfit: a pair of effects counts only if it gains more than this many nats over each single
         one, and each single one leaves more than this many times its misfit.
+    predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
+    many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
     alternative: effects with at least this fraction of the verdict's probability are named as alternatives.
     """
 
@@ -49,6 +54,8 @@ class ComparisonSettings:
     prior_none: float = 0.3
     second_gain: float = 15.0
     second_misfit: float = 1.15
+    predicted: tuple[float, float] = (0.9, 0.98)
+    many: float = 3.0
     alternative: float = 0.1
 
 
@@ -70,11 +77,15 @@ TWIN_SHARE = 0.003
 
 @dataclass(frozen=True, kw_only=True)
 class ModelComparison:
-    """probabilities: by name, including ``none`` and ``unknown``; they sum to 1. best: the fit behind each name."""
+    """probabilities: by name, including ``none`` and ``unknown``; they sum to 1. best: the fit behind each name.
+
+    reasons: why each effect is not the verdict, in a few words.
+    """
 
     verdict: Verdict
     probabilities: Mapping[str, float]
     best: Mapping[str, CandidateFit]
+    reasons: Mapping[str, str]
 
 
 def compare_models(fits: Fits, weighing: ComparisonSettings) -> ModelComparison:
@@ -82,11 +93,20 @@ def compare_models(fits: Fits, weighing: ComparisonSettings) -> ModelComparison:
     candidates = [nominal_or_refitted(fits), *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
     weights = _weights(candidates, weighing)
     adequate = [_adequacy(c.misfit, candidates[0].misfit, weighing) for c in candidates]
+    if _far_off(fits, weighing):
+        adequate[0] = 0.0
+    shares = [w * a for w, a in zip(weights, adequate, strict=True)]
+    predicted = [_predicted(c, fits, weighing) for c in candidates]
+    if max(predicted) > 0:
+        # What predicts held-out trials down to the noise is an explanation: unknown yields to it.
+        claims = np.array(predicted) * (np.array(weights) + 1e-12)
+        yielded = max(predicted) * max(0.0, 1.0 - sum(shares))
+        shares = [s + yielded * c for s, c in zip(shares, claims / claims.sum(), strict=True)]
     probabilities: dict[str, float] = {}
     best: dict[str, tuple[float, CandidateFit]] = {}
-    for fit, weight, chance in zip(candidates, weights, adequate, strict=True):
+    for fit, share in zip(candidates, shares, strict=True):
         name = fit.effects[0] if fit.effects else NONE
-        probability = float(weight * chance)
+        probability = float(share)
         probabilities[name] = probabilities.get(name, 0.0) + probability
         if name not in best or probability > best[name][0]:
             best[name] = (probability, fit)
@@ -94,7 +114,62 @@ def compare_models(fits: Fits, weighing: ComparisonSettings) -> ModelComparison:
     total = sum(probabilities.values())
     probabilities = {name: p / total for name, p in probabilities.items()}
     found = {name: fit for name, (_, fit) in best.items()}
-    return ModelComparison(verdict=_verdict(probabilities, found, weighing), probabilities=probabilities, best=found)
+    verdict = _verdict(probabilities, found, weighing)
+    reasons = {
+        name: _reason(fit, found, fits, weighing)
+        for name, fit in found.items()
+        if name not in (verdict.effect, *verdict.effects, *verdict.alternatives)
+    }
+    return ModelComparison(verdict=verdict, probabilities=probabilities, best=found, reasons=reasons)
+
+
+RESOLVABLE = 1.5
+"""Gap over noise floor below which gap closure is not resolvable."""
+
+
+def closed_fraction(before: float, after: float, floor: float) -> float:
+    """Return (before - after) / (before - floor), from -1 to 1; NaN where the gap is not resolvable.
+
+    A model that is better than the floor closes all of the gap; one that doubles it, or worse, counts as -1.
+    """
+    if not before > RESOLVABLE * floor or not math.isfinite(after):
+        return math.nan
+    return min(max((before - after) / (before - floor), -1.0), 1.0)
+
+
+def _far_off(fits: Fits, weighing: ComparisonSettings) -> bool:
+    """Return whether the nominal model's held-out error is many times noise and grain, so that something is missing."""
+    error = min(fits.nominal.heldout_rms_m, nominal_or_refitted(fits).heldout_rms_m)
+    return error > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m)
+
+
+def _predicted(fit: CandidateFit, fits: Fits, weighing: ComparisonSettings) -> float:
+    """Return how far ``fit`` counts as an explanation because it predicts held-out trials: 0 to 1."""
+    closed = closed_fraction(fits.nominal.heldout_rms_m, fit.heldout_rms_m, fits.floor_rms_m)
+    low, high = weighing.predicted
+    return min(max((closed - low) / (high - low), 0.0), 1.0) if fit.effects and math.isfinite(closed) else 0.0
+
+
+def _reason(fit: CandidateFit, best: Mapping[str, CandidateFit], fits: Fits, weighing: ComparisonSettings) -> str:
+    """Return why ``fit`` is not the verdict, in a few words."""
+    nominal = nominal_or_refitted(fits)
+    if not fit.effects:
+        if _far_off(fits, weighing):
+            return f"its error is more than {weighing.many:g} times noise and the simulator's own uncertainty"
+        return "an effect explains the trials far better"
+    if not math.isfinite(fit.log_evidence) or not math.isfinite(fit.heldout_rms_m):
+        return "its simulation failed"
+    if abs(fit.heldout_rms_m - nominal.heldout_rms_m) <= 1e-6 * nominal.heldout_rms_m:
+        return SAME
+    if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m:
+        return "predicts held-out trials no better than the nominal model"
+    gain = fit.log_evidence - nominal.log_evidence
+    if gain < weighing.fee:
+        return "gains too little for its parameters"
+    top = max((f for f in best.values() if f.effects), key=lambda f: f.log_evidence)
+    if top.log_evidence - fit.log_evidence > weighing.fee:
+        return f"{' and '.join(effect_label(n) for n in top.effects)} fits the trials far better"
+    return f"leaves {fit.misfit:.1f} times the noise unexplained"
 
 
 def nominal_or_refitted(fits: Fits) -> CandidateFit:

@@ -10,17 +10,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from ..effects.registry import effects
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from .capture import Capture
 from .diagnosis import NONE, UNKNOWN, Array, CandidateFit, Diagnosis, Discrepancy, Fits, Gap, RankedEffect, TrialArrays
 from .gap_metrics import bootstrap_interval, localise, measure_gap, negative_controls
-from .model_comparison import ComparisonSettings, ModelComparison, compare_models, kind_of, nominal_or_refitted
+from .model_comparison import (
+    ComparisonSettings,
+    ModelComparison,
+    closed_fraction,
+    compare_models,
+    kind_of,
+    nominal_or_refitted,
+)
+from .provenance import provenance
 from .report.wording import verdict_summary
-from .suggested_experiments import next_experiment
+from .suggested_experiments import next_experiment, recorded_setting
 from .verification_run import VerificationRun, run_verification
 from .work import RIGID_RATE, SOFT_RATE, Work, WorkRecord
 
@@ -56,6 +62,12 @@ class DiagnoseOptions:
         if self.effects is not None and not self.effects:
             raise InputError("effects is empty: name at least one, or leave it out for all")
 
+    def arguments(self) -> tuple[str, ...]:
+        """Return the arguments of ``physgen diagnose`` that stand for these options."""
+        said = ["--budget", f"{self.budget_s:g}s"] if self.work is None else ["--work", str(self.work)]
+        said += [] if self.effects is None else ["--effects", ",".join(self.effects)]
+        return (*said, *(() if self.confirm else ("--no-confirm",)))
+
 
 def diagnose(
     capture: Capture,
@@ -77,8 +89,8 @@ def diagnose(
     for warning in warnings[len(capture.warnings) :]:
         on_event({"event": "notice", "stage": "diagnose", "message": warning})
     verdict, found = weighed.verdict, _found(fits, weighed)
-    gap = measure_gap(capture, fits, found)
     nominal_points, found_points = fits.simulate(fits.nominal), fits.simulate(found)
+    gap = measure_gap(capture, fits, found, nominal_points)
     gap = dataclasses.replace(
         gap, closed_fraction_ci95=bootstrap_interval(capture, nominal_points, found_points, found, gap)
     )
@@ -86,10 +98,8 @@ def diagnose(
     if options.confirm and len(capture.objects) == 1 and verdict.effect not in (NONE, UNKNOWN):
         confirmations, notes = _confirm(capture, fits, found, nominal_points, found_points, on_event, cancelled)
         warnings += notes
-        if confirmations and all(math.isfinite(c.numerics_rms_m) for c in confirmations):
-            gap = dataclasses.replace(gap, numerics_rms_m=float(np.mean([c.numerics_rms_m for c in confirmations])))
     discrepancies = fits.discrepancy(None if verdict.effect in (NONE, UNKNOWN) else found)
-    ranked = _ranking(fits, weighed, gap)
+    ranked = _ranking(weighed, gap)
     kinds = {item.name: item.kind for item in ranked}
     predictions = fits.predict(fits.nominal), fits.predict(found)
     return Diagnosis(
@@ -97,7 +107,7 @@ def diagnose(
         effects=ranked,
         gap=gap,
         controls=negative_controls(capture, fits, weighed, found, nominal_points),
-        next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable),
+        next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable, setting=recorded_setting(capture)),
         where=localise(capture, discrepancies),
         trials=_arrays(capture, discrepancies, nominal_points, found_points, *predictions),
         summary=verdict_summary(verdict, gap),
@@ -109,6 +119,7 @@ def diagnose(
             per_second=int(work.rate),
             skipped=dict(sorted(work.skipped.items())),
         ),
+        provenance=provenance(capture, options.arguments()),
         confirmation=_confirmation_json(confirmations),
     )
 
@@ -160,7 +171,9 @@ def _found(fits: Fits, weighed: ModelComparison) -> CandidateFit:
     name = weighed.verdict.effect
     if name == UNKNOWN and fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m:
         return fits.refitted
-    return nominal_or_refitted(fits) if name in (NONE, UNKNOWN) else weighed.best[name]
+    if name not in (NONE, UNKNOWN):
+        return weighed.best[name]
+    return min(fits.nominal, nominal_or_refitted(fits), key=lambda fit: fit.heldout_rms_m)
 
 
 def _confirm(
@@ -201,31 +214,42 @@ def _confirmation_json(items: list[VerificationRun]) -> Mapping[str, Any]:
     return {"takes": [dataclasses.asdict(c) | {"word": c.word} for c in items]} if items else {}
 
 
-def _ranking(fits: Fits, weighed: ModelComparison, gap: Gap) -> tuple[RankedEffect, ...]:
-    room = gap.before_rms_m - gap.noise_floor_rms_m
+def _ranking(weighed: ModelComparison, gap: Gap) -> tuple[RankedEffect, ...]:
+    verdict = weighed.verdict
     items = []
     for name, probability in weighed.probabilities.items():
         fit = weighed.best.get(name)
         if fit is None:
             items.append(RankedEffect(name=name, kind=kind_of(name), probability=probability))
             continue
-        closed = (gap.before_rms_m - fit.heldout_rms_m) / room if room > 0 else math.nan
+        error = fit.heldout_rms_m if fit.effects else min(fit.heldout_rms_m, gap.before_rms_m)
+        closed = math.nan
+        if gap.resolvable and verdict.effect != NONE:
+            closed = closed_fraction(gap.before_rms_m, error, gap.noise_floor_rms_m)
         items.append(
             RankedEffect(
                 name=name,
                 kind=kind_of(name),
                 probability=probability,
                 parameters=fit.parameters.get(name, {}),
-                heldout_rms_m=fit.heldout_rms_m,
+                heldout_rms_m=error,
                 closed_fraction=closed,
+                misfit=fit.misfit,
+                reason=weighed.reasons.get(name, ""),
             )
         )
-    verdict = weighed.verdict
     for name in verdict.effects[1:]:
         # The second of two causes takes its parameters from the fit of both.
         fit = weighed.best[verdict.effect]
         items = [
-            dataclasses.replace(item, parameters=fit.parameters[name], heldout_rms_m=fit.heldout_rms_m)
+            dataclasses.replace(
+                item,
+                parameters=fit.parameters[name],
+                heldout_rms_m=fit.heldout_rms_m,
+                closed_fraction=gap.closed_fraction,
+                misfit=fit.misfit,
+                reason="",
+            )
             if item.name == name
             else item
             for item in items

@@ -4,8 +4,53 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
+import numpy as np
+
+from .capture import Capture
+from .capture_geometry import mean_known
 from .diagnosis import NONE, UNKNOWN, Verdict
+
+DROPPED = 0.1
+"""Sideways over vertical distance up to which a body counts as dropped."""
+
+NEAR_GROUND = 1.5
+"""Height of the lowest point seen, in sizes of the body, up to which it counts as having reached the ground."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedSetting:
+    """What an experiment can repeat. dropped: nothing moved sideways. lands: the ground was reached. turns: the points
+    show how the body turns."""
+
+    dropped: bool = False
+    lands: bool = True
+    turns: bool = True
+
+
+def recorded_setting(capture: Capture) -> RecordedSetting:
+    """Return the setting of ``capture``; of pixels, which leave the depth open, one in which everything is possible."""
+    if any(t.points is None for t in capture.trials):
+        return RecordedSetting()
+    normal, foot = capture.ground.unit_normal, np.asarray(capture.ground.point)
+    size = max(float(np.ptp(item.vertices, axis=0).max()) for item in capture.objects)
+    sideways, upright, low = 0.0, 0.0, np.inf
+    for trial in capture.trials:
+        way = mean_known(trial.observed, axis=1)
+        way = way[np.isfinite(way).all(axis=1)]
+        heights = (trial.observed - foot) @ normal
+        low = min(low, float(heights[np.isfinite(heights)].min(initial=np.inf)))
+        if len(way):
+            along = (way - way[0]) @ normal
+            upright = max(upright, float(np.ptp(along)))
+            sideways = max(sideways, float(np.linalg.norm(way - way[0] - along[:, None] * normal, axis=1).max()))
+    return RecordedSetting(
+        dropped=sideways < DROPPED * upright,
+        lands=low < NEAR_GROUND * size,
+        turns=all(np.bincount(t.object_index).max() > 1 for t in capture.trials),
+    )
+
 
 _PAIRS: Mapping[frozenset[str], str] = {
     frozenset(pair.split("+")): text
@@ -56,30 +101,51 @@ _PAIRS: Mapping[frozenset[str], str] = {
     }.items()
 }
 
+_DROPPED: Mapping[frozenset[str], str] = {
+    frozenset(pair.split("+")): text
+    for pair, text in {
+        "air_drag+wind": "Repeat the drop where the air is still: drag stays, wind does not.",
+        "wind+gravity_tilt": "Drop a heavier object of the same shape: a tilted gravity bends its path just as much, "
+        "wind much less.",
+        "air_drag+buoyancy": "Drop the object from half the height as well: drag grows with speed, buoyancy does not.",
+        "air_drag+time_scale": "Drop the object from half the height as well: drag grows with speed, a wrong clock "
+        "does not.",
+        "air_drag+magnus": "Drop the object once without spin and once with much: only lift follows the spin.",
+    }.items()
+}
+"""What a recording of drops can repeat: no throw, and no greater height."""
+
 _SINGLE: Mapping[str, str] = {
-    "force": "Repeat the throw with a heavier object of the same shape.",
+    "force": "Repeat the motion with a heavier object of the same shape.",
     "contact": "Repeat the contact once slowly and once fast, over the same ground.",
     "material": "Drop the object from a low and a high position and film the contact at a higher frame rate.",
-    "mass": "Throw the object high with much spin.",
+    "mass": "Let the object fly with much spin, and track several points on it.",
     "observation": "Film a ruler, a plumb line and a running stopwatch in the same view.",
 }
 
 
-def next_experiment(verdict: Verdict, kinds: Mapping[str, str], *, resolvable: bool) -> str | None:
-    """Return the suggested experiment in a sentence, or None where nothing is open. kinds: kind by effect name."""
+def next_experiment(
+    verdict: Verdict, kinds: Mapping[str, str], *, resolvable: bool, setting: RecordedSetting | None = None
+) -> str | None:
+    """Return the suggested experiment in a sentence, or None where nothing is open.
+
+    kinds: kind by effect name. setting: what can be repeated; None for everything.
+    """
+    setting = RecordedSetting() if setting is None else setting
+    pairs = {**_PAIRS, **_DROPPED} if setting.dropped else _PAIRS
     if verdict.effect == NONE:
         return None
     if verdict.effect == UNKNOWN:
         guesses = verdict.alternatives[:2]
-        if len(guesses) == 2 and frozenset(guesses) in _PAIRS:
-            return _PAIRS[frozenset(guesses)]
+        if len(guesses) == 2 and _possible(pairs.get(frozenset(guesses)), setting):
+            return pairs[frozenset(guesses)]
         return (
             "Repeat one trial exactly, and one with a heavier object of the same shape: what stays the same belongs to "
             "the environment, what changes with the mass is a force."
         )
     for other in verdict.alternatives:
-        text = _PAIRS.get(frozenset((verdict.effect, other)))
-        if text is not None:
+        text = pairs.get(frozenset((verdict.effect, other)))
+        if text is not None and _possible(text, setting):
             return text
     if verdict.alternatives:
         own, other = kinds[verdict.effect], kinds.get(verdict.alternatives[0], "force")
@@ -87,3 +153,16 @@ def next_experiment(verdict: Verdict, kinds: Mapping[str, str], *, resolvable: b
     if not resolvable:
         return "Record longer or faster trials: in these the gap is hardly larger than the noise."
     return None
+
+
+_THROWN = ("Throw", "throw", "opposite", "Roll", "Slide")
+_GROUND = ("Slide", "slide", "Roll", "roll", "bounce", "ground")
+
+
+def _possible(text: str | None, setting: RecordedSetting) -> bool:
+    """Return whether ``text`` can be done in ``setting``: what was dropped is not thrown, what never lands not slid."""
+    if text is None:
+        return False
+    if setting.dropped and any(word in text for word in _THROWN):
+        return False
+    return setting.lands or not any(word in text for word in _GROUND)

@@ -13,7 +13,7 @@ from ...atomic import write_bytes
 from ...html import page_head, page_style, picture_style, render, short_number, shortened
 from ...version import VERSION
 from ..capture import Capture
-from ..diagnosis import NONE, PAGE_FILE, UNKNOWN, Diagnosis
+from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
 from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
 from .diagnosis_figures import Pictures, draw_pictures, gap_bars
 from .object_heatmaps import VIEWS
@@ -91,8 +91,10 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
     """Return the page as text."""
     verdict, effects = diagnosis.verdict, diagnosis.effects
     title = headline(diagnosis)
-    shown = [item for i, item in enumerate(effects) if i < ALWAYS or _finite(item.probability) >= LEAST]
-    folded = effects[len(shown) :]
+    alike = [item for item in effects if item.reason == SAME]
+    others = [item for item in effects if item.reason != SAME]
+    shown = [item for i, item in enumerate(others) if i < ALWAYS or _finite(item.probability) >= LEAST]
+    folded = others[len(shown) :]
     intervals = sorted(diagnosis.where.intervals, key=lambda i: -_finite(i.share))[:MAX_ROWS]
     kinds = {item.name: item.kind for item in effects}
     observed = [effect_label(name) for name in found_effects(verdict) if kinds.get(name) == "observation"]
@@ -114,6 +116,10 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         shown=shown,
         folded=folded,
         folded_probability=sum(_finite(item.probability) for item in folded),
+        alike=listed([effect_label(item.name) for item in alike], "and"),
+        alike_probability=sum(_finite(item.probability) for item in alike),
+        second={name: effect_label(verdict.effect) for name in found_effects(verdict)[1:]},
+        provenance=diagnosis.provenance,
         closure=closure_sentence(diagnosis),
         gap_bars=gap_bars(diagnosis),
         next_experiment=_next_experiment(diagnosis),

@@ -280,13 +280,27 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
             return "No effect was added, so there is no gap to close."
         return (
             f"The gap on held-out trials is {_length(gap.before_rms_m)}, of which noise explains only "
-            f"{_length(gap.noise_floor_rms_m)}. Nothing was added."
+            f"{_length(gap.noise_floor_rms_m)}. Nothing was added.{_floor(gap)}"
         )
     low, high = gap.closed_fraction_ci95
     spread = f" (95 %: {percent_text(low)} to {percent_text(high)})" if math.isfinite(low + high) else ""
     return (
         f"On held-out trials the error changes from {_length(gap.before_rms_m)} to "
-        f"{_length(gap.after_rms_m)}: {_closed(gap.closed_fraction)}{spread}."
+        f"{_length(gap.after_rms_m)}: {_closed(gap.closed_fraction)}{spread}.{_floor(gap)}"
+    )
+
+
+FAR = 3.0
+"""Noise floor over tracking noise above which the page says where it comes from."""
+
+
+def _floor(gap: Gap) -> str:
+    """Return a sentence on a noise floor far above the tracking noise, or ""."""
+    if not gap.noise_floor_rms_m > FAR * gap.noise_rms_m:
+        return ""
+    return (
+        f" The noise floor, {_length(gap.noise_floor_rms_m)}, is far above the tracking noise of "
+        f"{_length(gap.noise_rms_m)}: it is what that noise, in the first frames, makes of the prediction."
     )
 
 
@@ -323,10 +337,15 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
             "Re-fitting the nominal model's own parameters does as well "
             f"({_length(gap.refitted_rms_m)}), without any new effect."
         )
-    if gap.numerics_rms_m > 0.25 * gap.before_rms_m:
+    if gap.numerics_rms_m > max(0.25 * gap.before_rms_m, after):
         said.append(
-            f"{_length(gap.numerics_rms_m)} of the error is the simulator's own numerical error: raise "
-            "the quality before looking for physical causes."
+            f"A finer simulation moves this prediction by {_length(gap.numerics_rms_m)}, more than the "
+            f"{_length(after)} that remain: part of the agreement is with one resolution."
+        )
+    elif gap.numerics_rms_m > 0.25 * gap.before_rms_m:
+        said.append(
+            f"Up to {_length(gap.numerics_rms_m)} of the remaining {_length(after)} may be the simulator's own "
+            "numerical error."
         )
     return said
 
@@ -385,7 +404,7 @@ def verdict_summary(verdict: Verdict, gap: Gap) -> str:
     if verdict.effect == NONE:
         return f"The nominal model explains the recording down to its noise ({_confidence(verdict)})."
     if verdict.effect == UNKNOWN:
-        text = f"Something is missing from the model, and no known effect closes the gap ({_confidence(verdict)})."
+        text = f"Something is missing from the model, and no known effect explains it ({_confidence(verdict)})."
         return f"{text} Closest: {others}." if others else text
     causes = [effect_label(name) for name in found_effects(verdict)]
     opening = "The cause of the gap is" if len(causes) == 1 else "The causes of the gap are"

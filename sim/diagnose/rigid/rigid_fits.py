@@ -24,6 +24,7 @@ from .rigid_prediction import (
     HeldOutScore,
     Points,
     believed_fit,
+    contact_spread_rms,
     marginal_points,
     marginal_rms,
     noise_floor,
@@ -74,8 +75,12 @@ class RigidFits:
     refitted: CandidateFit
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
-    numerics_rms_m: float
+    grain_rms_m: float
     expects: bool = False
+
+    def numerics_rms_m(self, fit: CandidateFit) -> float:
+        """See ``Fits``."""
+        return float(np.sqrt(np.mean([step_size_error(f) ** 2 for f in self._own(fit)])))
 
     def predict(self, fit: CandidateFit) -> dict[str, Array]:
         """See ``Fits``."""
@@ -95,10 +100,15 @@ class RigidFits:
             self.capture, [(b.fits[()], None if key is None else b.fits[key]) for b in self.bodies]
         )
 
+    def _own(self, fit: CandidateFit) -> list[Fit]:
+        """Return the fit of each body behind ``fit``."""
+        if fit is self.nominal:
+            return [believed_fit(body.fits[()]) for body in self.bodies]
+        return [body.fits[fit.effects] for body in self.bodies]
+
     def _joined(self, how: Callable[[Fit], Points], fit: CandidateFit, trials: list[Trial]) -> dict[str, Array]:
         joined: dict[str, Array] = {}
-        for body in self.bodies:
-            found = believed_fit(body.fits[()]) if fit is self.nominal else body.fits[fit.effects]
+        for found in self._own(fit):
             for name, (columns, points) in how(found).items():
                 trial = next(t for t in trials if t.name == name)
                 if name not in joined:
@@ -186,16 +196,17 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     for k in shown:
         made[k] = _candidate(capture, bodies, k, held[k])
     _level_twins(made)
-    believed = [score_held_out(believed_fit(b.fits[()])) for b in bodies]
     top = max(made, key=lambda k: made[k].log_evidence)
     floors = [noise_floor(b.fits[top]) for b in bodies]
-    floor = min([float(np.sqrt(np.mean(np.square(floors)))), *(c.heldout_rms_m for c in made.values())])
+    plain = [believed_fit(b.fits[()]) for b in bodies]
+    grains = [np.hypot(contact_spread_rms(f), step_size_error(f)) for f in plain]
     expects, gap = False, min(c.misfit for c in made.values())
     if gap > UNEXPLAINED and not any(b.problem.scene.body.round for b in bodies):
-        expected = float(np.sqrt(np.mean([marginal_rms(believed_fit(b.fits[()])) ** 2 for b in bodies])))
+        expected = float(np.sqrt(np.mean([marginal_rms(f) ** 2 for f in plain])))
         # A few tumbling trials hardly tell which re-fitted parameters predict better: the nominal ones are the
         # reference, and parameters re-fitted to an unexplained motion are not used.
-        expects = expected < WORSE * float(np.sqrt(np.mean([b.rms_m**2 for b in believed])))
+        believed = [score_held_out(f).rms_m for f in plain]
+        expects = expected < WORSE * float(np.sqrt(np.mean(np.square(believed))))
         if expects:
             made[REFITS] = dataclasses.replace(made[REFITS], heldout_rms_m=expected)
     singles = sorted((made[k] for k in keys if k), key=lambda c: -c.log_evidence)
@@ -206,8 +217,8 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         nominal=made[()],
         refitted=made[REFITS],
         candidates=tuple(singles),
-        floor_rms_m=floor,
-        numerics_rms_m=float(np.sqrt(np.mean([step_size_error(believed_fit(b.fits[()])) ** 2 for b in bodies]))),
+        floor_rms_m=float(np.sqrt(np.mean(np.square(floors)))),
+        grain_rms_m=float(np.sqrt(np.mean(np.square(grains)))),
     )
 
 

@@ -153,6 +153,36 @@ def step_size_error(fit: Fit) -> float:
     return float(np.sqrt(np.mean(np.concatenate(off))))
 
 
+def contact_spread_rms(fit: Fit) -> float:
+    """Return the RMS distance in m by which the contact uncertainty moves the prediction of fit trials.
+
+    At every node the state gets a defect drawn from its covariance, which then travels on through later contacts.
+    """
+    problem, rng, squares = fit.problem, np.random.default_rng(0), []
+    row = problem.scene.numbers([fit.model.setting(problem.scene, fit.z)])
+    rate = fit.model.setting(problem.scene, fit.z).rate
+    for trial, (begin, state) in zip(problem.trials, first_states(fit, fit.z), strict=True):
+        times = trial.observations.times
+        later = [(n, c) for n, c in zip(trial.nodes[1:], trial.covers, strict=False) if n > begin]
+        if trial.observations.trial.role != "fit" or not later:
+            continue
+        # World 0 has no defects.
+        states, at = np.repeat(state[None], NOISE_DRAWS + 1, axis=0), begin
+        rows = np.repeat(row, len(states), axis=0)
+        for number, (node, cover) in enumerate(later):
+            states = problem.simulator.run(states, rows, [(times[node : node + 1] - times[at]) * rate] * len(states))
+            states = states[:, 0, :13].copy()
+            draws = rng.multivariate_normal(np.zeros(12), cover, size=NOISE_DRAWS, method="cholesky")
+            states[1:] = perturbed(states[1:], draws)
+            at, end = node, later[number + 1][0] if number + 1 < len(later) else len(times)
+            clock = (times[at:end] - times[at]) * rate
+            out = [world_points(trial, r) for r in problem.simulator.run(states, rows, [clock] * len(states))]
+            squares += [np.sum((points - out[0]) ** 2, axis=-1).ravel() for points in out[1:]]
+        shown = NOISE_DRAWS * (later[0][0] - shown_frames(fit, trial)) * len(trial.observations.places)
+        squares.append(np.zeros(max(shown, 0)))
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutScore:
     """Held-out scores. log_score: (fit trials,) nats. rms_m: RMS error predicted from the first frames."""

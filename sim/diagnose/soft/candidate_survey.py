@@ -288,6 +288,11 @@ class Survey:
         rms = math.sqrt(float(apart.mean())) if len(apart) else 0.0
         return rms, model_error_between(fine, coarse, [w.times - w.contact for w in windows], self._size)
 
+    def rough_motions(self, world: WorldParameters) -> list[Array]:
+        """Return points (T, K, 3) of every fit trial under ``world`` on the coarse lattice."""
+        times = [self.trials[i].times for i in self.fit_trials]
+        return self._coarse.lasting_motion(list(self.fit_trials), [world] * len(times), times)
+
     def _check(self) -> None:
         if not self.fit_trials:
             raise InputError('no trial has role "fit": mark the complete trials as such')

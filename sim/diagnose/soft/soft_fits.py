@@ -174,14 +174,13 @@ class SoftFits:
     refitted: CandidateFit
     candidates: tuple[CandidateFit, ...]
     floor_rms_m: float
-    numerics_rms_m: float
+    grain_rms_m: float
 
     def __init__(self, survey: Survey) -> None:
         self._survey = survey
         self._trials, self._fit_trials, self._flights = survey.trials, survey.fit_trials, survey.flights
         self._laws: dict[int, WorldParameters] = {}
         self._found: dict[int, FoundFit] = {}
-        self.numerics_rms_m = survey.numerics_rms_m
         self._summarize(survey.plain, survey.believed, survey.found)
 
     # Predictions and localisation
@@ -204,6 +203,11 @@ class SoftFits:
             fits.append(self._candidate_fit(entry, rms))
         self.candidates = tuple(fits)
         self.floor_rms_m = math.sqrt(3) * self._flights.sigma
+        self.grain_rms_m = self._rms(trials, self._survey.rough_motions(believed.world), whole[0])
+
+    def numerics_rms_m(self, fit: CandidateFit) -> float:
+        """See ``Fits``: both lattices of the nominal model in the fitted window; other models are as near."""
+        return self._survey.numerics_rms_m
 
     def _candidate_fit(self, found: FoundFit, rms: float | None, *, believed: bool = False) -> CandidateFit:
         search, fit = found.search, found.fit
@@ -287,11 +291,11 @@ class SoftFits:
     # Scores
 
     @staticmethod
-    def _rms(trials: list[SoftTrial], motions: list[Array]) -> float:
-        """Return the RMS distance in m from first contact on, predicted from the flight alone."""
+    def _rms(trials: list[SoftTrial], motions: list[Array], others: list[Array] | None = None) -> float:
+        """Return the RMS distance in m from first contact on to the tracks (or ``others``), from the flight alone."""
         squares = []
-        for trial, motion in zip(trials, motions, strict=True):
-            d = (trial.points - motion)[trial.flying :]
+        for trial, motion, other in zip(trials, motions, others or [t.points for t in trials], strict=True):
+            d = (other - motion)[trial.flying :]
             squares.append((d[trial.seen[trial.flying :]] ** 2).sum(axis=1))
         found = np.concatenate(squares) if squares else np.zeros(1)
         return float(np.sqrt(found.mean())) if len(found) else 0.0
@@ -310,7 +314,7 @@ def _estimates(name: str, draws: list[dict[str, float]], values: dict[str, float
     for parameter in effect(name).parameters:
         found = np.array([d[parameter.name] for d in draws])
         value = float(np.clip(values[parameter.name], parameter.low, parameter.high))
-        low, high = (float(q) for q in np.quantile(found, [0.025, 0.975]))
+        low, high = (float(np.clip(q, parameter.low, parameter.high)) for q in np.quantile(found, [0.025, 0.975]))
         out[parameter.name] = Estimate(value=value, unit=parameter.unit, low=min(low, value), high=max(high, value))
     return out
 

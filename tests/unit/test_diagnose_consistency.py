@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""No report contradicts itself: a checker reads diagnoses of drops, throws and bounces, with and without a cause."""
+
+import copy
+import html
+import json
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from physgen.sim.app.diagnose import diagnose
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial, load_capture, save_capture
+from physgen.sim.diagnose.diagnosis import read_diagnosis
+from physgen.sim.diagnose.provenance import content_hash
+from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions
+
+from .report_contradictions import contradictions
+
+RADIUS, SIGMA = 0.04, 1e-3
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def flight(drag=0.0, kick=0.0, velocity=(2.0, 0.0, 3.0), start=(0.0, 0.0, 2.0), times=None):
+    """Positions of a ball under drag, with a push in mid-flight, in small steps."""
+    times = np.arange(0, 0.6, 0.02) if times is None else times
+    x, v, found, fine = np.array(start), np.array(velocity), [], 100
+    for i, t in enumerate(times):
+        found.append(x.copy())
+        step = (times[min(i + 1, len(times) - 1)] - t) / fine
+        for _ in range(fine):
+            v = v + step * (GRAVITY - drag * np.linalg.norm(v) * v)
+            x = x + step * v
+        if i == len(times) // 2:
+            v = v + np.array([0.0, kick, 0.0])
+    return np.array(found)
+
+
+def bounces(restitution, height, times):
+    """Heights of a ball's centre dropped without drag."""
+    found = []
+    for t in times:
+        h, v, left = height, 0.0, t
+        while True:
+            reach = (v + np.sqrt(v * v + 2 * 9.81 * (h - RADIUS))) / 9.81
+            if left < reach or v < 0:
+                break
+            left, v, h = left - reach, restitution * (9.81 * reach - v), RADIUS
+        found.append([0.0, 0.0, h + v * left - 4.905 * left**2])
+    return np.array(found)
+
+
+def trial(name, way, times, rng, *, points=6, sigma=SIGMA, role="fit", shown=None):
+    rest = RADIUS * np.concatenate([np.eye(3), -np.eye(3)]) if points > 1 else np.zeros((1, 3))
+    seen = way[:, None] + rest + rng.normal(0, sigma, (len(way), len(rest), 3))
+    cut = len(times) if shown is None else shown
+    return Trial(
+        name=name, role=role, times=times[:cut], points=seen[:cut], pixels=None,
+        object_index=np.zeros(len(rest), dtype=np.int64), rest_points=rest,
+        predict_times=times[cut:] if shown is not None else None,
+    )  # fmt: skip
+
+
+def made(kind):
+    """A capture, the candidates to try, and the setting for the checker."""
+    rng = np.random.default_rng(5)
+    times, sigma, foot, friction = np.arange(0, 0.6, 0.02), SIGMA, -50.0, 0.4
+    names, setting = ("air_drag", "wind", "buoyancy"), {"lands": False}
+    throws = ((2.0, 0.0, 3.0), (-1.0, 2.0, 3.5), (0.5, -2.5, 2.0))
+    if kind == "drop":
+        times, sigma, setting = np.arange(0, 2.4, 1 / 15), 0.04, {"dropped": True, "lands": False}
+        names = (*names, "time_scale", "friction")
+        ways = [flight(0.02, velocity=(0.0, 0.0, -v), times=times) for v in (3.0, 3.4, 2.6)]
+        takes = [trial(f"drop{i}", w, times, rng, points=1, sigma=sigma) for i, w in enumerate(ways)]
+    elif kind == "bounce":
+        times, foot, setting = np.arange(0, 0.9, 0.02), 0.0, {"dropped": True}
+        names = ("restitution", "friction", "air_drag")
+        takes = [trial(f"drop{i}", bounces(0.6, h, times), times, rng) for i, h in enumerate((0.4, 0.5, 0.6))]
+    else:
+        drag, kick = {"plain": (0.0, 0.0), "drag": (0.12, 0.0), "kick": (0.0, 1.5)}[kind]
+        takes = [trial(f"throw{i}", flight(drag, kick, v), times, rng) for i, v in enumerate(throws)]
+    last = takes[-1]
+    takes[-1] = trial("last", last.points.mean(axis=1), times, rng, points=len(last.rest_points), sigma=1e-9,
+                      role="predict", shown=len(times) // 3)  # fmt: skip
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    belief = ObjectBelief(name="ball", mesh="ball.obj", density_kg_m3=150.0, stiffness="hard")
+    item = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    ground = Ground(point=(0.0, 0.0, foot), friction=friction, restitution=0.8)
+    return Capture(
+        gravity=tuple(GRAVITY), ground=ground, objects=(item,), noise_sigma=sigma, camera=None, trials=tuple(takes)
+    ), names, setting  # fmt: skip
+
+
+EXPECTED = {"plain": "none", "drag": "air_drag", "kick": "unknown", "drop": "air_drag", "bounce": "restitution"}
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory):
+    """report.json, the page's text and the setting, by kind."""
+    root, found = tmp_path_factory.mktemp("reports"), {}
+    for kind in EXPECTED:
+        capture, names, setting = made(kind)
+        save_capture(capture, root / kind)
+        options = DiagnoseOptions(effects=names, confirm=False)
+        diagnose(load_capture(root / kind), out=root / f"{kind}_out", options=options)
+        page = (root / f"{kind}_out" / "report.html").read_text(encoding="utf-8")
+        words = html.unescape(re.sub(r"<[^>]+>", "", re.sub(r"<style>.*?</style>", "", page, flags=re.S)))
+        found[kind] = read_diagnosis(root / f"{kind}_out")[0], words, setting
+    return found
+
+
+@pytest.mark.parametrize("kind", EXPECTED)
+def test_no_line_contradicts_another(reports, kind):
+    report, page, setting = reports[kind]
+    assert contradictions(report, page, **setting) == []
+    verdict = report["verdict"]
+    assert EXPECTED[kind] in (verdict["effect"], *verdict["alternatives"])
+
+
+def test_capture_command_and_version_are_on_the_page(reports):
+    report, page, _ = reports["drag"]
+    made_of = report["provenance"]
+    assert made_of["capture"] == "drag" and "“drag”" in page
+    assert made_of["command"] == (
+        "physgen diagnose drag --out DIR --budget 300s --effects air_drag,wind,buoyancy --no-confirm"
+    )
+
+
+def test_effects_that_change_nothing_are_folded_into_a_line(reports):
+    report, page, _ = reports["drop"]
+    row = next(r for r in report["effects"] if r["name"] == "friction")
+    assert row["reason"] == "the same motion as without it"
+    assert re.search(r"No different from the nominal model in this capture, together [^:]*: friction\.", page)
+
+
+def test_the_hash_is_of_what_was_measured():
+    capture, _, _ = made("plain")
+    same, _, _ = made("plain")
+    assert content_hash(capture) == content_hash(same)
+    moved = Trial(**{**capture.trials[0].__dict__, "times": capture.trials[0].times + 1e-9})
+    assert content_hash(Capture(**{**capture.__dict__, "trials": (moved, *capture.trials[1:])})) != content_hash(
+        capture
+    )
+    ground = Ground(point=capture.ground.point, friction=0.41, restitution=0.8)
+    assert content_hash(Capture(**{**capture.__dict__, "ground": ground})) != content_hash(capture)
+
+
+def doctored(kind, change):
+    def apply(reports):
+        report, page, setting = copy.deepcopy(reports[kind][0]), reports[kind][1], dict(reports[kind][2])
+        page = change(report, page) or page
+        return report, page, setting
+
+    return apply
+
+
+def _row(report, name):
+    return next(r for r in report["effects"] if r["name"] == name)
+
+
+DOCTORED = {
+    "closes 100%": doctored("kick", lambda r, p: _row(r, "wind").update(closed_fraction=1.0, reason="x")),
+    "closes 178%": doctored("drag", lambda r, p: _row(r, "wind").update(closed_fraction=1.78)),
+    "not around": doctored("drag", lambda r, p: r["gap"].update(closed_fraction_ci95=[0.78, 1.87])),
+    "-17000000000.0": doctored("drag", lambda r, p: r["gap"].update(closed_fraction_ci95=[-1.7e10, 1.0])),
+    "below the noise floor": doctored("drag", lambda r, p: r["gap"].update(noise_floor_rms_m=0.069)),
+    "more numerical error": doctored(
+        "drag", lambda r, p: r["gap"].update(numerics_rms_m=0.028, after_rms_m=0.0037) or p + " own numerical error"
+    ),
+    "cannot be repeated so": doctored(
+        "drop", lambda r, p: r.update(next_experiment="Throw the object the opposite way at the same speed.")
+    ),
+    "nothing lands there": doctored("drop", lambda r, p: r.update(next_experiment="Let the object bounce.")),
+    "nothing is missing, with": doctored("plain", lambda r, p: r["gap"].update(before_rms_m=0.031, resolvable=True)),
+    "without a reason": doctored("drag", lambda r, p: _row(r, "buoyancy").update(reason="")),
+    "is not on the page": doctored("drag", lambda r, p: p.replace(r["provenance"]["content_sha256"], "")),
+    "unsaid": doctored("drag", lambda r, p: r["work"]["skipped"].update(tether="tried")),
+    "two errors of the nominal": doctored("kick", lambda r, p: _row(r, "none").update(heldout_rms_m=9.0)),
+    "allowed": doctored(
+        "drag", lambda r, p: _row(r, "air_drag")["parameters"]["drag_per_mass"].update(ci95=[-1.7e10, 1])
+    ),
+}
+
+
+@pytest.mark.parametrize("words", DOCTORED)
+def test_the_checker_sees(reports, words):
+    report, page, setting = DOCTORED[words](reports)
+    assert any(words in said for said in contradictions(report, page, **setting)), json.dumps(report["gap"])
