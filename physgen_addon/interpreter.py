@@ -22,22 +22,27 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
-from ..sim.app.requirements import MODULE, NEWEST, OLDEST, REQUIREMENTS
+from ..sim.app.requirements import MODULE, NEWEST, OLDEST, RENDERER, REQUIREMENTS
 from ..sim.app.stage_process import NO_WINDOW, child_environment, own_command
 from ..sim.errors import InputError
 
 VARIABLE = "PHYSGEN_PYTHON"
 TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
 """Name of the terminal for commands: PowerShell, Windows' other one, has no ``&&``."""
+RENDERING = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
+"""Modules that rendering into a photo imports, and their package names."""
 _TIMEOUT_S = 60.0
 _MOST_BYTES = 2**20
 """Maximum output of a probed program; one that prints more is not Python."""
 
 
 class NoPython(InputError):
-    """No interpreter can simulate. reason: the cause; command: a shell command that fixes it, in one line."""
+    """No interpreter can simulate, or render into a photo.
+
+    reason: the cause; command: a shell command that fixes it, in one line.
+    """
 
     def __init__(self, reason: str, command: str) -> None:
         super().__init__(f"{reason}. In {TERMINAL}: {command}")
@@ -93,12 +98,59 @@ def named_python() -> Path | None:
 
 def python_version(python: Path) -> str:
     """Return the version, such as ``3.13.1``, of an interpreter from ``find_python``."""
-    return _checked(str(python), wheels_for(python))
+    return _checked(str(python), wheels_for(python)).version
+
+
+def renders(python: Path) -> bool:
+    """Return whether an interpreter from ``find_python`` can render into a photo: it has bpy."""
+    return _checked(str(python), wheels_for(python)).renders
+
+
+def require_renderer(python: Path) -> None:
+    """Raise NoPython if ``python``, from ``find_python``, cannot render into a photo."""
+    if not renders(python):
+        command = f"{_quoted(python)} -m pip install {_quoted(RENDERER)}"
+        raise NoPython(f"{python} simulates, but cannot render into a photo: it lacks bpy", command)
+
+
+def missing_modules() -> list[str]:
+    """Return the packages that this Blender's own Python lacks for rendering into a photo."""
+    return [title for module, title in RENDERING.items() if importlib.util.find_spec(module) is None]
+
+
+class PhotoCheck:
+    """Whether a photo can be reconstructed and rendered here, found out beside the user's work.
+
+    ``trouble`` is why not, empty until that is known.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = ""
+
+    def begin(self, preferred: str) -> None:
+        """Look for the interpreter as ``find_python`` does, in a thread, because probing one takes seconds."""
+        threading.Thread(target=self.look, args=(preferred,), daemon=True).start()
+
+    def look(self, preferred: str) -> None:
+        """Set ``trouble``."""
+        try:
+            python = find_python(preferred)
+            if missing_modules():
+                require_renderer(python)
+        except NoPython as error:
+            self.trouble = error.reason
+        else:
+            self.trouble = ""
+
+
+photo_check = PhotoCheck()
+"""Of this session: begun when a photo is opened and when the interpreter is checked, shown in the Photo panel."""
 
 
 def forget() -> None:
     """Clear the cache, because packages were installed."""
     _checked.cache_clear()
+    photo_check.trouble = ""
 
 
 def cli_command(python: Path, *arguments: str) -> Sequence[str]:
@@ -118,7 +170,7 @@ def install_command(python: Path | None = None, installs: bool = False) -> str:
     python: interpreter that gets the missing packages, or, if pip may not install into it, the base of a virtual
     environment in the home folder; None for one based on the newest suitable Python.
     """
-    wanted = " ".join(_quoted(requirement) for requirement in REQUIREMENTS.values())
+    wanted = " ".join(_quoted(requirement) for requirement in (*REQUIREMENTS.values(), RENDERER))
     if python is not None and installs:
         return f"{_quoted(python)} -m pip install {wanted}"
     newest = f"py -{_dotted(NEWEST)}" if os.name == "nt" else f"python{_dotted(NEWEST)}"
@@ -180,9 +232,16 @@ class _Unfit(Exception):
         self.lacks, self.installs = lacks, installs
 
 
+class _Interpreter(NamedTuple):
+    """One that can simulate: its version, such as ``3.13.1``, and whether it has bpy."""
+
+    version: str
+    renders: bool
+
+
 @functools.lru_cache(maxsize=8)
-def _checked(python: str, packages: str) -> str:
-    """Return the version of an interpreter that can simulate (cached); raises _Unfit."""
+def _checked(python: str, packages: str) -> _Interpreter:
+    """Return the interpreter if it can simulate (cached); raises _Unfit."""
     code, said, complaints = _asked(own_command(MODULE, python=python, packages=packages))
     lines = said.strip().splitlines()
     if code != 0 or not lines:
@@ -202,7 +261,7 @@ def _checked(python: str, packages: str) -> str:
         raise _Unfit(f"it lacks {names}", lacks=True, installs=installs)
     if trouble:
         raise _Unfit(trouble)
-    return version
+    return _Interpreter(version, answer.get("renders") is True)
 
 
 def _asked(command: Sequence[str]) -> tuple[int, str, str]:

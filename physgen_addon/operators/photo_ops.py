@@ -14,7 +14,7 @@ from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
 from ..background_jobs import JobOperator, Work
 from ..context import TAB, show_beside
-from ..interpreter import cli_command, find_python
+from ..interpreter import cli_command, find_python, photo_check
 from ..photo.photo_image import (
     SUFFIXES,
     PhotoTool,
@@ -45,6 +45,8 @@ def set_photo(scene: bpy.types.Scene, path: Path) -> None:
         state.boxes.clear()
         state.has_found = False
     state.path = str(path)
+    if not bpy.app.background:
+        photo_check.begin(python(bpy.context))
     if old is not None and old.users == 0:
         bpy.data.images.remove(old)
 

@@ -30,7 +30,13 @@ class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
                 return {"event": "done", "python": "", "reason": error.reason, "command": error.command}
             if cancelled():
                 raise Cancelled("the check was cancelled")
-            return {"event": "done", "python": str(python), "version": interpreter.python_version(python)}
+            answer = {"event": "done", "python": str(python), "version": interpreter.python_version(python)}
+            try:
+                if interpreter.missing_modules():
+                    interpreter.require_renderer(python)
+            except interpreter.NoPython as error:
+                return {**answer, "reason": error.reason, "command": error.command}
+            return {**answer, "reason": "", "command": ""}
 
         return work
 
@@ -40,8 +46,8 @@ class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
             reason, command = str(final["reason"]), str(final["command"])
             preferences.show_check(bpy.context, "NO", reason, command)
             raise interpreter.NoPython(reason, command)
-        sentence = f"Python {final['version']} simulates: {final['python']}"
-        preferences.show_check(bpy.context, "YES", sentence, "")
+        sentence = str(final["reason"]) or f"Python {final['version']} simulates: {final['python']}"
+        preferences.show_check(bpy.context, "NO" if final["reason"] else "YES", sentence, str(final["command"]))
         return sentence
 
 

@@ -2,7 +2,6 @@
 """Operators: render into the photo, export as Alembic, USD, or a .blend that needs no extension."""
 
 import contextlib
-import importlib.util
 import os
 import sys
 import tempfile
@@ -24,28 +23,30 @@ from ..background_jobs import JobOperator, Work
 from ..compat import OperatorMixin
 from ..context import show_result
 from ..frames.frame_index import frame_name
+from ..interpreter import find_python, missing_modules, require_renderer
 from ..paths import require_folder
 from ..playback import bake_record, particles, show_bake
+from ..props import preferences
 from ..props.body_props import bodies
 from ..props.render_props import render_options
 from ..render.render_options import render_arguments
 from ..scene_io import export_animation
 
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
-NEEDED = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
-"""Modules that rendering into a photo imports, and their package names."""
 
 
-def missing_modules() -> list[str]:
-    """Return the packages that this Blender's Python lacks for rendering into a photo."""
-    return [title for module, title in NEEDED.items() if importlib.util.find_spec(module) is None]
-
-
-def render_command() -> list[str]:
+def render_command(preferred: str = "") -> list[str]:
     """Return the command that runs ``batch/render.py``, to be followed by its arguments.
 
-    It is this Python if that has bpy as a module, else this Blender.
+    It is this Python if that has bpy as a module, else this Blender; where its Python lacks packages, the interpreter
+    that simulates (``preferred``: the one in the preferences), which may have to be probed for seconds. Raises
+    NoPython, or InputError if that one cannot render either.
     """
+    if missing_modules():
+        # The light zip brings no packages.
+        python = find_python(preferred)
+        require_renderer(python)
+        return [str(python), str(SCRIPT)]
     if not bpy.app.binary_path:
         return [sys.executable, str(SCRIPT)]
     # A factory start-up does not load extensions, hence not their wheels.
@@ -98,12 +99,6 @@ class _Render(JobOperator):
         return super().poll(context)
 
     def _work(self, scene: bpy.types.Scene, *choices: str) -> Work:
-        lacking = missing_modules()
-        if lacking:
-            raise RenderError(
-                f"this Blender's Python lacks {', '.join(lacking)}, needed to render into a photo: install PhysGen "
-                "from the zip for your system, which brings them, or render with `physgen render`"
-            )
         bake = require_folder(scene.physgen.simulation.bake, "Bake")
         if not (bake / MANIFEST_FILE).is_file():
             raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost (see Simulate, Cache)")
@@ -112,13 +107,14 @@ class _Render(JobOperator):
         out = _output_folder(scene)
         arguments = ["--out", str(out), "--parent", str(os.getpid()), "--json", *choices]
         arguments += render_arguments(render_options(scene.physgen.rendering))
-        start = render_command()
+        preferred = preferences.python(bpy.context)
         path = _camera_path(scene, photo, bake)
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             if strangers:
                 message = f"not in the photo, so not rendered into it: {', '.join(strangers)}"
                 on_event({"event": "notice", "message": message})
+            start = render_command(preferred)
             with tempfile.TemporaryDirectory(prefix="physgen-render-") as scratch:
                 rendered = bake
                 if (baked_scene / SCENE_FILE).is_file():

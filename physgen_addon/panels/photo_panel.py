@@ -13,6 +13,7 @@ from ...sim.reconstruct.models.known_models import ISNET
 from ...sim.reconstruct.models.model_folder import model_status
 from .. import text
 from ..context import TAB
+from ..interpreter import photo_check
 from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
 from ..operators.model_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
 from ..operators.photo_object_ops import (
@@ -184,6 +185,9 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if state.image is None:
         text.sentences(layout, context, "A photo of objects on a table or floor. It can be dropped here.")
         return
+    if photo_check.trouble:
+        words = f"{photo_check.trouble}. Preferences, PhysGen, Check gives the command that mends it."
+        text.sentences(layout, context, words, icon="ERROR")
     _draw_boxes(layout, context, state)
     if 0 <= state.box_index < len(state.boxes):
         draw_details(layout, context, state.boxes[state.box_index])

@@ -9,13 +9,13 @@ import bpy
 
 from .. import text
 from ..background_jobs import running
+from ..interpreter import missing_modules
 from ..operators.render_ops import (
     PHYSGEN_OT_export_alembic,
     PHYSGEN_OT_export_usd,
     PHYSGEN_OT_make_independent,
     PHYSGEN_OT_render_still,
     PHYSGEN_OT_render_video,
-    missing_modules,
 )
 from ..render.render_options import VIDEO_CODECS
 from .sidebar import RENDER, Sidebar, draw_job
@@ -61,10 +61,8 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     if rendering.output.startswith("//") and not bpy.data.filepath:
         words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
         text.sentences(layout, context, words, icon="INFO")
-    lacking = missing_modules()
-    if lacking:
-        words = f"Blender's Python lacks {', '.join(lacking)}: install PhysGen from the zip for your system."
-        text.sentences(layout, context, words, icon="ERROR")
+    if missing_modules():
+        text.sentences(layout, context, "Rendered by the Python that simulates (see Preferences).", icon="INFO")
     if under_way is not None and under_way.title == "Render":
         draw_job(layout)
     elif under_way is not None:
@@ -73,7 +71,6 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
         text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
     row = layout.row(align=True)
     row.scale_y = 1.4
-    row.enabled = not lacking
     row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
     row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
     _draw_result(layout, rendering)

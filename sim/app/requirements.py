@@ -2,8 +2,8 @@
 """Packages that an interpreter needs to simulate, and whether this one has them.
 
 As a module, ``launch.py sim.app.requirements`` prints one line of JSON: ``python`` (its version), ``missing``
-(missing requirements), ``trouble`` (why Taichi does not load, or null) and ``installs`` (whether pip may install into
-it, which Linux distributions and Blender forbid).
+(missing requirements), ``trouble`` (why Taichi does not load, or null), ``installs`` (whether pip may install into
+it, which Linux distributions and Blender forbid) and ``renders`` (whether it has bpy to render with).
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ REQUIREMENTS = {
 }
 """Module → requirement for pip; the widest range of pyproject.toml."""
 
+RENDERER = "bpy>=4.5,<5.3"
+"""Requirement for rendering into a photo, where Blender's own Python cannot."""
+
 OLDEST, NEWEST = (3, 11), (3, 13)
 """Python versions for which all of them have wheels; Taichi 1.7.4 supports up to 3.13."""
 
@@ -48,6 +51,11 @@ def installs() -> bool:
     return own or not (Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED").exists()
 
 
+def renders() -> bool:
+    """Return whether this interpreter has Blender as a module; it is not imported."""
+    return importlib.util.find_spec("bpy") is not None
+
+
 def main() -> None:
     """Print the answer. A Taichi whose libraries do not fit the machine may crash here, which callers handle too."""
     lacking, trouble = missing(), None
@@ -57,7 +65,7 @@ def main() -> None:
         except Exception as error:
             trouble = f"Taichi does not load ({type(error).__name__}: {error})"
     version = ".".join(str(number) for number in sys.version_info[:3])
-    answer = {"python": version, "missing": lacking, "trouble": trouble, "installs": installs()}
+    answer = {"python": version, "missing": lacking, "trouble": trouble, "installs": installs(), "renders": renders()}
     sys.stdout.write(json.dumps(answer) + "\n")
 
 

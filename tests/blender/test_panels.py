@@ -15,7 +15,7 @@ from physgen import physgen_addon
 from physgen.batch.blender_script import add_script_options
 from physgen.batch.commands.render_commands import render_options
 from physgen.batch.render import build_parser
-from physgen.physgen_addon import text
+from physgen.physgen_addon import interpreter, text
 from physgen.physgen_addon.operators import render_ops
 from physgen.physgen_addon.panels.render_panel import RESULTS
 from physgen.physgen_addon.panels.sidebar import is_in
@@ -586,8 +586,10 @@ def test_rendering_reports_why_it_is_impossible(world, bake, tmp_path, monkeypat
     with pytest.raises(RuntimeError, match="not saved yet"):
         bpy.ops.physgen.render_video()
     state.rendering.output = str(tmp_path / "out")
-    monkeypatch.setitem(render_ops.NEEDED, "no_such_module", "Something")
-    with pytest.raises(RuntimeError, match="lacks Something"):
+    # With the light zip the Python that simulates renders.
+    monkeypatch.setitem(interpreter.RENDERING, "no_such_module", "Something")
+    monkeypatch.setenv(interpreter.VARIABLE, str(tmp_path / "nothing"))
+    with pytest.raises(RuntimeError, match="nothing, named in PHYSGEN_PYTHON, is no Python"):
         bpy.ops.physgen.render_video()
 
 

@@ -17,6 +17,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import background_jobs, bake_state, interpreter, paths
+from physgen.physgen_addon.operators import render_ops
 from physgen.physgen_addon.operators.bake_ops import Bake
 from physgen.physgen_addon.playback import bake_record, particles, point_caches, show_bake
 from physgen.physgen_addon.playback.bake_record import BakeRecord, Look
@@ -396,6 +397,22 @@ def test_a_worker_that_ends_without_a_word_is_told_in_the_panel(python, tmp_path
     with pytest.raises(RuntimeError, match=words):
         bpy.ops.physgen.bake("EXEC_DEFAULT")
     assert words in found().trouble and found().advice == bake_state.MESSAGES["none"]
+
+
+@posix
+def test_where_blenders_own_python_lacks_packages_the_one_that_simulates_renders(python, monkeypatch):
+    monkeypatch.setitem(interpreter.RENDERING, "no_such_module", "Something")
+    path = python(f"echo {GOOD}")
+    with pytest.raises(interpreter.NoPython, match="cannot render into a photo: it lacks bpy") as raised:
+        render_ops.render_command()
+    assert raised.value.command.startswith(f"{path} -m pip install 'bpy")
+    check = interpreter.PhotoCheck()
+    check.look("")
+    assert check.trouble == raised.value.reason
+    python(f"echo {GOOD}".replace("}", ', "renders": true}'))
+    assert render_ops.render_command() == [str(path), str(render_ops.SCRIPT)]
+    check.look("")
+    assert not check.trouble
 
 
 @posix
