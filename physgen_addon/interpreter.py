@@ -33,6 +33,10 @@ TERMINAL = "the Command Prompt" if os.name == "nt" else "a terminal"
 """Name of the terminal for commands: PowerShell, Windows' other one, has no ``&&``."""
 RENDERING = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "OpenCV", "OpenImageIO": "OpenImageIO"}
 """Modules that rendering into a photo imports, and their package names."""
+_USUAL_PLACES = ("/usr/local/bin", "/opt/homebrew/bin", "/usr/bin")
+_FRAMEWORK = "/Library/Frameworks/Python.framework/Versions/{}/bin"
+"""Where Pythons are that are not on the search path of programs started from a desktop."""
+_BASE_PROBE = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2]); print(sys.executable)"
 _TIMEOUT_S = 60.0
 _MOST_BYTES = 2**20
 """Maximum output of a probed program; one that prints more is not Python."""
@@ -181,6 +185,24 @@ def install_command(python: Path | None = None, installs: bool = False) -> str:
 def _quoted(word: str | Path) -> str:
     """Return ``word`` quoted for the terminal; inside double quotes a shell would still expand $ and `."""
     return f'"{word}"' if os.name == "nt" else shlex.quote(str(word))
+
+
+def find_base() -> Path:
+    """Return a Python from which an environment that simulates can be made; each candidate is started to find out.
+
+    In this order: those on the search path and where installers put them, Blender's own. Raises NoPython.
+    """
+    places = [*os.environ.get("PATH", "").split(os.pathsep), *_USUAL_PLACES]
+    for version in (f"3.{minor}" for minor in range(NEWEST[1], OLDEST[1] - 1, -1)):
+        launcher = [["py", f"-{version}"]] if os.name == "nt" else []
+        named = shutil.which(f"python{version}", path=os.pathsep.join([*places, _FRAMEWORK.format(version)]))
+        for command in [*launcher, *([[named]] if named else []), [sys.executable]]:
+            with contextlib.suppress(_Unfit):
+                found = _asked([*command, "-I", "-c", _BASE_PROBE])[1].strip().splitlines()
+                if len(found) == 2 and found[0] == version:
+                    return Path(found[1])
+    reason = f"no Python {_dotted(OLDEST)} to {_dotted(NEWEST)} with venv was found: install one (python.org, or your"
+    raise NoPython(f"{reason} system's packages)", install_command())
 
 
 def home_folder() -> Path:

@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the preferences: check the Python interpreter, and copy the command that installs one."""
+"""Operators of the preferences: check the Python interpreter, install one, or copy the command that does."""
+
+from pathlib import Path
 
 import bpy
+from bpy.props import BoolProperty, StringProperty
 
-from ...sim.errors import Cancelled
+from ...sim.app import install_worker
+from ...sim.app.stage_process import own_command, run_stage
+from ...sim.errors import Cancelled, InputError
 from ...sim.events import Event, IsCancelled, OnEvent
-from .. import interpreter
-from ..background_jobs import JobOperator, Work
+from .. import interpreter, text
+from ..background_jobs import JobOperator, Work, no_job_runs, start_chosen
 from ..props import preferences
+from ..text import report_errors
+
+OFFLINE = (
+    "Blender's preferences keep it offline (System > Network > Allow Online Access): allow it there, or choose a "
+    "folder of wheels that were downloaded elsewhere"
+)
 
 
 class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
@@ -48,6 +59,107 @@ class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
             raise interpreter.NoPython(reason, command)
         sentence = str(final["reason"]) or f"Python {final['version']} simulates: {final['python']}"
         preferences.show_check(bpy.context, "NO" if final["reason"] else "YES", sentence, str(final["command"]))
+        return sentence
+
+
+class PHYSGEN_OT_install_python(bpy.types.Operator):
+    """Make a Python environment with all that simulates; shows size, folder and source first"""
+
+    bl_idname = "physgen.install_python"
+    bl_label = "Install"
+
+    wheels: StringProperty(
+        name="Wheels",
+        description="Folder of wheels that were downloaded elsewhere; empty: pip downloads them",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+    agreed: BoolProperty(
+        name="Agreed",
+        description="Agreement to size, folder and source, for scripts; pressing Install agrees as well",
+        options={"HIDDEN", "SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled unless a job runs."""
+        return no_job_runs(cls)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Show what would be installed; its button is the agreement."""
+        self.agreed = True
+        manager = context.window_manager
+        return manager.invoke_props_dialog(self, width=460, title="Install what simulates", confirm_text="Install")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw what is installed, where, from where, and how much it is."""
+        column = self.layout.column()
+        for line in install_description():
+            text.paragraph(column, line, 76)
+        column.prop(self, "wheels")
+        if not self.wheels.strip() and not bpy.app.online_access:
+            text.paragraph(column, f"{OFFLINE}.", 76)
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Start the installation."""
+        if not self.agreed:
+            raise InputError("Install: not agreed to; nothing was installed (agreed=True agrees, for scripts)")
+        return start_chosen(self, context, bpy.ops.physgen.install_packages, {"wheels": self.wheels})
+
+
+def install_description() -> list[str]:
+    """Return what *Install* would do, in sentences."""
+    renders = bool(interpreter.missing_modules())
+    parts = [install_worker.SIMULATING_MB, *([install_worker.RENDERING_MB] if renders else [])]
+    download, disk = (sum(part[index] for part in parts) for index in (0, 1))
+    packages = "Taichi, NumPy, SciPy, OpenCV and others" + (
+        ", and Blender as a module to render photos" if renders else ""
+    )
+    return [
+        f"{packages}: about {download} MB to download, {disk} MB on disk.",
+        f"Into {interpreter.home_folder()}, which is yours to delete. Nothing else is changed.",
+        "From the Python package index, or whichever index pip is set to; wheels only, checked by pip.",
+    ]
+
+
+class PHYSGEN_OT_install_packages(JobOperator, bpy.types.Operator):
+    """Install what was agreed to"""
+
+    bl_idname = "physgen.install_packages"
+    bl_label = "Install Packages"
+    bl_options = {"INTERNAL"}  # noqa: RUF012
+    job_title = preferences.INSTALLATION
+
+    wheels: StringProperty(options={"HIDDEN", "SKIP_SAVE"})
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return the installation as a child process of the Python that the environment is based on."""
+        words = [str(interpreter.home_folder()), *(["--render"] if interpreter.missing_modules() else [])]
+        if self.wheels.strip():
+            folder = Path(bpy.path.abspath(self.wheels.strip())).resolve()
+            if not folder.is_dir():
+                raise InputError(f"Wheels: there is no folder {folder}; choose where they are, or clear the field")
+            words += ["--wheels", str(folder)]
+        elif not bpy.app.online_access:
+            raise InputError(OFFLINE)
+        preferences.show_check(context, "", "", "")
+
+        def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
+            on_event({"event": "progress", "message": "looking for a Python to start from"})
+            base = interpreter.find_base()
+            done = run_stage(own_command(install_worker.MODULE, *words, python=str(base)), on_event, cancelled)
+            interpreter.forget()
+            on_event({"event": "progress", "message": "trying it"})
+            return {**done, "version": interpreter.python_version(Path(str(done["python"])))}
+
+        return work
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Use it from now on."""
+        preferences.use_python(bpy.context, str(final["python"]))
+        sentence = f"Python {final['version']} simulates: {final['python']}"
+        preferences.show_check(bpy.context, "YES", sentence, "")
         return sentence
 
 

@@ -186,8 +186,8 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         text.sentences(layout, context, "A photo of objects on a table or floor. It can be dropped here.")
         return
     if photo_check.trouble:
-        words = f"{photo_check.trouble}. Preferences, PhysGen, Check gives the command that mends it."
-        text.sentences(layout, context, words, icon="ERROR")
+        text.sentences(layout, context, f"{photo_check.trouble}.", icon="ERROR")
+        layout.operator("physgen.install_python", text="Install…", icon="IMPORT")
     _draw_boxes(layout, context, state)
     if 0 <= state.box_index < len(state.boxes):
         draw_details(layout, context, state.boxes[state.box_index])

@@ -57,11 +57,13 @@ def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Con
 
 
 def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message: str, *, icon: str = "NONE") -> None:
-    """Draw an error; for a Python problem, a button to the preferences instead of a long command."""
+    """Draw an error; for a Python problem, buttons that install or choose one instead of a long command."""
     words, command, _ = message.partition(COMMAND)
     text.sentences(layout, context, text.brief(words), icon=icon)
     if command:
-        button = layout.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
+        row = layout.row(align=True)
+        row.operator("physgen.install_python", text="Install…", icon="IMPORT")
+        button = row.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
         button.module = PHYSGEN_AP_preferences.bl_idname
 
 

@@ -4,11 +4,14 @@
 import bpy
 
 from .. import text
+from ..background_jobs import progress_text, running
 from ..context import redraw
 from ..interpreter import TERMINAL, home_folder
 
 ADDON = __package__.removesuffix(".physgen_addon.props")
 """Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` when installed."""
+INSTALLATION = "Installation"
+"""Title of the job of *Install*, whose progress the preferences show."""
 
 
 def _forget(self: "PHYSGEN_AP_preferences", context: bpy.types.Context) -> None:
@@ -41,13 +44,20 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         split = layout.split(factor=0.85, align=True)
         split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
         split.operator("physgen.check_python")
+        job = running()
+        if job is not None and job.title == INSTALLATION:
+            row = layout.row(align=True)
+            row.progress(factor=job.fraction or 0.0, text=progress_text(job))
+            row.operator("physgen.cancel_job", text="", icon="X")
+            layout.label(text=job.message)
         if not self.check:
             return
         box = layout.box()
         text.sentences(box, context, self.check_text, icon="CHECKMARK" if self.check == "YES" else "ERROR")
         if self.check_command:
             emptied = "empty the field above and " if self.python and str(home_folder()) in self.check_command else ""
-            box.label(text=f"Type this into {TERMINAL}; when it has ended, {emptied}press Check again:")
+            box.operator("physgen.install_python", text="Install Here…", icon="IMPORT")
+            box.label(text=f"Or type this into {TERMINAL}; when it has ended, {emptied}press Check again:")
             row = box.row(align=True)
             row.prop(self, "check_command", text="")
             row.operator("physgen.copy_command", text="", icon="COPYDOWN").command = self.check_command
@@ -62,6 +72,13 @@ def python(context: bpy.types.Context) -> str:
     """Return the interpreter set in the preferences; empty if none, or if registered by a script."""
     own = _own(context)
     return bpy.path.abspath(own.python) if own and own.python else ""
+
+
+def use_python(context: bpy.types.Context, path: str) -> None:
+    """Set the interpreter in the preferences."""
+    own = _own(context)
+    if own is not None:
+        own.python = path
 
 
 def show_check(context: bpy.types.Context, answer: str, sentence: str, command: str) -> None:

@@ -105,3 +105,29 @@ def test_check_reports_and_fails_with_the_remedy(bare, monkeypatch):
         assert preferences.python(bpy.context) == ""
     finally:
         physgen.unregister()
+
+
+def test_a_python_to_start_from_is_found(tmp_path, monkeypatch):
+    assert interpreter.find_base().is_file()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(interpreter, "_USUAL_PLACES", ())
+    assert interpreter.find_base().is_file(), "Blender's own will do"
+    monkeypatch.setattr(sys, "executable", "/bin/echo")
+    with pytest.raises(interpreter.NoPython, match=r"no Python 3\.11 to 3\.13 with venv was found: install one"):
+        interpreter.find_base()
+
+
+def test_nothing_is_installed_without_agreement_or_from_a_folder_that_is_not_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    physgen.register()
+    try:
+        with pytest.raises(RuntimeError, match="not agreed to; nothing was installed"):
+            bpy.ops.physgen.install_python()
+        with pytest.raises(RuntimeError, match="there is no folder"):
+            bpy.ops.physgen.install_python(agreed=True, wheels=str(tmp_path / "nothing"))
+        if not bpy.app.online_access:
+            with pytest.raises(RuntimeError, match="Allow Online Access"):
+                bpy.ops.physgen.install_python(agreed=True)
+    finally:
+        physgen.unregister()
+    assert not list(tmp_path.iterdir())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The extension in a real Blender with its windows open: install, work, save, open again without it, look at it.
 
-    python tests/real_blender/run.py [--zip ZIP] [--blender blender] [--python PYTHON] [--out DIR]
+    python tests/real_blender/run.py [--zip ZIP] [--blender blender] [--python PYTHON] [--photo PHOTO] [--out DIR]
 
 Needs the standard library only, so that it also runs where nothing but Blender is installed. Without a display it
 starts Xvfb. docs/blender.md says how to set up a container for it. Everything is written below DIR: ``report.json``,
@@ -99,6 +99,7 @@ class Run:
         self.start("install", "-b", "--command", *install, timeout=300)
         task = self.out / "task.json"
         words = {"out": str(self.out), "python": self.options.python, "addon": f"bl_ext.{REPOSITORY}.physgen"}
+        words["photo"] = str(self.options.photo.resolve()) if self.options.photo else ""
         task.write_text(json.dumps(words), encoding="utf-8")
         width, height = self.options.size.split("x")
         window = ("--window-geometry", "0", "0", width, height)
@@ -134,6 +135,7 @@ def main() -> int:
     parser.add_argument("--blender", default="blender", help="program or command line that starts Blender")
     parser.add_argument("--zip", type=Path, default=default_zip(), help="the extension (default: %(default)s)")
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
+    parser.add_argument("--photo", type=Path, help="photo to open and find objects in (default: one that is rendered)")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds for the work inside Blender")

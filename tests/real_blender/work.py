@@ -219,6 +219,30 @@ def photographed():
     job.result()
 
 
+def opened():
+    """A photo in the image editor: its objects found, a stroke over the first, and the panel that goes with them."""
+    bpy.ops.wm.read_homefile()
+    yield 1.0
+    with screens.focus():
+        assert bpy.ops.physgen.open_photo(filepath=TASK["photo"] or str(OUT / "photo.png")) == {"FINISHED"}
+    yield 1.5
+    yield from screens.shoot(SCREENS, "5_photo_opened")
+    running = extension("physgen_addon.background_jobs").running
+    with screens.focus():
+        assert bpy.ops.physgen.find_objects("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    job = running()
+    yield from session.until(lambda: running() is None, 200, "the objects")
+    job.result()
+    state = bpy.context.scene.physgen_photo
+    assert len(state.boxes) > 0, "nothing was found"
+    box = state.boxes[0]
+    x, y, width, height = box.x0, box.y0, box.x1 - box.x0, box.y1 - box.y0
+    box.keep = ",".join(f"{x + width * u:.0f},{y + height * v:.0f}" for u, v in ((0.3, 0.4), (0.5, 0.6), (0.7, 0.5)))
+    box.drop = f"{x + 0.02 * width:.0f},{y + 0.05 * height:.0f},{x + 0.1 * width:.0f},{y + 0.05 * height:.0f}"
+    yield from screens.shoot(SCREENS, "5_photo_found")
+    return {"boxes": [item.name for item in state.boxes]}
+
+
 def imported():
     """The scene folder, imported, looked at, baked, rendered and saved."""
     yield from screens.show_sidebar()
@@ -306,6 +330,7 @@ STEPS = [
     played,
     saved,
     photographed,
+    opened,
     imported,
     rendered,
     capture_loaded,
