@@ -233,7 +233,6 @@ class JobOperator(OperatorMixin):
         # Sidebars show the progress, some of them in image editors.
         redraw("VIEW_3D", "UI")
         redraw("IMAGE_EDITOR", "UI")
-        redraw("PREFERENCES")
         if result is None:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)

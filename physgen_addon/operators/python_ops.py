@@ -8,10 +8,10 @@ from bpy.props import BoolProperty, StringProperty
 
 from ...sim.app import install_worker
 from ...sim.app.stage_process import own_command, run_stage
-from ...sim.errors import Cancelled, InputError
+from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from .. import interpreter, text
-from ..background_jobs import JobOperator, Work, no_job_runs, start_chosen
+from ..background_jobs import Job, JobOperator, Work, no_job_runs, start_chosen
 from ..props import preferences
 from ..text import report_errors
 
@@ -129,7 +129,7 @@ class PHYSGEN_OT_install_packages(JobOperator, bpy.types.Operator):
     bl_idname = "physgen.install_packages"
     bl_label = "Install Packages"
     bl_options = {"INTERNAL"}  # noqa: RUF012
-    job_title = preferences.INSTALLATION
+    job_title = "Installation"
 
     wheels: StringProperty(options={"HIDDEN", "SKIP_SAVE"})
 
@@ -155,8 +155,17 @@ class PHYSGEN_OT_install_packages(JobOperator, bpy.types.Operator):
 
         return work
 
+    def progressed(self, scene: bpy.types.Scene, job: Job) -> None:
+        """Show it where it was started."""
+        preferences.show_progress(bpy.context, job.fraction or 0.0, job.message)
+
+    def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
+        """Show no progress any more."""
+        preferences.show_progress(bpy.context, 0.0, "")
+
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Use it from now on."""
+        preferences.show_progress(bpy.context, 0.0, "")
         preferences.use_python(bpy.context, str(final["python"]))
         sentence = f"Python {final['version']} simulates: {final['python']}"
         preferences.show_check(bpy.context, "YES", sentence, "")

@@ -4,14 +4,11 @@
 import bpy
 
 from .. import text
-from ..background_jobs import progress_text, running
 from ..context import redraw
 from ..interpreter import TERMINAL, home_folder
 
 ADDON = __package__.removesuffix(".physgen_addon.props")
 """Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` when installed."""
-INSTALLATION = "Installation"
-"""Title of the job of *Install*, whose progress the preferences show."""
 
 
 def _forget(self: "PHYSGEN_AP_preferences", context: bpy.types.Context) -> None:
@@ -33,6 +30,8 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
         update=_forget,
     )
+    progress: bpy.props.FloatProperty(options={"SKIP_SAVE", "HIDDEN"})
+    progress_text: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
     check: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
     check_text: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
     check_command: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
@@ -44,12 +43,10 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
         split = layout.split(factor=0.85, align=True)
         split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
         split.operator("physgen.check_python")
-        job = running()
-        if job is not None and job.title == INSTALLATION:
+        if self.progress_text:
             row = layout.row(align=True)
-            row.progress(factor=job.fraction or 0.0, text=progress_text(job))
+            row.progress(factor=self.progress, text=self.progress_text)
             row.operator("physgen.cancel_job", text="", icon="X")
-            layout.label(text=job.message)
         if not self.check:
             return
         box = layout.box()
@@ -72,6 +69,14 @@ def python(context: bpy.types.Context) -> str:
     """Return the interpreter set in the preferences; empty if none, or if registered by a script."""
     own = _own(context)
     return bpy.path.abspath(own.python) if own and own.python else ""
+
+
+def show_progress(context: bpy.types.Context, share: float, words: str) -> None:
+    """Show how far an installation is, from 0 to 1, in the preferences; no words when it has ended."""
+    own = _own(context)
+    if own is not None:
+        own.progress, own.progress_text = share, words
+    redraw("PREFERENCES")
 
 
 def use_python(context: bpy.types.Context, path: str) -> None:
