@@ -102,7 +102,7 @@ def run_render(
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """What the program chooses, by what suits the scene (``sim/app/default_motion``).
+    """Choices left to the program, to suit the scene (``sim/app/default_motion``).
 
     motion: of the objects. frames, slow: with it, the clip's length and slow motion, in place of the bake's options.
     """

@@ -37,7 +37,7 @@ MOST_DEPTH, MOST_ENTRIES = 3, 100_000
 """How deep, and at how many names, ``recover`` looks in a folder: ours are not deeper."""
 
 _unfinished: set[Path] = set()
-"""What this process is writing, to be removed by an exit that skips ``finally`` blocks."""
+"""Files that this process is writing, to be removed by an exit that skips ``finally`` blocks."""
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a photo's objects of sand, snow or a liquid show when their skin tears; the surface of liquids.
+"""Grains and liquid surfaces that replace an object of sand, snow or a liquid where its skin tears.
 
 Until its skin tears an object is its mesh, which equals the photo at rest. Afterwards grains show where the skin is
 gone (``photo_grains.py``), and a liquid is the surface around its particles, each of which keeps the colour, and the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a clip will not show, said before it is rendered: what leaves the picture, and that nothing moves."""
+"""Warnings about a clip before it is rendered: objects leave the picture, or nothing moves."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ UNSTEADY = 0.4
 
 @dataclass(frozen=True, kw_only=True)
 class Move:
-    """What one object does.
+    """The motion of one object.
 
     name: of the object. height: peak of its path over its rest, m. aside: where it comes down, (3,) m from its rest.
     start_s: when it begins. flight_s: from leaving to coming down. velocity, spin: m/s and rad/s at the beginning.

@@ -29,7 +29,7 @@ STAMP_FILE = "reconstruct.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What a scene was reconstructed from: ``photo``, ``objects`` and ``options``, with absolute paths."""
+    """The inputs that a scene was reconstructed from: ``photo``, ``objects`` and ``options``, with absolute paths."""
 
     photo: Path
     objects: tuple[ObjectRequest, ...]

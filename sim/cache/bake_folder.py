@@ -228,7 +228,7 @@ def save_manifest(folder: Path, manifest: BakeManifest) -> None:
 
 _PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-[\d]+(?:-[0-9a-f]+){0,2}\.(?:json|npz)")
 _LOCK_LEFTOVER = re.compile(r"\.lock-(?:dead-)?(\d+)-[0-9a-f]{8}")
-"""What earlier versions left."""
+"""Temporary files that earlier versions left behind."""
 _PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
 
 

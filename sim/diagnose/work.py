@@ -47,7 +47,7 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkRecord:
-    """What a diagnosis spent, as the report states it.
+    """The cost of a diagnosis, as the report states it.
 
     budget: largest work; spent: used; per_second: the fixed rate that turns a time into work. skipped: by effect (two
     joined by "+"), what was not done for lack of work.

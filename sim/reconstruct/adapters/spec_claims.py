@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an adapter's specification would run or read, found without running it: a claim for the user to agree to."""
+"""Programs and files that an adapter's specification would run or read, found without running it, for consent."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What contours say about a mask that colours made: a part of the ground's tone that belongs to it, gaps, thin rods.
+"""Contour evidence for a mask made by colours: parts of the ground's tone that belong to it, gaps, thin rods.
 
 Colours cannot tell a book's white spine from a white wall. But the spine has a closed contour of its own, shares a long
 border with the cover, and completes it to a plain convex figure; ground does not. Gaps between slats are ground by

@@ -204,7 +204,7 @@ def _parts(mask: Mask) -> list[Mask]:
 
 
 def _closed_contours(lab: NDArray[np.float32]) -> list[Mask]:
-    """What lies inside closed contours: strong edges with gaps bridged, filled."""
+    """Regions inside closed contours: strong edges with gaps bridged, filled."""
     edges = edge_strength(lab)
     result = []
     for quantile, side in ((0.85, 3), (0.85, 7), (0.92, 5), (0.95, 9)):

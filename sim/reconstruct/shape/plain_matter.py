@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an object is mostly made of, from its picture: plain colours without marks, and the grain of its matter.
+"""An object's plain material, from its picture: colours without marks, and grain.
 
 Marks (eyes, letters, bows, highlights) are what the outline does not reach: darker or lighter islands, found as the
 difference from a picture whose islands are levelled by greyscale reconstruction from the outline (Vincent, IEEE
