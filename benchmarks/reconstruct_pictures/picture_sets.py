@@ -7,6 +7,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from physgen.sim.scene.model import Camera
 
 from . import cases, thin_bodies
 from .cases import Case, Item
@@ -73,31 +75,64 @@ def _painted(set_name: str, number: int) -> Case:
         raise ValueError(f"picture {number}: the set {set_name} has 0 to {count - 1}")
     shot, seed = SHOTS[set_name][number], first + number
     rng = np.random.default_rng(seed)
-    turn = math.radians(-shot.turn)
+    body = (make_painted if set_name == "turntable" else make_held_out)(shot.kind, shot.size_m)
+    paint = np.full((2, 3), 0.3)
+    item = Item(f"{shot.kind}_1", shot.kind, body, _turned(shot.turn), paint, "painted", shot.roughness)
+    camera = _aimed(item, shot.size_px, shot.view, shot.pitch, rng)
+    lamps = cases.lights(shot.light, True, _reach(item), rng)
+    ground = cases.paint_of_ground(shot.ground, rng)
+    return _alone(number, seed, item, camera, (shot.ground, ground), (shot.light, lamps), 1.2, rng)
+
+
+def _turned(to_the_left_deg: float) -> NDArray[np.float64]:
+    """Pose (4, 4) of a thing turned about the vertical."""
+    turn = math.radians(-to_the_left_deg)
     matrix = np.eye(4)
     matrix[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-    body = (make_painted if set_name == "turntable" else make_held_out)(shot.kind, shot.size_m)
-    item = Item(f"{shot.kind}_1", shot.kind, body, matrix, np.full((2, 3), 0.3), "painted", shot.roughness)
+    return matrix
+
+
+def _aimed(item: Item, size: tuple[int, int], view_deg: float, pitch_deg: float, rng: np.random.Generator) -> Camera:
     camera = None
     while camera is None:
-        camera = cases.aim([item], shot.size_px, math.radians(shot.view), math.radians(shot.pitch), 0.0, rng)
-    reach = float(np.abs(item.vertices).max())
-    lamps, sky = cases.lights(shot.light, True, reach, rng)
+        camera = cases.aim([item], size, math.radians(view_deg), math.radians(pitch_deg), 0.0, rng)
+    return camera
+
+
+def _reach(item: Item) -> float:
+    return float(np.abs(item.vertices).max())
+
+
+def _alone(
+    number: int,
+    seed: int,
+    item: Item,
+    camera: Camera,
+    ground: tuple[str, NDArray[np.float64]],
+    light: tuple[str, tuple[tuple[cases.Lamp, ...], tuple[float, float, float]]],
+    wall_behind: float,
+    rng: np.random.Generator,
+) -> Case:
+    """One thing on its ground before a wall, ``wall_behind`` times its reach behind it.
+
+    ground: name and paint. light: name, and lamps and sky.
+    """
+    reach = _reach(item)
     return Case(
         name=f"case_{number:02}",
         seed=seed,
         camera=camera,
         items=(item,),
-        ground=shot.ground,
-        ground_paint=cases.paint_of_ground(shot.ground, rng),
+        ground=ground[0],
+        ground_paint=ground[1],
         ground_turn=float(rng.uniform(0, math.pi)),
         grain=0.6 * reach,
-        wall=float(item.vertices[:, 1].max()) + 1.2 * reach,
+        wall=float(item.vertices[:, 1].max()) + wall_behind * reach,
         wall_turn=0.0,
         wall_paint=np.array([0.5, 0.52, 0.55]),
-        light=shot.light,
-        lamps=lamps,
-        sky=sky,
+        light=light[0],
+        lamps=light[1][0],
+        sky=light[1][1],
         sky_gradient=0.5,
         exif=True,
         noise=1.2,
@@ -127,39 +162,14 @@ def _thin(number: int) -> Case:
         raise ValueError(f"picture {number}: the set thin has 0 to {count - 1}")
     kind, seed = thin_bodies.KINDS[number], first + number
     rng = np.random.default_rng(seed)
-    turn = math.radians(-THIN_TURNS_DEG[number])
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
     body = thin_bodies.make_thin(kind, 0.3, rng)
-    item = Item(f"{kind}_1", kind, body, matrix, np.array(THIN_PAINT[number]), "plain", 0.6)
-    camera = None
-    while camera is None:
-        pitch = math.radians(THIN_PITCH_DEG[number])
-        camera = cases.aim([item], (640, 480), math.radians(50.0), pitch, 0.0, rng)
-    reach = float(np.abs(item.vertices).max())
+    pose, paint = _turned(THIN_TURNS_DEG[number]), np.array(THIN_PAINT[number])
+    item = Item(f"{kind}_1", kind, body, pose, paint, "plain", 0.6)
+    camera = _aimed(item, (640, 480), 50.0, THIN_PITCH_DEG[number], rng)
     ground = cases.paint_of_ground(THIN_GROUNDS[number], rng)
     if kind == "pale":
         ground = np.array([[0.62, 0.58, 0.5], [0.55, 0.51, 0.44], [0.5, 0.47, 0.4]])
     if kind == "dark":
         ground = np.array([[0.05, 0.05, 0.055], [0.035, 0.035, 0.04], [0.06, 0.06, 0.06]])
-    lamps, sky = cases.lights(THIN_LIGHTS[number], True, reach, rng)
-    return Case(
-        name=f"case_{number:02}",
-        seed=seed,
-        camera=camera,
-        items=(item,),
-        ground=THIN_GROUNDS[number],
-        ground_paint=ground,
-        ground_turn=float(rng.uniform(0, math.pi)),
-        grain=0.6 * reach,
-        wall=float(item.vertices[:, 1].max()) + 1.5 * reach,
-        wall_turn=0.0,
-        wall_paint=np.array([0.5, 0.52, 0.55]),
-        light=THIN_LIGHTS[number],
-        lamps=lamps,
-        sky=sky,
-        sky_gradient=0.5,
-        exif=True,
-        noise=1.2,
-        reach=reach,
-    )
+    lamps = cases.lights(THIN_LIGHTS[number], True, _reach(item), rng)
+    return _alone(number, seed, item, camera, (THIN_GROUNDS[number], ground), (THIN_LIGHTS[number], lamps), 1.5, rng)

@@ -11,7 +11,6 @@ from typing import Any
 
 import bpy
 
-from ..context import redraw, scene_with
 from ..photo import photo_maths
 from ..photo.photo_image import (
     PhotoTool,
@@ -43,7 +42,6 @@ class _Session:
 
     painting: Painting
     scene: int
-    box: int
     brush: float = BRUSH_PX
     region: bpy.types.Region | None = None
     mouse: tuple[int, int] = (0, 0)
@@ -85,50 +83,40 @@ class PHYSGEN_OT_paint_mask(PhotoTool, bpy.types.Operator):
         state, box = context.scene.physgen_photo, chosen_box(context)
         found = found_mask(state, box)
         painting = Painting(first_mask(state, box, found or Path()))
-        self._session = _Session(painting, context.scene.session_uid, state.box_index, _brush[0])
+        self.tool_box = state.box_index
+        self._session = _Session(painting, context.scene.session_uid, _brush[0])
         _sessions[:] = [self._session]
         return self.begin(context)
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Handle strokes until painting is finished."""
-        session, scene = self._session, scene_with(self._session.scene)
-        # The extension was disabled, or the box is gone.
-        if session not in _sessions or scene is None or session.box >= len(scene.physgen_photo.boxes):
-            return self.end(context, "CANCELLED")
-        state = scene.physgen_photo
+    def photo_state(self) -> bpy.types.PropertyGroup | None:
+        """Return the photo's settings; None also if the extension was disabled."""
+        return PhotoTool.photo_state(self) if self._session in _sessions else None
+
+    def press(self, state: bpy.types.PropertyGroup, event: bpy.types.Event, region: bpy.types.Region) -> None:
+        """Begin a stroke."""
+        self._session.region, self._session.mouse = region, (event.mouse_x, event.mouse_y)
+        place, radius = self._place(event)
+        self._session.painting.press(place, radius, adds=not (event.ctrl or event.shift))
+
+    def handle(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> bool:
+        """Paint, end or undo a stroke, or change the brush."""
+        session = self._session
         session.mouse = (event.mouse_x, event.mouse_y)
-        if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
-            return self._done(context, state)
         if event.type == "LEFTMOUSE":
-            return self._button(context, state, event)
-        if event.type == "Z" and event.ctrl:
+            if event.value == "RELEASE":
+                session.painting.release()
+        elif event.type == "Z" and event.ctrl:
             if event.value == "PRESS":
                 session.painting.undo()
         elif factor := _size_change(event):
             session.brush = _brush[0] = min(max(session.brush * factor, LEAST_BRUSH_PX), MOST_BRUSH_PX)
         elif event.type not in ("MOUSEMOVE", "INBETWEEN_MOUSEMOVE"):
-            # Zooming and panning stay available.
-            return {"PASS_THROUGH"}
+            return False
         elif session.painting.is_in_stroke:
             session.painting.move(*self._place(event))
         else:
             session.region = region_under(context, state.image, event)
-        redraw("IMAGE_EDITOR", "WINDOW")
-        return {"RUNNING_MODAL"}
-
-    def _button(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> set[str]:
-        session = self._session
-        if event.value == "PRESS":
-            session.region = region_under(context, state.image, event)
-            if session.region is None:
-                # A click elsewhere ends painting and is passed on.
-                return self._done(context, state)
-            place, radius = self._place(event)
-            session.painting.press(place, radius, adds=not (event.ctrl or event.shift))
-        elif event.value == "RELEASE":
-            session.painting.release()
-        redraw("IMAGE_EDITOR", "WINDOW")
-        return {"RUNNING_MODAL"}
+        return True
 
     def _place(self, event: bpy.types.Event) -> tuple[tuple[float, float], float]:
         """Return the brush position in pixels of the mask, and its radius there."""
@@ -137,8 +125,9 @@ class PHYSGEN_OT_paint_mask(PhotoTool, bpy.types.Operator):
         u, v = place_under(session.region, event)
         return (u * width, v * height), session.brush * width_of_pixel(session.region) * width
 
-    def _done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
-        painting, box = self._session.painting, state.boxes[self._session.box]
+    def done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
+        """Store the mask; without strokes nothing has changed."""
+        painting, box = self._session.painting, state.boxes[self.tool_box]
         if not painting.changed:
             return self.end(context, "CANCELLED")
         if store_mask(box, painting.mask) is None:
@@ -291,33 +280,23 @@ class PHYSGEN_OT_set_horizon(PhotoTool, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show the horizon and wait for drags."""
         take_over(context.scene.physgen_photo)
-        self._scene = context.scene.session_uid
         self._grip: tuple[bpy.types.Region, tuple[float, float], tuple[float, float]] | None = None
         return self.begin(context)
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Handle drags until finished."""
-        scene = scene_with(self._scene)
-        if scene is None or scene.physgen_photo.image is None:
-            return self.end(context, "CANCELLED")
-        state = scene.physgen_photo
-        if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
-            return self.end(context, "FINISHED")
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            region = region_under(context, state.image, event)
-            if region is None:
-                # A click elsewhere ends the tool and is passed on.
-                return self.end(context, "FINISHED")
-            self._grip = (region, place_under(region, event), (state.horizon, state.roll))
-        elif self._grip is None:
-            # Zooming and panning stay available.
-            return {"PASS_THROUGH"}
-        elif event.type == "MOUSEMOVE":
+    def press(self, state: bpy.types.PropertyGroup, event: bpy.types.Event, region: bpy.types.Region) -> None:
+        """Begin a drag."""
+        self._grip = (region, place_under(region, event), (state.horizon, state.roll))
+
+    def handle(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> bool:
+        """Drag the horizon while the button is held."""
+        if self._grip is None:
+            return False
+        if event.type == "MOUSEMOVE":
             region, begun, start = self._grip
             drag(state, start, begun[0], place_under(region, event)[1] - begun[1])
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             self._grip = None
-        return {"RUNNING_MODAL"}
+        return True
 
 
 def draw_horizon(

@@ -15,9 +15,9 @@ from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.reconstruct.reconstruct_options import Proposal
 from ..background_jobs import JobOperator, Work
-from ..context import redraw, scene_with
+from ..context import redraw
 from ..interpreter import cli_command, find_python
-from ..photo.photo_image import PhotoTool, on_screen, place_under, region_under, shows_photo
+from ..photo.photo_image import PhotoTool, on_screen, place_under, shows_photo
 from ..photo.photo_maths import box_overlap, simplified
 from ..photo.photo_request import photo_file, scene_folder
 from ..props.preferences import python
@@ -112,30 +112,22 @@ class PHYSGEN_OT_draw_strokes(PhotoTool, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Wait for strokes."""
-        state = context.scene.physgen_photo
-        self._scene, self._box = context.scene.session_uid, state.box_index
+        self.tool_box = context.scene.physgen_photo.box_index
         self._region: bpy.types.Region | None = None
         self._places: list[tuple[float, float]] = []
         self._field, self._drawn = "", list[str]()
         return self.begin(context)
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Handle strokes until finished."""
-        scene = scene_with(self._scene)
-        if scene is None or scene.physgen_photo.image is None or self._box >= len(scene.physgen_photo.boxes):
-            return self.end(context, "CANCELLED")
-        state = scene.physgen_photo
-        box = state.boxes[self._box]
-        if event.type in ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE") and event.value == "PRESS":
-            return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            self._region = region_under(context, state.image, event)
-            if self._region is None:
-                # A click elsewhere ends the tool and is passed on.
-                return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
-            self._field = "drop" if event.ctrl or event.shift else "keep"
-            self._places = [self._place(state, event)]
-        elif event.type == "LEFTMOUSE" and event.value == "RELEASE" and self._places:
+    def press(self, state: bpy.types.PropertyGroup, event: bpy.types.Event, region: bpy.types.Region) -> None:
+        """Begin a stroke."""
+        self._region = region
+        self._field = "drop" if event.ctrl or event.shift else "keep"
+        self._places = [self._place(state, event)]
+
+    def handle(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> bool:
+        """Draw, end or undo a stroke."""
+        box = state.boxes[self.tool_box]
+        if event.type == "LEFTMOUSE" and event.value == "RELEASE" and self._places:
             text = ",".join(f"{x:.0f},{y:.0f}" for x, y in simplified(self._places))
             setattr(box, self._field, f"{getattr(box, self._field)} {text}".strip())
             self._drawn.append(self._field)
@@ -147,10 +139,12 @@ class PHYSGEN_OT_draw_strokes(PhotoTool, bpy.types.Operator):
                 field = self._drawn.pop()
                 setattr(box, field, getattr(box, field).rpartition(" ")[0])
         else:
-            # Zooming and panning stay available.
-            return {"PASS_THROUGH"}
-        redraw("IMAGE_EDITOR", "WINDOW")
-        return {"RUNNING_MODAL"}
+            return False
+        return True
+
+    def done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
+        """Finish; without strokes nothing has changed."""
+        return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
 
     def _place(self, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> tuple[float, float]:
         """Return the upright photo's pixel under the mouse, within the photo."""

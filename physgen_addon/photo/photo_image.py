@@ -15,7 +15,7 @@ from mathutils import Vector
 
 from ...sim.errors import InputError
 from ..compat import OperatorMixin
-from ..context import redraw
+from ..context import redraw, scene_with
 from .photo_maths import Mask, ellipse, extent, resized
 
 MAX_TURNED = 2048
@@ -297,15 +297,21 @@ def _pixels(image: bpy.types.Image) -> np.ndarray:
     return pixels.reshape(height, width, image.channels)[::-1]
 
 
+ENDING = ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE")
+"""Keys and buttons that end a tool."""
+
+
 class PhotoTool(OperatorMixin):
     """Mixin of modal operators that work over the photo in the image editor: enabled while it is visible, with a cursor
-    and a line of help until it ends.
+    and a line of help until Enter, Esc, the right button or a click outside the photo ends it.
 
-    tool_cursor: one of Blender's cursors. tool_help: shown in the status bar.
+    tool_cursor: one of Blender's cursors. tool_help: shown in the status bar. tool_box: index of the box that it
+    changes; None for none.
     """
 
     tool_cursor = "CROSSHAIR"
     tool_help = ""
+    tool_box: int | None = None
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -322,11 +328,49 @@ class PhotoTool(OperatorMixin):
 
     def begin(self, context: bpy.types.Context) -> set[str]:
         """Start to receive events; return the result of ``invoke``."""
+        self.tool_scene = context.scene.session_uid
         context.window.cursor_modal_set(self.tool_cursor)
         context.workspace.status_text_set(self.tool_help)
         context.window_manager.modal_handler_add(self)
         redraw("IMAGE_EDITOR")
         return {"RUNNING_MODAL"}
+
+    def photo_state(self) -> bpy.types.PropertyGroup | None:
+        """Return the photo's settings in the scene that the tool works on; None if photo, box or scene are gone."""
+        scene = scene_with(self.tool_scene)
+        if scene is None or scene.physgen_photo.image is None:
+            return None
+        state = scene.physgen_photo
+        return state if self.tool_box is None or self.tool_box < len(state.boxes) else None
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Handle events until the tool ends."""
+        state = self.photo_state()
+        if state is None:
+            return self.end(context, "CANCELLED")
+        if event.type in ENDING and event.value == "PRESS":
+            return self.done(context, state)
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            region = region_under(context, state.image, event)
+            if region is None:
+                return self.done(context, state)
+            self.press(state, event, region)
+        elif not self.handle(context, state, event):
+            # Zooming and panning stay available.
+            return {"PASS_THROUGH"}
+        redraw("IMAGE_EDITOR", "WINDOW")
+        return {"RUNNING_MODAL"}
+
+    def press(self, state: bpy.types.PropertyGroup, event: bpy.types.Event, region: bpy.types.Region) -> None:
+        """Handle the left button, pressed over the photo in ``region``."""
+
+    def handle(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> bool:
+        """Handle any other event; return whether it was one of the tool's own."""
+        return False
+
+    def done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
+        """Finish; return the result of ``modal``."""
+        return self.end(context, "FINISHED")
 
     def end(self, context: bpy.types.Context, how: str) -> set[str]:
         """Give cursor and status bar back; return the result ``how``, FINISHED or CANCELLED, of ``modal``."""
