@@ -1,4 +1,4 @@
-# make demo | test | test-all | test-explore | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
+# make demo | test | test-all | test-explore | fuzz | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
 # PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
 # BEST=1 renders the demo as the documentation shows it, WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
@@ -14,10 +14,12 @@ BIN := $(VENV)/bin
 ZIPS ?=
 NAMES ?= mpm worlds demo
 BLENDER ?= blender
+N ?= 100000
+SEED ?= 0
 # Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup demo test test-all test-explore lint docs benchmark extension test-blender-app clean
+.PHONY: setup demo test test-all test-explore fuzz lint docs benchmark extension test-blender-app clean
 
 setup:
 	@test -n "$(PYTHON)" || exit 1
@@ -36,6 +38,10 @@ test-all: setup
 # Examples that no run has drawn before, for the tests that draw any. Failing ones are kept in .hypothesis/.
 test-explore: setup
 	HYPOTHESIS_PROFILE=explore $(PYTEST) -m "hypothesis and not slow" $(TESTS)
+
+# Damaged and hostile files for every loader, N each; only its own errors may escape. SEED=… draws others.
+fuzz: setup
+	$(BIN)/python tests/fuzz/run.py --count $(N) --seed $(SEED)
 
 lint: setup
 	$(BIN)/ruff check .

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 
 from ..sim.app.bake_options import BakeOptions
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
-from ..sim.errors import InputError, PhysGenError
+from ..sim.errors import OUT_OF_MEMORY, InputError, PhysGenError
 from ..sim.events import IsCancelled
+from ..sim.files import shown
 from ..sim.version import VERSION
 from . import stages
 from .commands import (
@@ -129,6 +130,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except PhysGenError as error:
         terminal.error(type(error).__name__, str(error))
         return error.exit_code
+    # A path that no file system takes, a disk that went away, no memory left: one line, like any other mistake.
+    except OSError as error:
+        name = "" if error.filename is None else f"{shown(str(error.filename))}: "
+        terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
+        return InputError.exit_code
+    except MemoryError:
+        terminal.error(InputError.__name__, f"{options.command}: {OUT_OF_MEMORY}")
+        return InputError.exit_code
 
 
 if __name__ == "__main__":

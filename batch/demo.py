@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +14,14 @@ from ..sim.app.add_drops import Drop
 from ..sim.app.bake_options import BakeOptions
 from ..sim.app.reconstruct import Physics
 from ..sim.errors import InputError, PhysGenError
+from ..sim.files import read_toml
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.scene.model import Vector
 from ..sim.validation import parse
 from . import stages
 from .terminal import Terminal, stop_signals
 
+MAX_BYTES = 64 * 2**10
 CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml"
 
 
@@ -65,8 +66,8 @@ class DemoConfig:
 def load_config(path: Path = CONFIG) -> DemoConfig:
     """Return the demo's configuration. Raises InputError when it cannot be read."""
     try:
-        return parse(DemoConfig, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, tomllib.TOMLDecodeError) as error:
+        return parse(DemoConfig, read_toml(path, MAX_BYTES, what="configuration"), str(path))
+    except FileNotFoundError as error:
         raise InputError(f"{path}: {error}") from error
 
 

@@ -9,6 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+OUT_OF_MEMORY = (
+    "memory ran out; nothing that was finished is lost: close other programs, choose a coarser quality or a smaller "
+    "picture, and run it again"
+)
+
 
 class PhysGenError(Exception):
     """Base of all errors that the user can fix.

@@ -8,6 +8,7 @@ paths, numbers and booleans. Unknown keys are rejected, so that a misspelt field
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -16,18 +17,22 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .errors import InputError
+from .files import read_bytes
 from .trust import UntrustedSpec
 
 
 def require(condition: bool, field_name: str, value: object, remedy: str) -> None:
     """Raise InputError, "FIELD is VALUE: REMEDY", unless ``condition`` holds."""
     if not condition:
-        raise InputError(f"{field_name} is {value!r}: {remedy}")
+        raise InputError(f"{field_name} is {_brief(value)}: {remedy}")
 
 
 def finite(*numbers: float) -> bool:
-    """Return whether all ``numbers`` are finite."""
-    return all(math.isfinite(n) for n in numbers)
+    """Return whether all ``numbers`` are finite, as 64-bit floats."""
+    try:
+        return all(math.isfinite(n) for n in numbers)
+    except OverflowError:
+        return False
 
 
 def require_range(field_name: str, value: float | None, low: float, high: float, unit: str = "a number") -> None:
@@ -61,30 +66,42 @@ MAX_JSON_BYTES = 16 * 2**20
 """Larger files are refused unread; scenes, manifests and jobs are far smaller."""
 
 
-def read_json(path: Path) -> Any:
-    """Return the parsed JSON file ``path``. Raises InputError when it is missing, too large, not UTF-8 or not JSON."""
+MOST_WHOLE = 2**63 - 1
+"""Whole numbers beyond do not fit the arrays and programs that they go on to."""
+
+
+def read_json(path: Path, *, folder: Path | None = None) -> Any:
+    """Return the parsed JSON file ``path``.
+
+    folder: where the file must lie, links followed. Raises InputError when it is missing, no regular file, too large,
+    not UTF-8 or not JSON.
+    """
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise InputError(f"{path}: larger than {MAX_JSON_BYTES >> 20} MiB, so it is no file of PhysGen")
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = read_bytes(path, MAX_JSON_BYTES, folder=folder)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
-    except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
+    return json_value(content, str(path))
+
+
+def json_value(content: bytes | str, where: str) -> Any:
+    """Return the JSON value in ``content``, UTF-8 or text. Raises InputError, naming ``where``, when it is none."""
+    try:
+        text = content if isinstance(content, str) else content.decode("utf-8")
+        return json.loads(text)
+    # Texts of 16 MiB of brackets end in either of the last two.
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise InputError(f"{where}: not readable as JSON ({str(error)[:200] or type(error).__name__})") from None
 
 
 def parse(kind: type[T], value: Any, path: str) -> T:
     """Return the dataclass ``kind`` built from parsed JSON ``value``; ``path`` names it in messages."""
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected an object with fields, found {_brief(value)}")
-    hints = typing.get_type_hints(kind)
-    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    hints, fields = _fields_of(typing.cast(typing.Hashable, kind))
     unknown = sorted(set(value) - set(fields))
     if unknown:
         raise InputError(
-            f"{path}.{unknown[0]}: unknown field; known are {', '.join(fields)}; "
+            f"{path}.{str(unknown[0])[:60]}: unknown field; known are {', '.join(fields)}; "
             "remove it, or update PhysGen if a newer version wrote it"
         )
     arguments = {}
@@ -97,6 +114,12 @@ def parse(kind: type[T], value: Any, path: str) -> T:
         return kind(**arguments)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+@functools.cache
+def _fields_of(kind: Any) -> tuple[dict[str, Any], dict[str, dataclasses.Field[Any]]]:
+    """Return types and fields of a dataclass by name; finding them takes longer than reading a file of a thousand."""
+    return typing.get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
 
 
 def _convert(hint: Any, value: Any, path: str) -> Any:
@@ -135,7 +158,9 @@ def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
             return number
         raise InputError(f"{path}: expected a finite number, found {_brief(value)}")
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        return value
+        if abs(value) <= MOST_WHOLE:
+            return value
+        raise InputError(f"{path}: expected a whole number up to {MOST_WHOLE}, found {_brief(value)}")
     if hint is UntrustedSpec and isinstance(value, str):
         return UntrustedSpec(value)
     if hint in (str, bool) and isinstance(value, hint):
@@ -154,7 +179,11 @@ def _convert_scalar(hint: Any, value: Any, path: str) -> Any:
 
 
 def _brief(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    # Python prints no integer of more than 4300 digits, and nothing nested too deeply.
+    except (ValueError, RecursionError):
+        text = f"a {type(value).__name__} too long to print"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

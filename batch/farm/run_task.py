@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import IsCancelled, OnEvent
+from ...sim.files import read_text
 from ..terminal import Terminal, stop_signals
 from .planning.plan import RETRIES, Outcome, Plan, Task, find_task, is_worth_retrying, load_plan
 from .task_execution import execute_task
@@ -83,10 +84,8 @@ def run_with_retries(
 def listed_task(path: Path, number: str) -> str:
     """Return line ``number``, from 0, of the list of ids at ``path``. Raises InputError if there is none."""
     try:
-        if path.stat().st_size > MOST_LIST_BYTES:
-            raise InputError(f"{path}: larger than {MOST_LIST_BYTES >> 20} MiB, so this is not a list of tasks")
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError) as error:
+        lines = read_text(path, MOST_LIST_BYTES, what="list of tasks").splitlines()
+    except FileNotFoundError as error:
         raise InputError(f"{path}: cannot be read as a list of tasks ({error})") from error
     if not number.isascii() or not number.isdigit() or len(number) > 9 or int(number) >= len(lines):
         raise InputError(f"{path}: has no line {number!r}; it has {len(lines)}, counted from 0")

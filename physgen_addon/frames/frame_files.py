@@ -17,6 +17,7 @@ from ...sim.atomic import replacing
 from ...sim.composite import srgb
 from ...sim.composite.compositing import FrameLayers
 from ...sim.errors import InputError, openimageio_error
+from ...sim.files import MAX_PICTURE_BYTES, require_file
 from ...sim.version import VERSION
 from ..render.render_options import FrameFormat, exact_rate
 
@@ -27,6 +28,10 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
 
     Blender 4.5 writes one part with all channels, 5.x a part for each pass. Raises InputError if unreadable.
     """
+    try:
+        require_file(path, MAX_PICTURE_BYTES, what="picture")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; restore it or make it again") from None
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise InputError(
@@ -37,6 +42,8 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
         part = 0
         while source.seek_subimage(part, 0):
             spec = source.spec()
+            if spec.width * spec.height * spec.nchannels > MAX_NUMBERS:
+                raise InputError(f"{path}: {spec.width}x{spec.height} pixels are too many; make it again")
             pixels = source.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)
             if pixels is None:
                 raise InputError(f"{path}: cut off or damaged ({openimageio_error(source.geterror)}); make it again")
@@ -51,6 +58,8 @@ def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     return channels
 
 
+MAX_NUMBERS = 2**30
+"""Of a part of a picture: pixels times channels."""
 SOFTWARE = f"PhysGen {VERSION}"
 PNG_COMPRESSION = 3
 """Of 9: higher levels take far longer and save little on photos."""
@@ -133,6 +142,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
     """
     linear = path.suffix.lower() == ".exr"
     try:
+        require_file(path, MAX_PICTURE_BYTES, what="frame")
         pixels = _read(path, oiio.FLOAT if linear else oiio.UINT8)
     except OSError as error:
         raise InputError(f"{path}: not a readable frame ({error}); render it again") from error
@@ -150,7 +160,10 @@ def _read(path: Path, kind: oiio.BASETYPE) -> NDArray[Any]:
         if source is None:
             raise OSError(openimageio_error(oiio.geterror))
         try:
-            pixels = source.read_image(0, 0, 0, source.spec().nchannels, kind)
+            spec = source.spec()
+            if spec.width * spec.height * spec.nchannels > MAX_NUMBERS:
+                raise OSError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
+            pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
             if pixels is None:
                 raise OSError(openimageio_error(source.geterror))
         finally:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,6 +44,8 @@ def parse_frame_range(
 
 INDEX_FILE = "frames.json"
 FORMAT = "physgen-frames/1"
+MOST_RATE = 1e6
+"""Frames per second; more were never recorded."""
 FRAME_NAME = re.compile(r"(\d{4,})\.(?:png|exr)")
 
 
@@ -62,7 +63,7 @@ def recorded_fps(folder: Path) -> float | None:
     fps = data.get("fps") if isinstance(data, dict) and data.get("format") == FORMAT else None
     if isinstance(fps, bool) or not isinstance(fps, int | float):
         return None
-    return float(fps) if 0 < fps < math.inf else None
+    return float(fps) if 0 < fps <= MOST_RATE else None
 
 
 class FrameIndex:

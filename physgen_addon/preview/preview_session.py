@@ -26,6 +26,8 @@ from ...sim.app.stage_process import parse_event, read_errors, start_process
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event
+from ...sim.npz import read_npy
+from ...sim.scene.folder import inside
 from ...sim.validation import to_json
 from ..context import scene_with
 from ..props.body_props import bodies
@@ -79,11 +81,11 @@ class Clip:
         return min(int(self._time * self.fps + 1e-6), max(self.done - 1, 0))
 
 
+MAX_FACES_BYTES = 64 * 2**20
+
+
 def _faces(folder: Path, item: dict[str, Any]) -> NDArray[np.int32]:
-    try:
-        faces = np.load(folder / f"{item['name']}.faces.npy", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: {error}; switch the preview off and on") from None
+    faces = read_npy(inside(folder, f"{item['name']}.faces.npy"), MAX_FACES_BYTES)
     if (
         faces.ndim != 2
         or faces.shape[1] != 3

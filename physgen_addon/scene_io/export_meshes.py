@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ...sim.atomic import replacing
 from ...sim.errors import InputError
+from ...sim.files import read_bytes
+from ...sim.scene.meshes import MAX_MESH_BYTES
 
 SMALL = 0.1
 """Largest total area of holes, as a share of the mesh's area, that is closed: eyes of a head, not the mouth of a bowl.
@@ -205,7 +207,7 @@ def write_mesh(path: Path, points: Points, faces: Indices) -> None:
 def read_points_file(path: Path) -> NDArray[np.float64]:
     """Return coordinates (V, 3) from a file by ``write_mesh``. Raises InputError for any other file."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_MESH_BYTES, what="file of points")
         head, _, data = content.partition(b"end_header\n")
         count = int(head.split(b"element vertex ", 1)[1].split(b"\n", 1)[0])
         points = np.frombuffer(data, "<f4", 3 * count).reshape(count, 3).astype(np.float64)

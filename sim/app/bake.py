@@ -105,7 +105,8 @@ def bake(
     if done is not None:
         progress.notice(f"up to date: {out}")
         return Bake(root=out, manifest=done)
-    _refuse_foreign_folder(out)
+    with _named_errors(out):
+        _refuse_foreign_folder(out)
     with folder_lock(out), _named_errors(out):
         return Bake(root=out, manifest=_bake_locked(scene, out, options, progress, cancelled))
 
@@ -170,7 +171,9 @@ def _bake_locked(
         )
     ]
     remove_leftovers(out)
-    first, metrics = resume(out, manifest, simulation.world)
+    first, metrics, refused = resume(out, manifest, simulation.world)
+    if refused is not None:
+        progress.notice(refused)
     if first:
         progress.notice(f"continuing at frame {first + 1} of {options.frames}")
     else:

@@ -7,6 +7,7 @@ Only files that the manifest lists are ever counted or deleted.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -21,7 +22,7 @@ from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 from ..version import VERSION
 from .folder_lock import folder_lock
-from .pc2 import Pc2Reader
+from .pc2 import MAX_VERTICES, Pc2Reader
 
 MANIFEST_FORMAT = "physgen-bake/1"
 MANIFEST_FILE = "manifest.json"
@@ -39,6 +40,10 @@ SPACES = (WORLD_SPACE, MESH_SPACE)
 GRAINS, SURFACE = "grains", "surface"
 """How particles are shown: as grains, or as the surface that encloses them."""
 
+
+MOST_FRAMES, MOST_START, MOST_RATE = 100_000, 10**7, 1e6
+MOST_FILES = 1_000_000
+"""What a manifest may claim: frames, the number of the first one, frames per second, files in all."""
 
 SPLAT_POINTS = 4
 """Points per splat in its cache: centre, and the ends of three half axes."""
@@ -68,6 +73,9 @@ class BakedObject:
     splats: int = 0
 
     def __post_init__(self) -> None:
+        counts = (self.vertices, self.points, SPLAT_POINTS * self.splats)
+        if self.vertices < 1 or min(counts) < 0 or max(counts) > MAX_VERTICES:
+            raise InputError(f"object {self.name}: {counts} are no numbers of points of its caches; bake again")
         if self.points_as not in (GRAINS, SURFACE):
             raise InputError(f"object {self.name}: points_as is {self.points_as!r}: choose {GRAINS} or {SURFACE}")
         if self.space not in SPACES:
@@ -136,11 +144,20 @@ class BakeManifest:
     def __post_init__(self) -> None:
         if self.state not in STATES:
             raise InputError(f"state is {self.state!r}: choose one of {', '.join(STATES)}")
-        if self.fps <= 0 or self.slow <= 0 or self.frames < 1 or not 0 <= self.frames_done <= self.frames:
+        if (
+            not 0 < self.fps <= MOST_RATE
+            or not 0 < self.slow <= MOST_RATE
+            or not 1 <= self.frames <= MOST_FRAMES
+            or not 0 <= self.frames_done <= self.frames
+            or abs(self.frame_start) > MOST_START
+        ):
             raise InputError(
-                f"{self.frames_done} of {self.frames} frames at {self.fps} fps, slow {self.slow}, is not a valid frame "
-                "range; bake again"
+                f"{self.frames_done} of {self.frames} frames from {self.frame_start} at {self.fps} fps, slow "
+                f"{self.slow}, is not a valid frame range (at most {MOST_FRAMES} frames); bake again"
             )
+        files = sum(2 + (self.frames if item.splats_folder else 0) for item in self.objects)
+        if files > MOST_FILES:
+            raise InputError(f"objects: name {files} files, and a bake has {MOST_FILES} at most; bake again")
 
 
 @dataclass(frozen=True)
@@ -198,9 +215,9 @@ def load_bake(root: str | Path) -> Bake:
 def load_manifest(folder: Path) -> BakeManifest:
     """Return the manifest of the bake ``folder``. Raises InputError if it is missing or unreadable."""
     path = folder / MANIFEST_FILE
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise InputError(f"{folder}: no bake there ({MANIFEST_FILE} is missing); run `physgen bake` first")
-    data = read_json(path)
+    data = read_json(path, folder=folder)
     found = data.pop("format", None) if isinstance(data, dict) else None
     if found != MANIFEST_FORMAT:
         remedy = "update PhysGen, or bake" if str(found).startswith("physgen-bake/") else "bake"

@@ -10,6 +10,7 @@ followed by samples × vertices × 3 float32.
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from pathlib import Path
@@ -19,11 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files import open_file
 
 _HEADER = struct.Struct("<12siiffi")
 _SIGNATURE = b"POINTCACHE2\0"
 MAX_VERTICES = 50_000_000
 """A header that claims more is refused; a sample of that size is 600 MB."""
+MAX_CACHE_BYTES = 2**44
 
 
 class Pc2Reader:
@@ -37,8 +40,8 @@ class Pc2Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            size = path.stat().st_size
-            with path.open("rb") as file:
+            with open_file(path, MAX_CACHE_BYTES, what="point cache") as file:
+                size = os.fstat(file.fileno()).st_size
                 header = file.read(_HEADER.size)
         except FileNotFoundError:
             raise InputError(f"{path}: there is no such point cache; bake the scene again") from None
@@ -47,7 +50,7 @@ class Pc2Reader:
         if len(header) < _HEADER.size or header[:12] != _SIGNATURE:
             raise InputError(f"{path}: not a PC2 point cache; bake the scene again")
         _, version, vertices, start, rate, samples = _HEADER.unpack(header)
-        if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or rate <= 0:
+        if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or not 0 < rate < math.inf:
             raise InputError(
                 f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is invalid; rebake"
             )
@@ -68,7 +71,8 @@ class Pc2Reader:
             )
         count = 3 * self.vertex_count
         try:
-            numbers = np.fromfile(self.path, dtype="<f4", count=count, offset=_HEADER.size + 4 * index * count)
+            with open_file(self.path, MAX_CACHE_BYTES, what="point cache") as file:
+                numbers = np.fromfile(file, dtype="<f4", count=count, offset=_HEADER.size + 4 * index * count)
         except OSError as error:
             raise InputError(f"{self.path}: {error.strerror or error}; bake again") from None
         if len(numbers) < count:

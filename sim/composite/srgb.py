@@ -6,14 +6,16 @@ Everything that mixes or scales pixels does so in linear light, as lenses and sh
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..errors import InputError
+from ..files import MAX_PICTURE_BYTES, open_file
 
 Linear = NDArray[np.float32]
 """(H, W, 3) linear light, Rec. 709 primaries, 1 is the white of an 8-bit image."""
@@ -57,11 +59,16 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 def _read(path: Path, mode: str) -> NDArray[np.uint8]:
     try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert(mode))
-    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
+                return np.asarray(image.convert(mode))
+    except InputError:
+        raise
+    # Decoders of damaged files raise arbitrary exceptions (SyntaxError, struct.error, …).
+    except Exception as error:
         raise InputError(
-            f"{path}: not a readable image ({error}); restore it or reconstruct the scene again"
+            f"{path}: not a readable image ({type(error).__name__}: {error}); restore it or reconstruct the scene again"
         ) from error
 
 

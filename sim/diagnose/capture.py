@@ -7,7 +7,6 @@ docs/file-formats.md describes the files for other programs.
 from __future__ import annotations
 
 import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_json
 from ..errors import InputError
+from ..npz import read_npz
 from ..scene.folder import inside
 from ..scene.meshes import read_mesh
 from ..validation import parse, read_json, to_json
@@ -233,7 +233,7 @@ def load_capture(root: str | Path) -> Capture:
 
     root = Path(root)
     path = root / CAPTURE_FILE
-    data = read_json(path)
+    data = read_json(path, folder=root)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else None
         raise InputError(f"{path}: format is {found!r}: this program reads {FORMAT!r}")
@@ -377,21 +377,7 @@ def read_arrays(path: Path) -> Mapping[str, NDArray[Any]]:
 
     Raises InputError when it is missing, too large once unpacked, or not an archive of plain arrays.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(item.file_size for item in archive.infolist())
-        if size > MAX_TRIAL_BYTES:
-            raise InputError(f"{path}: holds {size >> 20} MiB, more than {MAX_TRIAL_BYTES >> 20}; shorten the trial")
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, MemoryError, NotImplementedError) as error:
-        raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from None
-    except Exception as error:  # zlib and numpy's header parser raise all kinds of errors on corrupt data
-        raise InputError(f"{path}: not a readable archive of arrays ({type(error).__name__}: {error})") from error
+    return read_npz(path, MAX_TRIAL_BYTES, own=True, remedy="shorten the trial")
 
 
 def _array(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], where: str) -> Array:

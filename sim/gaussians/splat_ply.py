@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing
 from ..errors import InputError
+from ..files import open_file
 from .ply_format import Columns, Element, Header, Property, read_columns, read_header
 from .splats import MAX_SCALE, MIN_SCALE, Splats
 
@@ -237,6 +238,10 @@ class SplatFile:
     notes: tuple[str, ...] = ()
 
 
+MAX_FILE_BYTES = 2**36
+"""Rows are read one block at a time, and only as many as the header declares."""
+
+
 def read_splats(path: Path, *, max_splats: int = MAX_SPLATS) -> Splats:
     """Return the splats of ``read_splat_file``, without its notes."""
     return read_splat_file(path, max_splats=max_splats).splats
@@ -253,7 +258,7 @@ def read_splat_file(path: Path, *, max_splats: int = MAX_SPLATS) -> SplatFile:
     if other := _OTHER_FORMATS.get(path.suffix.lower()):
         raise InputError(f"{path}: {other} files are not supported: convert it to PLY, for example with SuperSplat")
     try:
-        with path.open("rb") as stream:
+        with open_file(path, MAX_FILE_BYTES, what="file of splats") as stream:
             return _read(stream, path, max_splats)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

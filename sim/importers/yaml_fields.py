@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import read_bytes
 
 MAX_YAML_BYTES = 64 * 2**10
 """Larger files are refused unread: the settings of a simulation are a few kilobytes, and the parser is slow."""
@@ -32,9 +33,7 @@ def read_yaml(path: Path) -> Any:
             return super().compose_node(parent, index)
 
     try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise InputError(f"{path}: larger than {MAX_YAML_BYTES >> 10} KiB, too large for settings")
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bytes(path, MAX_YAML_BYTES, what="file of settings").decode("utf-8-sig")
         return yaml.load(text, Loader=PlainLoader)  # noqa: S506 - a SafeLoader
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from ..errors import InputError
+from ..files import MAX_PICTURE_BYTES, open_file
 
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 ROUNDING_SIGMA = 0.02
@@ -202,7 +203,7 @@ def load_photo(path: Path, max_size: int) -> Photo:
         with warnings.catch_warnings():
             # Pillow only warns between its limit and twice that; our own check below has the better message.
             warnings.simplefilter("ignore")
-            with Image.open(path) as image:
+            with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
                 return _decode(path, image, max_size)
     except InputError:
         raise

@@ -12,7 +12,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
-from ..errors import Cancelled
+from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent
-from ..validation import to_json
+from ..npz import read_npz
+from ..validation import json_value, to_json
 
 
 class Steps:
@@ -135,14 +135,9 @@ def _feed(digest: Any, value: object) -> None:
 def _read(path: Path) -> tuple[dict[str, NDArray[Any]], list[str]] | None:
     """The arrays and notices in ``path``; None if there is no file, or it is damaged."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                return None
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        said = json.loads(str(arrays.pop(_NOTICES)))
-    # Damaged archives raise arbitrary exceptions (zlib.error, struct.error, KeyError, …).
-    except Exception:
+        arrays = read_npz(path, MAX_BYTES, own=True)
+        said = json_value(str(arrays.pop(_NOTICES)), str(path))
+    except (InputError, KeyError):
         return None
     if not isinstance(said, list) or not all(isinstance(text, str) for text in said):
         return None

@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import read_toml
 from ..validation import parse
 
+MAX_BYTES = 64 * 2**10
 QUALITY_FOLDER = Path(__file__).resolve().parents[2] / "presets" / "qualities"
 COARSEST = "preview"
 """The quality whose cells are largest, so that a base carries least."""
@@ -56,7 +57,4 @@ def load_quality(name: str) -> Quality:
     if name not in quality_names():
         raise InputError(f"quality {name!r}: unknown; choose one of {', '.join(quality_names())}")
     path = QUALITY_FOLDER / f"{name}.toml"
-    try:
-        return parse(Quality, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
+    return parse(Quality, read_toml(path, MAX_BYTES, what="quality"), str(path))

@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..errors import InputError, openimageio_error
+from ..files import MAX_PICTURE_BYTES, require_file
 from .equirectangular import FRAMES, LUMINANCE, Radiance, directions
 from .model import Camera, Ground
 
@@ -39,8 +40,10 @@ def read_environment(path: Path) -> Radiance:
             "8-bit pictures have lost what is brighter than white; of DiffusionLight take hdr/NAME.exr, which its "
             "exposure2hdr.py makes of envmap/NAME_ev-*.png"
         )
-    if not path.is_file():
-        raise InputError(f"environment {path}: there is no such file; check its name")
+    try:
+        require_file(path, MAX_PICTURE_BYTES, what="environment map")
+    except FileNotFoundError:
+        raise InputError(f"environment {path}: there is no such file; check its name") from None
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise InputError(

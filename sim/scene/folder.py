@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from urllib.parse import unquote
 
 from ..atomic import write_json
 from ..errors import InputError
+from ..files import MOST_HASHED, is_file, open_file, read_bytes, shown
 from ..validation import parse, read_json, to_json
 from .model import FORMAT, Ground, SceneModel
 from .scene_object import SceneObject
@@ -121,11 +123,17 @@ class Scene:
         return save_scene(self.root, self.model)
 
 
+MOST_NAME, MOST_PART = 1024, 255
+"""Characters of a name within a folder, and bytes between its slashes: what every file system can hold."""
+
+
 def inside(root: Path, name: str) -> Path:
     """Return ``root / name`` for a relative ``name`` with forward slashes that stays inside ``root``.
 
     Raises InputError for absolute names, drive letters, ``..`` and links that lead out.
     """
+    if len(name) > MOST_NAME or any(len(part.encode("utf-8", "replace")) > MOST_PART for part in name.split("/")):
+        raise InputError(f"file name {shown(name)!r}: is too long; names have at most {MOST_PART} bytes a part")
     pure = PurePosixPath(name)
     if not name or "\\" in name or "\0" in name or ":" in name or pure.is_absolute() or ".." in pure.parts:
         raise InputError(f"file name {name!r}: must be relative to {root}, with forward slashes and without '..'")
@@ -143,7 +151,7 @@ def inside(root: Path, name: str) -> Path:
 def file_hash(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as 64 hex digits; InputError when it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_file(path, MOST_HASHED) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
@@ -160,11 +168,13 @@ def load_scene(root: str | Path) -> Scene:
     """
     root = Path(root)
     path = root / SCENE_FILE
-    data = read_json(path)
+    data = read_json(path, folder=root)
     folder = Scene(root=root, model=parse_scene(data, str(path)))
     for name in referenced_files(folder.model):
-        if not folder.file(name).is_file():
-            raise InputError(f"{path}: names {name!r}, which is missing; restore it or reconstruct the scene again")
+        if not is_file(folder.file(name)):
+            raise InputError(
+                f"{path}: names {name!r}, which is missing or cannot be read; restore it or reconstruct the scene again"
+            )
     return folder
 
 
@@ -243,6 +253,9 @@ def referenced_files(scene: SceneModel) -> list[str]:
     return names
 
 
+MOST_NAMING = 512 * 2**20
+"""Bytes of a mesh file that is searched for names, as many as a mesh may have."""
+
 _MTL_TEXTURE = re.compile(r"(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+)", re.IGNORECASE)
 
 
@@ -272,16 +285,16 @@ def _named_beside(path: Path) -> Iterator[str]:
     suffix = path.suffix.lower()
     try:
         if suffix == ".gltf":
-            yield from _named_in_gltf(json.loads(path.read_bytes()))
+            yield from _named_in_gltf(json.loads(read_bytes(path, MOST_NAMING)))
         elif suffix in (".obj", ".mtl"):
-            with path.open(encoding="utf-8", errors="replace") as file:
+            with io.TextIOWrapper(open_file(path, MOST_NAMING), encoding="utf-8", errors="replace") as file:
                 for line in map(str.strip, file):
                     # Several names may follow, and one name may hold spaces; options may come before a texture's.
                     if suffix == ".obj" and line.startswith("mtllib "):
                         yield from (line.removeprefix("mtllib ").strip(), *line.split()[1:])
                     elif suffix == ".mtl" and (texture := _MTL_TEXTURE.match(line)):
                         yield from (texture[1], texture[1].split()[-1])
-    except (OSError, ValueError, RecursionError):
+    except (OSError, InputError, ValueError, RecursionError, MemoryError):
         return
 
 

@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import json
 import math
-import tomllib
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 from ..atomic import replacing
 from ..constitutive import RIGID, models
 from ..errors import InputError
+from ..files import read_toml
 from ..validation import finite, parse, quantity, require, require_quantities
 from .object_names import DEVICES
 
@@ -191,11 +191,9 @@ def delete_preset(folder: Path, name: str) -> None:
 
 def _read_preset(path: Path) -> tuple[Material, str]:
     try:
-        if path.stat().st_size > MAX_PRESET_BYTES:
-            raise InputError(f"{path}: larger than {MAX_PRESET_BYTES >> 10} KiB, so this is no material preset")
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
+        data = read_toml(path, MAX_PRESET_BYTES, what="material preset")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; choose another preset") from None
     description = data.pop("description", "")
     data.pop("source", None)
     data.pop("preset", None)

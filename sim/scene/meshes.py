@@ -3,19 +3,21 @@
 
 from __future__ import annotations
 
+import io
 import math
-import struct
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .folder import Scene
+from ..files import read_bytes
+from ..npz import array_body, array_header, open_npz
+from .folder import Scene, inside
 from .model import SceneObject
 
 if TYPE_CHECKING:
@@ -68,10 +70,9 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: mesh files are {', '.join(MESH_SUFFIXES)}, not {path.suffix or 'without suffix'!r}")
     try:
-        size = path.stat().st_size
-        if size > MAX_MESH_BYTES:
-            raise InputError(f"{path}: {size >> 20} MiB is more than the {MAX_MESH_BYTES >> 20} MiB a mesh may have")
-        mesh = trimesh.load(path, process=False, force="mesh")
+        content = io.BytesIO(read_bytes(path, MAX_MESH_BYTES, what="mesh"))
+        kind, beside = path.suffix.lower().removeprefix("."), _files_beside(path.parent)
+        mesh = trimesh.load(content, file_type=kind, resolver=beside, process=False, force="mesh")
     except InputError:
         raise
     except FileNotFoundError:
@@ -81,6 +82,12 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     # Third-party parsers raise anything on malformed input (struct.error, KeyError, …).
     except Exception as error:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again") from error
+    return _checked_mesh(mesh, path)
+
+
+def _checked_mesh(mesh: Any, path: Path) -> trimesh.Trimesh:
+    import trimesh
+
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: holds no triangles; export it again as a triangle mesh")
     if np.ndim(mesh.vertices) != 2 or np.shape(mesh.vertices)[1] != 3:
@@ -93,6 +100,32 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
+def _files_beside(folder: Path) -> Any:
+    """Return trimesh's way to the files that a mesh names (buffers, materials, textures): regular files in ``folder``
+    or below, whatever the version of trimesh itself would open.
+    """
+    from trimesh.resolvers import Resolver
+
+    class Beside(Resolver):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.folder = folder
+
+        def get(self, name: str) -> bytes:
+            path = inside(folder, unquote(str(name)).replace("\\", "/").removeprefix("./").strip())
+            return read_bytes(path, MAX_MESH_BYTES, what="part of a mesh", folder=folder)
+
+        def keys(self) -> tuple[str, ...]:
+            return ()
+
+        def write(self, name: str, data: bytes) -> None:
+            raise InputError(f"{folder}/{name}: is not written while a mesh is read")
+
+        def namespaced(self, namespace: str) -> Any:
+            return _files_beside(inside(folder, namespace))
+
+    return Beside()
+
+
 MAX_TRACK_BYTES = 2**30
 """Largest array that is read, as float64; larger ones are refused unread."""
 
@@ -103,14 +136,9 @@ def load_vertex_track(path: Path, vertex_count: int) -> tuple[NDArray[np.float64
     Raises InputError when the file is missing, damaged, of another shape or larger than ``MAX_BYTES``, holds anything
     but numbers, or its times do not rise. Nothing is unpickled.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            times = _read_track_array(archive, "times", path)
-            vertices = _read_track_array(archive, "vertices", path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; restore it or remove vertices_file") from None
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error) as error:
-        raise InputError(f"{path}: not readable as .npz ({error}); write it again with numpy.savez") from None
+    with open_npz(path, 2 * MAX_TRACK_BYTES) as archive:
+        times = _read_track_array(archive, "times", path)
+        vertices = _read_track_array(archive, "vertices", path)
     if times.ndim != 1 or len(times) == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError(f"{path}: times has shape {times.shape}: give (K,) finite seconds in rising order, each once")
     if vertices.shape != (len(times), vertex_count, 3):
@@ -124,30 +152,17 @@ def load_vertex_track(path: Path, vertex_count: int) -> tuple[NDArray[np.float64
 
 
 def _read_track_array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[np.float64]:
+    where = f"{path}: {name}"
     try:
         with archive.open(f"{name}.npy") as file:
-            shape = _checked_shape(file, name, path)
-        with archive.open(f"{name}.npy") as file:
-            array = np.lib.format.read_array(file, allow_pickle=False)
+            header = array_header(file, where)
+            if header.dtype.kind not in "fiu":
+                raise InputError(f"{where} holds {header.dtype}; give numbers")
+            if math.prod(header.shape) * max(8, header.dtype.itemsize) > MAX_TRACK_BYTES:
+                raise InputError(
+                    f"{where} has shape {header.shape}, more than {MAX_TRACK_BYTES >> 20} MiB; give fewer keyframes"
+                )
+            array = array_body(file, header, where)
     except KeyError:
         raise InputError(f"{path}: holds no array {name!r}; write times and vertices") from None
-    if array.shape != shape:
-        raise InputError(f"{path}: {name} has shape {array.shape}, its header says {shape}; write it again")
     return np.ascontiguousarray(array, dtype=np.float64)
-
-
-def _checked_shape(file: IO[bytes], name: str, path: Path) -> tuple[int, ...]:
-    version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    elif version == (2, 0):
-        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
-    else:
-        raise InputError(f"{path}: {name} is of .npy version {version}; write it again with numpy.savez")
-    if dtype.kind not in "fiu":
-        raise InputError(f"{path}: {name} holds {dtype}; give numbers")
-    if any(n < 0 for n in shape) or math.prod(shape) * max(8, dtype.itemsize) > MAX_TRACK_BYTES:
-        raise InputError(
-            f"{path}: {name} has shape {shape}, more than {MAX_TRACK_BYTES >> 20} MiB; give fewer keyframes"
-        )
-    return tuple(shape)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
 from ..errors import InputError
+from ..files import read_bytes
 from .meshes import MAX_MESH_BYTES, read_mesh
 
 MAX_JSON_BYTES = 16 * 2**20
@@ -70,10 +71,7 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
 def _read_glb(path: Path) -> TexturedMesh | None:
     """Return the mesh, or None for a GLB with features that this reader does not support."""
     try:
-        size = path.stat().st_size
-        if size > MAX_MESH_BYTES:
-            raise InputError(f"{path}: {size >> 20} MiB is more than the {MAX_MESH_BYTES >> 20} MiB a mesh may have")
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_MESH_BYTES, what="mesh")
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such mesh; restore it or reconstruct the scene again") from None
     except OSError as error:
@@ -305,7 +303,7 @@ def write_moved_mesh(source: Path, target: Path, vertices: Array, faces: NDArray
     if kind in (".glb", ".ply"):
         # Read first, for the usual errors about missing and oversized files.
         read_textured_mesh(source)
-        content = source.read_bytes()
+        content = read_bytes(source, MAX_MESH_BYTES, what="mesh")
         moved = _glb_moved(content, vertices, faces) if kind == ".glb" else _ply_moved(content, vertices)
     if moved is not None:
         write_bytes(target, moved)

@@ -15,6 +15,7 @@ from ....sim.app.bake_options import BakeOptions
 from ....sim.app.reconstruct import require_physics, with_physics
 from ....sim.cache.bake_folder import WORLD_SPACE
 from ....sim.errors import InputError
+from ....sim.files import read_bytes
 from ....sim.reconstruct import ObjectRequest, ReconstructOptions
 from ....sim.reconstruct.reconstruct_options import object_names
 from ....sim.scene.bake_quality import load_quality
@@ -158,17 +159,13 @@ def _load(path: Path) -> Job:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB, so this is not a job file")
-        text = content.decode("utf-8")
+        text = read_bytes(path, MAX_BYTES, what="job file").decode("utf-8")
         if endless := _ENDLESS_NAME.search(text):
             raise InputError(f"{path}: {brief(endless[0])}: is nested too deeply; this is not a job file")
         return tomllib.loads(text)
-    except OSError as error:
+    except FileNotFoundError as error:
         raise InputError(f"{path}: {error.strerror or error}; give the name of a job file") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...files import MAX_PICTURE_BYTES, read_bytes
 from ...scene.folder import Scene, require_photo
 from ..capture import Camera
 from .feature_tracking import align, extract_patches, find_corners, identity_maps, smoothed, track_points, warp
@@ -54,7 +55,14 @@ def load_scene_photo(folder: Scene, camera: Camera, bodies: Sequence[SceneBody])
 
 def _picture(folder: Scene, name: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     path = folder.file(name)
-    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        content = read_bytes(path, MAX_PICTURE_BYTES, what="picture")
+        image = cv2.imdecode(np.frombuffer(content or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; restore it or reconstruct the scene again") from None
+    # OpenCV refuses more than 2^30 pixels, and some damage, by an error of its own.
+    except cv2.error:
+        image = None
     if image is None:
         raise InputError(f"{path}: is not an image that can be read; restore it or reconstruct the scene again")
     smaller = size[0] < image.shape[1]

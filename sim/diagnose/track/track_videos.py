@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ...files import open_file
 from ...scene.folder import Scene
 from ..capture import Camera, Capture, Trial
 from ..capture_checks import check_capture
@@ -59,13 +60,19 @@ class Frame:
     colour: NDArray[np.uint8]
 
 
+MAX_VIDEO_BYTES = 2**40
+
+
 class Video:
     """An open video, a context manager; ``frames`` reads it once from its beginning."""
 
     def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            raise InputError(f"{path}: no such video; check the path")
-        if path.stat().st_size == 0:
+        try:
+            with open_file(path, MAX_VIDEO_BYTES, what="video") as file:
+                empty = not file.read(1)
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such video; check the path") from None
+        if empty:
             raise InputError(f"{path}: is empty; copy the video again")
         self._path = path
         self._source = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -18,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, PhysGenError
+from ...files import read_bytes
+from ...validation import json_value
 
 PACKAGES = ("torch", "diffusers", "transformers", "safetensors")
 INSTALL = "pip install 'physgen[diffusion]'"
@@ -68,14 +69,12 @@ def package_version(name: str) -> str | None:
 
 def read_json(path: Path, where: str, remedy: str) -> dict[str, Any]:
     """Return the object in a JSON file of at most 1 MiB. Raises InputError that ends with ``remedy``."""
-    if not path.is_file():
-        raise InputError(f"{where}: has no {path.name}: {remedy}")
-    if path.stat().st_size > MAX_JSON_BYTES:
-        raise InputError(f"{where}: {path.name} is larger than {MAX_JSON_BYTES >> 20} MiB: {remedy}")
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{where}: {path.name} cannot be read ({str(error)[:200]}): {remedy}") from error
+        value = json_value(read_bytes(path, MAX_JSON_BYTES), path.name)
+    except FileNotFoundError:
+        raise InputError(f"{where}: has no {path.name}: {remedy}") from None
+    except InputError as error:
+        raise InputError(f"{where}: {path.name} cannot be read ({error}): {remedy}") from None
     if not isinstance(value, dict):
         raise InputError(f"{where}: {path.name} is not a JSON object: {remedy}")
     return value

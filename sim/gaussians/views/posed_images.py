@@ -16,6 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy import ndimage
 
 from ...errors import InputError
+from ...files import MAX_PICTURE_BYTES, open_file
 from ...scene.folder import inside
 from ...scene.model import Camera, Matrix4
 
@@ -224,7 +225,7 @@ def _require_size(path: Path, image: Image.Image, size: tuple[int, int]) -> None
 
 def _open_image(path: Path, budget: PixelBudget) -> Image.Image:
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file, formats=FORMATS) as image:
             budget.take(image.width, image.height, path)
             image.load()
             return image

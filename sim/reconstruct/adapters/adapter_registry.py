@@ -19,12 +19,13 @@ import importlib.util
 import os
 import re
 import shutil
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
+from ...files import MOST_HASHED, open_file
+from ...files import read_toml as bounded_toml
 from ...scene.meshes import MESH_SUFFIXES
 from ...trust import Spec, trusted_spec
 from ..models.known_models import PackagedModel
@@ -119,13 +120,9 @@ def read_command_file(path: Path, stage: str, program: Path | None = None) -> Co
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of the small TOML file ``path``. Raises InputError."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES >> 10} KiB, so it is not an adapter file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return bounded_toml(path, MAX_BYTES, what="adapter file")
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; its contents are described in docs/extending.md") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
 
 
 def _command(value: Any, stage: str, path: Path) -> tuple[str, ...]:
@@ -327,6 +324,11 @@ def chosen_segmenter(asked: Spec | None) -> str | None:
     return next((model.name for model in good if isinstance(model, PackagedModel)), None)
 
 
+def _content(path: Path) -> str:
+    with open_file(path, MOST_HASHED, what="file of an adapter") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
 def adapter_content(stage: str, spec: Spec | None) -> tuple[str, ...]:
     """Return the specification and the hashes of its files, as a cache key; () for none."""
     if spec is None:
@@ -335,7 +337,7 @@ def adapter_content(stage: str, spec: Spec | None) -> tuple[str, ...]:
     try:
         return (
             spec,
-            *(hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in spec_files(stage, spec)),
+            *(_content(path) for path in spec_files(stage, spec)),
         )
     except OSError as error:
         raise InputError(f"{stage} {spec}: cannot be read ({error.strerror or error}); check its files") from None

@@ -27,6 +27,7 @@ from PIL import Image
 
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled
+from ...files import MAX_PICTURE_BYTES, open_file
 from ...npz import read_npy, read_npz
 from ...scene.meshes import MAX_MESH_BYTES
 from .adapter_registry import CommandFile, program_python
@@ -286,7 +287,7 @@ def _picture(path: Path, size: tuple[int, int], mode: str, where: str) -> NDArra
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=("PNG",)) as image:
+            with open_file(path, MAX_PICTURE_BYTES, what="PNG") as file, Image.open(file, formats=("PNG",)) as image:
                 if image.size != size:
                     raise InputError(
                         f"{where}: wrote {path.name} of {image.size[0]}x{image.size[1]} pixels, expected "

@@ -18,7 +18,6 @@ and where the array's or the file's name contains ``metric``; else their scale i
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -30,10 +29,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ...errors import InputError, openimageio_error
+from ...files import open_file, require_file
+from ...npz import array_body, array_header, open_npz
 
 SUFFIXES = (".npy", ".npz", ".exr", ".png", ".pfm")
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 8 * 4 * MAX_PIXELS
+MAX_FILE_BYTES = MAX_BYTES + 2**20
 DISPARITY_NAMES = ("disparity", "disp", "inverse", "inv_depth", "invdepth")
 POINT_NAMES = ("points", "pts3d", "point_map", "pointmap")
 
@@ -64,7 +66,7 @@ def read_arrays(path: Path) -> Arrays:
     if suffix == ".npz":
         return _from_npz(path, disparity, metric)
     if suffix == ".npy":
-        with path.open("rb") as file:
+        with open_file(path, MAX_FILE_BYTES, what="depth map") as file:
             return Arrays(_picture(path, _array(path, file)), disparity=disparity, metric=metric)
     if suffix == ".png":
         return Arrays(_from_png(path), disparity=disparity, metric=metric, sixteen_bits=True)
@@ -92,27 +94,16 @@ def _picture(path: Path, values: NDArray[Any]) -> NDArray[Any]:
 
 def _array(path: Path, file: IO[bytes]) -> NDArray[Any]:
     """One array in NumPy's format; its header is validated before allocation. Never unpickles."""
-    version = np.lib.format.read_magic(file)
-    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(
-        version
-    )
-    if read_header is None:
-        raise ValueError(f"version {version} of NumPy's format")
-    shape, fortran, dtype = read_header(file)
-    # Python's integers do not overflow; NumPy's would.
-    count = 1
-    for side in shape:
-        count *= int(side)
-    if dtype.hasobject or dtype.kind not in "fiub":
-        raise InputError(f"depth {path}: holds {dtype}, not numbers; save the depth as float32")
-    if count < 0 or count * dtype.itemsize > MAX_BYTES:
-        raise _too_large(path, shape)
-    data = file.read(count * dtype.itemsize)
-    return np.frombuffer(data, dtype=dtype, count=count).reshape(shape, order="F" if fortran else "C")
+    header = array_header(file, f"depth {path}")
+    if header.dtype.kind not in "fiub":
+        raise InputError(f"depth {path}: holds {header.dtype}, not numbers; save the depth as float32")
+    if header.size > MAX_BYTES:
+        raise _too_large(path, header.shape)
+    return array_body(file, header, f"depth {path}")
 
 
 def _from_npz(path: Path, disparity: bool | None, metric: bool) -> Arrays:
-    with zipfile.ZipFile(path) as archive:
+    with open_npz(path, 4 * MAX_BYTES) as archive:
         names = {
             Path(info.filename).stem.lower(): info for info in archive.infolist() if info.filename.endswith(".npy")
         }
@@ -145,7 +136,7 @@ def _from_npz(path: Path, disparity: bool | None, metric: bool) -> Arrays:
 
 
 def _from_png(path: Path) -> NDArray[Any]:
-    with Image.open(path, formats=("PNG",)) as image:
+    with open_file(path, MAX_FILE_BYTES, what="depth map") as file, Image.open(file, formats=("PNG",)) as image:
         if image.width * image.height > MAX_PIXELS:
             raise _too_large(path, f"{image.width}x{image.height}")
         if image.mode not in ("I;16", "I;16B", "I;16L", "I;16N", "I"):
@@ -160,7 +151,7 @@ def _from_png(path: Path) -> NDArray[Any]:
 
 def _from_pfm(path: Path) -> NDArray[Any]:
     """Portable float map: Pf or PF, width and height, a scale whose sign is the byte order, rows from the bottom up."""
-    with path.open("rb") as file:
+    with open_file(path, MAX_FILE_BYTES, what="depth map") as file:
         kind = file.readline(8).strip()
         words = file.readline(64).split()
         scale = float(file.readline(64))
@@ -175,6 +166,7 @@ def _from_pfm(path: Path) -> NDArray[Any]:
 
 
 def _from_exr(path: Path) -> NDArray[Any]:
+    require_file(path, MAX_FILE_BYTES, what="depth map")
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise InputError(
@@ -245,12 +237,12 @@ def read_depth(path: Path, width: int, height: int) -> DepthMap:
             f"depth {path}: depth maps are read from {', '.join(SUFFIXES)}, not {path.suffix or 'without suffix'!r}; "
             "8-bit pictures are too coarse for depth"
         )
-    if not path.is_file():
-        raise InputError(f"depth {path}: there is no such file; check its name")
     try:
         arrays = read_arrays(path)
     except InputError:
         raise
+    except FileNotFoundError:
+        raise InputError(f"depth {path}: there is no such file; check its name") from None
     except MemoryError:
         raise InputError(f"depth {path}: does not fit in memory; give a smaller one") from None
     # Readers of damaged files raise arbitrary exceptions (TokenError, BadZipFile, struct.error, …).

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ...errors import InputError
+from ...files import MOST_HASHED, open_file
 
 BLOCK = 512
 PIECE = 2**20
@@ -26,15 +27,18 @@ class ArchiveReader:
         self._path, self._left = path, most_bytes
         self._member = self._padding = 0
         try:
-            self._stream = gzip.open(path, "rb")  # noqa: SIM115  closed by ``close``
-        except OSError as error:
-            raise InputError(f"{path}: cannot be opened ({error.strerror or error}); check its path") from None
+            self._packed = open_file(path, MOST_HASHED, what="archive")
+        except (FileNotFoundError, InputError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise InputError(f"{path}: cannot be opened ({why}); check its path") from None
+        self._stream = gzip.open(self._packed, "rb")  # noqa: SIM115  closed by ``__exit__``
 
     def __enter__(self) -> ArchiveReader:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stream.close()
+        self._packed.close()
 
     def members(self) -> Iterator[tuple[str, int]]:
         """Yield name and size in bytes of each regular file, which ``content`` may read until the next is asked for."""

@@ -20,6 +20,7 @@ from pathlib import Path
 from ...atomic import replacing
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ...files import MOST_HASHED, open_file
 from . import known_models
 from .known_models import HUB_FILES, HubModel, KnownModel, PackagedModel, megabytes
 from .model_archive import ArchiveReader
@@ -227,7 +228,7 @@ def _stop_if(cancelled: IsCancelled) -> None:
 
 def _hash_of(path: Path) -> str:
     try:
-        with path.open("rb") as stream:
+        with open_file(path, MOST_HASHED, what="model") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); install the model again") from None

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import re
-import tomllib
 import unicodedata
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ...errors import InputError
+from ...files import read_toml
 from ...scene.material import preset_names
 from ...validation import parse
 from ..reconstruct_options import SHAPES
@@ -195,11 +195,9 @@ def load_names(path: Path) -> NameTable:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(f"{path}: larger than {MAX_FILE_BYTES >> 10} KiB, so it is not a table of names")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
+        return read_toml(path, MAX_FILE_BYTES, what="table of names")
+    except FileNotFoundError:
+        raise InputError(f"{path}: not readable as TOML (there is no such file)") from None
 
 
 def _table(value: Any, where: str) -> dict[str, Any]:

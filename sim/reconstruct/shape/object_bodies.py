@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...files import read_bytes
+from ...scene.meshes import MAX_MESH_BYTES
 from ...scene.model import Camera
 from ...trust import trusted_spec
 from ..adapters.adapter_registry import adapter_content
@@ -288,8 +290,8 @@ def make_bodies(
 
 def _content(path: Path) -> NDArray[np.uint8]:
     try:
-        return np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
+        return np.frombuffer(read_bytes(path, MAX_MESH_BYTES, what="mesh"), dtype=np.uint8)
+    except FileNotFoundError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its name") from None
 
 

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The gate through which files are read: regular files only, of bounded size, inside their folder.
+
+A name may lead to a pipe that nobody writes into, to a device without end, or to a terabyte. So a file is opened
+without waiting, looked at through the open descriptor, and never read further than its kind may be long.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from .errors import InputError
+
+OF_PHYSGEN = "file of PhysGen"
+MOST_HASHED = 2**40
+"""Of a file of which only a hash is taken, so that memory does not matter."""
+MAX_PICTURE_BYTES = 2**30
+"""Of a picture's file; how many pixels it may have is its reader's to say."""
+
+_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOCTTY", 0)
+
+
+def open_file(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | None = None) -> io.BufferedReader:
+    """Return the regular file ``path``, of at most ``most`` bytes, open for reading; the caller closes it.
+
+    what: kind of file, for the message. folder: where the file must lie, links followed; None: anywhere.
+
+    Raises FileNotFoundError where there is none, so that the caller can say how to get one, else InputError: for a
+    folder, pipe, device or socket, for more bytes, and for what cannot be opened.
+    """
+    try:
+        if folder is not None and not path.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{path}: leads out of {folder}; put the file itself there")
+        number = os.open(path, _FLAGS)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise InputError(f"{shown(path)}: {_reason(error)}") from None
+    # A lone surrogate, a zero byte, or links in a circle.
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{shown(path)}: no file can be called that ({error})") from None
+    try:
+        found = os.fstat(number)
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{path}: is {_kind(found.st_mode)}, not a file; name a regular file")
+        if found.st_size > most:
+            raise InputError(f"{path}: larger than {_size(most)}, so it is no {what}")
+        if hasattr(os, "set_blocking"):
+            os.set_blocking(number, True)
+        return io.BufferedReader(io.FileIO(number, "rb"))
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_bytes(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | None = None) -> bytes:
+    """Return the content of the regular file ``path``, of at most ``most`` bytes. Raises as ``open_file`` does."""
+    with open_file(path, most, what=what, folder=folder) as stream:
+        try:
+            content = stream.read(most + 1)
+        except OSError as error:
+            raise InputError(f"{path}: {_reason(error)}") from None
+        except MemoryError:
+            raise InputError(f"{path}: does not fit in memory; close other programs") from None
+    # Files that grow meanwhile, and those of /proc, are longer than they say.
+    if len(content) > most:
+        raise InputError(f"{path}: larger than {_size(most)}, so it is no {what}")
+    return content
+
+
+def read_text(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | None = None) -> str:
+    """Return the UTF-8 text of the file ``path``. Raises as ``read_bytes`` does, and InputError for other text."""
+    try:
+        return read_bytes(path, most, what=what, folder=folder).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not readable as UTF-8 ({error}); save it as UTF-8") from None
+
+
+def read_toml(path: Path, most: int, *, what: str = "TOML file") -> dict[str, Any]:
+    """Return the content of the TOML file ``path``. Raises as ``read_text`` does, and InputError for other text."""
+    text = read_text(path, most, what=what)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as TOML ({error})") from None
+
+
+def require_file(path: Path, most: int, *, what: str = OF_PHYSGEN) -> None:
+    """Raise as ``open_file`` does, for libraries that open ``path`` themselves, by its name."""
+    open_file(path, most, what=what).close()
+
+
+def to_disk(path: Path) -> None:
+    """Wait until the content of the file or folder ``path`` is on the disk, so that a rename after it can count.
+
+    Does nothing where the system cannot do it, such as for folders on Windows.
+    """
+    try:
+        number = os.open(path, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(number)
+    except OSError as error:
+        # Network file systems refuse with EINVAL; a full or failing disk does not.
+        if error.errno not in (errno.EINVAL, errno.EROFS, errno.EBADF):
+            raise
+    finally:
+        os.close(number)
+
+
+def is_file(path: Path) -> bool:
+    """Return whether ``path`` is a regular file that can be looked at; never raises."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def shown(path: Path | str) -> str:
+    """Return ``path`` for a message: at most 200 characters, printable."""
+    text = str(path).encode("utf-8", "replace").decode("utf-8")
+    return text if len(text) <= 200 else f"{text[:100]}…{text[-60:]}"
+
+
+def _reason(error: OSError) -> str:
+    if error.errno == errno.ENAMETOOLONG:
+        return "the name is too long for a file; choose a shorter one"
+    return str(error.strerror or error)
+
+
+def _kind(mode: int) -> str:
+    kinds = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
+    return next((name for test, name in kinds if test(mode)), "a device")
+
+
+def _size(most: int) -> str:
+    return f"{most >> 20} MiB" if most >= 2**20 else f"{most >> 10} KiB" if most >= 2**10 else f"{most} bytes"

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: MIT
+"""Reads damaged files with every loader: only PhysGenError may escape, within seconds and a bounded address space.
+
+    python tests/fuzz/run.py --count 300                     every loader, 300 inputs each
+    python tests/fuzz/run.py --only "mesh OBJ" --index 17    one input again, with its traceback
+
+Every loader runs in a child of its own, so that a crash of the interpreter is a result like any other. Input I of a
+loader follows from its name, the seed and I alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import mmap
+import os
+import random
+import resource
+import select
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from loaders import LOADERS, Loader
+from mutations import mutated
+from physgen.sim.errors import PhysGenError
+
+CPU_S, WALL_S = 5.0, 20.0
+"""Longest that one input may compute, and be waited for on a busy machine."""
+ADDRESS_SPACE = 3 * 2**29
+"""Bytes beyond those of the process with all libraries loaded, before it reads anything."""
+MOST_CRASHES = 5
+OUTSIDE = "/etc/passwd"
+
+
+class TooSlow(BaseException):
+    """An input took longer than ``CPU_S``; no loader catches it."""
+
+
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def _circle(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def _outside(path: Path) -> None:
+    path.symlink_to(OUTSIDE)
+
+
+def _sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(2**42)
+
+
+INSTEAD = (_pipe, _endless, _circle, _outside, Path.mkdir, Path.touch, _sparse, lambda path: None)
+"""What is put in the place of a file: the first inputs of every loader. The last one is nothing."""
+
+
+def place_input(name: str, loader: Loader, folder: Path, seed: int, index: int) -> None:
+    """Damage a file of ``loader`` in ``folder``, as input ``index`` says."""
+    choose = random.Random(f"{name}:{seed}:{index}")
+    path = folder / loader.files[index % len(loader.files)]
+    special = index // len(loader.files)
+    if special < len(INSTEAD):
+        path.unlink()
+        INSTEAD[special](path)
+        return
+    path.write_bytes(mutated(path.read_bytes(), choose, as_json=path.suffix in (".json", ".gltf")))
+
+
+@contextlib.contextmanager
+def _bounded() -> Iterator[None]:
+    """Bounds on time, for one input."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TooSlow(f"{'cpu' if number == signal.SIGPROF else 'wall'} time")
+
+    signal.signal(signal.SIGPROF, stop)
+    signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_PROF, CPU_S)
+    signal.setitimer(signal.ITIMER_REAL, WALL_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def attempt(name: str, loader: Loader, template: Path, folder: Path, seed: int, index: int) -> BaseException | None:
+    """Return what escaped from ``loader`` besides PhysGenError at input ``index``; None if nothing."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(template, folder)
+    place_input(name, loader, folder, seed, index)
+    try:
+        with _bounded():
+            loader.read(folder)
+    except PhysGenError as error:
+        return None if str(error) else error
+    except BaseException as error:
+        return error
+    return None
+
+
+def _where(error: BaseException) -> str:
+    """Return the type and the last own line of the traceback."""
+    own = [f for f in traceback.extract_tb(error.__traceback__) if "/sim/" in f.filename or "physgen" in f.filename]
+    own = [f for f in own if "/tests/" not in f.filename] or own
+    place = f"{Path(own[-1].filename).name}:{own[-1].lineno}" if own else "?"
+    return f"{type(error).__name__} at {place}: {str(error)[:160]}"
+
+
+def _limit_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + ADDRESS_SPACE
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def _child(name: str, loader: Loader, seed: int, first: int, count: int, at: mmap.mmap, out: int, cpu_s: float) -> None:
+    """Run inputs ``first`` to ``count``: each finding is a line on ``out``, the number reached is in ``at``."""
+    warnings.simplefilter("ignore")
+    with open(os.devnull, "w") as nowhere:  # noqa: PTH123
+        os.dup2(nowhere.fileno(), 2)
+    with tempfile.TemporaryDirectory(prefix="physgen-fuzz-") as place:
+        template, folder = Path(place, "template"), Path(place, "input")
+        template.mkdir()
+        try:
+            loader.write(template)
+            shutil.copytree(template, folder)
+            loader.read(folder)
+        except BaseException as error:
+            os.write(out, f"{json.dumps([-1, 'as it is: ' + _where(error)])}\n".encode())
+            return
+        _limit_memory()
+        for index in range(first, count):
+            at[:8] = struct.pack("<q", index)
+            if time.process_time() > cpu_s:
+                return
+            error = attempt(name, loader, template, folder, seed, index)
+            if error is not None:
+                os.write(out, f"{json.dumps([index, _where(error)])}\n".encode())
+        at[:8] = struct.pack("<q", count)
+
+
+def fuzz(name: str, *, count: int, seed: int = 0, cpu_s: float = 1e9) -> tuple[int, list[tuple[int, str]]]:
+    """Return how many inputs the loader ``name`` was given, and (index, text) of each that something escaped at."""
+    found: list[tuple[int, str]] = []
+    first, crashes = 0, 0
+    while True:
+        at = mmap.mmap(-1, 8)
+        reading, writing = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            code = 1
+            try:
+                os.close(reading)
+                _child(name, LOADERS[name], seed, first, count, at, writing, time.process_time() + cpu_s)
+                code = 0
+            finally:
+                os._exit(code)
+        os.close(writing)
+        status = _listen(pid, reading, found, at)
+        (reached,) = struct.unpack("<q", at[:8])
+        if status == 0:
+            return reached, found
+        crashes += 1
+        found.append((reached, f"the process ended with {status}"))
+        first = reached + 1
+        if crashes > MOST_CRASHES or first >= count:
+            return first, found
+
+
+def _listen(pid: int, reading: int, found: list[tuple[int, str]], at: mmap.mmap) -> int:
+    """Collect what a child reports; return how it ended, "stuck" where an input keeps it for too long."""
+    content, before, since, stuck = b"", at[:8], time.monotonic(), False
+    while True:
+        ready, _, _ = select.select([reading], [], [], 2.0)
+        if ready:
+            piece = os.read(reading, 65536)
+            if not piece:
+                break
+            content += piece
+        if at[:8] != before:
+            before, since = at[:8], time.monotonic()
+        elif time.monotonic() - since > 1.5 * WALL_S:
+            os.kill(pid, signal.SIGKILL)
+            stuck = True
+    os.close(reading)
+    found += [tuple(json.loads(line)) for line in content.splitlines()]
+    _, status = os.waitpid(pid, 0)
+    return -1 if stuck else os.waitstatus_to_exitcode(status)
+
+
+def again(name: str, seed: int, index: int) -> None:
+    """Read one input, here, and let its traceback be seen."""
+    loader = LOADERS[name]
+    place = Path(tempfile.mkdtemp(prefix="physgen-fuzz-"))
+    (place / "input").mkdir()
+    loader.write(place / "input")
+    if index >= 0:
+        place_input(name, loader, place / "input", seed, index)
+    print(f"{name}, seed {seed}, input {index}: {place / 'input'}")  # noqa: T201
+    _limit_memory()
+    loader.read(place / "input")
+
+
+def main() -> int:
+    """Run the loaders that the command line names; return 1 where anything was found."""
+    parser = argparse.ArgumentParser(description="read damaged files with every loader")
+    parser.add_argument("--count", type=int, default=300, help="inputs for each loader")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", default=list(LOADERS), choices=list(LOADERS), metavar="NAME")
+    parser.add_argument("--index", type=int, help="this input of the one loader that --only names, with its traceback")
+    parser.add_argument("--cpu", type=float, default=1e9, help="CPU seconds for each loader, at most")
+    parser.add_argument("--json", action="store_true", help="the findings as JSON")
+    options = parser.parse_args()
+    if options.index is not None:
+        again(options.only[0], options.seed, options.index)
+        return 0
+    results = {}
+    for name in options.only:
+        started = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done, found = fuzz(name, count=options.count, seed=options.seed, cpu_s=options.cpu)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = ended.ru_utime + ended.ru_stime - started.ru_utime - started.ru_stime
+        results[name] = {"inputs": done, "cpu_s": round(cpu, 2), "found": found}
+        if not options.json:
+            kinds: dict[str, list[int]] = {}
+            for index, text in found:
+                kinds.setdefault(text, []).append(index)
+            print(f"{name}: {done} inputs, {cpu:.1f} CPU s, {len(found)} escaped", flush=True)  # noqa: T201
+            for text, indices in sorted(kinds.items(), key=lambda pair: -len(pair[1]))[:12]:
+                print(f"    {len(indices)} × {text} (input {indices[0]})", flush=True)  # noqa: T201
+    if options.json:
+        print(json.dumps(results))  # noqa: T201
+    return int(any(result["found"] for result in results.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Every loader reads damaged and hostile files: only PhysGenError may escape, in time and in bounded memory."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RUN = Path(__file__).with_name("run.py")
+LEAST_LOADERS = 34
+
+
+def fuzz(count, seed):
+    command = [sys.executable, str(RUN), "--count", str(count), "--seed", str(seed), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
+    assert done.stdout, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def check(results, count):
+    assert len(results) >= LEAST_LOADERS
+    assert {name: result["found"] for name, result in results.items() if result["found"]} == {}
+    assert {result["inputs"] for result in results.values()} == {count}
+
+
+def test_only_own_errors_escape_from_any_loader():
+    check(fuzz(100, seed=0), 100)
+
+
+@pytest.mark.long
+def test_only_own_errors_escape_from_any_loader_with_more_inputs():
+    check(fuzz(300, seed=1), 300)

@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is refused before it is read: pipes, devices, links out of a folder, files and numbers beyond all bounds."""
+
+import json
+import os
+import signal
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from physgen.batch.cli import main
+from physgen.sim.cache.bake_folder import disk_usage, load_bake
+from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.errors import InputError
+from physgen.sim.files import open_file, read_bytes, read_text, read_toml
+from physgen.sim.npz import read_npy, read_npz
+from physgen.sim.scene.folder import load_scene
+from physgen.sim.scene.meshes import read_mesh
+from physgen.sim.validation import MOST_WHOLE, parse, read_json
+
+
+@pytest.fixture(autouse=True)
+def within_seconds():
+    """No file may keep a test waiting."""
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+
+
+def a_pipe(path):
+    os.mkfifo(path)
+
+
+def endless(path):
+    path.symlink_to("/dev/zero")
+
+
+def a_circle(path):
+    path.symlink_to(path.name)
+
+
+def too_long(path):
+    with path.open("wb") as file:
+        file.truncate(2**40)
+
+
+WRONG = {"a pipe": a_pipe, "a device": endless, "a folder": lambda path: path.mkdir(), "Too many levels": a_circle}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_only_regular_files_are_read(tmp_path, words):
+    path = tmp_path / "scene.json"
+    WRONG[words](path)
+    for read in (lambda: read_bytes(path, 100), lambda: read_json(path), lambda: read_toml(path, 100)):
+        with pytest.raises(InputError, match=words):
+            read()
+
+
+def test_a_file_is_read_to_its_bound(tmp_path):
+    path = tmp_path / "x"
+    path.write_bytes(b"x" * 1000)
+    assert read_bytes(path, 1000) == b"x" * 1000
+    with pytest.raises(InputError, match="larger than 999 bytes, so it is no job"):
+        read_bytes(path, 999, what="job")
+    too_long(path)
+    with pytest.raises(InputError, match="larger than 16 MiB"):
+        read_json(path)
+
+
+def test_files_that_say_they_are_empty_are_bounded_too():
+    # /proc gives no lengths.
+    with pytest.raises(InputError, match="larger than 10 bytes"):
+        read_bytes(Path("/proc/self/status"), 10)
+
+
+def test_a_missing_file_is_left_to_the_caller(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        open_file(tmp_path / "none", 10)
+
+
+def test_links_lead_out_of_no_folder(tmp_path):
+    inner = tmp_path / "scene"
+    inner.mkdir()
+    (tmp_path / "outside.json").write_text("{}")
+    (inner / "a.json").symlink_to("../outside.json")
+    (inner / "b.json").symlink_to("c.json")
+    (inner / "c.json").write_text("{}")
+    with pytest.raises(InputError, match="leads out of"):
+        read_json(inner / "a.json", folder=inner)
+    assert read_json(inner / "b.json", folder=inner) == {}
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b", "\ud800"])
+def test_names_that_no_file_has(tmp_path, name):
+    with pytest.raises((InputError, FileNotFoundError)) as refusal:
+        read_text(tmp_path / name, 10)
+    assert len(str(refusal.value)) < 600
+
+
+def scene_json(ball_scene, **changes):
+    scene = ball_scene()
+    path = scene.root / "scene.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    return scene.root
+
+
+def test_a_name_of_70000_characters_is_refused_shortly(ball_scene):
+    root = scene_json(ball_scene, photo="x" * 70_000)
+    with pytest.raises(InputError, match="too long") as refusal:
+        load_scene(root)
+    assert len(str(refusal.value)) < 600
+
+
+def test_a_folder_that_cannot_be_entered_is_named(ball_scene, monkeypatch):
+    root = ball_scene().root
+    real = os.stat
+
+    def denied(path, *arguments, **options):
+        if "meshes" in os.fspath(path):
+            raise PermissionError(13, "Permission denied", os.fspath(path))
+        return real(path, *arguments, **options)
+
+    # As for anybody but root, whom permissions do not stop.
+    monkeypatch.setattr(os, "stat", denied)
+    with pytest.raises(InputError, match=r"meshes/ball0\.glb.*missing or cannot be read"):
+        load_scene(root)
+
+
+MANIFEST = {
+    "format": "physgen-bake/1",
+    "inputs_hash": "0",
+    "fps": 24.0,
+    "frame_start": 1,
+    "frames": 3,
+    "frames_done": 3,
+    "state": "complete",
+    "engine": "mpm",
+    "version": "0",
+    "particles": 1,
+    "objects": [
+        {"name": "a", "file": "a.pc2", "vertices": 8, "splats_file": "b.pc2", "splats_folder": "s", "splats": 1}
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": 10**9},
+        {"frames": 10**9, "frames_done": 10**9},
+        {"frames": 10**30},
+        {"frame_start": 10**18},
+        {"fps": 1e300},
+        {"fps": 10**400},
+        {"objects": MANIFEST["objects"] * 20_000},
+        {"objects": [{"name": "a", "file": "a.pc2", "vertices": 2**40}]},
+    ],
+    ids=lambda change: str(change)[:40],
+)
+def test_a_manifest_cannot_claim_what_no_bake_has(tmp_path, change):
+    frames = {"frames": 100_000} if "objects" in change else {}
+    (tmp_path / "manifest.json").write_text(json.dumps({**MANIFEST, **frames, **change}))
+    for use in (load_bake, disk_usage):
+        with pytest.raises(InputError):
+            use(tmp_path)
+
+
+def test_whole_numbers_are_bounded():
+    from physgen.sim.app.bake_options import BakeOptions
+
+    assert parse(BakeOptions, {"seed": MOST_WHOLE}, "job").seed == MOST_WHOLE
+    for seed in (MOST_WHOLE + 1, 10**4000, 10**5000):
+        with pytest.raises(InputError, match=r"job\.seed: expected a whole number"):
+            parse(BakeOptions, {"seed": seed}, "job")
+
+
+def npy(path, header):
+    head = header.encode()
+    head += b" " * (-(10 + len(head) + 1) % 64) + b"\n"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(64))
+    return path
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        '" 64), }"',
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (8, 64), }\"",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (8,",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "9" * 300 + ",), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (0, " + "9" * 30 + "), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-8,), }",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (8,), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (True, 8), }",
+        "[" * 5000,
+    ],
+    ids=lambda header: header[-30:],
+)
+def test_no_header_of_an_array_gets_further(tmp_path, header):
+    with pytest.raises(InputError):
+        read_npy(npy(tmp_path / "x.npy", header), 2**20)
+
+
+def test_an_archive_whose_member_is_longer_than_it_says(tmp_path):
+    np.savez(tmp_path / "x.npz", a=np.arange(4.0))
+    whole = bytearray((tmp_path / "x.npz").read_bytes())
+    at = whole.index(b"'shape': (4,)")
+    whole[at : at + 13] = b"'shape': (2,)"
+    (tmp_path / "x.npz").write_bytes(whole)
+    with pytest.raises(InputError):
+        read_npz(tmp_path / "x.npz", 2**20)
+
+
+def test_a_cache_that_is_a_pipe_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.pc2")
+    with pytest.raises(InputError, match="a pipe"):
+        Pc2Reader(tmp_path / "a.pc2")
+
+
+@pytest.mark.parametrize("command", ["bake", "variant", "free", "estimate"])
+def test_an_output_of_300_characters_is_one_line(ball_scene, tmp_path, capfd, command):
+    scene = ball_scene().root
+    place = str(tmp_path / ("x" * 300))
+    arguments = {
+        "bake": ["bake", str(scene), "--out", place, "--frames", "2"],
+        "variant": ["variant", str(scene), "--out", place],
+        "free": ["free", place],
+        "estimate": ["estimate", place],
+    }[command]
+    assert main(arguments) == 3
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and len(said.strip().splitlines()) == 1 and len(said) < 1500
+
+
+# Whatever the installed trimesh itself would open, meshes see their own folder only.
+
+
+def an_obj(folder, names, picture):
+    rows = "".join(f"v {x} {y} {z}\n" for x, y, z in trimesh.creation.box().vertices)
+    faces = "".join(f"f {a}/1 {b}/2 {c}/3\n" for a, b, c in trimesh.creation.box().faces + 1)
+    (folder / "a.obj").write_text(f"mtllib {names}\n{rows}vt 0 0\nvt 1 0\nvt 0 1\nusemtl m\n{faces}")
+    (folder / "a.mtl").write_text(f"newmtl m\nKd 1 1 1\nmap_Kd {picture}\n")
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_mesh_opens_no_file_outside_its_folder(tmp_path, monkeypatch, inside):
+    from PIL import Image
+
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for place in (tmp_path, folder):
+        Image.fromarray(np.full((4, 4, 3), 200, np.uint8)).save(place / "p.png")
+    an_obj(folder, "a.mtl", "p.png" if inside else "../p.png")
+    (tmp_path / "b.mtl").write_text("newmtl m\nmap_Kd p.png\n")
+    opened = []
+    real = os.open
+    monkeypatch.setattr(os, "open", lambda path, *rest, **more: opened.append(str(path)) or real(path, *rest, **more))
+    mesh = read_mesh(folder / "a.obj")
+    assert (mesh.visual.material.image is not None) == inside
+    an_obj(folder, "../b.mtl", "p.png")
+    read_mesh(folder / "a.obj")
+    assert opened and all(path.startswith(str(folder)) for path in opened)
+
+
+def test_a_gltf_reads_no_buffer_outside_its_folder(tmp_path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box())).items():
+        (folder / ("a.gltf" if name.endswith(".gltf") else name)).write_bytes(content)
+    assert len(read_mesh(folder / "a.gltf").faces) == 12
+    document = json.loads((folder / "a.gltf").read_text())
+    buffer = document["buffers"][0]["uri"]
+    (folder / buffer).rename(tmp_path / buffer)
+    for uri in (f"../{buffer}", str(tmp_path / buffer), f"%2e%2e/{buffer}"):
+        document["buffers"][0]["uri"] = uri
+        (folder / "a.gltf").write_text(json.dumps(document))
+        with pytest.raises(InputError):
+            read_mesh(folder / "a.gltf")
+    assert stat.S_ISREG((tmp_path / buffer).stat().st_mode)
