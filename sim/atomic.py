@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .files import to_disk
 from .process_identity import MARK, Mark, own_mark, parse_mark
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
@@ -52,6 +53,8 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
+        # The content first: a name that points to blocks never written is what a power cut leaves otherwise.
+        _sync_tree(partial) if partial.is_dir() else to_disk(partial)
         _replace(partial, path)
     except OSError as error:
         raise InputError(

@@ -17,7 +17,7 @@ from ..atomic import replacing
 from ..cache.bake_folder import CHECKPOINT_FILE, BakeManifest, load_manifest
 from ..cache.pc2 import Pc2Reader
 from ..errors import InputError
-from ..files import is_file, to_disk
+from ..files import is_file
 from ..npz import read_npz
 from ..validation import json_value
 
@@ -51,7 +51,6 @@ def save_checkpoint(out: Path, inputs_hash: str, checkpoint: Checkpoint) -> None
     arrays["metrics"] = np.array(json.dumps(checkpoint.metrics))
     with replacing(out / CHECKPOINT_FILE) as partial:
         np.savez(partial, **arrays, digest=np.array(_digest(arrays)))
-        to_disk(partial)
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -8,19 +8,19 @@ is in their list, any other counts after their word.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
+from ..files import read_bytes
 from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.adapters.spec_claims import spec_claim
 from ..scene.folder import Scene
 from ..trust import NOTHING, READS, Agreed, Claim, Replaced, Untrusted, UntrustedSpec, trusted_spec
-from ..validation import MAX_JSON_BYTES, parse, to_json
+from ..validation import MAX_JSON_BYTES, json_value, parse, to_json
 
 T = TypeVar("T")
 
@@ -81,12 +81,9 @@ def read_stamp(root: Path) -> Stamp | None:
     """Return the record of what the folder ``root`` was reconstructed from; None without one, or of another version."""
     path = root / STAMP_FILE
     try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_JSON_BYTES + 1)
-        if len(content) > MAX_JSON_BYTES:
-            return None
-        file = parse(_File, json.loads(content), STAMP_FILE)
-    except (OSError, ValueError, RecursionError, InputError):
+        content = read_bytes(path, MAX_JSON_BYTES, folder=root)
+        file = parse(_File, json_value(content, STAMP_FILE), STAMP_FILE)
+    except (FileNotFoundError, InputError):
         return None
     return Stamp(
         inputs_hash=file.inputs_hash,

@@ -682,7 +682,8 @@ def _read_record(folder: Path) -> None:
     task = load_plan(folder / "plan.json").tasks[0]
     record_path(task, folder).parent.mkdir(parents=True, exist_ok=True)
     record_path(task, folder).unlink(missing_ok=True)
-    (folder / "record.json").rename(record_path(task, folder))
+    with contextlib.suppress(FileNotFoundError):
+        (folder / "record.json").rename(record_path(task, folder))
     load_record(task, folder)
 
 
@@ -718,7 +719,7 @@ _add(
     "worker's job",
     "job.json",
     _worker_job,
-    lambda f: bake_worker.run_job(f / "job.json", lambda event: None, lambda: False),
+    _run_job,
 )
 _add(
     "list of tasks",
