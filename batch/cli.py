@@ -4,13 +4,22 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NoReturn
 
+from . import early_stop  # noqa: F401 - before the modules that take long
+
+# isort: split
+from ..sim import atomic
 from ..sim.app.bake_options import BakeOptions
+from ..sim.cache.folder_lock import LOCK_FILE, release_all, remove_dead_lock
+from ..sim.children import kill_children
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
-from ..sim.errors import OUT_OF_MEMORY, InputError, PhysGenError
+from ..sim.errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.files import shown
 from ..sim.version import VERSION
@@ -118,26 +127,60 @@ def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
     return [f" {a}" if re.match(r"-[\d.][\d.,eE+-]*$", a) else a for a in arguments]
 
 
+def recover(options: argparse.Namespace, terminal: Terminal) -> None:
+    """Put back or remove what killed runs left of the files and folders that the command names, and among the system's
+    temporary files; say so."""
+    said = atomic.recover_scratch()
+    for path in _named_paths(options):
+        said += atomic.recover(path)
+        for lock in (path / LOCK_FILE, path.with_name(f".{path.name}{LOCK_FILE}")):
+            remove_dead_lock(lock)
+    for sentence in said:
+        terminal({"event": "notice", "stage": "recover", "message": sentence})
+
+
+def _named_paths(options: argparse.Namespace) -> Iterator[Path]:
+    for value in vars(options).values():
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, Path) and item.name:
+                yield item
+
+
+def end_at_last(terminal: Terminal) -> NoReturn:
+    """End a command that does not stop by itself, and leave nothing of it but what was complete."""
+    kill_children()
+    atomic.remove_unfinished()
+    release_all()
+    terminal.error("Cancelled", "cancelled in the middle of a long step; run it again to continue")
+    os._exit(Cancelled.exit_code)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``physgen``; returns the exit code (docs/cli.md)."""
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
     expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
     run: Command = options.run
-    try:
-        with stop_signals() as stopped:
-            return run(options, terminal, lambda: stopped() or terminal.reader_gone)
-    except PhysGenError as error:
-        terminal.error(type(error).__name__, str(error))
-        return error.exit_code
-    # A path that no file system takes, a disk that went away, no memory left: one line, like any other mistake.
-    except OSError as error:
-        name = "" if error.filename is None else f"{shown(str(error.filename))}: "
-        terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
-        return InputError.exit_code
-    except MemoryError:
-        terminal.error(InputError.__name__, f"{options.command}: {OUT_OF_MEMORY}")
-        return InputError.exit_code
+    with stop_signals(lambda: end_at_last(terminal)) as stopped:
+        try:
+            with atomic.own_scratch():
+                recover(options, terminal)
+                return run(options, terminal, lambda: stopped() or terminal.reader_gone)
+        except PhysGenError as error:
+            terminal.error(type(error).__name__, str(error))
+            if isinstance(error, Cancelled) and arguments is None:
+                # Not the seconds that some libraries take to unload.
+                sys.stdout.flush()
+                os._exit(error.exit_code)
+            return error.exit_code
+        # A path that no file system takes, a disk that went away, no memory left: one line, like any other mistake.
+        except OSError as error:
+            name = "" if error.filename is None else f"{shown(str(error.filename))}: "
+            terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
+            return InputError.exit_code
+        except MemoryError:
+            terminal.error(InputError.__name__, f"{options.command}: {OUT_OF_MEMORY}")
+            return InputError.exit_code
 
 
 if __name__ == "__main__":

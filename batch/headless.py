@@ -24,10 +24,11 @@ from ..physgen_addon.interpreter import find_python, wheels_for
 from ..sim.app import requirements
 from ..sim.app.launch import PACKAGES_VARIABLE
 from ..sim.app.stage_process import child_environment, own_command
+from ..sim.atomic import scratch_prefix
 from ..sim.errors import Cancelled, InputError, PhysGenError
 from .terminal import Terminal
 
-STOP_GRACE_S = 6.0
+STOP_GRACE_S = 0.9
 """Time for the current frame to finish when the process is asked to stop; the caller waits a little longer
  (``sim/app/stage_process.py``), and then kills."""
 
@@ -69,7 +70,7 @@ def events_apart_from_chatter() -> Iterator[TextIO]:
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Yield one folder for all temporary files of this process, so that it can be removed at any time."""
-    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as folder:
         tempfile.tempdir = folder
         try:
             yield Path(folder)

@@ -17,6 +17,7 @@ from ..sim.app.add_drops import Drop, add_drops
 from ..sim.app.bake_options import BakeOptions, inputs_hash
 from ..sim.app.reconstruct import Physics, reconstruct, require_physics
 from ..sim.app.stage_process import own_command, run_stage
+from ..sim.atomic import scratch_prefix
 from ..sim.cache.bake_folder import Bake, load_bake
 from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
@@ -40,7 +41,7 @@ def run_bake(folder: Scene, out: Path, options: BakeOptions, on_event: OnEvent, 
         options=options,
         expected_inputs=inputs_hash(folder, options),
     )
-    with tempfile.TemporaryDirectory(prefix="physgen-") as temporary:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as temporary:
         path = Path(temporary) / "job.json"
         path.write_text(json.dumps(bake_worker.job_to_json(job)), encoding="utf-8")
         return run_stage(own_command("sim.app.bake_worker", str(path)), on_event, cancelled, failure=SimulationError)

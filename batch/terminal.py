@@ -9,24 +9,48 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
 from ..sim.events import Event, IsCancelled
 
+STOP_S = 1.6
+"""A command has ended so long after it was asked to stop, by itself or not."""
+
 
 @contextmanager
-def stop_signals() -> Iterator[IsCancelled]:
+def stop_signals(at_last: Callable[[], object] | None = None) -> Iterator[IsCancelled]:
     """Yield a function that returns whether SIGINT or SIGTERM arrived since; the former handlers return at the end.
 
-    For the main thread: only there Python allows handlers.
+    at_last: called by another thread, ``STOP_S`` after the signal, if the work has not ended by then; it ends the
+    process. For the main thread: only there Python allows handlers.
     """
-    stop = threading.Event()
+    stop, done = threading.Event(), threading.Event()
     former = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    # Python's handlers wait until the main thread's present call into a library is over; the pipe is written at once.
+    reading, writing = os.pipe()
+    if os.name != "nt":
+        os.set_blocking(writing, False)
+    earlier = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while not done.is_set() and os.read(reading, 1) not in (b"", b"\0"):
+            stop.set()
+            if at_last is not None and not done.wait(STOP_S):
+                at_last()
+
+    watcher = threading.Thread(target=watch, name="physgen-signals", daemon=True)
+    watcher.start()
     try:
         yield stop.is_set
     finally:
+        signal.set_wakeup_fd(earlier)
+        done.set()
+        os.write(writing, b"\0")
+        watcher.join(timeout=5)
+        os.close(writing)
+        os.close(reading)
         for number, handler in former.items():
             # None: installed by C code, which Python can't put back.
             if handler is not None:

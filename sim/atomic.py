@@ -183,19 +183,53 @@ def recover(path: Path) -> list[str]:
     said: list[str] = []
     path = path.parent.resolve() / path.name
     for left in _dead_beside(path):
-        found = _TEMPORARY.fullmatch(left.name)
-        if found is not None and found["role"] == "old" and found["name"] == path.name and not path.exists():
-            with contextlib.suppress(OSError):
-                left.rename(path)
-                said.append(f"{path}: was put back, as a run that replaced it was killed in the middle")
-                continue
-        _remove(left)
-        said.append(f"{left}: removed, left by a run that was killed")
+        said.append(_put_back_or_removed(left))
     if path.is_dir() and not path.is_symlink():
         for left in _dead_within(path):
-            _remove(left)
-            said.append(f"{left}: removed, left by a run that was killed")
+            said.append(_put_back_or_removed(left))
     return said
+
+
+def _put_back_or_removed(left: Path) -> str:
+    found = _TEMPORARY.fullmatch(left.name)
+    if found is not None and found["role"] == "old":
+        path = left.with_name(found["name"])
+        if not path.exists():
+            with contextlib.suppress(OSError):
+                left.rename(path)
+                return f"{path}: was put back, as a run that replaced it was killed in the middle"
+    _remove(left)
+    return f"{left}: removed, left by a run that was killed"
+
+
+@contextmanager
+def own_scratch() -> Iterator[Path | None]:
+    """Yield one folder for all temporary files of this process and its children, removed at the end.
+
+    Whatever ends them, ``recover_scratch`` then finds all they left, that of other programs too. None where there can
+    be no such folder.
+    """
+    names = ("TMPDIR", "TEMP", "TMP")
+    former, earlier = tempfile.tempdir, {name: os.environ.get(name) for name in names}
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=scratch_prefix()))
+    except OSError:
+        yield None
+        return
+    _unfinished.add(folder)
+    tempfile.tempdir = str(folder)
+    os.environ.update(dict.fromkeys(names, str(folder)))
+    try:
+        yield folder
+    finally:
+        tempfile.tempdir = former
+        for name, value in earlier.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        _remove(folder)
+        _unfinished.discard(folder)
 
 
 def recover_scratch(folder: Path | None = None) -> list[str]:

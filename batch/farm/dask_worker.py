@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ...sim.atomic import scratch_prefix
 from ...sim.errors import PhysGenError
 from .dask_cluster import check_trust, file_security
 from .dask_tasks import ending
@@ -63,7 +64,7 @@ async def _work(address: str, host: str | None, resources: dict[str, float], sec
     from distributed.utils import get_ip
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
-    with tempfile.TemporaryDirectory(prefix="physgen-worker-", ignore_cleanup_errors=True) as scratch:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix("worker"), ignore_cleanup_errors=True) as scratch:
         # Tasks run in child processes, so its own memory is meaningless.
         worker = Worker(
             address,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from ...sim.atomic import replacing
+from ...sim.atomic import replacing, scratch_prefix
 from ...sim.errors import Cancelled, InputError, RenderError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from .. import compat
@@ -44,7 +44,7 @@ def encode_video(
         raise RenderError(f"Blender {bpy.app.version_string} was built without FFmpeg; encode the frames otherwise")
     progress = StageProgress(on_event, "encode", len(frames))
     progress.report(0)
-    with tempfile.TemporaryDirectory(prefix="physgen-video-") as folder:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix("video")) as folder:
         staged = _staged(frames, Path(folder), cancelled)
         with replacing(video) as partial:
             _encode(staged, partial.resolve(), fps, progress)

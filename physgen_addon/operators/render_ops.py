@@ -13,6 +13,7 @@ import bpy
 
 from ...sim.app.bake_transfer import transfer_bake
 from ...sim.app.stage_process import run_stage
+from ...sim.atomic import scratch_prefix
 from ...sim.cache.bake_folder import MANIFEST_FILE, load_bake, load_manifest
 from ...sim.errors import InputError, PhysGenError, RenderError
 from ...sim.events import Event, IsCancelled, OnEvent
@@ -115,7 +116,7 @@ class _Render(JobOperator):
                 message = f"not in the photo, so not rendered into it: {', '.join(strangers)}"
                 on_event({"event": "notice", "message": message})
             start = render_command(preferred)
-            with tempfile.TemporaryDirectory(prefix="physgen-render-") as scratch:
+            with tempfile.TemporaryDirectory(prefix=scratch_prefix("render")) as scratch:
                 rendered = bake
                 if (baked_scene / SCENE_FILE).is_file():
                     rendered = Path(scratch) / "bake"

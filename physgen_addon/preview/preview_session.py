@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.app.stage_process import parse_event, read_errors, start_process
+from ...sim.atomic import scratch_prefix
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event
@@ -301,7 +302,7 @@ class Session:
         self.unit = 1.0
         self.answer_s: float | None = None
         self._coming: Clip | None = None
-        self._root = Path(tempfile.mkdtemp(prefix="physgen-preview-"))
+        self._root = Path(tempfile.mkdtemp(prefix=scratch_prefix("preview")))
         self._client = Client(lambda: command(self._root / "runs"), self._remove_files)
         self._ended = False
         self._ready = self._ran = False

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.app.stage_process import NO_WINDOW, child_environment
+from ...sim.atomic import scratch_prefix
 from ...sim.errors import InputError, RenderError
 from .. import compat
 from ..frames.frame_files import read_layers
@@ -115,7 +116,7 @@ def require_graphics() -> str:
     else:
         start = [sys.executable, "-c"]
     # Blender leaves its crash report in the temporary folder.
-    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as folder:
         try:
             result = subprocess.run(
                 [*start, _PROBE],

@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 from ...sim.app.clip_check import Clip, clip_notices
-from ...sim.atomic import replacing
+from ...sim.atomic import recover, replacing
 from ...sim.cache.bake_folder import Bake
 from ...sim.cache.folder_lock import folder_lock
 from ...sim.composite.compositing import FrameLayers
@@ -261,6 +261,7 @@ def render_frames(
     suffix = options.frame_format.suffix
     FrameIndex(out, suffix=suffix)
     with folder_lock(out):
+        recover(out)
         frame_index = FrameIndex(out, suffix=suffix, fps=fps)
         progress = StageProgress(on_event, "render", len(planned))
         if frames is None and opened.unfinished:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...sim.atomic import scratch_prefix
 from ...sim.errors import InputError
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene, require_photo
@@ -128,7 +129,7 @@ def _base_colour(visual: Any) -> Image.Image | None:
 
 def _load_image(name: str, image: Image.Image) -> bpy.types.Image:
     """Return a packed Blender image, so that a saved .blend needs no file beside it."""
-    with tempfile.TemporaryDirectory(prefix="physgen-") as folder:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as folder:
         path = Path(folder) / "texture.png"
         image.save(path, compress_level=0)
         loaded = bpy.data.images.load(str(path))

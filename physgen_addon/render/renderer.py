@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.atomic import scratch_prefix
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.composite import compositing, floor_reflection
 from ...sim.composite.backdrop import Backdrop
@@ -190,7 +191,7 @@ class Renderer:
         self._data_scene: DataScene | None = None
         self._grains: list[PhotoGrains] = []
         self._steps: list[Pc2Reader | PhotoGrains] = []
-        self._temporary = tempfile.TemporaryDirectory(prefix="physgen-render-")
+        self._temporary = tempfile.TemporaryDirectory(prefix=scratch_prefix("render"))
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
         try:

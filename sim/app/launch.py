@@ -31,6 +31,9 @@ def main(arguments: "list[str]") -> None:
     """Parse the options in ``arguments`` and run the module as ``__main__``."""
     if sys.version_info[:2] < OLDEST:
         sys.exit("Python {}.{} is too old: 3.11 to 3.13 are needed".format(*sys.version_info[:2]))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Until the module takes them over: imports take seconds, and nothing has been written yet.
+        signal.signal(number, lambda *_: os._exit(130))
     # Python puts the script's folder first in its search path, where ours could shadow modules of the same names.
     here = Path(__file__).absolute().parent
     hiding = (here, here.parents[1] / "batch")

@@ -19,11 +19,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from queue import Empty, Queue
 
+from ..children import note_child
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ..events import Event, IsCancelled, OnEvent
 
-CANCEL_GRACE_S = 10.0
-"""Time for a stage to clean up before it is killed."""
+CANCEL_GRACE_S = 1.2
+"""Time for a stage to clean up before it is killed: a command ends within two seconds of being asked to
+(``batch/terminal.py``). What it had not kept by then is computed again; nothing that was complete is lost."""
 
 MOST_LINE_BYTES = 2**22
 """Longer lines are cut. The longest of ours names the files of 100,000 frames, 1.4 MB."""
@@ -72,7 +74,7 @@ def start_process(command: Sequence[str], *, stdin: int = subprocess.DEVNULL) ->
     started, such as an interpreter that has been deleted.
     """
     try:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             list(command),
             stdin=stdin,
             stdout=subprocess.PIPE,
@@ -81,6 +83,8 @@ def start_process(command: Sequence[str], *, stdin: int = subprocess.DEVNULL) ->
             start_new_session=os.name != "nt",
             creationflags=0x00000200 | NO_WINDOW if os.name == "nt" else 0,  # a process group of its own
         )
+        note_child(process)
+        return process
     except OSError as error:
         raise InputError(
             f"{command[0]}: cannot be started ({error.strerror or error}); put it back, or choose another interpreter"

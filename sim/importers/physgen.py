@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ..atomic import scratch_prefix
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions
@@ -210,7 +211,7 @@ def import_physgen(
 
     source = read_physgen(root)
     settings = _reconstruct_options(source, options or ReconstructOptions())
-    with tempfile.TemporaryDirectory(prefix="physgen-import-") as temporary, replacing_folder(out) as partial:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix("import")) as temporary, replacing_folder(out) as partial:
         requests = object_requests(source, Path(temporary), size_m)
         from ..reconstruct import reconstruct_photo
 

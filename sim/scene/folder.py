@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
-from ..atomic import write_json
+from ..atomic import recover, write_json
 from ..errors import InputError
 from ..files import MOST_HASHED, is_file, open_file, read_bytes, shown
 from ..validation import parse, read_json, to_json
@@ -167,6 +167,9 @@ def load_scene(root: str | Path) -> Scene:
     lie outside the folder.
     """
     root = Path(root)
+    if not root.exists():
+        # A run that replaced it may have been killed between two steps.
+        recover(root)
     path = root / SCENE_FILE
     data = read_json(path, folder=root)
     folder = Scene(root=root, model=parse_scene(data, str(path)))

@@ -12,8 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ....physgen_addon.render.render_options import flagged_fields
 from ....sim.atomic import write_bytes
 from ....sim.errors import InputError
+from ....sim.scene.folder import inside
 from ....sim.validation import MAX_JSON_BYTES, parse, read_json
 
 STAGES = ("reconstruct", "variant", "bake", "render", "encode")
@@ -214,13 +216,14 @@ def _parse_plan(data: Any, path: Path) -> Plan:
     if not file.name.isprintable() or not 0 < len(file.name) <= 200:
         raise InputError(f"{path}.name: is {file.name[:60]!r}; expected 1 to 200 printable characters")
     _check_inside(file.out, f"{path}.out")
+    root = _root(file.root, path)
     seen: set[str] = set()
     for index, task in enumerate(file.tasks):
-        _check_task(task, seen, f"{path}.tasks[{index}]")
+        _check_task(task, seen, root, f"{path}.tasks[{index}]")
         seen.add(task.id)
     return Plan(
         name=file.name,
-        root=_root(file.root, path),
+        root=root,
         version=file.version,
         tasks=tuple(_from_file(task) for task in file.tasks),
         out=file.out,
@@ -251,7 +254,7 @@ def _root(text: str, path: Path) -> Path:
     return Path(os.path.normpath(path.absolute().parent / text))
 
 
-def _check_task(task: _FileTask, seen: set[str], where: str) -> None:
+def _check_task(task: _FileTask, seen: set[str], root: Path, where: str) -> None:
     if task.stage not in STAGES:
         raise InputError(f"{where}.stage: is {task.stage[:60]!r}; known are {', '.join(STAGES)}")
     for part in task.id.split("/"):
@@ -263,6 +266,7 @@ def _check_task(task: _FileTask, seen: set[str], where: str) -> None:
         raise InputError(f"{where}.needs: {missing[0][:60]!r} is not an earlier task; dependencies come first")
     if not task.argv or len(task.argv) > MOST_ARGUMENTS or any("\0" in word for word in task.argv):
         raise InputError(f"{where}.argv: expected 1 to {MOST_ARGUMENTS} arguments without zero bytes")
+    _check_command(task, root, f"{where}.argv")
     for names in ("inputs", "produces"):
         for name in getattr(task, names):
             _check_inside(name, f"{where}.{names}")
@@ -271,6 +275,40 @@ def _check_task(task: _FileTask, seen: set[str], where: str) -> None:
         _check_name(slot.name, f"{where}.slots")
         if not 0 < slot.count <= MOST_SLOTS:
             raise InputError(f"{where}.slots: {slot.name} is {slot.count}; expected 1 to {MOST_SLOTS}")
+
+
+_RENDER_FLAGS = [word for _, flag, _ in flagged_fields() for word in (flag, f"--no-{flag[2:]}")]
+FLAGS: Mapping[str, frozenset[str]] = {
+    "reconstruct": frozenset(("--out", "--box", "--name", "--size", "--horizon", "--pitch", "--fov")),
+    "variant": frozenset(("--out", "--preset", "--velocity", "--spin", "--set", "--effects-json")),
+    "bake": frozenset(("--out", "--frames", "--fps", "--quality", "--arch", "--seed", "--no-points", "--slow")),
+    "render": frozenset(("--out", "--bake", "--frames", *_RENDER_FLAGS)),
+    "encode": frozenset(("--out", "--fps")),
+    "effects": frozenset(),
+}
+"""Flags of a plan's commands, by verb: those that ``make_plan`` writes. None starts a program or calls anybody."""
+
+
+def _check_command(task: _FileTask, root: Path, where: str) -> None:
+    """Raise InputError unless the command is one that a plan of ours may have, on files below ``root``.
+
+    A plan is a file, and may be a stranger's: with any flag of ``physgen`` it could run adapters or send photos.
+    """
+    verb, *words = task.argv
+    if verb not in (task.stage, "effects"):
+        raise InputError(f"{where}: runs {verb[:60]!r} as {task.stage}; export the plan again with this version")
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if word.startswith("-") and not re.fullmatch(r"-[\d.,eE+-]+", word):
+            if flag not in FLAGS[verb]:
+                raise InputError(f"{where}: {flag[:60]!r} is no flag of a plan's {verb}; export the plan again")
+            if flag not in ("--out", "--bake", "--camera") or not equals:
+                continue
+            word = value
+        try:
+            inside(root, word)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
 
 
 def _check_name(text: str, where: str) -> None:

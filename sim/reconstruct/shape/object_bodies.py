@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...atomic import scratch_prefix
 from ...errors import InputError
 from ...files import read_bytes
 from ...scene.meshes import MAX_MESH_BYTES
@@ -329,7 +330,7 @@ def _fitted(
     mesher: Mesher | None,
     notice: Notice,
 ) -> Arrays:
-    with tempfile.TemporaryDirectory(prefix="physgen-mesh-") as place:
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix("mesh")) as place:
         path = item.mesh
         if path is None:
             assert mesher is not None

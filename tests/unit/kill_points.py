@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""Kill a command before each of its system calls that change the disk, and look at what is left.
+
+``python kill_points.py SCENARIO FOLDER FIRST:LAST:STEP`` runs the scenario once to its end, counting the calls, then
+once for each point: a forked process kills itself (SIGKILL) just before that call, and ``check`` judges the disk.
+Calls are seen by Python's audit events (open for writing, rename, replace, remove, mkdir, rmdir, link, symlink,
+truncate, and ``ctypes`` for the exchange), and by wrapping ``os.write`` and ``os.fsync``, which have none. A file that
+was opened last is cut to half at every second point, as if it had been written in part.
+
+Prints one JSON line: the number of calls and of points, and what was wrong.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import cv2
+import numpy as np
+from physgen import batch  # noqa: F401
+from physgen.sim import atomic
+from physgen.sim.app import rest_check  # noqa: F401 - before the fork
+from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
+from physgen.sim.app.reconstruct_record import STAMP_FILE, read_stamp, require_request
+from physgen.sim.app.scene_variant import make_variant
+from physgen.sim.app.set_light import LightRequest, set_light
+from physgen.sim.cache.folder_lock import LOCK_FILE, remove_dead_lock
+from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
+from physgen.sim.scene.folder import load_scene
+from PIL import Image
+
+cv2.setNumThreads(0)
+QUICK = ReconstructOptions(mesh_vertices=500, pitch_deg=25.0, patch_radius=2, sun=False, max_size=96)
+REQUESTS = [ObjectRequest(box=(30, 18, 66, 58), name="ball", shape="inflated")]
+CHANGING = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
+
+
+class Counter:
+    """Counts calls that change the disk below a folder, and dies before the ``fatal``-th."""
+
+    def __init__(self):
+        self.on, self.count, self.fatal, self.opened = False, 0, None, None
+
+    def see(self, event, arguments):
+        if not self.on:
+            return
+        opened = None
+        if event == "open":
+            _, mode, flags = (*arguments, None, None)[:3]
+            writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+            if not (writes or (isinstance(mode, str) and set("wax+") & set(mode))):
+                return
+            opened = arguments[0]
+        elif event == "ctypes.call_function":
+            pass
+        elif event not in CHANGING and event not in ("write", "fsync"):
+            return
+        self.count += 1
+        if self.count == self.fatal:
+            self.die()
+        self.opened = opened
+
+    def die(self):
+        self.on = False
+        if self.opened is not None and self.count % 2:
+            with contextlib.suppress(OSError, TypeError, ValueError):
+                os.truncate(self.opened, Path(self.opened).stat().st_size // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+counter = Counter()
+sys.addaudithook(counter.see)
+real_write, real_fsync = os.write, os.fsync
+os.write = lambda *given: (counter.see("write", given), real_write(*given))[1]
+os.fsync = lambda *given: (counter.see("fsync", given), real_fsync(*given))[1]
+
+
+def draw(folder):
+    rng = np.random.default_rng(2)
+    image = np.full((72, 96, 3), (190.0, 175, 140)) + rng.normal(scale=4, size=(72, 96, 1))
+    rows, columns = np.mgrid[:72, :96] + 0.5
+    image[(columns - 48) ** 2 + (rows - 38) ** 2 < 15**2] = (200, 50, 40)
+    Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(folder / "photo.png")
+
+
+def edited(folder):
+    """A scene whose gravity, wind, velocity and light a user has set."""
+    draw(folder)
+    scene = reconstruct(folder / "photo.png", REQUESTS, out=folder / "scene", options=QUICK)
+    changes = ("scene.gravity=0,0,-1.62", "ball.density=321")
+    scene = set_physics(scene, Physics(presets=("hard",), velocities=((1.0, 0.0, 2.0),), overrides=changes))
+    wind = json.loads(
+        '[{"name": "wind", "parameters": {"wind_x": 1.0, "wind_y": 0.0, "wind_z": 0.0, "drag_per_mass": 0.05}}]'
+    )
+    model = make_variant(scene, out=folder / "windy", physics=Physics(), effects=json.dumps(wind)).model
+    shutil.rmtree(folder / "windy")
+    scene.with_model(dataclasses.replace(scene.model, effects=model.effects)).save()
+    set_light(load_scene(folder / "scene"), request=LightRequest(sun_direction=(0.0, 0.3, 1.0), sun_strength=2.0))
+
+
+def do_correct(folder):
+    scene = load_scene(folder / "scene")
+    earlier = require_request(scene, lambda source, claims: True)
+    objects = [dataclasses.replace(earlier.objects[0], size_m=0.3)]
+    correct(scene, earlier=earlier, objects=objects, options=earlier.options)
+
+
+def do_reconstruct(folder):
+    """Another photo's worth of options into the same folder."""
+    options = dataclasses.replace(QUICK, default_size_m=0.4)
+    reconstruct(folder / "photo.png", REQUESTS, out=folder / "scene", options=options)
+
+
+def do_light(folder):
+    set_light(load_scene(folder / "scene"), request=LightRequest(sun_direction=(0.5, 0.3, 1.0), sun_strength=1.0))
+
+
+def do_variant(folder):
+    make_variant(load_scene(folder / "scene"), out=folder / "windy", physics=Physics(presets=("jelly",)))
+
+
+def do_correct_with_a_journal(folder):
+    """As on a system that cannot exchange two folders."""
+    atomic._exchange = lambda first, second: False
+    do_correct(folder)
+
+
+SCENARIOS = {
+    "correct": do_correct,
+    "journal": do_correct_with_a_journal,
+    "reconstruct": do_reconstruct,
+    "light": do_light,
+    "variant": do_variant,
+}
+
+
+def state(folder):
+    """What of the scene lasts: content and record."""
+    scene = load_scene(folder / "scene")
+    record = read_stamp(folder / "scene")
+    assert record is not None, f"{STAMP_FILE} is missing"
+    return (scene.model, record.inputs_hash, json.dumps(record.scene, sort_keys=True))
+
+
+def leftovers(folder):
+    return [str(path.relative_to(folder)) for path in folder.rglob(".*")]
+
+
+def check(folder, whole):
+    """Return what is wrong after a kill and the next command's recovery."""
+    atomic.recover(folder / "scene")
+    atomic.recover(folder / "windy")
+    atomic.recover_scratch(folder / "scratch")
+    for name in ("scene", "windy"):
+        remove_dead_lock(folder / f".{name}{LOCK_FILE}")
+        remove_dead_lock(folder / name / LOCK_FILE)
+    if state(folder) not in whole:
+        return "neither the earlier scene nor the new one"
+    left = [*leftovers(folder), *(path.name for path in (folder / "scratch").iterdir())]
+    return f"left over: {left[:4]}" if left else None
+
+
+def forked(work):
+    """Run ``work`` in a forked process; its exit status."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            work()
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def main(name, folder, points):
+    action, start = SCENARIOS[name], folder / "start"
+    start.mkdir()
+    assert forked(lambda: edited(start)) == 0
+    (start / "scratch").mkdir()
+
+    def attempt(number, fatal):
+        """Copy the start, run, die before the call ``fatal``; the copy and the number of calls."""
+        copy = folder / f"point-{number}"
+        shutil.copytree(start, copy)
+        reading, writing = os.pipe()
+
+        def work():
+            tempfile.tempdir = str(copy / "scratch")
+            counter.fatal, counter.on = fatal, True
+            with atomic.own_scratch():
+                action(copy)
+            counter.on = False
+            real_write(writing, str(counter.count).encode())
+
+        code = forked(work)
+        os.close(writing)
+        said = os.read(reading, 20)
+        os.close(reading)
+        return copy, code, int(said or 0)
+
+    done, code, calls = attempt(0, None)
+    assert code == 0
+    # The copies differ in nothing but their place.
+    whole = [state(start), state(done)]
+    assert whole[0] != whole[1] or name == "variant"
+    wrong = [] if check(done, [whole[1]]) is None else ["the whole run left something"]
+    first, last, step = points
+    tried = 0
+    for number in range(first, min(last, calls) + 1, step):
+        copy, code, _ = attempt(number, number)
+        tried += 1
+        problem = check(copy, whole) if code == -signal.SIGKILL else f"ended with {code}"
+        if problem is not None:
+            wrong.append(f"killed before call {number} of {calls}: {problem}")
+        shutil.rmtree(copy)
+    sys.stdout.write(json.dumps({"calls": calls, "points": tried, "wrong": wrong}) + "\n")
+
+
+if __name__ == "__main__":
+    first, last, step = (int(part) for part in sys.argv[3].split(":"))
+    main(sys.argv[1], Path(sys.argv[2]), (first, last, step))

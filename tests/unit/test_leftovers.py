@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""Killed at any moment, a command loses nothing, and the next one clears away what it left, and nothing else."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+from physgen.batch.cli import main
+from physgen.sim import atomic
+from physgen.sim.cache.folder_lock import lock_beside
+from physgen.sim.errors import InputError
+from physgen.sim.process_identity import Mark, own_mark, parse_mark
+from physgen.sim.scene.folder import load_scene
+
+HERE = Path(__file__).parent
+
+
+def kill_points(scenario, folder, points):
+    command = [sys.executable, str(HERE / "kill_points.py"), scenario, str(folder), points]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(("scenario", "least"), [("correct", 60), ("journal", 60)])
+def test_killed_before_some_calls_a_correction_loses_nothing(tmp_path, scenario, least):
+    found = kill_points(scenario, tmp_path, "5:1000:33" if scenario == "correct" else "88:1000:7")
+    assert found["wrong"] == [] and found["calls"] >= least and found["points"] >= 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["correct", "journal", "reconstruct", "light", "variant"])
+def test_killed_before_any_call_nothing_is_lost(tmp_path, scenario):
+    found = kill_points(scenario, tmp_path, "1:100000:1")
+    assert found["wrong"] == [] and found["points"] == found["calls"] > 10
+
+
+@pytest.fixture
+def dead():
+    """The mark of a process that has ended."""
+    command = "from physgen.sim.process_identity import own_mark; print(own_mark())"
+    said = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True).stdout
+    mark = parse_mark(said.strip())
+    assert mark.is_here and mark.is_dead
+    return mark
+
+
+@pytest.fixture
+def living():
+    """The mark of a process that runs."""
+    command = "from physgen.sim.process_identity import own_mark; print(own_mark(), flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        mark = parse_mark(process.stdout.readline().decode().strip())
+        assert mark.pid == process.pid and not mark.is_dead
+        yield mark
+        process.kill()
+
+
+def test_a_mark_is_of_one_process_only(dead, living):
+    # The number is used again, by a process that started at another time.
+    assert Mark(living.pid, dead.started, dead.machine).is_dead
+    assert not Mark(living.pid, "0", dead.machine).is_dead
+    assert not Mark(dead.pid, dead.started, "00000000").is_dead
+    assert not own_mark().is_dead and parse_mark("1-2") is None
+
+
+def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(tmp_path, dead, living, ball_scene, capsys):
+    root = ball_scene().root
+    other = Mark(dead.pid, dead.started, "00000000")
+    gone = [
+        root / f".scene.partial-{dead}.json",
+        root / "meshes" / f".ball0.partial-{dead}.glb",
+        tmp_path / f".scene.partial-{dead}" / "meshes",
+        tmp_path / f"..scene.partial-{dead}.partial-{dead}" / "meshes",
+        tmp_path / f".scene.old-{dead}" / "meshes",
+    ]
+    kept = [
+        root / f".scene.partial-{living}.json",
+        root / f".scene.partial-{other}.json",
+        root / f".scene.partial-{dead.pid}.json",
+        root / ".notes",
+        tmp_path / f".scene2.partial-{dead}",
+        tmp_path / f".scene.partial-{living}",
+        tmp_path / "my.partial-1",
+        tmp_path / f"scene.partial-{dead}",
+    ]
+    for path in (*gone, *kept):
+        path.mkdir(parents=True) if not path.suffix or "-" in path.suffix else path.write_text("half")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("mine")
+    (root / f".link.partial-{dead}").symlink_to(outside)
+    assert main(["estimate", str(root), "--frames", "2"]) == 0
+    said = capsys.readouterr().out
+    assert not any(path.exists() for path in gone) and all(path.exists() for path in kept)
+    assert not (root / f".link.partial-{dead}").is_symlink() and (outside / "precious").read_text() == "mine"
+    assert said.count("removed, left by a run that was killed") == len(gone) + 1
+
+
+def test_a_folder_that_was_moved_aside_is_put_back(tmp_path, dead, ball_scene):
+    root = ball_scene().root
+    content = (root / "scene.json").read_bytes()
+    root.rename(tmp_path / f".scene.old-{dead}")
+    (tmp_path / f".scene.partial-{dead}").mkdir()
+    # Whoever asks for it first, command or script, finds it again.
+    assert load_scene(root).root == root and (root / "scene.json").read_bytes() == content
+    assert not (tmp_path / f".scene.partial-{dead}").exists()
+
+
+def test_temporary_folders_of_dead_processes_are_removed(tmp_path, dead, living):
+    names = [f"physgen-{dead}-x1", f"physgen-mesh-{dead}-x2"]
+    kept = [f"physgen-{living}-x3", "physgen-abc", f"other-{dead}-x", f"physgen-{dead.pid}-x"]
+    for name in (*names, *kept):
+        (tmp_path / name / "deep").mkdir(parents=True)
+    assert len(atomic.recover_scratch(tmp_path)) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+
+
+def test_all_temporary_files_of_a_command_and_its_children_lie_in_one_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with atomic.own_scratch() as folder:
+        assert parse_mark(folder.name.removeprefix("physgen-").rpartition("-")[0]) == own_mark()
+        assert Path(tempfile.mkdtemp()).parent == folder
+        command = [sys.executable, "-c", "import tempfile; print(tempfile.gettempdir())"]
+        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == str(folder)
+    assert not list(tmp_path.iterdir()) and tempfile.gettempdir() == str(tmp_path)
+
+
+def test_of_two_reconstructs_into_one_folder_the_second_is_refused_by_name(tmp_path, ball_scene, capsys):
+    root = ball_scene().root
+    code = f"""
+from pathlib import Path
+from physgen.sim.cache.folder_lock import lock_beside
+with lock_beside(Path({str(root)!r})):
+    print("held", flush=True)
+    input()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"held\n"
+        given = ["--box", "5,5,30,30", "--out", str(root)]
+        assert main(["reconstruct", str(root / "photo.png"), *given]) == 3
+        assert f"scene: in use by process {first.pid}" in capsys.readouterr().err
+        first.kill()
+    with lock_beside(root):
+        pass
+    assert not (tmp_path / ".scene.lock").exists()
+
+
+def test_a_replaced_folder_is_whole_at_every_moment(tmp_path, monkeypatch):
+    """With an exchange there is no moment without it; a failure leaves the earlier one."""
+    out = tmp_path / "scene"
+    out.mkdir()
+    (out / "old").touch()
+    seen = []
+    monkeypatch.setattr(atomic, "_sync", lambda path: seen.append((out / "old").exists() or (out / "new").exists()))
+    with atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert all(seen) and [path.name for path in out.iterdir()] == ["new"]
+    with pytest.raises(InputError), atomic.replacing_tree(out):
+        raise InputError("no")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
