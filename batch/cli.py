@@ -22,6 +22,7 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.files import shown
+from ..sim.trust import LIST_FILE, config_folder
 from ..sim.version import VERSION
 from . import stages
 from .commands import (
@@ -131,7 +132,7 @@ def recover(options: argparse.Namespace, terminal: Terminal) -> None:
     """Put back or remove what killed runs left of the files and folders that the command names, and among the system's
     temporary files; say so."""
     said = atomic.recover_scratch()
-    for path in _named_paths(options):
+    for path in (*_named_paths(options), config_folder() / LIST_FILE):
         said += atomic.recover(path)
         for lock in (path / LOCK_FILE, path.with_name(f".{path.name}{LOCK_FILE}")):
             remove_dead_lock(lock)

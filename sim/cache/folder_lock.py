@@ -192,11 +192,12 @@ def release_all() -> None:
 
 
 def remove_dead_lock(path: Path) -> bool:
-    """Remove the lock file at ``path`` if the process that it names is dead and nobody holds it; whether it did."""
+    """Remove the lock file at ``path`` if the process that it names is dead, or died before it named itself, and nobody
+    holds it; return whether it did."""
     owner = _owner(path)
-    if owner is None or not owner.is_dead:
-        return False
     try:
+        if not (owner.is_dead if owner else path.is_file() and path.stat().st_size == 0):
+            return False
         file = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
     except OSError:
         return False

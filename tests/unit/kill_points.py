@@ -158,6 +158,7 @@ def check(folder, whole):
     """Return what is wrong after a kill and the next command's recovery."""
     atomic.recover(folder / "scene")
     atomic.recover(folder / "windy")
+    atomic.recover(folder / "config" / "trusted.json")
     atomic.recover_scratch(folder / "scratch")
     for name in ("scene", "windy"):
         remove_dead_lock(folder / f".{name}{LOCK_FILE}")
@@ -197,6 +198,7 @@ def main(name, folder, points):
 
         def work():
             tempfile.tempdir = str(copy / "scratch")
+            os.environ["PHYSGEN_CONFIG"] = str(copy / "config")
             counter.fatal, counter.on = fatal, True
             with atomic.own_scratch():
                 action(copy)
