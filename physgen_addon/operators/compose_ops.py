@@ -58,7 +58,7 @@ class Compose(JobOperator):
         scene, items = context.scene, chosen_meshes(context)
         if len(items) < 2:
             raise InputError(f"{count(len(items), 'mesh')} selected: select two or more meshes; the active one stays")
-        settings = scene.physgen_together
+        settings = scene.physgen_compose
         photo = photo_scene(scene) if settings.method != "ppps" else None
         if photo is None and settings.method != "ppps":
             raise InputError(
@@ -142,7 +142,7 @@ def _reshape(scene: bpy.types.Scene, item: bpy.types.Object, vertices: np.ndarra
         # Other users of the mesh are elsewhere.
         item.data = item.data.copy()
     mesh = item.data
-    if scene.physgen_together.keep_original and mesh.shape_keys is None:
+    if scene.physgen_compose.keep_original and mesh.shape_keys is None:
         item.shape_key_add(name="Composed", from_mix=False)
         item.shape_key_add(name=ORIGINAL, from_mix=False).value = 0.0
         # Edit Mode edits the active one.
@@ -178,7 +178,7 @@ def _numbers(state: Mapping[str, Any], when: str) -> dict[str, float]:
 
 
 def _show(scene: bpy.types.Scene, pairs: list[dict[str, Any]]) -> None:
-    shown = scene.physgen_together.pairs
+    shown = scene.physgen_compose.pairs
     shown.clear()
     for pair in pairs:
         entry = shown.add()

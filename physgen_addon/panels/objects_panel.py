@@ -30,9 +30,9 @@ from ..props import material_props
 from ..props.body_props import bodies, is_body
 from ..props.material_props import LAW_FIELDS, is_modified
 from .sidebar import (
+    COMPOSE,
     MOTION,
     OBJECTS,
-    TOGETHER,
     Sidebar,
     active_body,
     draw_arrows,
@@ -259,14 +259,14 @@ class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
 class PHYSGEN_PT_compose(Sidebar, bpy.types.Panel):
     """Resolve intersections of objects"""
 
-    bl_idname = "PHYSGEN_PT_together"
+    bl_idname = "PHYSGEN_PT_compose"
     bl_label = "Compose Objects"
-    bl_order = TOGETHER
+    bl_order = COMPOSE
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the fixed and the yielding objects, method, button and last result."""
-        layout, state = self.layout, context.scene.physgen_together
+        layout, state = self.layout, context.scene.physgen_compose
         items = chosen_meshes(context)
         if len(items) < 2:
             text.sentences(layout, context, "Select two or more meshes that intersect.", icon="INFO")

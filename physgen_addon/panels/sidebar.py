@@ -17,8 +17,8 @@ from ..preview.live_preview import PHYSGEN_OT_toggle_preview
 from ..props.body_props import is_body
 from ..props.preferences import PHYSGEN_AP_preferences
 
-SCENE, OBJECTS, TOGETHER, MOTION, WORLD, SIMULATE, RENDER, DIAGNOSE = range(8)
-"""``bl_order``: the order of work."""
+SCENE, OBJECTS, MOTION, SIMULATE, RENDER, WORLD, COMPOSE, DIAGNOSE = range(8)
+"""``bl_order``: the order of a first visit, so that Bake is in sight; what few need comes last."""
 
 COMMAND = f" In {TERMINAL}:"
 """Prefix of the command that installs missing packages (``interpreter``)."""

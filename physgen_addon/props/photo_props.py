@@ -201,6 +201,7 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
     default_motion: BoolProperty(
         name="Default Motion",
         description="Let the objects hop where they have room in the picture; off: everything is at rest",
+        default=True,
     )
     has_found: BoolProperty()
     found_horizon: FloatProperty()

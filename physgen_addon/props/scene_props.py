@@ -259,7 +259,7 @@ class PHYSGEN_PG_composed_pair(bpy.types.PropertyGroup):
 
 
 class PHYSGEN_PG_compose(bpy.types.PropertyGroup):
-    """Settings and last result of Compose Objects; ``Scene.physgen_together``."""
+    """Settings and last result of Compose Objects; ``Scene.physgen_compose``."""
 
     method: from_field(
         ComposeOptions,
@@ -293,10 +293,10 @@ class PHYSGEN_PG_compose(bpy.types.PropertyGroup):
 
 
 def register_compose_properties() -> None:
-    """Add ``physgen_together`` to scenes."""
-    bpy.types.Scene.physgen_together = PointerProperty(type=PHYSGEN_PG_compose)
+    """Add ``physgen_compose`` to scenes."""
+    bpy.types.Scene.physgen_compose = PointerProperty(type=PHYSGEN_PG_compose)
 
 
 def unregister_compose_properties() -> None:
     """Remove it; values stored in files are kept."""
-    del bpy.types.Scene.physgen_together
+    del bpy.types.Scene.physgen_compose

@@ -25,8 +25,8 @@ STEPS = 6
 @pytest.fixture(autouse=True)
 def addon(fresh_blender):
     physgen.register()
-    bpy.context.scene.physgen_together.method = "ppps"
-    bpy.context.scene.physgen_together.steps = STEPS
+    bpy.context.scene.physgen_compose.method = "ppps"
+    bpy.context.scene.physgen_compose.steps = STEPS
     yield
     physgen.unregister()
 
@@ -85,7 +85,7 @@ def test_the_active_object_stays_and_the_others_yield():
     assert key.value == 0 and np.array_equal(kept.reshape(-1, 3), rest)
     shown = yields.evaluated_get(bpy.context.evaluated_depsgraph_get())
     assert np.allclose(points(shown), points(yields))
-    pair = bpy.context.scene.physgen_together.pairs[0]
+    pair = bpy.context.scene.physgen_compose.pairs[0]
     assert pair.name == "Stays.001 – Yields"
     assert pair.volume_before > 1e-6 and pair.volume_after < 0.01 * pair.volume_before
     assert pair.deepest_before == pytest.approx(0.02, abs=0.003)
@@ -98,7 +98,7 @@ def test_objects_that_share_a_mesh_part_ways_and_undo_takes_it_all_back():
     two = bpy.data.objects.new("two", one.data)
     two.location = (0.085, 0, 0.2)
     bpy.context.scene.collection.objects.link(two)
-    bpy.context.scene.physgen_together.keep_original = False
+    bpy.context.scene.physgen_compose.keep_original = False
     select(two, one)
     rest = points(two)
     bpy.ops.ed.undo_push(message="before")
@@ -107,11 +107,11 @@ def test_objects_that_share_a_mesh_part_ways_and_undo_takes_it_all_back():
     one, two = bpy.data.objects["one"], bpy.data.objects["two"]
     assert two.data != one.data and np.array_equal(points(two), rest) and not np.allclose(points(one), rest)
     assert one.data.shape_keys is None and two.data.shape_keys is None
-    assert len(bpy.context.scene.physgen_together.pairs) == 1
+    assert len(bpy.context.scene.physgen_compose.pairs) == 1
     bpy.ops.ed.undo()
     one, two = bpy.data.objects["one"], bpy.data.objects["two"]
     assert two.data == one.data and np.array_equal(points(one), rest)
-    assert len(bpy.context.scene.physgen_together.pairs) == 0
+    assert len(bpy.context.scene.physgen_compose.pairs) == 0
 
 
 def test_impossible_composition_is_reported_and_changes_nothing():
@@ -123,9 +123,9 @@ def test_impossible_composition_is_reported_and_changes_nothing():
     select(one)
     assert not bpy.ops.physgen.compose_objects.poll()
     select(one, two)
-    bpy.context.scene.physgen_together.method = "pse-sds"
+    bpy.context.scene.physgen_compose.method = "pse-sds"
     refused("there is no photo.*choose the method Physics")
-    bpy.context.scene.physgen_together.method = "ppps"
+    bpy.context.scene.physgen_compose.method = "ppps"
     modifier = two.modifiers.new("Array", "ARRAY")
     refused("'two'.*'Array' changes its shape.*apply it or hide it")
     two.modifiers.remove(modifier)
@@ -175,7 +175,7 @@ class Live(Compose):
 @pytest.mark.long
 def test_progress_is_shown_and_cancelling_changes_nothing():
     one, two = a_ball("one", 0.0, subdivisions=2), a_ball("two", 0.08, subdivisions=2)
-    bpy.context.scene.physgen_together.steps = 100_000
+    bpy.context.scene.physgen_compose.steps = 100_000
     select(one, two)
     rest = points(two)
     live = Live()

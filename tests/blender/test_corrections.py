@@ -94,6 +94,9 @@ def drawn():
 
 def test_unset_fields_give_no_options(photo):
     words = arguments(photo)
+    assert words.count("--default-motion") == 1, "as `physgen run`, so that a first bake shows something"
+    photo.default_motion = False
+    words = arguments(photo)
     assert [word for word in words if word.startswith("--")] == ["--box", "--name"]
 
 

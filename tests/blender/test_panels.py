@@ -83,12 +83,12 @@ def test_extension_registers_and_unregisters_repeatedly():
     assert hasattr(bpy.types, "PHYSGEN_PT_world")
 
 
-def test_panels_are_in_the_order_of_work():
+def test_panels_are_in_the_order_of_a_first_visit():
     panels = [p for p in bpy.types.Panel.__subclasses__() if p.__name__.startswith("PHYSGEN_PT") and p.is_registered]
     mine = [p for p in panels if p.bl_space_type == "VIEW_3D" and not getattr(p, "bl_parent_id", "")]
     tops = {p.bl_label: p.bl_order for p in mine}
     assert sorted(tops, key=tops.get) == [
-        *("Scene", "Objects", "Compose Objects", "Motion", "World", "Simulate", "Render", "Diagnose")
+        *("Scene", "Objects", "Motion", "Simulate", "Render", "World", "Compose Objects", "Diagnose")
     ]
     assert len(set(tops.values())) == 8
 

@@ -100,6 +100,7 @@ class Run:
         task = self.out / "task.json"
         words = {"out": str(self.out), "python": self.options.python, "addon": f"bl_ext.{REPOSITORY}.physgen"}
         words["photo"] = str(self.options.photo.resolve()) if self.options.photo else ""
+        words["only"] = self.options.only
         task.write_text(json.dumps(words), encoding="utf-8")
         width, height = self.options.size.split("x")
         window = ("--window-geometry", "0", "0", width, height)
@@ -107,6 +108,8 @@ class Run:
             script = ("--python-exit-code", "1", "-P", str(HERE / "work.py"), "--", str(task))
             self.start("work", *window, *script, timeout=self.options.timeout, **screen)
         self.require("work.json")
+        if self.options.only:
+            return
         # Another user, who has never heard of the extension.
         script = ("--python-exit-code", "1", "-P", str(HERE / "reopen.py"), "--", str(task))
         self.start("reopen", "-b", *script, timeout=300, BLENDER_USER_RESOURCES=str(self.out / "user_without"))
@@ -136,6 +139,9 @@ def main() -> int:
     parser.add_argument("--zip", type=Path, default=default_zip(), help="the extension (default: %(default)s)")
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
     parser.add_argument("--photo", type=Path, help="photo to open and find objects in (default: one that is rendered)")
+    parser.add_argument(
+        "--only", default="", help="steps of work.py, separated by commas; nothing is opened again then"
+    )
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds for the work inside Blender")

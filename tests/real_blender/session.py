@@ -17,7 +17,7 @@ Step = Generator[float, None, dict | None]
 
 
 def task() -> dict[str, str]:
-    """What run.py asks for: ``out``, ``python``, ``addon``, ``photo``."""
+    """What run.py asks for: ``out``, ``python``, ``addon``, ``photo``, ``only``."""
     return json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8"))
 
 

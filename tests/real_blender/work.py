@@ -335,4 +335,4 @@ STEPS = [
     rendered,
     capture_loaded,
 ]
-session.run("work", STEPS)
+session.run("work", [step for step in STEPS if not TASK["only"] or step.__name__ in TASK["only"].split(",")])
