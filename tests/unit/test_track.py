@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tracking against videos whose truth is known: a textured cube or ball, drawn here, over a textured ground.
-
-The drawing shares no code with the tracker: homographies for planes, rays for the ball, averaged over the exposure.
-"""
+"""Videos become captures: accuracy, occlusion, blur, times and files, against videos whose truth is known."""
 
 from __future__ import annotations
 
@@ -16,210 +13,32 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.capture import Camera as CaptureCamera
 from physgen.sim.diagnose.capture import load_capture
-from physgen.sim.diagnose.track.feature_tracking import align, contrast, extract_patches, image_noise, smoothed, warp
-from physgen.sim.diagnose.track.pose_estimation import (
-    Pose,
-    Surface,
-    cast,
-    facing,
-    jitter,
-    locate,
-    pose_scatter,
-    project,
-    silhouette,
-)
 from physgen.sim.diagnose.track.track_command import add_arguments, parse_trials, run_command, track
 from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial, belief_warnings
 from physgen.sim.diagnose.track.track_videos import track_video, track_videos, withhold
 from physgen.sim.errors import Cancelled, InputError
-from physgen.sim.scene.folder import Scene, save_scene
+from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.material import load_preset
-from physgen.sim.scene.model import Camera, SceneModel, SceneObject
+from physgen.sim.scene.model import SceneObject
 from scipy.spatial.transform import Rotation
 
-WIDTH, HEIGHT = 480, 360
-SIDE = 0.10
-FPS = 60.0
-PITCH = np.radians(30.0)
-LOOK_DOWN = (
-    (1.0, 0.0, 0.0, 0.0),
-    (0.0, -np.sin(PITCH), np.cos(PITCH), -0.5),
-    (0.0, -np.cos(PITCH), -np.sin(PITCH), 0.35),
-    (0.0, 0.0, 0.0, 1.0),
+from .track_scenes import (
+    CAMERA,
+    FPS,
+    REST_PLACE,
+    REST_TURN,
+    SIDE,
+    Stage,
+    errors,
+    film,
+    make_scene,
+    resting,
+    squashed,
+    toss,
+    truth,
+    write_video,
 )
-CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=520.0, fy=520.0, cx=240.0, cy=180.0, world_from_camera=LOOK_DOWN)
-REST_TURN = Rotation.from_euler("z", 0.5)
-REST_PLACE = np.array([0.0, 0.0, SIDE / 2])
-
-
-def texture(seed: int, size: int = 256, low: int = 30, high: int = 225) -> np.ndarray:
-    """Blobs of several sizes, as on printed paper."""
-    rng = np.random.default_rng(seed)
-    total = sum(cv2.resize(rng.normal(size=(n, n)), (size, size), interpolation=cv2.INTER_CUBIC) for n in (6, 14, 30))
-    total = (total - total.mean()) / total.std()
-    return np.clip((low + high) / 2 + (high - low) / 3.2 * total, low, high).astype(np.float32)
-
-
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """What is drawn. textures: of the cube's faces or the ball (first one)."""
-
-    kind: str = "cube"
-    textures: tuple = dataclasses.field(default_factory=lambda: tuple(texture(i) for i in range(6)))
-    ground: np.ndarray = dataclasses.field(default_factory=lambda: texture(90, 512, 60, 160))
-    camera: Camera = CAMERA
-
-    def draw(self, turn: Rotation, place: np.ndarray, squash: float = 1.0, scale: int = 2) -> np.ndarray:
-        """(H, W) float32 grey levels of the object at world pose (turn, place), a ball squashed along z."""
-        camera = self.camera
-        size = (camera.width * scale, camera.height * scale)
-        picture = np.full(size[::-1], 90, np.float32)
-        corners = np.array([[-0.6, -0.45, 0], [0.6, -0.45, 0], [0.6, 0.75, 0], [-0.6, 0.75, 0]])
-        picture = self._plane(picture, self.ground, corners, size, scale)
-        if self.kind == "cube":
-            for axis in range(3):
-                for sign in (-1, 1):
-                    picture = self._face(picture, turn, place, axis, sign, size, scale)
-        else:
-            picture = self._ball(picture, turn, place, squash, scale)
-        return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-
-    def _plane(self, picture, image, corners, size, scale):
-        n = image.shape[0]
-        target = (self.camera.project(corners)[:, :2] * scale - 0.5).astype(np.float32)
-        source = np.array([[-0.5, -0.5], [n - 0.5, -0.5], [n - 0.5, n - 0.5], [-0.5, n - 0.5]], np.float32)
-        matrix = cv2.getPerspectiveTransform(source, target)
-        drawn = cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        cover = np.zeros(picture.shape, np.uint8)
-        cv2.fillConvexPoly(cover, np.round(target * 16).astype(np.int32), 1, shift=4)
-        return np.where(cover > 0, drawn, picture)
-
-    def _face(self, picture, turn, place, axis, sign, size, scale):
-        normal = np.zeros(3)
-        normal[axis] = sign
-        world = turn.apply(normal)
-        if (self.camera.position - (place + world * SIDE / 2)) @ world <= 0:
-            return picture
-        u, v = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-        corners = [normal + a * u + b * v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-        corners = turn.apply(np.array(corners) * SIDE / 2) + place
-        shade = 0.75 + 0.25 * max(0.0, float(world @ [0.3, -0.5, 0.8]))
-        return self._plane(picture, self.textures[2 * axis + (sign > 0)] * shade, corners, size, scale)
-
-    def _ball(self, picture, turn, place, squash, scale):
-        x, y, depth = self.camera.project(place)
-        reach = 0.6 * SIDE * self.camera.fx / (depth - SIDE / 2)
-        x0, y0 = (max(0, int((c - reach) * scale)) for c in (x, y))
-        x1, y1 = (max(0, int((c + reach) * scale)) for c in (x, y))
-        part = picture[y0:y1, x0:x1]
-        if part.size == 0:
-            return picture
-        rows, columns = np.mgrid[y0 : y0 + part.shape[0], x0 : x0 + part.shape[1]]
-        rays = self.camera.rays(np.stack([(columns + 0.5) / scale, (rows + 0.5) / scale], axis=-1))
-        # Where the ball is round again.
-        rays = rays / [1, 1, squash]
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        offset = (self.camera.position - place) / [1, 1, squash]
-        b = rays @ offset
-        inside = b**2 - offset @ offset + (SIDE / 2) ** 2
-        points = offset + rays * (-b - np.sqrt(np.maximum(inside, 0)))[..., None]
-        local = points @ turn.as_matrix() / (SIDE / 2)
-        # Latitude and longitude about x, whose poles stay out of sight.
-        n = self.textures[0].shape[0]
-        across = ((np.arctan2(local[..., 2], local[..., 1]) / (2 * np.pi) + 0.5) * n).astype(np.float32)
-        down = ((np.arcsin(np.clip(local[..., 0], -1, 1)) / np.pi + 0.5) * n).astype(np.float32)
-        drawn = cv2.remap(self.textures[0], across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        picture = picture.copy()
-        picture[y0:y1, x0:x1] = np.where(inside > 0, drawn, part)
-        return picture
-
-
-def toss(t: float) -> tuple[Rotation, np.ndarray]:
-    """Rests for four frames, then flies up to the right and away, and tumbles."""
-    t = max(0.0, t - 4.5 / FPS)
-    place = REST_PLACE + np.array([0.25 * t, 0.1 * t, 1.6 * t - 4.905 * t**2])
-    return Rotation.from_rotvec(np.array([1.5, 1.0, 2.0]) * t) * REST_TURN, place
-
-
-def squashed(t: float) -> tuple[Rotation, np.ndarray, float]:
-    """A soft ball that is pressed flat by a fifth while it stands, and comes back."""
-    squash = 1 - 0.2 * np.sin(np.pi * np.clip(t * FPS - 3, 0, 20) / 20) ** 2
-    return REST_TURN, REST_PLACE * [1, 1, squash], squash
-
-
-def resting(t: float) -> tuple[Rotation, np.ndarray]:
-    return REST_TURN, REST_PLACE
-
-
-def film(stage, motion, frames, *, exposure=0.0, noise=2.0, fps=FPS, bar=None, seed=0):
-    """Yields 8-bit grey frames. exposure: share of a frame's time, centred; bar: of time → x0, x1."""
-    rng = np.random.default_rng(seed)
-    pattern = texture(77, 512, 40, 200)
-    for i in range(frames):
-        parts = np.linspace(-0.5, 0.5, 5) * exposure if exposure else [0.0]
-        picture = np.mean([stage.draw(*motion((i + part) / fps)) for part in parts], axis=0)
-        if bar is not None:
-            x0, x1 = bar(i / fps)
-            a, b = max(0, round(x0)), min(picture.shape[1], round(x1))
-            if b > a:
-                picture[:, a:b] = pattern[: picture.shape[0], : b - a]
-        yield np.clip(picture + rng.normal(0, noise, picture.shape), 0, 255).astype(np.uint8)
-
-
-def write_video(path: Path, frames, *, fps=FPS, code="MJPG"):
-    writer = None
-    for frame in frames:
-        if writer is None:
-            size = (frame.shape[1], frame.shape[0])
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), fps, size)
-            assert writer.isOpened()
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR) if frame.ndim == 2 else frame)
-    writer.release()
-    return path
-
-
-def make_scene(root: Path, stage: Stage, *, preset="wood", objects=("body",), **changes) -> Scene:
-    """A perfect reconstruction: the mesh in millimetres, y up, in a frame of its own."""
-    (root / "meshes").mkdir(parents=True)
-    photo = np.clip(stage.draw(REST_TURN, REST_PLACE), 0, 255).astype(np.uint8)
-    for name in ("photo.png", "background.png"):
-        cv2.imwrite(str(root / name), photo)
-    if stage.kind == "cube":
-        mesh = trimesh.creation.box((100.0, 100.0, 100.0))
-    else:
-        mesh = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
-    mesh.export(root / "meshes/body.ply")
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = REST_TURN.as_matrix() * 1e-3, REST_PLACE
-    items = tuple(
-        SceneObject(
-            name=name,
-            mesh="meshes/body.ply",
-            size_m=SIDE,
-            world_from_mesh=tuple(map(tuple, matrix.tolist())),
-            material=load_preset(preset),
-        )
-        for name in objects
-    )
-    return save_scene(root, SceneModel(**{"camera": stage.camera, "objects": items, **changes}))
-
-
-def truth(trial, motion, camera=CAMERA) -> np.ndarray:
-    """(T, K, 2): where the trial's rest points really are in the picture. The rest frame has the world's axes."""
-    places = []
-    for t in trial.times:
-        turn, place, *squash = motion(t)
-        moved = (turn * REST_TURN.inv()).apply(trial.rest_points) * [1, 1, *(squash or [1])]
-        places.append(camera.project(moved + place)[:, :2])
-    return np.array(places)
-
-
-def errors(trial, motion) -> np.ndarray:
-    """Distances in px of all points that are seen."""
-    distance = np.linalg.norm(trial.pixels - truth(trial, motion), axis=2)
-    return distance[np.isfinite(distance)]
 
 
 @pytest.fixture(scope="module")
@@ -621,104 +440,3 @@ def test_wrong_arguments(changes, message):
 def test_wrong_objects(cube, tossed):
     with pytest.raises(InputError, match="no object 'cup'; choose from body"):
         track_video(VideoTrial(path=tossed[0]), cube[1], objects=["cup"])
-
-
-def capture_camera() -> CaptureCamera:
-    return CaptureCamera(
-        width=WIDTH, height=HEIGHT, fx=520.0, fy=500.0, cx=230.0, cy=190.0, world_from_camera=LOOK_DOWN
-    )
-
-
-@given(st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
-def test_casting_inverts_projecting(seed):
-    rng = np.random.default_rng(seed)
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
-    surface = Surface(vertices=np.asarray(ball.vertices), faces=np.asarray(ball.faces))
-    pose = Pose(
-        rotation=Rotation.random(random_state=seed).as_matrix(),
-        translation=rng.uniform([-0.05, -0.05, 0.45], [0.05, 0.05, 0.55]),
-    )
-    camera = capture_camera()
-    pixels = project(camera, pose.translation[None]) + rng.uniform(-80, 80, (60, 2))
-    hits = cast(surface, pose, camera, pixels)
-    hit = hits.face >= 0
-    assert hit.any()
-    np.testing.assert_allclose(project(camera, pose.apply(hits.rest[hit])), pixels[hit], atol=1e-6)
-    radius = np.linalg.norm(hits.rest[hit], axis=1)
-    assert (radius <= 0.05 + 1e-9).all() and (radius > 0.047).all()
-    # The near side of a convex body is the one that is turned towards the camera.
-    assert (facing(hits.rest[hit], surface.normals[hits.face[hit]], pose) > 0).all()
-    inside = silhouette(surface, pose, camera)
-    row, column = np.floor(pixels[hit]).astype(int)[:, ::-1].T
-    fits = (row >= 0) & (row < HEIGHT) & (column >= 0) & (column < WIDTH)
-    assert inside[row[fits], column[fits]].mean() > 0.97 if fits.any() else True
-
-
-@given(st.integers(0, 10_000), st.integers(0, 6))
-@settings(max_examples=30, deadline=None)
-def test_a_pose_is_found_in_spite_of_outliers(seed, outliers):
-    rng = np.random.default_rng(seed)
-    rest = rng.uniform(-0.05, 0.05, (24, 3))
-    true = Pose(rotation=Rotation.random(random_state=seed).as_matrix(), translation=np.array([0.02, -0.03, 0.6]))
-    camera = capture_camera()
-    pixels = project(camera, true.apply(rest)) + rng.normal(0, 0.1, (24, 2))
-    pixels[:outliers] += rng.choice([-1, 1], (outliers, 2)) * rng.uniform(10, 40, (outliers, 2))
-    guess = Pose(
-        rotation=Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix() @ true.rotation,
-        translation=true.translation + rng.normal(0, 0.005, 3),
-    )
-    found = locate(camera, rest, pixels, guess, tolerance=2.0, largest=5.0)
-    assert found is not None
-    assert not found.inliers[:outliers].any() and found.inliers[outliers:].all()
-    assert np.linalg.norm(found.pose.translation - true.translation) < 0.003
-
-
-def test_four_points_are_no_pose():
-    rest = np.eye(4, 3) * 0.05
-    pose = Pose(rotation=np.eye(3), translation=np.array([0, 0, 0.5]))
-    camera = capture_camera()
-    assert locate(camera, rest, project(camera, pose.apply(rest)), pose, tolerance=2.0, largest=5.0) is None
-
-
-@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(0.6, 1.2), st.floats(-30, 20))
-@settings(max_examples=30, deadline=None)
-def test_aligning_finds_shifts_whatever_the_light(dx, dy, gain, offset):
-    image = cv2.GaussianBlur(texture(3, 200, 70, 180), (0, 0), 1.0)
-    move = np.array([[1, 0, dx], [0, 1, dy]])
-    moved = cv2.warpAffine(image, move, (200, 200), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    lit = np.clip(moved * gain + offset, 0, 255).astype(np.uint8)
-    places = np.array([[80.5, 90.5], [120.5, 60.5], [100.5, 130.5]])
-    crops = extract_patches(smoothed(image.astype(np.uint8)), places, 8)
-    patches = warp(crops, np.broadcast_to(np.eye(2, 5), (3, 2, 5)), 8)
-    found, score = align(smoothed(lit), patches, places, 8)
-    np.testing.assert_allclose(found - places, np.broadcast_to([dx, dy], (3, 2)), atol=0.1)
-    assert (score > 0.95).all()
-
-
-@given(st.floats(1.0, 10.0))
-@settings(max_examples=10, deadline=None)
-def test_noise_is_measured_and_is_no_texture(sigma):
-    rng = np.random.default_rng(1)
-    grey = np.clip(128 + rng.normal(0, sigma, (200, 200)), 0, 255).astype(np.uint8)
-    assert image_noise(grey) == pytest.approx(np.hypot(sigma, 0.29), rel=0.1, abs=0.15)
-    assert np.median(contrast(grey, 8)) < 2 * 0.43 * max(sigma, 0.3)
-
-
-def test_contrast_is_in_levels_per_pixel():
-    x, y = np.meshgrid(np.arange(100), np.arange(100))
-    ramps = (128 + 40 * np.sin(0.2 * x) * np.sin(0.2 * y)).astype(np.uint8)
-    gradient = np.hypot(*np.gradient(ramps.astype(float))) / np.sqrt(2)
-    assert contrast(ramps, 15)[50, 50] == pytest.approx(np.sqrt((gradient[35:66, 35:66] ** 2).mean()), rel=0.15)
-
-
-@given(st.floats(0.05, 3.0), st.integers(0, 100))
-@settings(max_examples=15, deadline=None)
-def test_scatter_is_estimated(sigma, seed):
-    rng = np.random.default_rng(seed)
-    noise = rng.normal(0, sigma, (80, 30, 2))
-    noise[rng.random((80, 30)) < 0.2] = np.nan
-    drift = np.linspace(0, 5, 80)[:, None, None] ** 2
-    assert jitter(noise + drift) == pytest.approx(sigma, rel=0.15)
-    # pose_scatter corrects for poses that were fitted: 6 of about 48 numbers a frame.
-    assert pose_scatter(noise) == pytest.approx(sigma / np.sqrt(1 - 6 / 48), rel=0.1)
