@@ -269,3 +269,41 @@ def test_contact_shadow_stays_on_the_ground():
     mask = segment(paint([(truth, (200, 60, 50))], [shadow]), (85, 55, 240, 175), "ball")
     assert overlap(mask, truth) > 0.93
     assert (mask & shadow).sum() < 0.15 * shadow.sum()
+
+
+def toy_with_a_double_shadow(seed=0, height=240, width=320):
+    """A pale ball on planks of warm wood under two lamps; shaded wood is redder, as it is lit by wood. Linear light."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    plank = rng.uniform(0.85, 1.15, 9)[(rows // 30).astype(int)] * (1.0 + 0.05 * np.sin(columns / 9.0 + rows / 3.0))
+    wood = np.array([0.62, 0.27, 0.06]) * plank[..., None]
+    shade = np.ones((height, width))
+    for x, depth in ((178, 0.35), (128, 0.4)):
+        dark = ((columns - x) / 62.0) ** 2 + ((rows - 176) / 26.0) ** 2
+        shade *= 1.0 - (1.0 - depth) / (1.0 + np.exp(np.clip((dark - 1.0) * 14.0, -50, 50)))
+    middle = np.exp(np.log(wood).mean(axis=2, keepdims=True))
+    picture = middle * (wood / middle) ** (1.0 - 0.5 * np.log(shade))[..., None] * shade[..., None]
+    ball = (columns - 155) ** 2 + (rows - 118) ** 2 < 58**2
+    normal = np.clip(0.75 - (rows - 118) / 150.0 - (columns - 155) / 300.0, 0.2, 1.0)
+    picture[ball] = (np.array([0.9, 0.78, 0.62]) * normal[..., None])[ball]
+    noisy = np.clip(picture, 0.0, 1.0) ** (1.0 / 2.2) + rng.normal(0.0, 0.01, (height, width, 3))
+    soft = cv2.GaussianBlur(np.clip(noisy, 0.0, 1.0), (0, 0), 0.7)
+    return np.round(255.0 * soft).astype(np.uint8), ball, (shade < 0.7) & ~ball
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("box", [(88, 52, 222, 186), (70, 40, 250, 210)])
+def test_a_box_around_object_and_shadow_yields_the_object(box, seed):
+    pixels, ball, shadow = toy_with_a_double_shadow(seed)
+    found = segment(pixels, box, "toy")
+    assert (found & ball).sum() / (found | ball).sum() > 0.95
+    assert (found & shadow).sum() < 0.02 * shadow.sum()
+
+
+def test_a_brown_thing_on_brown_wood_is_not_given_back_to_the_ground():
+    pixels, ball, _ = toy_with_a_double_shadow(2)
+    # A lump of clay of nearly the wood's hue, as dark as its shadow.
+    lump = np.round(pixels * np.array([0.62, 0.75, 0.9])).astype(np.uint8)
+    pixels[ball] = lump[ball]
+    found = segment(pixels, (88, 52, 222, 186), "clay")
+    assert (found & ball).sum() / (found | ball).sum() > 0.9

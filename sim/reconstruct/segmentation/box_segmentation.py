@@ -9,6 +9,7 @@ cannot leak. Doubtful masks give notices.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from .contour_evidence import FINE, completed_by_contours, gaps_and_rods
+from .ground_shade import shaded_ground, without_ground
 from .mask_cleanup import drop_ground_shadow, fill_holes, open_holes, settle_outline, smooth_outline, touching
 from .mask_proposals import (
     BoxCrop,
@@ -279,19 +281,20 @@ def _coarse(
     )
     if not view.inside.any():
         return nothing, nothing, [], []
-    raw = proposals(view, iterations)
-    guesses = [_kept_part(mask, closed, view.keep) for mask in raw]
-    for index, mask in enumerate(list(guesses)):
-        whole = without_notches(mask, view.inside)
-        if whole is not None:
-            guesses.append(whole)
-            raw.append(raw[index] | whole)
-    ground = ground_like(view)
-    best = int(np.argmax([score(view, mask, ground) for mask in guesses]))
-    if outline_strength(view, guesses[best]) < FAINT and not view.keep.any():
+    raw, chosen = _best_proposal(view, iterations)
+    if outline_strength(view, chosen) < FAINT and not view.keep.any():
         return nothing, nothing, [], []
-    completed = completed_by_contours(view, guesses[best])
-    notices = mask_warnings(view, raw[best], guesses[best])
+    rest = without_ground(view, chosen)
+    if (chosen & ~rest).sum() > 0.02 * chosen.sum():
+        # Once more, with the shadow among what the ground is known by.
+        told = replace(view, drop=view.drop | (chosen & ~rest))
+        again = _best_proposal(told, iterations)[1]
+        near = cv2.dilate(rest.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        again = _kept_part(without_ground(told, again) & near, closed, view.keep)
+        rest = again if again.sum() > 0.5 * rest.sum() else rest
+    chosen = rest
+    completed = completed_by_contours(view, chosen, shade=shaded_ground(view, chosen) if chosen.any() else None)
+    notices = mask_warnings(view, raw, chosen)
     if completed.doubtful.any():
         away = np.argwhere(completed.doubtful).mean(axis=0) - np.argwhere(completed.mask).mean(axis=0)
         sides = ("above", "below") if abs(away[0]) > abs(away[1]) else ("left of", "right of")
@@ -310,6 +313,20 @@ def _coarse(
     return np.asarray(full), np.asarray(closed), notices, cut_sides(view, completed.mask)
 
 
+def _best_proposal(view: BoxCrop, iterations: int) -> tuple[Mask, Mask]:
+    """The proposal (h, w) that looks most like an object, and its part that is used."""
+    raw = proposals(view, iterations)
+    guesses = [_kept_part(mask, view.others, view.keep) for mask in raw]
+    for index, mask in enumerate(list(guesses)):
+        whole = without_notches(mask, view.inside)
+        if whole is not None:
+            guesses.append(whole)
+            raw.append(raw[index] | whole)
+    ground = ground_like(view)
+    best = int(np.argmax([score(view, mask, ground) for mask in guesses]))
+    return raw[best], guesses[best]
+
+
 def _details(
     crop: NDArray[np.uint8], inner: Box, found: Mask, taken: Mask, keep: Mask, drop: Mask
 ) -> tuple[Mask, Mask]:
@@ -324,7 +341,7 @@ def _details(
     ]
     x0, y0, x1, y1 = (round(v * scale) for v in inner)
     view = crop_around_box(small, (x0, y0, x1, y1), masks[1], keep=masks[2], drop=masks[3] & ~masks[2])
-    gaps, rods = gaps_and_rods(view, masks[0])
+    gaps, rods = gaps_and_rods(view, masks[0], shade=shaded_ground(view, masks[0]) if masks[0].any() else None)
     large = [cv2.resize(part.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
              for part in (gaps, rods)]  # fmt: skip
     return large[0] & ~keep, large[1] & ~drop & ~taken

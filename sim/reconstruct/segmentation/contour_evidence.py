@@ -42,6 +42,8 @@ CONVEX = 0.93
 """Least share of its convex hull that object and part fill together."""
 APART = 7.0
 """Least distance of a part's colour from that beyond its contour, CIELAB."""
+SHADE_SHARE = 0.5
+"""Share of a part or rod that looks like shaded ground above which it is a shadow."""
 LEAST_PART, MOST_PART = 0.015, 0.6
 """Area of such a part over the object's."""
 
@@ -56,10 +58,11 @@ class Completed:
     doubtful: Mask
 
 
-def completed_by_contours(view: BoxCrop, mask: Mask) -> Completed:
+def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Mask | None = None) -> Completed:
     """Return ``mask`` (h, w) with neighbouring parts that its contours close; see the module.
 
-    Works on a small copy; cost: a twentieth of a second. Nothing is added to a mask that is far from convex.
+    shade: (h, w) pixels of which no such part consists, as they look like shaded ground. Works on a small copy; cost: a
+    twentieth of a second. Nothing is added to a mask that is far from convex.
     """
     nothing = np.zeros_like(mask)
     if mask.sum() < 50:
@@ -77,6 +80,8 @@ def completed_by_contours(view: BoxCrop, mask: Mask) -> Completed:
                 continue
             part = part & view.inside
             if not LEAST_PART * mask.sum() <= part.sum() <= MOST_PART * mask.sum():
+                continue
+            if shade is not None and shade[part].mean() > SHADE_SHARE:
                 continue
             if not _has_contour(view, part, result, crest):
                 continue
@@ -163,12 +168,13 @@ above which it is none: the inside of a cup and a shade on it have the ground's 
 """
 
 
-def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
+def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Mask | None = None) -> tuple[Mask, Mask]:
     """Return gaps (h, w) in the filled ``mask`` through which the ground shows, and rods (h, w) beside it.
 
     Both models of colour are learned with the gaps left out of the object, and the cut has little smoothness, so that
     it follows slats and spokes. A gap is typical ground by colour, texture and place, long, and surrounded by edges;
-    a rod is unlike the ground, lit or shaded, thin, on edges, and joined to the object.
+    a rod is unlike the ground, lit or shaded, thin, on edges, and joined to the object. shade: (h, w) pixels of which
+    no rod consists, as they look like shaded ground.
     """
     nothing = np.zeros_like(mask)
     size = float(np.sqrt(mask.sum()))
@@ -206,6 +212,8 @@ def gaps_and_rods(view: BoxCrop, mask: Mask) -> tuple[Mask, Mask]:
         length = float(np.hypot(box[2], box[3]))
         inwards = cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3)
         if 2.0 * float(inwards.max()) > THIN * size + 3.0 or length < 0.06 * size:
+            continue
+        if shade is not None and shade[part].mean() > SHADE_SHARE:
             continue
         rim = _around(part, 1) & ~mask
         joined = (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & mask
