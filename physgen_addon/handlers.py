@@ -14,6 +14,7 @@ from bpy.app.handlers import persistent
 from . import bake_state, paths
 from . import bake_state as unsaved
 from .context import redraw
+from .photo import photo_trust
 from .playback import point_caches
 from .playback.bake_record import BAKES
 from .props.body_props import bodies
@@ -156,6 +157,7 @@ def _on_load(*_: Any) -> None:
     bake_state.forget()
     _settings.clear()
     paths.new_unsaved_key()
+    photo_trust.note_loaded()
     unsaved.forget_unsaved()
     for scene in bpy.data.scenes:
         _find_by_modifiers(scene)
@@ -196,6 +198,7 @@ def _after_save(path: str = "", *_: Any) -> None:
     if path:
         restore_folders(path)
         unsaved.after_first_save(path)
+        photo_trust.note_saved()
         bake_state.mark_dirty()
 
 

@@ -15,6 +15,7 @@ from ...sim.scene.folder import load_scene
 from ..background_jobs import JobOperator, Work
 from ..context import TAB, show_beside
 from ..interpreter import cli_command, find_python, photo_check
+from ..photo import photo_trust
 from ..photo.photo_image import (
     SUFFIXES,
     PhotoTool,
@@ -278,6 +279,32 @@ def unregister_box_drawing() -> None:
     _dragged.clear()
 
 
+class PHYSGEN_OT_trust_file(bpy.types.Operator):
+    """Agree to what this file would have read outside its folder, and reconstruct"""
+
+    bl_idname = "physgen.trust_file"
+    bl_label = "This File Asks for Others"
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Show every line."""
+        manager = context.window_manager
+        title = "Somebody set these files. Read them?"
+        return manager.invoke_props_dialog(self, width=560, title=title, confirm_text="Trust This File")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the lines."""
+        for claim in photo_trust.pending(context.scene):
+            self.layout.label(text=claim.line(), icon="FILE")
+        self.layout.label(text="Choose Cancel if you do not know who made this file.")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Agree; where there is a window, go on."""
+        photo_trust.agree(context.scene)
+        if not bpy.app.background:
+            bpy.ops.physgen.reconstruct("INVOKE_DEFAULT")
+        return {"FINISHED"}
+
+
 class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
     """Reconstruct a scene from the photo: segment the objects, inpaint the background, estimate camera, ground
     and light
@@ -297,8 +324,16 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
             return False
         return super().poll(context)
 
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask first, where the file came with settings that read outside its folder."""
+        if photo_trust.pending(context.scene) and not bpy.app.background:
+            bpy.ops.physgen.trust_file("INVOKE_DEFAULT")
+            return {"CANCELLED"}
+        return super().invoke(context, event)
+
     def request(self, context: bpy.types.Context) -> Work:
         """Return the reconstruction as a child process, which reads the masks from files."""
+        photo_trust.require_agreed(context.scene)
         state = context.scene.physgen_photo
         given, out, preferred = arguments(state), scene_folder(state), python(context)
         write_masks(dict(mask_files(state, out).values()))

@@ -65,9 +65,10 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row = layout.row(align=True)
     row.prop(state, "folder", text="")
     there = folder.is_dir()
-    if there:
+    # On macOS a folder may be a program, which opening starts.
+    if there and folder.suffix.lower() != ".app":
         row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
-    else:
+    if not there:
         row.alert = True
         text.sentences(
             layout, context, "This folder is not there: choose where it is now, or import it again.", icon="ERROR"

@@ -18,6 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..atomic import remove_unfinished
+from ..cache.folder_lock import release_all
 from ..errors import Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
 from ..scene.folder import load_scene
@@ -125,6 +127,8 @@ def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
             emit(_error(Cancelled("bake cancelled in the middle of a long step; run it again to continue")))
     else:
         time.sleep(LAST_GRACE_S)
+    remove_unfinished()
+    release_all()
     os._exit(Cancelled.exit_code)
 
 
