@@ -28,7 +28,7 @@ from ..sim.atomic import scratch_prefix
 from ..sim.errors import Cancelled, InputError, PhysGenError
 from .terminal import Terminal
 
-STOP_GRACE_S = 0.9
+STOP_GRACE_S = 0.7
 """Time for the current frame to finish when the process is asked to stop; the caller waits a little longer
  (``sim/app/stage_process.py``), and then kills."""
 

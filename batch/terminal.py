@@ -15,7 +15,7 @@ from typing import TextIO
 
 from ..sim.events import Event, IsCancelled
 
-STOP_S = 1.6
+STOP_S = 1.3
 """A command has ended so long after it was asked to stop, by itself or not."""
 
 

@@ -31,7 +31,7 @@ UNHEARD_S = 0.5
 """A bake checks for cancelling every tenth of a second. One that does not react within this time is compiling kernels
 or preparing the scene, so there is nothing to save, and the process ends at once, as after a crash."""
 
-RUNNING_UNHEARD_S = 0.9
+RUNNING_UNHEARD_S = 0.7
 """The same once frames are computed: with millions of particles, or on a busy machine, a launch takes longer, and there
 is something to save."""
 

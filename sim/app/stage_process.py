@@ -23,7 +23,7 @@ from ..children import note_child
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ..events import Event, IsCancelled, OnEvent
 
-CANCEL_GRACE_S = 1.2
+CANCEL_GRACE_S = 1.0
 """Time for a stage to clean up before it is killed: a command ends within two seconds of being asked to
 (``batch/terminal.py``). What it had not kept by then is computed again; nothing that was complete is lost."""
 

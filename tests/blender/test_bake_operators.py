@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import stat
 import time
 from pathlib import Path
@@ -23,6 +22,7 @@ from physgen.physgen_addon.playback import bake_record, point_caches, show_bake
 from physgen.sim.cache.bake_folder import load_manifest
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import InputError
+from physgen.sim.process_identity import mark_of
 
 FRAMES = 5
 START = 3
@@ -115,7 +115,7 @@ def test_a_bake_plays_what_is_in_its_cache(file):
 def test_a_bake_of_another_process_is_looked_at_until_it_ends(file):
     folder = paths.absolute(scene().physgen.simulation.bake)
     # The process above this one lives as long as it does.
-    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
+    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "mark": str(mark_of(os.getppid()))}))
     assert bake_state.observe(scene()).status == "baking"
     # Nobody tells when it ends, so the timer has to look again.
     assert bake_state.is_dirty(scene())

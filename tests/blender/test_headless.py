@@ -17,6 +17,7 @@ from physgen.sim.cache.bake_folder import MANIFEST_FILE, load_bake
 from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
+from physgen.sim.process_identity import mark_of
 from physgen.sim.scene.folder import load_scene
 
 bpy = pytest.importorskip("bpy")
@@ -164,7 +165,7 @@ def test_incomplete_bakes_are_reported_with_a_remedy(world, bake, tmp_path):
 
     assert "frames 1 to 6 are baked; bake more" in refusal("1-48")
     assert "was stopped: run `physgen bake` again" in refusal("1-48", frames=48, frames_done=6, state="cancelled")
-    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "host": os.uname().nodename}))
+    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "mark": str(mark_of(os.getppid()))}))
     assert "is still running: wait" in refusal("1-48", frames=48, frames_done=6, state="running")
     assert "format is 'physgen-bake/2', this version reads 'physgen-bake/1'; update" in refusal(format="physgen-bake/2")
     assert "PhysGen 9.0 wrote it, this is" in refusal(version="9.0", wobble=1)
