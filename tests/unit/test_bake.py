@@ -23,6 +23,8 @@ from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect, Ground, Key, Light, Material, Motion
 
 QUICK = BakeOptions(frames=6, fps=24.0, quality="preview")
+SHORT = dataclasses.replace(QUICK, frames=2)
+"""Where it only counts whether there is a bake."""
 
 
 def caches(out):
@@ -79,19 +81,19 @@ def test_a_moving_collider_is_baked_where_it_goes(ball_scene, tmp_path):
 def test_unchanged_inputs_skip_the_bake(ball_scene, tmp_path):
     folder = ball_scene()
     out = tmp_path / "bake"
-    first = bake(load_scene(folder.root), out=out, options=QUICK).manifest
+    first = bake(load_scene(folder.root), out=out, options=SHORT).manifest
     before = {p: p.stat().st_mtime_ns for p in out.iterdir()}
     notices = []
-    bake(load_scene(folder.root), out=out, options=QUICK, on_event=notices.append)
+    bake(load_scene(folder.root), out=out, options=SHORT, on_event=notices.append)
     assert {p: p.stat().st_mtime_ns for p in out.iterdir()} == before
     assert "up to date" in notices[-1]["message"]
     # Light does not move anything, matter does.
     save_scene(folder.root, dataclasses.replace(folder.model, light=Light(sun_strength=3.0)))
-    assert bake_module.is_up_to_date(load_scene(folder.root), out, QUICK)
+    assert bake_module.is_up_to_date(load_scene(folder.root), out, SHORT)
     stiffer = dataclasses.replace(folder.model.objects[0], material=Material(youngs_modulus=1e5, density=200.0))
     save_scene(folder.root, dataclasses.replace(folder.model, objects=(stiffer,)))
-    assert not bake_module.is_up_to_date(load_scene(folder.root), out, QUICK)
-    assert bake(load_scene(folder.root), out=out, options=QUICK).manifest.inputs_hash != first.inputs_hash
+    assert not bake_module.is_up_to_date(load_scene(folder.root), out, SHORT)
+    assert bake(load_scene(folder.root), out=out, options=SHORT).manifest.inputs_hash != first.inputs_hash
 
 
 def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
@@ -154,7 +156,7 @@ def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
 def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until):
     """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and is in no later bake's way."""
     folder = ball_scene()
-    job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)
+    job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=SHORT)
     (tmp_path / "job.json").write_text(json.dumps(bake_worker.job_to_json(job)))
     command = [sys.executable, "-m", bake_worker.__name__, str(tmp_path / "job.json")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "TI_OFFLINE_CACHE": "0"})
@@ -165,7 +167,7 @@ def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until
             process.terminate()
     assert process.wait() == 130
     assert (events[-1]["event"], events[-1]["kind"]) == ("error", "Cancelled")
-    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=SHORT).manifest.state == "complete"
 
 
 @pytest.mark.long
@@ -253,7 +255,7 @@ def test_surfaces_and_goals_of_objects_are_baked(ball_scene, tmp_path):
     folder = ball_scene(velocity=(1.0, 0.0, 0.0))
     item = dataclasses.replace(folder.model.objects[0], friction=0.1, goal_stiffness=400.0, goal_damping=0.5)
     save_scene(folder.root, dataclasses.replace(folder.model, objects=(item,)))
-    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
+    assert bake(load_scene(folder.root), out=tmp_path / "bake", options=SHORT).manifest.state == "complete"
 
 
 def test_an_open_mesh_is_refused_by_its_objects_name(ball_scene, tmp_path):

@@ -88,7 +88,7 @@ def test_example_drop_a_mesh(tmp_path):
 
 
 def test_example_sand_and_honey(tmp_path):
-    reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=8)
+    reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=6)
     assert 0.0707 < reach["sand"] < reach["water"]
 
 
