@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A broader base for inflated bodies: low down, the side that the photo does not show is made thicker.
+"""A broader base for inflated bodies: the side that the photo does not show is made thicker, its underside flat.
 
 Inflated bodies are round and would stand on a spot, where real things have settled and reach farther back. What faces
-away from the camera moves farther from it along its own ray, most at the bottom and where the body is thick, not at all
-on the outline, and no farther than the ground: the underside comes to lie on the ground, the back moves away, and the
-centre of mass with it. Neither the front nor the outline changes.
+away from the camera moves farther from it along its own ray, all of it over most of the height, so that the back stays
+upright, less where the body is thin, and no farther than the ground. Then the underside of that side settles straight
+down, as far as the body hides it from the camera. Neither the front nor the outline changes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from ...mpm.geometry.triangles import area_normals
 from ...scene.model import Camera
+from ...smoothstep import smoothstep
 from ..camera.ground_camera import ground_depth
 from .inflate import Silhouette
 from .support import support_of
@@ -27,33 +28,55 @@ STEPS = 30
 """Thicknesses to try."""
 COST = 1.0
 """Share of the wanted margin that a body has to gain for twice its volume; less is not worth its looks."""
+SAFE = 1.5
+"""What standing as safely as wanted counts, where less counts as the share that is reached."""
+WEDGE = 0.25
+"""By how much more an addition low down alone has to gain: the back slopes to the ground."""
 WHOLE = 0.3
 """Local half thickness, over the largest, from which all of it is added: less to limbs, ears and straps."""
 LOWEST, RISE = 0.2, 0.6
-"""Height over the body's, above which nothing is added, for hardly any thickness, and how much higher for each half
-thickness: a low and thick addition would be a wedge behind the body."""
+"""Of an addition low down: the height over the body's above which nothing is added, for hardly any thickness, and how
+much higher for each half thickness, or it would be a wedge."""
+TOP = 2.5
+"""Exponent of the superellipse by which the added thickness ends towards the top."""
+SETTLED = (0.4, 0.2)
+"""Heights over the body's between which the underside settles: not at all from the first, wholly below the second."""
+UNDER = (0.1, 0.5)
+"""Downward part of the normal between which a vertex belongs to the underside."""
+HIDDEN_PX = 2.0
+"""Least distance inside the outline of where settled vertices are seen."""
+FALLS = 8
+"""Steps in which settling is tried."""
+LYING = 0.8
+"""Share of the way to the ground that becomes all of it."""
+EVENED = 4
+"""Rounds of smoothing of how far neighbours settle."""
 
 
 def footed(
-    camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]
+    camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64], *, on_legs: bool = False
 ) -> tuple[Points, NDArray[np.bool_]]:
     """Return ``vertices`` (V, 3) with the unseen side as much thicker as the body needs to stand safely, and which of
     them moved (V,).
 
-    camera: above the ground z = 0. As safely as ``support.SupportMargin.wanted`` says, or as is worth it.
+    camera: above the ground z = 0. on_legs: only what is low is made thicker. As safely as
+    ``support.SupportMargin.wanted`` says, or as is worth it.
     """
     plain = support_of(vertices, faces)
     best, highest = vertices, plain.share
     if highest < 1.0:
         thicken = _Thickening(camera, silhouette, vertices, faces)
-        for extra in THICKEST * np.arange(1, STEPS + 1) / STEPS:
-            made = thicken.by(extra)
-            stands = support_of(made, faces)
-            score = min(stands.share, 1.0) - COST * (stands.volume / plain.volume - 1.0)
-            if score > (plain.share if stands.share >= 1.0 else highest):
-                best, highest = made, score
-            if stands.share >= 1.0:
-                break
+        # An upright back is preferred, but a body on legs stays as thick as it is.
+        for low, worse in ((True, 0.0),) if on_legs else ((False, 0.0), (True, WEDGE)):
+            for extra in THICKEST * np.arange(STEPS + 1) / STEPS:
+                made = thicken.by(extra, low=low)
+                stands = support_of(made, faces)
+                score = SAFE if stands.share >= 1.0 else stands.share
+                score -= COST * (stands.volume / plain.volume - 1.0) + worse
+                if score > highest:
+                    best, highest = made, score
+                if stands.share >= 1.0:
+                    break
     return best, (best != vertices).any(axis=1)
 
 
@@ -61,7 +84,12 @@ class _Thickening:
     """The unseen vertices of one body, and how far each may move away along its ray."""
 
     def __init__(self, camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]) -> None:
-        self._vertices = vertices
+        ends = (
+            np.concatenate([faces, np.roll(faces, 1, axis=1)]).reshape(-1),
+            np.concatenate([np.roll(faces, 1, axis=1), faces]).reshape(-1),
+        )
+        self._ends = ends
+        self._vertices, self._camera, self._silhouette = vertices, camera, silhouette
         projected = camera.project(vertices)
         self._rays = camera.rays(projected[:, :2])
         # Depths, along the optical axis: what each vertex moves for one half thickness, and at most.
@@ -69,15 +97,50 @@ class _Thickening:
         at = projected[:, :2] - (silhouette.left + 0.5, silhouette.top + 0.5)
         square = ndimage.map_coordinates(silhouette.square_height, at[:, ::-1].T, order=1, mode="nearest")
         share = np.sqrt(np.maximum(square, 0.0)) / silhouette.half_thickness
-        unseen = np.einsum("ij,ij->i", area_normals(vertices, faces), camera.position - vertices) < 0.0
-        self._height = vertices[:, 2] / vertices[:, 2].max()
-        self._step = np.where(unseen, half * np.minimum(share / WHOLE, 1.0), 0.0)
-        self._step /= np.linalg.norm(self._rays, axis=1)
+        normals = area_normals(vertices, faces)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        unseen = np.einsum("ij,ij->i", normals, camera.position - vertices) < 0.0
+        height = vertices[:, 2] / vertices[:, 2].max()
+        whole = np.where(unseen, np.minimum(share / WHOLE, 1.0), 0.0)
+        self._height = np.clip(height, 0.0, 1.0)
+        self._step = half * whole / np.linalg.norm(self._rays, axis=1)
+        self._settle = whole * smoothstep(-normals[:, 2], *UNDER) * smoothstep(height, *SETTLED)
         self._room = np.maximum(ground_depth(camera, self._rays) - projected[:, 2], 0.0)
 
-    def by(self, extra: float) -> Points:
-        """Return the vertices (V, 3) with ``extra`` half thicknesses added, none below the ground."""
-        moved = extra * self._step * np.clip(1.0 - self._height / (LOWEST + RISE * extra), 0.0, 1.0)
+    def by(self, extra: float, *, low: bool) -> Points:
+        """Return the vertices (V, 3) with ``extra`` half thicknesses added and settled, none below the ground.
+
+        low: only low down, less and less towards a height that rises with ``extra``.
+        """
+        if low:
+            profile = np.clip(1.0 - self._height / (LOWEST + RISE * extra), 0.0, 1.0)
+        else:
+            profile = (1.0 - self._height**TOP) ** (1.0 / TOP)
+        moved = extra * self._step * profile
         made = self._vertices + np.minimum(moved, self._room)[:, None] * self._rays
         made[(moved > 0.0) & (moved >= self._room), 2] = 0.0
-        return np.asarray(made)
+        return self._settled(made)
+
+    def _settled(self, made: Points) -> Points:
+        fallen, open_ = np.zeros(len(made)), self._settle > 0.0
+        for fall in np.arange(1, FALLS + 1) / FALLS:
+            lower = made[open_] * (1.0, 1.0, 1.0 - fall)
+            at = self._camera.project(lower)[:, :2] - (self._silhouette.left + 0.5, self._silhouette.top + 0.5)
+            inside = ndimage.map_coordinates(self._silhouette.distance, at[:, ::-1].T, order=1, mode="nearest")
+            open_[np.flatnonzero(open_)[inside < HIDDEN_PX]] = False
+            fallen[open_] = fall
+        # What nearly lies does.
+        made[:, 2] *= 1.0 - np.minimum(self._even(fallen * self._settle) / LYING, fallen)
+        return made
+
+    def _even(self, share: Points) -> Points:
+        """``share`` (V,) without teeth, nowhere more."""
+        first, second = self._ends
+        even = share.copy()
+        np.minimum.at(even, first, share[second])
+        for _ in range(EVENED):
+            even = np.bincount(first, even[second], len(share)) / np.maximum(
+                np.bincount(first, minlength=len(share)), 1
+            )
+            even = np.minimum(even, share)
+        return even

@@ -188,13 +188,13 @@ def inflated_mesh(
     points = relax(_DepthField(silhouette, reference), points, faces, RELAXATION_ROUNDS - 1)
     body = _to_world(silhouette, reference, points, faces)
     if not flat:
-        body = _footed(camera, silhouette, body)
+        body = _footed(camera, silhouette, body, on_legs=front is None and reference.middle is not None)
     return body, support_of(body.vertices, body.faces).steadiness, lost
 
 
-def _footed(camera: Camera, silhouette: Silhouette, body: BodyMesh) -> BodyMesh:
-    """``body`` with its hidden underside lowered to the ground."""
-    vertices, moved = footed(camera, silhouette, body.vertices, body.faces)
+def _footed(camera: Camera, silhouette: Silhouette, body: BodyMesh, *, on_legs: bool) -> BodyMesh:
+    """``body`` with a broader base on the side that the photo does not show."""
+    vertices, moved = footed(camera, silhouette, body.vertices, body.faces, on_legs=on_legs)
     pixels = np.where(moved[:, None], camera.project(vertices)[:, :2], body.pixels)
     return replace(body, vertices=vertices, pixels=pixels)
 
