@@ -20,6 +20,7 @@ from ..sim.errors import Cancelled, PhysGenError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from .compat import OperatorMixin
 from .context import redraw, scene_with
+from .interpreter import NoPython
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """The work of a job: called in a thread, without bpy; forwards events and returns the final event, or raises."""
@@ -291,7 +292,11 @@ class JobOperator(OperatorMixin):
                 self.report({"WARNING"}, str(error))
 
     def _fail(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
-        self.report({"WARNING" if isinstance(error, Cancelled) else "ERROR"}, str(error))
+        # A popup is one line: the command that mends it is in the preferences, and buttons are in the panel.
+        words = str(error)
+        if isinstance(error, NoPython) and not bpy.app.background:
+            words = f"{error.reason}: install one (see the panel)"
+        self.report({"WARNING" if isinstance(error, Cancelled) else "ERROR"}, words)
         self.stopped(scene, error)
 
     def _end(self, scene: bpy.types.Scene) -> set[str]:
@@ -344,7 +349,7 @@ def start_chosen(
 
 def progress_text(job: Job) -> str:
     """Return progress as text, such as ``Diagnose: fits 40 %, 12 s left``; elapsed time if the fraction is unknown."""
-    text = f"{job.title}: {job.stage}" if job.stage else job.title
+    text = job.title if job.stage in ("", job.title.lower()) else f"{job.title}: {job.stage}"
     if job.fraction is None:
         return f"{text}, {time.monotonic() - job.started:.0f} s"
     text += f" {100 * job.fraction:.0f} %"

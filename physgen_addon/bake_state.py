@@ -115,6 +115,13 @@ def set_trouble(scene: bpy.types.Scene, message: str) -> None:
     mark_dirty(scene)
 
 
+def clear_troubles() -> None:
+    """Forget the errors that stopped bakes, because their cause may be gone."""
+    for scene in bpy.data.scenes:
+        if _troubles.pop(scene.session_uid, ""):
+            mark_dirty(scene)
+
+
 def rest_s() -> float:
     """Return seconds since the last change: nothing is evaluated while the user drags or sculpts."""
     return time.monotonic() - _changed_at[0]

@@ -8,7 +8,7 @@ import bpy
 
 from ...sim.app.bake_options import BakeOptions, inputs_hash
 from ...sim.app.stage_process import run_stage
-from ...sim.cache.bake_folder import free_bake
+from ...sim.cache.bake_folder import free_bake, load_manifest
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
@@ -34,7 +34,9 @@ def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
     """
     settings = scene.physgen.simulation
     if not bodies(scene):
-        raise InputError("no object takes part in the simulation; select one and turn on In Simulation")
+        raise InputError(
+            "nothing is simulated yet; select a mesh and press Simulate Selected (see Scene)"
+        )
     if settings.frame_end <= settings.frame_start:
         raise InputError(
             f"End is frame {settings.frame_end} and Start {settings.frame_start}; let End come after Start"
@@ -160,7 +162,8 @@ class Bake(JobOperator):
         if record is None:
             raise InputError(f"{folder}: the record of the bake is gone; bake again")
         troubles = show_bake.show(scene, record)
-        last = scene.physgen.simulation.frame_end
+        # Of the bake: settings may have been undone since it began.
+        last = record.frame_start + load_manifest(folder).frames_done - 1
         scene.frame_end = max(scene.frame_end, last)
         waits = paths.is_unsaved_cache(scene)
         unsaved.settle(scene)

@@ -22,10 +22,20 @@ _MARGIN = 0.02
 """Margin of a pin beyond the surface, as a share of the object's size."""
 
 
+CONVERTIBLE = ("CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD")
+"""Types of objects that Blender converts to meshes."""
+
+
 def _unfit(item: bpy.types.Object) -> str | None:
     """Return why ``item`` cannot be simulated, or None."""
-    if item.type != "MESH":
+    if item.type in CONVERTIBLE:
         return f"{item.name!r} is no mesh: convert it first (Object > Convert > Mesh)"
+    if item.instance_type == "COLLECTION":
+        return (
+            f"{item.name!r} is an instance of a collection: add its meshes after Object > Apply > Make Instances Real"
+        )
+    if item.type != "MESH":
+        return f"{item.name!r} has no surface ({item.type.lower()}): only meshes are simulated"
     if not item.data.polygons and not item.modifiers:
         return f"{item.name!r} has no faces"
     if not item.is_editable:

@@ -36,6 +36,13 @@ def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
     return sorted(found, key=lambda item: item != first)
 
 
+def composing_method(scene: bpy.types.Scene) -> str:
+    """Return the method that was chosen; Physics where there is no photo and nothing was chosen."""
+    settings = scene.physgen_compose
+    by_itself = not scene.physgen.folder and not settings.is_property_set("method")
+    return "ppps" if by_itself else str(settings.method)
+
+
 class Compose(JobOperator):
     """A composition of the selected objects: ``begin``, then ``tick`` until it returns a result."""
 
@@ -59,8 +66,9 @@ class Compose(JobOperator):
         if len(items) < 2:
             raise InputError(f"{count(len(items), 'mesh')} selected: select two or more meshes; the active one stays")
         settings = scene.physgen_compose
-        photo = photo_scene(scene) if settings.method != "ppps" else None
-        if photo is None and settings.method != "ppps":
+        method = composing_method(scene)
+        photo = photo_scene(scene) if method != "ppps" else None
+        if photo is None and method != "ppps":
             raise InputError(
                 "there is no photo of the objects: choose the method Physics, or import the scene of a photo"
             )
@@ -71,7 +79,7 @@ class Compose(JobOperator):
             _remove(self._folder)
             raise
         source, out, preferred = self._folder / "scene", self._folder / "fitted", python(context)
-        arguments = ["--objects", ",".join(item.name for item in self._fitted), "--method", settings.method]
+        arguments = ["--objects", ",".join(item.name for item in self._fitted), "--method", method]
         arguments += ["--steps", str(settings.steps), "--keep-strain", repr(decimal(settings.keep_strain))]
         arguments += [] if photo is not None else ["--no-picture"]
 

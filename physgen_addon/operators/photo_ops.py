@@ -23,8 +23,8 @@ from ..photo.photo_image import (
     load_photo_image,
     on_screen,
     place_under,
-    region_under,
     shows_photo,
+    why_not_seen,
     write_masks,
 )
 from ..photo.photo_request import LEAST_PX, arguments, mask_files, photo_file, report_page, scene_folder, take_camera
@@ -176,54 +176,61 @@ def add_box(scene: bpy.types.Scene, corners: tuple[int, int, int, int], name: st
 
 
 class PHYSGEN_OT_draw_box(PhotoTool, bpy.types.Operator):
-    """Drag a box around an object of the photo in the image editor; it need not be tight"""
+    """Drag boxes around objects of the photo in the image editor, one after the other; they need not be tight"""
 
     bl_idname = "physgen.draw_box"
     bl_label = "Draw Box"
-    bl_options = {"UNDO"}  # noqa: RUF012
 
-    tool_help = "Drag a box around an object    Esc, right click: stop"
+    tool_help = "Drag a box around each object    Enter, Esc, right click: done"
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        """Return why no box can be drawn: no photo; an editor that shows it is opened."""
+        return "" if context.scene.physgen_photo.image is not None else "Open a photo first"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Wait for the drag."""
+        """Show the photo if no editor does, and wait for drags."""
+        if why_not_seen(context):
+            show_beside(context, context.scene.physgen_photo.image, TAB)
         self._start: tuple[int, int] | None = None
         self._region: bpy.types.Region | None = None
+        self._drawn = 0
         return self.begin(context)
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Handle events from press to release."""
-        image = context.scene.physgen_photo.image
-        if image is None or event.type in ("ESC", "RIGHTMOUSE"):
-            return self.end(context, "CANCELLED")
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            region = region_under(context, image, event)
-            if region is None:
-                self.report({"INFO"}, "drag inside the image in the image editor")
-                return self.end(context, "CANCELLED")
-            self._region, self._start = region, _pixel(context.scene, region, event)
-        elif self._start is None or self._region is None:
-            # Zooming and panning stay available.
-            return {"PASS_THROUGH"}
-        elif event.type == "MOUSEMOVE":
-            _dragged[:] = [(*self._start, *_pixel(context.scene, self._region, event))]
-            self._region.tag_redraw()
+    def press(self, state: bpy.types.PropertyGroup, event: bpy.types.Event, region: bpy.types.Region) -> None:
+        """Begin a box."""
+        self._region, self._start = region, _pixel(state, region, event)
+
+    def handle(self, context: bpy.types.Context, state: bpy.types.PropertyGroup, event: bpy.types.Event) -> bool:
+        """Draw the box while it is dragged; add it when the button is released."""
+        if self._start is None:
+            return False
+        corners = (*self._start, *_pixel(state, self._region, event))
+        if event.type == "MOUSEMOVE":
+            _dragged[:] = [corners]
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            corners = (*self._start, *_pixel(context.scene, self._region, event))
-            if min(abs(corners[2] - corners[0]), abs(corners[3] - corners[1])) < LEAST_PX:
-                return self.end(context, "CANCELLED")
-            add_box(context.scene, corners)
-            return self.end(context, "FINISHED")
-        return {"RUNNING_MODAL"}
+            self._start = None
+            self.forget()
+            if min(abs(corners[2] - corners[0]), abs(corners[3] - corners[1])) >= LEAST_PX:
+                add_box(context.scene, corners)
+                self._drawn += 1
+                # Each box is an undo step of its own.
+                bpy.ops.ed.undo_push(message="Draw Box")
+        return True
+
+    def done(self, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> set[str]:
+        """Finish; the boxes are steps of the undo history already."""
+        return self.end(context, "FINISHED" if self._drawn else "CANCELLED")
 
     def forget(self) -> None:
         """Drop the dragged rectangle."""
         _dragged.clear()
 
 
-def _pixel(scene: bpy.types.Scene, region: bpy.types.Region, event: bpy.types.Event) -> tuple[int, int]:
+def _pixel(state: bpy.types.PropertyGroup, region: bpy.types.Region, event: bpy.types.Event) -> tuple[int, int]:
     """Return the upright photo's pixel under the mouse, from its top left corner; may lie outside."""
     u, v = place_under(region, event)
-    return round(u * scene.physgen_photo.width), round(v * scene.physgen_photo.height)
+    return round(u * state.width), round(v * state.height)
 
 
 def _label(box: bpy.types.PropertyGroup) -> str:

@@ -10,7 +10,7 @@ from ...sim.app import install_worker
 from ...sim.app.stage_process import own_command, run_stage
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
-from .. import interpreter, text
+from .. import bake_state, interpreter, text
 from ..background_jobs import Job, JobOperator, Work, no_job_runs, start_chosen
 from ..props import preferences
 from ..text import report_errors
@@ -57,6 +57,8 @@ class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
             reason, command = str(final["reason"]), str(final["command"])
             preferences.show_check(bpy.context, "NO", reason, command)
             raise interpreter.NoPython(reason, command)
+        # What an interpreter that did not fit had kept from baking.
+        bake_state.clear_troubles()
         sentence = str(final["reason"]) or f"Python {final['version']} simulates: {final['python']}"
         preferences.show_check(bpy.context, "NO" if final["reason"] else "YES", sentence, str(final["command"]))
         return sentence
@@ -167,6 +169,7 @@ class PHYSGEN_OT_install_packages(JobOperator, bpy.types.Operator):
         """Use it from now on."""
         preferences.show_progress(bpy.context, 0.0, "")
         preferences.use_python(bpy.context, str(final["python"]))
+        bake_state.clear_troubles()
         sentence = f"Python {final['version']} simulates: {final['python']}"
         preferences.show_check(bpy.context, "YES", sentence, "")
         return sentence

@@ -9,7 +9,6 @@ from typing import Any
 import bpy
 
 from .. import text
-from ..background_jobs import running
 from ..operators.diagnose_ops import (
     PHYSGEN_OT_add_effect,
     PHYSGEN_OT_clear_capture,
@@ -80,9 +79,7 @@ class PHYSGEN_PT_diagnose(Sidebar, bpy.types.Panel):
         row = column.row(align=True)
         row.prop(state, "report", text="", placeholder="Beside the capture")
         row.operator(PHYSGEN_OT_load_diagnosis.bl_idname, text="", icon="FILE_REFRESH")
-        if running() is not None:
-            draw_job(layout)
-        else:
+        if not draw_job(layout, context, "Diagnosis"):
             row = layout.row()
             row.scale_y = 1.4
             row.operator(PHYSGEN_OT_diagnose.bl_idname, icon="VIEWZOOM")
@@ -228,7 +225,7 @@ class PHYSGEN_PT_diagnose_add(_Part, bpy.types.Panel):
         column.prop(state, "frames")
         column.prop(state, "fps")
         column.prop(state, "quality")
-        draw_job(layout)
+        draw_job(layout, context, "Bake")
         row = layout.row()
         row.scale_y = 1.4
         row.operator(PHYSGEN_OT_add_effect.bl_idname, icon="ADD")

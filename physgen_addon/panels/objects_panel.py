@@ -11,7 +11,6 @@ from mathutils import Vector
 
 from ...sim.constitutive import COHERENT, SHAPED, cohesion_of
 from .. import text
-from ..background_jobs import running
 from ..operators.body_ops import (
     PHYSGEN_OT_add_bodies,
     PHYSGEN_OT_add_pin,
@@ -24,7 +23,7 @@ from ..operators.body_ops import (
     PHYSGEN_OT_save_preset,
     PHYSGEN_OT_select_bodies,
 )
-from ..operators.compose_ops import PHYSGEN_OT_compose_objects, chosen_meshes
+from ..operators.compose_ops import Compose, PHYSGEN_OT_compose_objects, chosen_meshes
 from ..playback import splats
 from ..props import material_props
 from ..props.body_props import bodies, is_body
@@ -275,13 +274,14 @@ class PHYSGEN_PT_compose(Sidebar, bpy.types.Panel):
             text.sentences(layout, context, f"Yields: {', '.join(item.name for item in items[1:])}", icon="MOD_CLOTH")
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
-        column.prop(state, "method")
+        if context.scene.physgen.folder:
+            column.prop(state, "method")
+        else:
+            text.sentences(column, context, "Without a photo, by physics alone.")
         column.prop(state, "steps")
         column.prop(state, "keep_strain")
         column.prop(state, "keep_original")
-        if running() is not None:
-            draw_job(layout)
-        else:
+        if not draw_job(layout, context, Compose.job_title):
             row = layout.row()
             row.scale_y = 1.4
             row.operator(PHYSGEN_OT_compose_objects.bl_idname, icon="CON_SHRINKWRAP")

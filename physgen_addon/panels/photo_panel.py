@@ -210,7 +210,7 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     )
     if again:
         text.sentences(layout, context, "Only affected stages run again; your physics edits are kept.")
-    draw_job(layout)
+    draw_job(layout, context, "Reconstruction", "Finding objects", "Installation")
 
 
 def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:

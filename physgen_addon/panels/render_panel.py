@@ -63,11 +63,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
         text.sentences(layout, context, words, icon="INFO")
     if missing_modules():
         text.sentences(layout, context, "Rendered by the Python that simulates (see Preferences).", icon="INFO")
-    if under_way is not None and under_way.title == "Render":
-        draw_job(layout)
-    elif under_way is not None:
-        text.sentences(layout, context, f"{under_way.title} is running; render when it is done.", icon="INFO")
-    elif not state.simulation.bake:
+    if not draw_job(layout, context, "Render") and not state.simulation.bake:
         text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
     row = layout.row(align=True)
     row.scale_y = 1.4

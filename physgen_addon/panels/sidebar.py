@@ -78,11 +78,18 @@ def is_in(item: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     return scene.objects.get(item.name) == item
 
 
-def draw_job(layout: bpy.types.UILayout) -> None:
-    """Draw progress and Cancel of the running job; nothing without one."""
+def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, *titles: str) -> bool:
+    """Draw progress and Cancel of the running job if it has one of ``titles``, else that another runs; return whether
+    any does.
+    """
     job = running()
-    if job is not None:
+    if job is None:
+        return False
+    if job.title in titles:
         draw_progress(layout, job).operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+    else:
+        text.sentences(layout, context, f"{job.title} is running; go on when it is done.", icon="INFO")
+    return True
 
 
 def draw_progress(layout: bpy.types.UILayout, job: Job) -> bpy.types.UILayout:

@@ -353,7 +353,8 @@ class PhotoTool(OperatorMixin):
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             region = region_under(context, state.image, event)
             if region is None:
-                return self.done(context, state)
+                # The click is for whatever lies there, such as a button.
+                return self.done(context, state) | {"PASS_THROUGH"}
             self.press(state, event, region)
         elif not self.handle(context, state, event):
             # Zooming and panning stay available.

@@ -152,26 +152,26 @@ def channels(owner: bpy.types.ID) -> set[Channel]:
 
 
 def why_it_moves(item: bpy.types.Object) -> str | None:
-    """Return the reason why ``item`` may move, as the end of a sentence; None if it is static.
+    """Return why ``item`` may move, as the end of a sentence with its remedy; None if it is static.
 
     Constraints count even if they have no effect: they are not evaluated.
     """
     animated = sorted({curve.data_path for curve in curves(item) if curve.data_path in PLACING})
     if animated:
-        return f"is animated ({', '.join(animated)})"
+        return f"is animated ({', '.join(animated)}; Object > Animation > Clear Keyframes)"
     driven = sorted({curve.data_path for curve in drivers(item) if curve.data_path in PLACING})
     if driven:
-        return f"is driven ({', '.join(driven)})"
+        return f"is driven ({', '.join(driven)}; right click on the value > Delete Drivers)"
     for constraint in item.constraints:
         if constraint.enabled and not constraint.mute:
-            return f"has the constraint {constraint.name!r}"
+            return f"has the constraint {constraint.name!r} (Object > Constraints > Clear Object Constraints)"
     if item.rigid_body is not None and item.rigid_body.type == "ACTIVE":
-        return "is an active part of Blender's rigid body simulation"
+        return "is an active part of Blender's rigid body simulation (Object > Rigid Body > Remove)"
     parent = item.parent
     if parent is None:
         return None
     if item.parent_type != "OBJECT":
-        return f"hangs on a part of {parent.name!r} ({item.parent_type.lower()})"
+        return f"hangs on a part of {parent.name!r} ({item.parent_type.lower()}; Object > Parent > Clear Parent)"
     reason = why_it_moves(parent)
     return None if reason is None else f"is parented to {parent.name!r}, which {reason}"
 

@@ -87,8 +87,8 @@ def require_simulable(item: bpy.types.Object) -> None:
     reason = why_it_moves(item)
     if reason is not None:
         raise InputError(
-            f"{where}: {reason}, but the simulation decides where it goes: let it be a collider, or bake and clear "
-            "that (Object > Apply > Visual Transform, Object > Animation > Clear Keyframes)"
+            f"{where}: {reason}, but the simulation decides where it goes: let it be a collider, or end that by the "
+            "menu named here, after Object > Apply > Visual Transform if it is to stay where it is now"
         )
 
 
