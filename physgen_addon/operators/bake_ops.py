@@ -34,9 +34,7 @@ def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
     """
     settings = scene.physgen.simulation
     if not bodies(scene):
-        raise InputError(
-            "nothing is simulated yet; select a mesh and press Simulate Selected (see Scene)"
-        )
+        raise InputError("nothing is simulated yet; select a mesh and press Simulate Selected (see Scene)")
     if settings.frame_end <= settings.frame_start:
         raise InputError(
             f"End is frame {settings.frame_end} and Start {settings.frame_start}; let End come after Start"

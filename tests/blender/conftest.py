@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import math
 import os
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -248,3 +251,23 @@ def bake(world, tmp_path):
         return folder
 
     return write
+
+
+@contextlib.contextmanager
+def _held_elsewhere(folder: Path) -> Iterator[None]:
+    code = "import pathlib, sys; from physgen.sim.cache.folder_lock import folder_lock\n"
+    code += "with folder_lock(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(folder)]
+    holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        yield
+    finally:
+        holder.communicate()
+    assert holder.returncode == 0
+
+
+@pytest.fixture
+def held_elsewhere():
+    """A context in which another, living process holds a folder."""
+    return _held_elsewhere

@@ -215,7 +215,7 @@ def _nla(item):
 @pytest.mark.parametrize(
     ("how", "word"),
     [
-        (_keys, "animated (location)"),
+        (_keys, "animated (location; Object > Animation > Clear Keyframes)"),
         (_driver, "driven"),
         (_constraint, "constraint"),
         (_parent, "'mother', which is animated"),

@@ -17,7 +17,6 @@ from physgen.sim.cache.bake_folder import MANIFEST_FILE, load_bake
 from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
-from physgen.sim.process_identity import mark_of
 from physgen.sim.scene.folder import load_scene
 
 bpy = pytest.importorskip("bpy")
@@ -152,7 +151,7 @@ def test_a_verb_that_simulates_becomes_the_python_that_can(bare, tmp_path):
         assert code == 3 and words in json.loads(said)["message"]
 
 
-def test_incomplete_bakes_are_reported_with_a_remedy(world, bake, tmp_path):
+def test_incomplete_bakes_are_reported_with_a_remedy(world, bake, tmp_path, held_elsewhere):
     folder, options = bake(SHIFTS), RenderOptions(samples=1, scale=0.25)
     path = folder / MANIFEST_FILE
     whole = json.loads(path.read_text())
@@ -165,8 +164,8 @@ def test_incomplete_bakes_are_reported_with_a_remedy(world, bake, tmp_path):
 
     assert "frames 1 to 6 are baked; bake more" in refusal("1-48")
     assert "was stopped: run `physgen bake` again" in refusal("1-48", frames=48, frames_done=6, state="cancelled")
-    (folder / ".lock").write_text(json.dumps({"pid": os.getppid(), "mark": str(mark_of(os.getppid()))}))
-    assert "is still running: wait" in refusal("1-48", frames=48, frames_done=6, state="running")
+    with held_elsewhere(folder):
+        assert "is still running: wait" in refusal("1-48", frames=48, frames_done=6, state="running")
     assert "format is 'physgen-bake/2', this version reads 'physgen-bake/1'; update" in refusal(format="physgen-bake/2")
     assert "PhysGen 9.0 wrote it, this is" in refusal(version="9.0", wobble=1)
     assert not (tmp_path / "out").exists()

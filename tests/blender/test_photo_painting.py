@@ -18,6 +18,7 @@ from physgen.physgen_addon.operators import mask_horizon_ops
 from physgen.physgen_addon.operators.mask_horizon_ops import PHYSGEN_OT_paint_mask
 from physgen.physgen_addon.operators.photo_object_ops import PHYSGEN_OT_draw_strokes, add_found, stroke_lines
 from physgen.physgen_addon.operators.photo_ops import (
+    PHYSGEN_OT_draw_box,
     add_box,
     set_photo,
 )
@@ -242,7 +243,7 @@ def test_a_click_elsewhere_ends_painting_and_keeps_it(window, photo):
     operator.invoke(window, event("NONE"))
     operator.modal(window, event("LEFTMOUSE", 0.1, 0.1))
     operator.modal(window, event("LEFTMOUSE", 0.1, 0.1, "RELEASE"))
-    assert operator.modal(window, event("LEFTMOUSE", 1.5, 0.1)) == {"FINISHED"}
+    assert operator.modal(window, event("LEFTMOUSE", 1.5, 0.1)) == {"FINISHED", "PASS_THROUGH"}
     assert read_mask_image(photo.boxes[0].mask)[24, 32]
 
 
@@ -287,7 +288,7 @@ def test_the_horizon_follows_the_mouse(window, photo):
     modal(event("MOUSEMOVE", 0.9, 0.6, "NOTHING"))
     assert photo.horizon == pytest.approx(0.05, abs=1e-6)
     assert math.tan(photo.roll) == pytest.approx(0.1 * 240 / 320, abs=1e-6)
-    assert modal(event("LEFTMOUSE", 1.5, 0.5)) == {"FINISHED"}
+    assert modal(event("LEFTMOUSE", 1.5, 0.5)) == {"FINISHED", "PASS_THROUGH"}
 
 
 # -- horizon ----------------------------------------------------------------------------------------------------------
@@ -417,3 +418,25 @@ def test_found_objects_become_boxes_once(photo):
     assert tuple(getattr(photo.boxes[1], side) for side in ("x0", "y0", "x1", "y1")) == (10, 20, 90, 100)
     assert add_found(bpy.context.scene, found, every=True) == 1
     assert add_found(bpy.context.scene, found, every=True) == 0
+
+
+def test_boxes_are_drawn_one_after_the_other(window, photo):
+    operator = operate(PHYSGEN_OT_draw_box)
+    operator.invoke(window, event("NONE"))
+    modal, before = partial(operator.modal, window), len(photo.boxes)
+    for u in (0.1, 0.5):
+        assert modal(event("LEFTMOUSE", u, 0.2)) == {"RUNNING_MODAL"}
+        assert modal(event("MOUSEMOVE", u + 0.2, 0.4, "NOTHING")) == {"RUNNING_MODAL"}
+        assert modal(event("LEFTMOUSE", u + 0.2, 0.4, "RELEASE")) == {"RUNNING_MODAL"}
+        # Moving on draws nothing, and zooming stays possible.
+        assert modal(event("MOUSEMOVE", 0.9, 0.9, "NOTHING")) == {"PASS_THROUGH"}
+    # A click without a drag is no box.
+    modal(event("LEFTMOUSE", 0.5, 0.5))
+    modal(event("LEFTMOUSE", 0.5, 0.5, "RELEASE"))
+    assert modal(event("RET")) == {"FINISHED"}
+    drawn = [(box.x0, box.y0, box.x1, box.y1) for box in list(photo.boxes)[before:]]
+    assert drawn == [(32, 48, 96, 96), (160, 48, 224, 96)]
+
+
+def test_a_box_may_be_drawn_when_no_editor_shows_the_photo(photo):
+    assert bpy.ops.physgen.draw_box.poll()

@@ -9,8 +9,6 @@ import re
 import shutil
 import socket
 import struct
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -136,16 +134,10 @@ def test_a_lock_of_nonsense_locks_nothing(folder, pid):
     assert found().status == "baked"
 
 
-def test_a_lock_of_a_living_process_says_how_to_get_rid_of_it(folder):
-    code = "import pathlib, sys; from physgen.sim.cache.folder_lock import folder_lock\n"
-    code += "with folder_lock(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
-    holder = subprocess.Popen(
-        [sys.executable, "-c", code, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert holder.stdout.readline() == "held\n"
-    assert found().status == "baking" and str(folder / ".lock") in found().message
-    holder.communicate()
-    assert holder.returncode == 0 and found().status == "baked"
+def test_a_lock_of_a_living_process_says_how_to_get_rid_of_it(folder, held_elsewhere):
+    with held_elsewhere(folder):
+        assert found().status == "baking" and str(folder / ".lock") in found().message
+    assert found().status == "baked"
 
 
 def test_records_and_manifests_of_random_bytes_are_survived(folder):
