@@ -143,7 +143,7 @@ def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "ba
 def choose_motion(scene: Scene, options: BakeOptions, choices: Choices, on_event: OnEvent) -> tuple[Scene, BakeOptions]:
     """Return ``scene`` set in motion and the options of a bake that shows it; a notice says what was chosen.
 
-    Effects that somebody added to the scene say how it moves, so the caller asks for none then.
+    A scene with effects moves by these: the caller asks for no default motion then.
     """
     # Imported here: it needs SciPy, which most commands do without.
     from ..sim.app.default_motion import default_motion

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which process made something: number, start and machine, so that a number used again names nobody else.
+"""Identity of a process: number, start and machine, so that a reused number does not match another process.
 
 A ``Mark`` is written into names of temporary files and into locks. Whether its process still runs is known for this
 machine only; of another one's nothing is ever said to be dead.

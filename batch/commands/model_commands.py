@@ -65,7 +65,7 @@ def require_agreement(model: KnownModel, terminal: Terminal, *, as_json: bool) -
     """Ask on the terminal whether to install ``model``. Raises InputError unless the answer is yes."""
     remedy = "nothing was fetched or installed; agree with --yes"
     if as_json or not sys.stdin.isatty():
-        raise InputError(f"{model.name}: nobody can be asked here, so {remedy}")
+        raise InputError(f"{model.name}: there is no terminal to agree on, so {remedy}")
     terminal.line("Install it? [y/N]")
     # Otherwise a read that waits would go on after Ctrl-C.
     former = signal.signal(signal.SIGINT, signal.default_int_handler)

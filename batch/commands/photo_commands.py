@@ -151,8 +151,8 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
     """Run ``physgen run``; the exit code."""
     require_video_name(options.out)
     physics = physics_options(options)
-    told = tells_motion(physics.velocities, physics.spins, physics.overrides)
-    if options.still and told:
+    given = tells_motion(physics.velocities, physics.spins, physics.overrides)
+    if options.still and given:
         raise InputError("--still: a motion is given as well (--velocity, --spin or --set); leave one of them out")
     fetch_models(options, terminal, cancelled)
     work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
@@ -168,7 +168,7 @@ def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancel
         bake=bake_options(options),
         render=render_options(options),
         choices=stages.Choices(
-            motion=not (options.still or told), frames=options.frames is None, slow=options.slow is None
+            motion=not (options.still or given), frames=options.frames is None, slow=options.slow is None
         ),
     )
     stages.photo_to_video(request, terminal, cancelled)

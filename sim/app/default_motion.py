@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A motion for a scene that was given none: its freest objects hop where they have room, whole and in the picture.
+"""Default motion of a scene at rest: its freest objects hop where they have room, whole and in the picture.
 
 Reconstruction stays true to the photo, in which everything is at rest; this is asked for separately (``physgen run``
-does, unless it is told how things move, or ``--still``). Paths are ballistic, as the engine's are until the first
-contact; what follows is bounded: bounces, and sliding by v² / (2 μ g) or rolling on. Nothing is drawn at random.
+does, without a velocity, spin, moving override or ``--still``). Paths are ballistic, as the engine's are until the
+first contact; what follows is bounded: bounces, and sliding by v² / (2 μ g) or rolling on. Nothing is drawn at random.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ before moving matter reaches it.
 A body may sleep only where nothing but gravity acts on it and where it would stand: friction holds it on the ground's
 slope, and its centre of mass lies over what it rests on (the hull of its contacts, as far as the grid can tell: widened
 by a cell). A stack sleeps as far as it stands on the ground or on static colliders. What is held (it hangs, or leans on
-what nobody knows) sleeps without that, unless something that it touches is awake: a thing that leans falls when its
+something unknown) sleeps without that, unless something that it touches is awake: a thing that leans falls when its
 support is thrown.
 """
 

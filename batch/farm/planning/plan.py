@@ -286,7 +286,7 @@ FLAGS: Mapping[str, frozenset[str]] = {
     "encode": frozenset(("--out", "--fps")),
     "effects": frozenset(),
 }
-"""Flags of a plan's commands, by verb: those that ``make_plan`` writes. None starts a program or calls anybody."""
+"""Flags of a plan's commands, by verb: those that ``make_plan`` writes. None starts a program or contacts a host."""
 
 
 def _check_command(task: _FileTask, root: Path, where: str) -> None:

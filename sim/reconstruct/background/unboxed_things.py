@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Things on the ground that nobody boxed: they stay in the photo, and are no source for inpainting.
+"""Things on the ground without a box: they stay in the photo, and inpainting does not copy from them.
 
 A thing is a compact region with a sharp outline and another colour than the ground around it, about as large as the
 boxed objects. A pattern of the ground is none: it covers much of the ground, or the rest of the ground predicts it.

@@ -106,8 +106,8 @@ def install(
 ) -> Path:
     """Install ``model`` from ``archive``, else from what is fetched; return its file or folder.
 
-    For callers that have shown ``model.description()`` and were told yes. An earlier file is replaced at the end, when
-    the hash is right; otherwise nothing changes. Raises InputError, and Cancelled.
+    For callers with consent, given after ``model.description()`` was shown. An earlier file is replaced at the end,
+    when the hash is right; otherwise nothing changes. Raises InputError, and Cancelled.
     """
     if isinstance(model, HubModel):
         if archive is not None:

@@ -4,7 +4,7 @@
 Closed-form matting (Levin, Lischinski & Weiss, PAMI 30, 2008) in the band of pixels that are neither certainly object
 nor certainly background: in every window of 3 × 3 pixels alpha is an affine function of colour. Only windows that hold
 an unknown pixel are built, so cost and memory follow the outline's length. Where object and background have the same
-colours nothing can be told from them, and the outline stays where it was.
+colours, the outline stays where it was.
 """
 
 from __future__ import annotations
