@@ -340,7 +340,8 @@ def test_a_reconstruction_uses_it_tells_and_can_do_without(model, archive, tmp_p
     pixels, truth = picture()
     pixels[95:112, 20:60] = (40, 90, 200)
     Image.fromarray(pixels).save(tmp_path / "photo.png")
-    requests = [ObjectRequest(box=(30, 15, 130, 105), name="ball"), ObjectRequest(box=(10, 88, 72, 118), name="brick")]
+    boxes = {"ball": (30, 15, 130, 105), "brick": (10, 88, 72, 118)}
+    requests = [ObjectRequest(box=box, name=name, shape="inflated") for name, box in boxes.items()]
     options = ReconstructOptions(mesh_vertices=800, pitch_deg=25.0, patch_radius=3, sun=False)
     out, said = tmp_path / "scene", []
     model_folder.install(model, archive=archive)
