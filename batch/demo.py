@@ -27,15 +27,11 @@ CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml
 
 @dataclass(frozen=True, kw_only=True)
 class ClipConfig:
-    """How the demo is rendered. rate: times as many frames a second. samples, scale, orbit, dolly, motion_blur: as of
-    ``RenderOptions``.
-    """
+    """How the demo is rendered. samples, light_scale, orbit, motion_blur: as of ``RenderOptions``."""
 
-    rate: int = 1
     samples: int
-    scale: float = 1.0
+    light_scale: float | None = None
     orbit: float = 0.0
-    dolly: float = 0.0
     motion_blur: float = 0.5
 
 
@@ -43,7 +39,8 @@ class ClipConfig:
 class DemoConfig:
     """A photo from scikit-image and its physics; units as on the command line (docs/cli.md).
 
-    drops: what falls into the picture. clip: the render of ``make demo``; best: of ``make demo BEST=1``.
+    overrides: ``OBJECT.FIELD=VALUE``, as of ``--set``. drops: what falls into the picture. clip: the render of
+    ``make demo``; best: of ``make demo BEST=1``.
     """
 
     description: str
@@ -54,6 +51,7 @@ class DemoConfig:
     presets: tuple[str, ...]
     velocities: tuple[Vector, ...]
     pitch: float | None = None
+    overrides: tuple[str, ...] = ()
     drops: tuple[Drop, ...] = ()
     frames: int
     fps: float
@@ -93,13 +91,11 @@ def request(config: DemoConfig, out: Path, *, best: bool = False) -> stages.RunR
         objects=objects,
         video=out / f"{config.photo}{'_best' if best else ''}.mp4",
         work=out,
-        physics=Physics(presets=config.presets, velocities=config.velocities),
+        physics=Physics(presets=config.presets, velocities=config.velocities, overrides=config.overrides),
         reconstruct=ReconstructOptions(pitch_deg=config.pitch),
-        bake=BakeOptions(
-            frames=clip.rate * config.frames, fps=clip.rate * config.fps, slow=config.slow, quality=config.quality
-        ),
+        bake=BakeOptions(frames=config.frames, fps=config.fps, slow=config.slow, quality=config.quality),
         render=RenderOptions(
-            samples=clip.samples, scale=clip.scale, orbit=clip.orbit, dolly=clip.dolly, motion_blur=clip.motion_blur
+            samples=clip.samples, light_scale=clip.light_scale, orbit=clip.orbit, motion_blur=clip.motion_blur
         ),
         drops=config.drops,
     )

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..physgen_addon.render.render_options import RenderOptions, render_arguments, require_video_name
 from ..sim.app import bake_worker
@@ -27,6 +28,9 @@ from ..sim.reconstruct.reconstruct_options import object_names
 from ..sim.scene.bake_quality import load_quality
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
+
+if TYPE_CHECKING:
+    from ..sim.app.default_motion import DefaultMotion
 
 
 def run_bake(folder: Scene, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled) -> Event:
@@ -140,22 +144,58 @@ def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "ba
     return {stage: guesses[stage] for stage in stages}
 
 
-def choose_motion(scene: Scene, options: BakeOptions, choices: Choices, on_event: OnEvent) -> tuple[Scene, BakeOptions]:
+def choose_motion(
+    scene: Scene,
+    options: BakeOptions,
+    choices: Choices,
+    on_event: OnEvent,
+    *,
+    rehearsals: Path | None = None,
+    cancelled: IsCancelled = never,
+) -> tuple[Scene, BakeOptions]:
     """Return ``scene`` set in motion and the options of a bake that shows it; a notice says what was chosen.
 
-    A scene with effects moves by these: the caller asks for no default motion then.
+    rehearsals: folder for coarse bakes, which tell when the motion is over and whether all of it is in the picture;
+    None is content with an estimate. A scene with effects moves by these: the caller asks for no default motion then.
     """
     # Imported here: it needs SciPy, which most commands do without.
     from ..sim.app.default_motion import default_motion
 
-    motion = default_motion(
-        scene,
-        fps=options.fps,
-        frames=None if choices.frames else options.frames,
-        slow=None if choices.slow else options.slow,
-    )
+    frames = None if choices.frames else options.frames
+    slow = None if choices.slow else options.slow
+    motion = default_motion(scene, fps=options.fps, frames=frames, slow=slow)
+    if rehearsals is not None and motion.moves:
+        motion = _rehearse(scene, motion, options, frames, slow, rehearsals, on_event, cancelled)
     on_event({"event": "notice", "stage": "motion", "message": motion.sentence})
     return motion.applied(scene), dataclasses.replace(options, frames=motion.frames, slow=motion.slow)
+
+
+def _rehearse(
+    scene: Scene,
+    motion: DefaultMotion,
+    options: BakeOptions,
+    frames: int | None,
+    slow: float | None,
+    folder: Path,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+) -> DefaultMotion:
+    """Return ``motion`` with the speed and the clip that coarse bakes in ``folder`` suggest."""
+    from ..sim.app.rehearsal import MOST_REHEARSALS, rehearsal_options, rehearsed
+
+    for number in range(MOST_REHEARSALS):
+        out = folder / str(number)
+        try:
+            run_bake(motion.applied(scene), out, rehearsal_options(motion, options), ignore, cancelled)
+        except SimulationError as error:
+            message = f"no rehearsal: {error}; when the motion is over is an estimate"
+            on_event({"event": "notice", "stage": "motion", "message": message})
+            return motion
+        found = rehearsed(scene, load_bake(out), motion, frames=frames, slow=slow)
+        if not found.leaving or number == MOST_REHEARSALS - 1:
+            return found.motion
+        motion = found.tamed(scene)
+    return motion
 
 
 def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> Path:
@@ -181,7 +221,10 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
     if request.drops:
         scene = add_drops(scene, request.drops)
     if request.choices.motion and not scene.model.effects:
-        scene, options = choose_motion(scene, options, request.choices, on_event)
+        rehearsals = request.work / "rehearsal"
+        scene, options = choose_motion(
+            scene, options, request.choices, on_event, rehearsals=rehearsals, cancelled=cancelled
+        )
     run_bake(scene, request.work / "bake", options, on_event, cancelled)
     render(
         scene,

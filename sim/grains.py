@@ -47,6 +47,9 @@ STRETCH = (0.85, 1.6)
 SPARSEST, FARTHEST = 2.2, 2.5
 """Largest s; and farthest that a child is from its particle, in spacings."""
 
+NEAREST = 6
+"""Neighbours at rest that tell whether matter has come apart."""
+
 NEIGHBOURS, STILL_NEAR, GONE, RIDGE = 12, 2.5, 4.0, 0.5
 """Neighbours at rest that tell a particle's A; distances in spacings at which one begins and ends to count as gone; and
 the weight of the identity, in squared spacings."""
@@ -229,6 +232,18 @@ class GrainCloud:
     def numbers(self, parents: Ints, children: Ints) -> Ints:
         """Return the place (G,) of each child in tables of ``TABLE`` entries."""
         return (self._start[parents] + np.maximum(children, 0)) % TABLE
+
+    def parted(self, state: CloudState) -> Array:
+        """Return how much farther (N,) each particle is from the farthest gone of its nearest neighbours at rest."""
+        nearest = slice(0, NEAREST)
+        there = state.positions[self._neighbours[:, nearest]] - state.positions[:, None, :]
+        here = np.linalg.norm(self._offsets[:, nearest], axis=2)
+        return np.asarray((np.linalg.norm(there, axis=2) / np.maximum(here, 1e-12)).max(axis=1))
+
+    def turns(self, grains: ShownGrains) -> Array:
+        """Return at which share (G,) of the time in which ``grains`` come each one does, 0 to 1, evenly spread."""
+        # The golden ratio's multiples spread evenly, whatever part of the table a particle has.
+        return np.asarray(self.numbers(grains.parents, grains.children) * 0.6180339887498949 % 1.0)
 
     def at_rest(self, parents: Ints, children: Ints) -> Array:
         """Return the rest positions (G, 3) of ``children`` of ``parents`` (G,); of the particle itself for -1."""

@@ -33,6 +33,13 @@ SKIN_SAMPLES, FEW_SAMPLES, SHALLOW, NEARLY = 150_000, 2_000, 3.0, 0.25
 """Points of the skin that tell colours; a few of them, which do so for what is deeper than so many of their distances;
 and how much farther than the nearest, in shares, the one taken may be."""
 KEPT_STATES = 3
+GROWN_S, FADING_S = 0.25, (0.17, 0.5)
+"""How many seconds of the clip after the skin tears the last grain has come, and in which the skin goes where nothing
+tears it: grains break through one by one before it does, so that no single frame changes everything."""
+PARTED = 1.3
+"""Stretch between neighbouring particles above which their grains do not wait. The skin there is about to tear."""
+GROWING = 0.35
+"""Share of the time until the last has come in which one grain grows."""
 
 Positions = NDArray[np.float64]
 
@@ -49,12 +56,13 @@ class PhotoGrains:
         camera: Camera,
         scale: float,
         ground: Ground,
+        growing: float = 0.0,
     ) -> None:
         """Add them, still without any, beside ``target``, which has reference lighting. scale: of the frames over the
-        photo.
+        photo. growing: frames after the skin tears until all grains are there.
         """
         assert flow.from_sample is not None
-        self._flow, self._first_frame = flow, first_frame
+        self._flow, self._first_frame, self._growing = flow, first_frame, growing
         rest = flow.cache.sample(0)
         apart = spacing(rest)
         depth = float(np.median(camera.project(rest)[:, 2]))
@@ -118,7 +126,7 @@ class PhotoGrains:
             return
         if self._shown is not None and self._shown[0] == (sample, before):
             return
-        grains = self._cloud.shown(self._state(sample), eye)
+        grains = self._grown(self._cloud.shown(self._state(sample), eye), sample)
         self._shown = (sample, before), grains
         came = grains.positions if before == sample else self._places(before)
         self.mesh.clear_geometry()
@@ -139,6 +147,27 @@ class PhotoGrains:
             return np.zeros((0, 3)), np.zeros((0, 3))
         now = self._shown[1].positions
         return self._places(after) - now, self._places(before) - now
+
+    def _grown(self, grains: ShownGrains, sample: int) -> ShownGrains:
+        """Return the part of ``grains`` that has come at ``sample``, the last ones still small.
+
+        The core and grains where matter has come apart are there at once: nothing else covers that.
+        """
+        assert self._flow.from_sample is not None
+        share = (sample - self._flow.from_sample + 1.0) / max(self._growing, 1e-9)
+        if share >= 1.0:
+            return grains
+        loose = (self._cloud.parted(self._state(sample)) > PARTED)[grains.parents]
+        size = np.clip((share - self._cloud.turns(grains) * (1.0 - GROWING)) / GROWING, 0.0, 1.0)
+        size[(grains.children < 0) | loose] = 1.0
+        there = np.flatnonzero(size > 0.0)
+        return ShownGrains(
+            parents=grains.parents[there],
+            children=grains.children[there],
+            positions=grains.positions[there],
+            radii=(grains.radii * size)[there],
+            shades=grains.shades[there],
+        )
 
     def _enclose(self, state: CloudState) -> None:
         """Make the hull that of ``state``, with the reference lighting of the particles nearest to it."""

@@ -38,6 +38,7 @@ from .render_scene import (
 SKIN, SURFACE = "PhysGen photo skin", "PhysGen photo surface"
 REST_LENGTH = "rest_length"
 """Attribute of the skin's edges, m."""
+FADES, FADED = "Fades After", "Faded After"
 STEP = "Step"
 COLOUR, MIXED = "flow_colour", "flow_mixed"
 """Attributes of particles and of a fluid's surface: texture colour, linear; and how mixed it is."""
@@ -141,8 +142,12 @@ def _material(skin: bpy.types.Material) -> bpy.types.Material:
     return material
 
 
-def open_skin(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool) -> None:
-    """Open the skin where it is stretched, from ``from_frame`` on; or remove it if it is ``gone``."""
+def open_skin(
+    target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool, fading: tuple[float, float] = (0.0, 0.0)
+) -> None:
+    """Open the skin where it is stretched, from ``from_frame`` on; and remove it if it is ``gone``: at once, or one face
+    after another between so many frames after ``from_frame``, ``fading``.
+    """
     data = target.item.data
     ends = np.empty(2 * len(data.edges), dtype=np.int32)
     data.edges.foreach_get("vertices", ends)
@@ -153,16 +158,28 @@ def open_skin(target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: 
     modifier.node_group = _skin_group()
     set_input(modifier, particles.FROM, from_frame)
     set_input(modifier, "Gone", gone)
+    set_input(modifier, FADES, float(fading[0]))
+    set_input(modifier, FADED, float(fading[1]))
 
 
 def _skin_group() -> bpy.types.NodeTree:
-    tree = Tree(SKIN, {particles.FROM: ("Int", 1), "Gone": ("Bool", False)})
+    inputs: dict[str, tuple[str, Any]] = {particles.FROM: ("Int", 1), "Gone": ("Bool", False)}
+    tree = Tree(SKIN, {**inputs, FADES: ("Float", 0.0), FADED: ("Float", 0.0)})
     ends = tree.node("GeometryNodeInputMeshEdgeVertices").outputs
     length = tree.out("ShaderNodeVectorMath", ends["Position 1"], ends["Position 2"], operation="DISTANCE")
     longest = tree.math("MULTIPLY", tree.attribute(REST_LENGTH, "FLOAT"), TORN_STRETCH)
     torn = tree.compare("GREATER_THAN", length, longest)
     open_skin = tree.out("GeometryNodeDeleteGeometry", tree.inputs["Geometry"], torn, domain="EDGE", mode="EDGE_FACE")
-    left = particles.switch(tree, tree.inputs["Gone"], open_skin, None)
+    since = tree.math("SUBTRACT", tree.node("GeometryNodeInputSceneTime").outputs["Frame"], tree.inputs[particles.FROM])
+    span = tree.math("MAXIMUM", tree.math("SUBTRACT", tree.inputs[FADED], tree.inputs[FADES]), 1e-3)
+    share = tree.math("DIVIDE", tree.math("SUBTRACT", since, tree.inputs[FADES]), span)
+    # The first faces go with the first frame after FADES, and the last ones not a frame too late.
+    lost = tree.compare("LESS_THAN", tree.out("FunctionNodeRandomValue", data_type="FLOAT"), share)
+    fading = tree.out("GeometryNodeDeleteGeometry", open_skin, lost, domain="FACE", mode="ALL")
+    over = tree.compare("GREATER_EQUAL", share, 1.0)
+    left = particles.switch(
+        tree, tree.inputs["Gone"], open_skin, particles.switch(tree, over, fading, None)
+    )
     return tree.finish(particles.switch(tree, particles.begun(tree), tree.inputs["Geometry"], left))
 
 

@@ -38,7 +38,7 @@ from .motion_blur import Pose
 from .render_options import RenderOptions
 from .renderer import DataLayers, Renderer
 
-RENDER_REVISION = 5
+RENDER_REVISION = 6
 """Increased with every change of rendering that affects frames."""
 
 

@@ -28,7 +28,7 @@ from .clean_plate import CameraMotion, CleanPlate, PlateView, make_relief
 from .image_finish import ImageFinish
 from .lighting import GroundShadow, reflections
 from .motion_blur import Moment
-from .photo_grains import PhotoGrains
+from .photo_grains import FADING_S, GROWN_S, PhotoGrains
 from .render_options import RenderOptions
 from .render_regions import Box, ground_depth, object_box
 from .render_scene import BlenderScene, aim, build, everything, remove
@@ -284,12 +284,15 @@ class Renderer:
                     camera=self._scene.camera,
                     scale=self._options.scale,
                     ground=self._scene.ground_plane,
+                    growing=GROWN_S * self._bake.manifest.fps,
                 )
                 self._grains.append(shown)
                 self._steps.append(shown)
                 item, far = shown.item, shown.reach
             coherent = target.source.material.law == "snow"
-            photo_particles.open_skin(target, cache, first + flow.from_sample, gone=flow.surface or not coherent)
+            begins, ends = (0.0, 0.0) if flow.surface else tuple(each * self._bake.manifest.fps for each in FADING_S)
+            gone, torn = flow.surface or not coherent, first + flow.from_sample
+            photo_particles.open_skin(target, cache, torn, gone=gone, fading=(begins, ends))
             reach = max(reach, far)
             if self._data_scene is not None:
                 self._data_scene.follow(item, number)

@@ -54,20 +54,27 @@ def clip_notices(
     names: of the objects. poses: for every frame, the vertices (V, 3) of each object in world metres. cameras: one for
     every frame.
     """
-    seen: list[list[NDArray[np.float64]]] = [[] for _ in names]
-    lens: list[Camera] = []
-    for pose, camera in zip(poses, cameras, strict=False):
-        lens.append(camera)
-        for found, vertices in zip(seen, pose, strict=True):
-            found.append(camera.project(vertices[:: max(1, math.ceil(len(vertices) / MOST_POINTS))]))
+    lens = list(cameras)
+    tracks = seen_tracks(len(names), poses, lens)
     if len(lens) < 2:
         return []
-    tracks = [np.array(found) for found in seen]
-    texts = [text for name, track in zip(names, tracks, strict=True) if (text := _leaving(name, track, lens[0], clip))]
+    texts = [text for name, track in zip(names, tracks, strict=True) if (text := leaving(name, track, lens[0], clip))]
     return [*texts, *_pace(tracks, lens, clip)]
 
 
-def _leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip) -> str | None:
+def seen_tracks(count: int, poses: Iterable[Sequence[Array]], cameras: Iterable[Camera]) -> list[NDArray[np.float64]]:
+    """Return for each of ``count`` objects the pixels and depth (F, N, 3) of some of its points in every frame.
+
+    poses, cameras: as of ``clip_notices``.
+    """
+    seen: list[list[NDArray[np.float64]]] = [[] for _ in range(count)]
+    for pose, camera in zip(poses, cameras, strict=False):
+        for found, vertices in zip(seen, pose, strict=True):
+            found.append(camera.project(vertices[:: max(1, math.ceil(len(vertices) / MOST_POINTS))]))
+    return [np.array(found) for found in seen]
+
+
+def leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip) -> str | None:
     """Return what is to be said of a thing whose points (F, N, 3) are projected; None for nothing."""
     x, y, depth = np.moveaxis(track, -1, 0)
     beyond = np.stack([-x, x - camera.width, -y, y - camera.height])

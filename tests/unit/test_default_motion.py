@@ -14,6 +14,7 @@ from physgen.batch.commands import photo_commands
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.clip_check import Clip, clip_notices
 from physgen.sim.app.default_motion import default_motion, tells_motion
+from physgen.sim.app.rehearsal import rehearsal_options, rehearsed
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.material import load_preset
@@ -91,6 +92,11 @@ def test_what_is_seen_at_rest_stays_in_the_picture(table, box, pitch, preset):
 
     rest = beyond(load_object_mesh(scene, scene.objects[0]).vertices)
     for move in motion.moves:
+        if move.slides:
+            # Friction takes v² / (2 μ g): the box is as free of the frame's edges where it stops.
+            stop = load_object_mesh(scene, scene.objects[0]).vertices + np.asarray(move.aside)
+            assert beyond(stop) <= rest + 1e-6 and move.aside[2] == pytest.approx(0.0, abs=1e-6)
+            continue
         path = flight(moved, move, np.linspace(0, move.flight_s, 40))
         assert beyond(path) <= rest + 1e-6
         # It peaks where the move says, and comes down where it says, as low as it stood, but for its lean.
@@ -118,12 +124,12 @@ def test_a_thing_in_the_middle_hops_and_its_clip_is_long_enough(table):
     assert still == scene.objects[0] and inputs_hash(moved, BakeOptions()) != inputs_hash(scene, BakeOptions())
 
 
-def test_large_things_hop_less_for_their_size_and_what_flows_least(table):
+def test_larger_things_hop_less_for_their_size_the_largest_slide_and_what_flows_hops_least(table):
     def share(extent, preset="medium"):
         scene = table([(0, 0, 0, extent, extent, extent)], [preset], looking_down(30, 10 * extent))
         return default_motion(scene).moves[0].height / extent
 
-    assert share(0.05) > 1.3 * share(0.5) > 1.3 * share(2.0)
+    assert share(0.05) > 1.3 * share(0.45) > 0.0 == share(2.0)
     assert share(0.1, "sand") < 0.5 * share(0.1) and share(0.1, "wood") < share(0.1)
     assert default_motion(table([(0, 0, 0, 0.1, 0.1, 0.1)], ["sand"])).moves[0].aside == (0.0, 0.0, 0.0)
 
@@ -143,10 +149,70 @@ def test_neighbours_are_not_hit(table):
                 assert (apart.max(axis=1) > 0).all(), (move.name, name)
 
 
-def test_what_falls_over_easily_hops_straight_up(table):
-    (book,) = default_motion(table([(0, 0, 0, 0.15, 0.02, 0.2)])).moves
+def test_what_falls_over_easily_slides_along_its_length(table):
+    scene = table([(0, 0, 0, 0.15, 0.02, 0.2)])
+    (book,) = (motion := default_motion(scene)).moves
+    assert book.slides and book.spin == (0.0, 0.0, 0.0) and "box0 slides" in motion.sentence
+    # Along its board: across it tips at 0.02 / 0.2, which is less than the friction.
+    assert abs(book.aside[0]) > 0.05 and abs(book.aside[1]) < 1e-6 and book.aside[2] == 0.0
+    speed = np.linalg.norm(book.velocity)
+    friction = speed**2 / (2 * 9.81 * np.linalg.norm(book.aside))
+    assert friction == pytest.approx(scene.model.ground_plane.friction, rel=0.01)
+    assert book.flight_s == pytest.approx(speed / (friction * 9.81), rel=0.01)
     (crate,) = default_motion(table([(0, 0, 0, 0.15, 0.2, 0.2)])).moves
-    assert book.aside == book.spin == (0.0, 0.0, 0.0) and book.height < 0.5 * crate.height
+    assert not crate.slides
+    # A pencil on its end tips over every edge, so it may only hop, and hardly.
+    (pencil,) = default_motion(table([(0, 0, 0, 0.02, 0.02, 0.2)])).moves
+    assert not pencil.slides and pencil.aside == (0.0, 0.0, 0.0) and pencil.height < 0.5 * crate.height
+
+
+def test_furniture_slides_and_what_has_no_room_above_does_too(table):
+    (crate,) = default_motion(table([(0, 0, 0, 1.0, 1.0, 0.8)], camera=looking_down(30, 8.0))).moves
+    assert crate.slides
+    # It reaches the picture's upper edge but not its sides.
+    scene = table([(0, 0, 0, 0.25, 0.25, 0.25)], camera=looking_down(15, 0.9, focal=520.0))
+    shifted = dataclasses.replace(scene.model.camera, cy=156.0)
+    tops = shifted.project(load_object_mesh(scene, scene.objects[0]).vertices)
+    assert 0 < tops[:, 1].min() < 10 and tops[:, 1].max() < 400 and tops[:, 0].min() > 60
+    (tall,) = default_motion(save_scene(scene.root, dataclasses.replace(scene.model, camera=shifted))).moves
+    assert tall.slides and abs(tall.aside[0]) > 0.02
+
+
+@given(share=st.floats(0.1, 1.0))
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_slower_move_is_what_gravity_and_friction_make_of_less_speed(table, share):
+    for extents in ((0.07, 0.07, 0.07), (0.15, 0.02, 0.2)):
+        (move,) = default_motion(table([(0, 0, 0, *extents)])).moves
+        slow = move.slower(share)
+        up = slow.velocity[2]
+        assert slow.height == pytest.approx(up**2 / (2 * 9.81), rel=1e-4, abs=1e-9)
+        level = np.array([*slow.velocity[:2], 0.0])
+        assert np.allclose(slow.aside, level * slow.flight_s * (0.5 if slow.slides else 1.0), rtol=1e-4, atol=1e-9)
+
+
+def test_a_rehearsal_tells_when_a_motion_is_over_and_what_leaves(table, tmp_path):
+    import physgen
+
+    scene = table([(0, 0, 0, 0.07, 0.07, 0.07)], ["wood"])
+    motion = default_motion(scene)
+    (move,) = motion.moves
+    options = rehearsal_options(motion, BakeOptions())
+
+    def rehearse(motion, number):
+        bake = physgen.bake(motion.applied(scene), out=tmp_path / str(number), options=options)
+        return rehearsed(scene, bake, motion)
+
+    found = rehearse(motion, 0)
+    assert found.leaving == ()
+    # It ends after it came down, soon, and the clip a little later.
+    assert move.flight_s <= found.motion.action_s < move.flight_s + 0.4
+    after = found.motion.frames / found.motion.fps - found.motion.slow * found.motion.action_s
+    assert 0.29 < after < 0.35 and found.motion.moves == motion.moves
+    # Three times as fast sideways it slides out of the picture, which a hop of its own does not tell.
+    fast = dataclasses.replace(move, velocity=(6.0 * np.sign(move.velocity[0]), 0.0, move.velocity[2]))
+    gone = rehearse(dataclasses.replace(motion, moves=(fast,)), 1)
+    assert len(gone.leaving) == 1 and gone.leaving[0].startswith("box0 leaves the picture")
+    assert gone.tamed(scene).moves[0].velocity == pytest.approx(0.75 * np.asarray(fast.velocity))
 
 
 def test_what_carries_something_stays_and_what_it_carries_comes_down_on_it(table):
