@@ -145,8 +145,9 @@ def _material(skin: bpy.types.Material) -> bpy.types.Material:
 def open_skin(
     target: RenderObject, cache: Pc2Reader, from_frame: int, *, gone: bool, fading: tuple[float, float] = (0.0, 0.0)
 ) -> None:
-    """Open the skin where it is stretched, from ``from_frame`` on; and remove it if it is ``gone``: at once, or one face
-    after another between so many frames after ``from_frame``, ``fading``.
+    """Open the skin where it is stretched, from ``from_frame`` on; and remove it if it is ``gone``.
+
+    fading: between how many frames after ``from_frame`` its faces go, one after another; all at once by default.
     """
     data = target.item.data
     ends = np.empty(2 * len(data.edges), dtype=np.int32)
@@ -177,9 +178,7 @@ def _skin_group() -> bpy.types.NodeTree:
     lost = tree.compare("LESS_THAN", tree.out("FunctionNodeRandomValue", data_type="FLOAT"), share)
     fading = tree.out("GeometryNodeDeleteGeometry", open_skin, lost, domain="FACE", mode="ALL")
     over = tree.compare("GREATER_EQUAL", share, 1.0)
-    left = particles.switch(
-        tree, tree.inputs["Gone"], open_skin, particles.switch(tree, over, fading, None)
-    )
+    left = particles.switch(tree, tree.inputs["Gone"], open_skin, particles.switch(tree, over, fading, None))
     return tree.finish(particles.switch(tree, particles.begun(tree), tree.inputs["Geometry"], left))
 
 

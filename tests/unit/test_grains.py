@@ -164,3 +164,22 @@ def test_what_cannot_have_grains_is_an_input_error():
         GrainCloud(SCATTERED[:3], spacing=SPACING, size=size)
     with pytest.raises(InputError, match="wanted"):
         grain_size(particles=10, spacing=0.01, wanted=math.nan)
+
+
+def test_grains_come_evenly_and_at_once_where_matter_parts():
+    shape = cloud()
+    still = shape.state(SCATTERED)
+    shown = shape.shown(still)
+    turns = shape.turns(shown)
+    assert ((turns >= 0) & (turns < 1)).all()
+    # Evenly in time over all of the surface, and over any part of it.
+    for part in (turns, turns[shown.positions[:, 0] > 0.02]):
+        counts = np.histogram(part, bins=10, range=(0, 1))[0]
+        assert counts.max() < 1.25 * counts.mean() and counts.min() > 0.75 * counts.mean()
+    np.testing.assert_allclose(shape.parted(still), 1.0)
+    # A cut through the middle: only particles along it have parted.
+    right = SCATTERED[:, 0] > 0
+    cut = shape.parted(shape.state(SCATTERED + np.where(right, 5.0 * SPACING, 0.0)[:, None] * [1.0, 0.0, 0.0]))
+    near = np.abs(SCATTERED[:, 0]) < 0.4 * SPACING
+    far = np.abs(SCATTERED[:, 0]) > 3.0 * SPACING
+    assert cut[near].min() > 1.3 and cut[far].max() == pytest.approx(1.0)
