@@ -2,6 +2,7 @@
 """Objects that are found without a box: on drawn photos, in a model's alpha, on the command line."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -33,14 +34,33 @@ def saved(image, path):
     return path
 
 
-@pytest.fixture
-def photo(tmp_path):
+def drawn(path):
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = floor()
     for (x, y, radius), colour in THINGS.items():
         image[(((columns - x) / (1.2 * radius)) ** 2 + ((rows - y - radius) / (0.3 * radius)) ** 2) < 1] *= 0.6
         image[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = colour
-    return saved(image, tmp_path / "photo.png")
+    return saved(image, path)
+
+
+@pytest.fixture
+def photo(tmp_path):
+    return drawn(tmp_path / "photo.png")
+
+
+@pytest.fixture(scope="module")
+def proposals(tmp_path_factory):
+    """A folder with the proposals of that photo, for tests that are not about the search."""
+    folder = tmp_path_factory.mktemp("searched")
+    propose(drawn(folder / "photo.png"), out=folder / "list")
+    return folder / "list"
+
+
+@pytest.fixture
+def searched(photo, proposals, tmp_path):
+    """The photo, beside the folder ``list`` with its proposals."""
+    shutil.copytree(proposals, tmp_path / "list")
+    return photo
 
 
 def iou(box, other):
@@ -85,12 +105,12 @@ def test_a_photo_of_one_pixel_is_refused(tmp_path, capsys):
     assert not (tmp_path / "list").exists()
 
 
-def test_the_command_lists_boxes_as_the_command_line_takes_them(photo, tmp_path, capsys):
-    assert main(["propose", str(photo), "--out", str(tmp_path / "list")]) == 0
+def test_the_command_lists_boxes_as_the_command_line_takes_them(searched, tmp_path, capsys):
+    assert main(["propose", str(searched), "--out", str(tmp_path / "list")]) == 0
     lines = capsys.readouterr().out.splitlines()
     first = next(line for line in lines if line.strip().startswith("1 "))
     box = first.split("--box ")[1].split()[0]
-    assert [float(v) for v in box.split(",")] == list(propose(photo, out=tmp_path / "list")[0].box)
+    assert [float(v) for v in box.split(",")] == list(propose(searched, out=tmp_path / "list")[0].box)
     assert str(tmp_path / "list" / PICTURE_FILE) in lines[-1]
 
 
@@ -108,24 +128,24 @@ def requested(arguments, monkeypatch):
     return main(["reconstruct", *map(str, arguments)]), seen
 
 
-def test_without_a_box_the_best_are_taken_and_a_line_says_which(photo, tmp_path, monkeypatch):
-    code, seen = requested([photo, "--out", tmp_path / "scene"], monkeypatch)
+def test_without_a_box_the_best_are_taken_and_a_line_says_which(searched, tmp_path, monkeypatch):
+    code, seen = requested([searched, "--out", tmp_path / "scene"], monkeypatch)
     assert code == 0 and len(seen["boxes"]) >= 2
     (line,) = seen["notices"]
     assert "--pick" in line and "--box" in line and PICTURE_FILE in line and "\n" not in line
-    _, seen = requested([photo, "--out", tmp_path / "scene", "--pick", 2], monkeypatch)
-    assert seen["boxes"] == [propose(photo, out=tmp_path / "list")[1].box]
-    _, seen = requested([photo, "--out", tmp_path / "scene", "--name", "ball"], monkeypatch)
+    _, seen = requested([searched, "--out", tmp_path / "scene", "--pick", 2], monkeypatch)
+    assert seen["boxes"] == [propose(searched, out=tmp_path / "list")[1].box]
+    _, seen = requested([searched, "--out", tmp_path / "scene", "--name", "ball"], monkeypatch)
     assert len(seen["boxes"]) == 1
 
 
-def test_picks_that_are_not_there_are_refused(photo, tmp_path, monkeypatch, capsys):
+def test_picks_that_are_not_there_are_refused(searched, tmp_path, monkeypatch, capsys):
     for extra, message in (
         (["--pick", 99], "give numbers from 1 to"),
         (["--pick", 1, 1], "each once"),
         (["--pick", 1, "--box", "10,10,90,90"], "leave out one of the two"),
     ):
-        assert requested([photo, "--out", tmp_path / "scene", *extra], monkeypatch)[0] == 3
+        assert requested([searched, "--out", tmp_path / "scene", *extra], monkeypatch)[0] == 3
         assert message in capsys.readouterr().err
 
 
