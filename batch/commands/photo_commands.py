@@ -18,7 +18,7 @@ from ...sim.cache.bake_folder import load_bake
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, never
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
-from ...sim.reconstruct.adapters.adapter_registry import FOLDERS
+from ...sim.reconstruct.adapters.adapter_registry import FOLDERS, chosen_segmenter
 from ...sim.reconstruct.models import model_folder
 from ...sim.reconstruct.models.known_models import known_model
 from ...sim.reconstruct.reconstruct_options import object_names
@@ -85,6 +85,8 @@ def add_propose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
     text = "folder for the numbered picture and the list (default: NAME_proposals in the current folder)"
     parser.add_argument("--out", type=Path, metavar="DIR", help=text)
+    text = "model whose objects come first (default: the installed one); none: without learned weights"
+    parser.add_argument("--segmenter", metavar="NAME", help=text)
 
 
 def add_correct(parser: argparse.ArgumentParser) -> None:
@@ -212,12 +214,18 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
 def run_propose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen propose``; the exit code."""
     out = options.out or Path(f"{options.photo.stem}_proposals")
-    found = propose(options.photo, out=out, on_event=terminal, cancelled=cancelled)
+    found = propose(options.photo, out=out, segmenter=_finder(options), on_event=terminal, cancelled=cancelled)
     terminal({"event": "done", "proposals": [to_json(item) for item in found], "out": str(out)})
     for number, item in enumerate(found, start=1):
         terminal.line(f"{number:>2}  --box {box_text(item.box)}  score {item.score:.2f}")
     terminal.line(f"picture: {out / PICTURE_FILE}")
     return 0
+
+
+def _finder(options: argparse.Namespace) -> str | None:
+    """The model that finds objects: the segmenter, but none that has to be shown boxes."""
+    segmenter = chosen_segmenter(options.segmenter)
+    return None if segmenter in FOLDERS else segmenter
 
 
 def use_found_boxes(
@@ -231,7 +239,7 @@ def use_found_boxes(
         if options.pick:
             raise InputError("--pick: chooses among objects that are found without a box; leave out one of the two")
         return
-    found = propose(options.photo, out=folder, on_event=terminal, cancelled=cancelled)
+    found = propose(options.photo, out=folder, segmenter=_finder(options), on_event=terminal, cancelled=cancelled)
     wanted = max(len(options.name), len(options.size), len(options.velocity), len(options.spin))
     wanted = max(wanted, len(options.preset) if len(options.preset) > 1 else 0)
     chosen = choose(found, options.pick, wanted)

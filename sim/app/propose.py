@@ -11,13 +11,15 @@ from pathlib import Path
 from ..atomic import write_bytes, write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..reconstruct.adapters.adapter_registry import WITHOUT
 from ..reconstruct.reconstruct_options import Proposal
 from ..scene.folder import file_hash
+from ..trust import trusted_spec
 from ..validation import parse, read_json, to_json
 
 FORMAT = "physgen-proposals/1"
 LIST_FILE, PICTURE_FILE = "proposals.json", "proposals.jpg"
-REVISION = 1
+REVISION = 2
 """Raised with every change that changes which objects are proposed."""
 SEARCHED = 1024
 """Longest side in pixels of the photo as it is read; the search itself needs less."""
@@ -25,12 +27,16 @@ SEARCHED = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class ProposalRecord:
-    """``proposals.json``: the objects found in a photo, best first; boxes in pixels of the upright photo."""
+    """``proposals.json``: the objects found in a photo, best first; boxes in pixels of the upright photo.
+
+    segmenter: the model that found them, or ``none``.
+    """
 
     format: str = FORMAT
     revision: int = REVISION
     photo: str
     photo_hash: str
+    segmenter: str = WITHOUT
     width: int
     height: int
     proposals: tuple[Proposal, ...]
@@ -40,44 +46,53 @@ def propose(
     photo: str | Path,
     *,
     out: str | Path | None = None,
+    segmenter: str | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> tuple[Proposal, ...]:
     """Return the objects of ``photo`` that stand out, best first: at most 20, each with a box and a score from 0 to 1.
 
     out: folder for ``proposals.jpg``, the photo with their numbers, and ``proposals.json``; None writes nothing. The
-    same photo is not searched twice into the same folder.
+    same photo is not searched twice into the same folder. segmenter: a model that gives opacities, as IS-Net
+    (``isnet``), whose objects come first; None finds them without learned weights, other models are not asked.
 
     >>> import physgen
     >>> found = physgen.propose("photo.jpg", out="proposals")  # doctest: +SKIP
     >>> cup = physgen.ObjectRequest(box=found[0].box)  # doctest: +SKIP
 
-    Raises InputError for an unreadable photo and where nothing stands out, Cancelled when cancelled; nothing is
-    written then.
+    Raises InputError for an unreadable photo, for a model that cannot be used, and where nothing stands out, Cancelled
+    when cancelled; nothing is written then.
     """
     photo = Path(photo)
     if not photo.is_file():
         raise InputError(f"{photo}: there is no such photo; check its name")
     content = file_hash(photo)
     if out is not None:
-        earlier = _earlier(Path(out), content)
+        earlier = _earlier(Path(out), content, segmenter or WITHOUT)
         if earlier is not None:
             return earlier
     # The pipeline's modules cost a second of imports that an up-to-date list does not need, and Blender has no Pillow.
     from PIL import Image
 
+    from ..reconstruct.adapters.protocols import SoftSegmenter
+    from ..reconstruct.adapters.resolve import resolve
     from ..reconstruct.photo import load_photo
     from ..reconstruct.report_pictures import numbered_boxes
-    from ..reconstruct.segmentation.object_proposals import propose_boxes
+    from ..reconstruct.segmentation.object_proposals import proposals_from_alpha, propose_boxes, with_model
     from ..reconstruct.stage_cache import Steps
 
     steps = Steps(2, on_event, cancelled)
     steps.begin("photo")
     picture = load_photo(photo, SEARCHED)
     steps.begin("propose objects")
+    seen = propose_boxes(picture.pixels)
+    cutter = None if segmenter is None else resolve("segmenter", trusted_spec(segmenter), cancelled)
+    if isinstance(cutter, SoftSegmenter):
+        alpha = cutter.alpha(picture.pixels, (0, 0, picture.width, picture.height))
+        seen = with_model(proposals_from_alpha(alpha), seen, LEAST_CHOSEN)
     found = tuple(
         Proposal(tuple(round(v / picture.scale) for v in item.box), item.score)  # type: ignore[arg-type]
-        for item in propose_boxes(picture.pixels)
+        for item in seen
     )
     if not found:
         raise InputError(f"{photo}: no object stands out in it; draw a box around each one: --box x0,y0,x1,y1")
@@ -90,19 +105,25 @@ def propose(
         write_bytes(Path(out) / PICTURE_FILE, file.getvalue())
         width, height = picture.original_size
         record = ProposalRecord(
-            photo=str(photo.resolve()), photo_hash=content, width=width, height=height, proposals=found
+            photo=str(photo.resolve()),
+            photo_hash=content,
+            segmenter=segmenter or WITHOUT,
+            width=width,
+            height=height,
+            proposals=found,
         )
         write_json(Path(out) / LIST_FILE, to_json(record))
     return found
 
 
-def _earlier(folder: Path, content: str) -> tuple[Proposal, ...] | None:
-    """The proposals in ``folder`` for a photo with the hash ``content``; None without any."""
+def _earlier(folder: Path, content: str, segmenter: str) -> tuple[Proposal, ...] | None:
+    """The proposals in ``folder`` for a photo with the hash ``content`` by ``segmenter``; None without any."""
     try:
         record = parse(ProposalRecord, read_json(folder / LIST_FILE), LIST_FILE)
     except InputError:
         return None
-    same = (record.format, record.revision, record.photo_hash) == (FORMAT, REVISION, content)
+    found = (record.format, record.revision, record.photo_hash, record.segmenter)
+    same = found == (FORMAT, REVISION, content, segmenter)
     return record.proposals if same and record.proposals and (folder / PICTURE_FILE).is_file() else None
 
 

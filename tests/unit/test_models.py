@@ -297,6 +297,23 @@ def test_an_installed_model_is_the_segmenter_by_default(model, archive):
     assert (mask & truth).sum() / (mask | truth).sum() > 0.97
 
 
+def test_an_installed_model_finds_objects_without_a_box(model, archive, tmp_path, monkeypatch, physgen):
+    pixels = np.full((120, 200, 3), 128, np.uint8)
+    # Two halves that colour divides, and a grey thing that the network does not know.
+    pixels[30:90, 40:75], pixels[30:90, 75:110] = (230, 40, 40), (150, 10, 20)
+    pixels[40:80, 150:185] = 20
+    Image.fromarray(pixels).save(tmp_path / "photo.png")
+    model_folder.install(model, archive=archive)
+    assert physgen("propose", tmp_path / "photo.png", "--out", tmp_path / "list")[0] == 0
+    record = json.loads((tmp_path / "list" / "proposals.json").read_text())
+    x0, y0, x1, y1 = record["proposals"][0]["box"]
+    assert record["segmenter"] == "isnet"
+    assert (abs(x0 - 36) < 8, abs(y0 - 26) < 8, abs(x1 - 114) < 8, abs(y1 - 94) < 8) == (True,) * 4
+    assert all(item["box"][0] > 110 and item["score"] < 0.8 for item in record["proposals"][1:])
+    assert physgen("propose", tmp_path / "photo.png", "--out", tmp_path / "list", "--segmenter", "none")[0] == 0
+    assert json.loads((tmp_path / "list" / "proposals.json").read_text())["segmenter"] == "none"
+
+
 def test_without_onnxruntime_the_weight_free_way_stays(model, archive, monkeypatch):
     model_folder.install(model, archive=archive)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)

@@ -14,7 +14,7 @@ from physgen.sim.app import propose as propose_module
 from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, choose, propose
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.reconstruct_options import Proposal
-from physgen.sim.reconstruct.segmentation.object_proposals import proposals_from_alpha
+from physgen.sim.reconstruct.segmentation.object_proposals import proposals_from_alpha, with_model
 from PIL import Image
 from scipy import ndimage
 
@@ -168,6 +168,16 @@ def test_a_model_s_alpha_becomes_boxes():
     assert iou(found[0].box, (120, 30, 180, 80)) > 0.7 and iou(found[1].box, (30, 20, 80, 60)) > 0.7
     assert found[0].score > found[1].score
     assert proposals_from_alpha(np.zeros((50, 50))) == []
+
+
+def test_what_a_model_sees_as_one_is_one_and_its_objects_are_used_first():
+    whole, lone = Proposal((40, 20, 140, 90), 0.93), Proposal((200, 20, 260, 80), 0.71)
+    halves = [Proposal((40, 20, 88, 90), 0.99), Proposal((92, 22, 140, 90), 0.98)]
+    other = Proposal((10, 120, 60, 170), 0.97)
+    found = with_model([lone, whole], [*halves, other], 0.8)
+    assert [item.box for item in found] == [whole.box, lone.box, other.box]
+    assert best_proposals(found) == [0] and found[-1].score < 0.8
+    assert with_model([], halves, 0.8) == halves
 
 
 @settings(max_examples=40)

@@ -38,6 +38,8 @@ MARGIN = 0.06
 """Margin of a proposed box around what was found in it, over its longer side: boxes are to be loose."""
 LEAST_AREA, MOST_AREA = 0.0025, 0.6
 """Areas of objects over the photo's."""
+ELSEWHERE = 0.4
+"""Share of the smaller of two boxes in the other above which they hold the same object, or a part of it."""
 LEAST_SIDE = 0.035
 """Least side of an object's box over the photo's shorter side."""
 
@@ -90,6 +92,27 @@ def proposals_from_alpha(alpha: NDArray[np.floating], *, most: int = MOST) -> li
         x0, y0, x1, y1 = _loose(_extent(part), size)
         result.append((int(part.sum()), Proposal((x0, y0, x1, y1), round(float(value[part].mean()), 3))))
     return [item for _, item in sorted(result, key=lambda pair: -pair[0] * pair[1].score)][:most]
+
+
+def with_model(by_model: Sequence[Proposal], seen: Sequence[Proposal], most: float) -> list[Proposal]:
+    """Return the objects ``by_model``, best first, and then those ``seen`` without one that lie elsewhere.
+
+    A model sees as one what colours divide, such as a saucer or a motorcycle, and leaves out what only stands out.
+    most: score below which the others stay, so that the model's are the ones that are used; all of ``seen`` where it
+    found nothing.
+    """
+    if not by_model:
+        return list(seen)
+    elsewhere = [item for item in seen if all(_share_inside(item.box, own.box) < ELSEWHERE for own in by_model)]
+    lowered = [Proposal(item.box, min(item.score, round(most - 0.01, 3))) for item in elsewhere]
+    return [*sorted(by_model, key=lambda item: -item.score), *lowered][:MOST]
+
+
+def _share_inside(box: Box, other: Box) -> float:
+    """Share of the area of the smaller of two boxes that both have in common."""
+    width, height = (min(box[i + 2], other[i + 2]) - max(box[i], other[i]) for i in (0, 1))
+    area = min((b[2] - b[0]) * (b[3] - b[1]) for b in (box, other))
+    return max(0.0, width) * max(0.0, height) / max(area, 1e-9)
 
 
 def _extent(mask: Mask) -> tuple[int, int, int, int]:
