@@ -75,23 +75,25 @@ class Occluders:
         surfaces."""
         first, second = orthonormal_pair(direction)
         axes, cell = np.stack([first, second, direction]), self._cell
-        local, places = self._surface @ axes.T, self._points @ axes.T
-        low = places[:, :2].min(axis=0) - 2 * cell
-        columns, rows = (int(v) + 4 for v in np.ptp(places[:, :2], axis=0) / cell)
-        at = np.floor((local[:, :2] - low) / cell).astype(np.int64)
-        inside = (at[:, 0] >= 0) & (at[:, 0] < columns) & (at[:, 1] >= 0) & (at[:, 1] < rows)
-        lowest = float(min(places[:, 2].min(), local[:, 2].min())) - 4 * cell
+        # One array a component: this is computed in more than a hundred directions.
+        x, y, height = np.ascontiguousarray((self._surface @ axes.T).T)
+        places = np.ascontiguousarray((self._points @ axes.T).T)
+        low = places[:2].min(axis=1) - 2 * cell
+        columns, rows = (int(v) + 4 for v in np.ptp(places[:2], axis=1) / cell)
+        column, row = np.floor((x - low[0]) / cell), np.floor((y - low[1]) / cell)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        lowest = float(min(places[2].min(), height.min())) - 4 * cell
         depth = np.full(rows * columns, lowest, dtype=np.float64)
-        np.maximum.at(depth, at[inside, 1] * columns + at[inside, 0], local[inside, 2])
+        np.maximum.at(depth, (row * columns + column)[inside].astype(np.int64), height[inside])
         grid = depth.reshape(rows, columns).astype(np.float32)
         closed = cv2.morphologyEx(grid, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         flat = np.asarray(closed, dtype=np.float64).ravel()
-        x, y = ((places[:, :2] - low) / cell - 0.5).T
-        column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+        x, y = (places[0] - low[0]) / cell - 0.5, (places[1] - low[1]) / cell - 0.5
+        column, row = np.floor(x), np.floor(y)
         right, lower = x - column, y - row
-        index = row * columns + column
-        limit = places[:, 2] + SLACK * cell
-        open_to = np.zeros(len(places))
+        index = (row * columns + column).astype(np.int64)
+        limit = places[2] + SLACK * cell
+        open_to = np.zeros(len(limit))
         for step, share in (
             (0, (1 - right) * (1 - lower)),
             (1, right * (1 - lower)),
