@@ -38,6 +38,8 @@ class ComparisonSettings:
         the same for one that removes most of it.
     sharpness: slope of a(m) in ln m.
     prior_none: prior probability that nothing is missing; the effects share the rest.
+    containing: prior of an effect that contains another one (``CONTAINING``), relative to it: numbers that the trials
+        leave open cost no evidence.
     second_gain, second_misfit: a pair of effects counts only if it gains more than this many nats over each single
         one, and each single one leaves more than this many times its misfit.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
@@ -52,6 +54,7 @@ class ComparisonSettings:
     enough_explained: float = 3.0
     sharpness: float = 8.0
     prior_none: float = 0.3
+    containing: float = 0.2
     second_gain: float = 15.0
     second_misfit: float = 1.15
     predicted: tuple[float, float] = (0.9, 0.98)
@@ -68,6 +71,9 @@ TWINS: Mapping[str, tuple[str, ...]] = {
     "air_drag": ("wind",),
 }
 """Effects with the same rigid motion, or containing it: if one is named, so is the other."""
+
+CONTAINING = ("wind",)
+"""Effects that are another one with more numbers: air drag is wind in still air."""
 
 MOST_ALTERNATIVES = 4
 
@@ -197,10 +203,19 @@ def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings) -
         # A second cause is as improbable as the first one.
         each = (1 - weighing.prior_none) / VOCABULARY
         prior = each ** len(fit.effects) if fit.effects else weighing.prior_none
+        if fit.effects and any(_same_motion(fit, other) for other in candidates):
+            prior /= 2
+        prior *= weighing.containing ** sum(name in CONTAINING for name in fit.effects)
         logs.append(math.log(prior) + _gain(fit, nominal, weighing) / weighing.temperature)
     highest = max(logs)
     raw = np.exp(np.array(logs) - highest)
     return [float(w) for w in raw / raw.sum()]
+
+
+def _same_motion(fit: CandidateFit, other: CandidateFit) -> bool:
+    """Return whether both are single effects that are two names of one motion, which share its prior."""
+    names = {*fit.effects, *other.effects}
+    return names == {"time_scale", "buoyancy"} and fit.log_evidence == other.log_evidence
 
 
 def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings) -> float:

@@ -5,6 +5,7 @@ Quaternions are (..., 4), w first; rotation vectors (..., 3) are in world axes."
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import cv2
@@ -79,11 +80,14 @@ def state_difference(a: Array, b: Array) -> Array:
     return np.concatenate([b[..., :3] - a[..., :3], turn, b[..., 7:13] - a[..., 7:13]], axis=-1)
 
 
-SCALE_ERROR = 0.006
-"""Relative error of the scale along the path of a single tracked point."""
+SLOW_ERROR = 0.006
+"""Largest slow error of a single tracked point, as a share of its path; how large it is, the best candidate shows."""
 
 TOGETHER = 4.0
 """Frames, or fractions of a trial, with common errors where they are correlated."""
+
+CENTRED = 1e-3
+"""Distance in m from the body's centre up to which a point counts as the centre."""
 
 STIFF = 0.3
 """RMS change of point distances over the noise below which points must come from a tracked pose."""
@@ -94,7 +98,8 @@ class ObservedBody:
     """Observations of one body in one trial. T frames, K points.
 
     times: (T,) s. seen: (T, K, 3) m or (T, K, 2) pixels, NaN where not seen. places: (K, 3) m, body axes, about its
-    centre. sigma: noise of one coordinate. columns: (K,) indices of its points in the trial.
+    centre. sigma: noise of one coordinate with independent frames. columns: (K,) indices of its points in the trial.
+    white: noise of one coordinate as stated.
     """
 
     trial: Trial
@@ -104,6 +109,21 @@ class ObservedBody:
     sigma: float
     camera: Camera | None
     columns: NDArray[np.int64]
+    white: float = 0.0
+
+    @property
+    def hides_spin(self) -> bool:
+        """Return whether only the body's centre is tracked, so that its spin shows in nothing but its path."""
+        return self.camera is None and len(self.places) == 1 and float(np.abs(self.places).max()) < CENTRED
+
+    def sharpened(self, residual: float) -> ObservedBody:
+        """Return the same with the noise that a residual RMS of a coordinate, in m, implies; never more than now.
+
+        What exceeds the white noise is slow: it is common to the frames of a quarter of the trial.
+        """
+        count = max(1.0, float(np.isfinite(self.seen).all(axis=(1, 2)).sum()))
+        slow = max(residual**2 - self.white**2, 0.0) * max(1.0, count / TOGETHER)
+        return dataclasses.replace(self, sigma=min(self.sigma, float(np.hypot(self.white, np.sqrt(slow)))))
 
     @property
     def poses_alone(self) -> bool:
@@ -150,6 +170,7 @@ def observe_body(capture: Capture, trial: Trial, index: int, center: Array) -> O
         sigma=effective_sigma(capture, trial, columns),
         camera=capture.camera if trial.pixels is not None else None,
         columns=columns,
+        white=capture.noise_sigma,
     )
 
 
@@ -157,7 +178,7 @@ def effective_sigma(capture: Capture, trial: Trial, columns: NDArray[np.int64]) 
     """Return the standard deviation of independent coordinates with the same information content.
 
     Points that keep their distances far better than their noise come from a tracked pose, with errors correlated
-    between points and frames. A single distant point is read off an image, whose scale error varies slowly.
+    between points and frames. A single point may have a slow error: at first the largest one is assumed.
     """
     sigma = capture.noise_sigma
     if trial.points is None:
@@ -166,7 +187,7 @@ def effective_sigma(capture: Capture, trial: Trial, columns: NDArray[np.int64]) 
     if len(columns) == 1:
         seen = points[np.isfinite(points).all(axis=(1, 2)), 0]
         reach = float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
-        return float(np.hypot(sigma, SCALE_ERROR * reach * np.sqrt(max(1.0, len(seen) / TOGETHER))))
+        return float(np.hypot(sigma, SLOW_ERROR * reach * np.sqrt(max(1.0, len(seen) / TOGETHER))))
     if len(columns) < 4:
         return sigma
     rest = trial.rest_points[columns]

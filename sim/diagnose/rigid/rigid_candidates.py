@@ -28,6 +28,11 @@ RUB = 5.0 / np.pi
 FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.01, 0.01, 0.1
 """Standard deviations of the nominal coefficients (relative; absolute; relative); larger deviations are an effect."""
 
+SCALE_SPREAD, CLOCK_SPREAD = 0.01, 0.005
+RECORDED_GRAVITY_SPREAD = float(np.hypot(SCALE_SPREAD, 2 * CLOCK_SPREAD))
+"""Relative standard deviations of the length scale and the clock of a recording of single points. In flight both are a
+gravity that differs in strength: lengths scale it, times scale it twice, and speeds are free."""
+
 UNKNOWN_RESTITUTION, UNKNOWN_RESTITUTION_SPREAD = 0.35, 0.2
 
 
@@ -55,11 +60,15 @@ class WorldSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BodyScene:
-    """Nominal model of one body, shared by all candidates. middle: (3,) m, centre of the observed points."""
+    """Nominal model of one body, shared by all candidates. middle: (3,) m, centre of the observed points.
+
+    unscaled: only its centre is tracked, so neither its size nor its spin checks the recording's scale and clock.
+    """
 
     capture: Capture
     body: RigidBody
     middle: Array
+    unscaled: bool = False
 
     @property
     def base(self) -> WorldSettings:
@@ -139,15 +148,16 @@ def _beliefs(scene: BodyScene, setting: WorldSettings, z: Array) -> WorldSetting
         friction=setting.friction * float(np.exp(FRICTION_SPREAD * z[0])),
         restitution=setting.restitution + spread * float(z[1]),
         contact_time=setting.contact_time * float(np.exp(CONTACT_TIME_SPREAD * np.clip(z[2], -4, 4))),
+        gravity=setting.gravity * float(np.exp(RECORDED_GRAVITY_SPREAD * z[3])) if scene.unscaled else setting.gravity,
     )
 
 
 BELIEFS = CandidateEffect(
     name="beliefs",
-    size=3,
+    size=4,
     change=_beliefs,
     values=lambda scene, setting, z: {"friction": setting.friction, "restitution": setting.restitution},
-    starts=((0.0, 0.0, 0.0),),
+    starts=((0.0, 0.0, 0.0, 0.0),),
     step=0.2,
 )
 """Return settings with the nominal model's own parameters changed."""

@@ -46,6 +46,7 @@ from .rigid_search import (
     refit_beliefs,
     refit_best,
     search_pairs,
+    sharpen,
 )
 
 Array = NDArray[np.float64]
@@ -54,6 +55,9 @@ REFITS = ("friction", "restitution")
 """Contact parameters that are re-fitted as a candidate of their own."""
 UNEXPLAINED = 1.5
 """Misfit of the best candidate above which the capture counts as unexplained."""
+
+SHARPENINGS = 3
+"""Repetitions in which the noise of single points follows the closest fit."""
 
 WORSE = 1.2
 """Factor on the nominal error of complete trials up to which the mean over plausible contacts is preferred."""
@@ -168,6 +172,11 @@ def fit_rigid(
         refine_promising(body)
         reconsider_nominal(body)
         search_pairs(body, wanted)
+        for _ in range(SHARPENINGS):
+            if not sharpen(body):
+                break
+            # Sharper noise may leave room for a second effect.
+            search_pairs(body, wanted)
     return _assemble(capture, bodies)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture_geometry import mean_known
-from .multiple_shooting import Fit, Model, Problem, SegmentedTrial
+from .multiple_shooting import Fit, Model, Problem, SegmentedTrial, solve
 from .observed_poses import as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
@@ -203,10 +203,40 @@ def leave_one_out(fit: Fit) -> Array:
     return np.array(found)
 
 
+def _middle(trial: SegmentedTrial) -> int:
+    """Return the frame at half of the time of ``trial``, at least the third and not the last."""
+    times = trial.observations.times
+    return int(np.clip(np.searchsorted(times, 0.5 * (times[0] + times[-1])), 3, max(len(times) - 1, 3)))
+
+
+def _from_first_half(fit: Fit, index: int) -> Array:
+    """Return numbers (P,) fitted without the second half of trial ``index``, the only complete one."""
+    trials, states = list(fit.problem.trials), list(fit.states)
+    trial = trials[index]
+    end = min(_middle(trial), trial.end)
+    kept = max(1, sum(n < end - 2 for n in trial.nodes))
+    weights = list(trial.weights[:kept])
+    weights[-1] = weights[-1][: end - trial.nodes[kept - 1]]
+    trials[index] = dataclasses.replace(
+        trial,
+        nodes=trial.nodes[:kept],
+        end=end,
+        states=states[index][:kept],
+        covers=trial.covers[:kept],
+        weights=weights,
+    )
+    states[index] = states[index][:kept]
+    half = dataclasses.replace(fit.problem, trials=trials)
+    return solve(half, fit.model, fit.z, states, rounds=6).z
+
+
 def score_held_out(fit: Fit) -> HeldOutScore:
     """Return the held-out scores of ``fit``."""
     problem = fit.problem
     numbers = leave_one_out(fit)
+    alone = [i for i, t in enumerate(problem.trials) if t.observations.trial.role == "fit"]
+    if len(alone) == 1:
+        numbers[alone[0]] = _from_first_half(fit, alone[0])
     scores = []
     for i, trial in enumerate(problem.trials):
         if trial.observations.trial.role == "fit":
@@ -225,7 +255,8 @@ def score_held_out(fit: Fit) -> HeldOutScore:
         off = (trial.observations.seen if trial.observations.camera is None else _tracked_points(fit, i))[
             begin:
         ] - points
-        off = off[max(0, shown_frames(fit, trial) - begin) :]
+        first = _middle(trial) if len(alone) == 1 else shown_frames(fit, trial)
+        off = off[max(0, first - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
     rms = float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("nan")
     return HeldOutScore(log_score=np.array(scores), rms_m=rms)
@@ -237,7 +268,7 @@ def noise_floor(fit: Fit) -> float:
     Pixels are compared with the fitted path, which has almost no noise.
     """
     trials = [t for t in fit.problem.trials if t.observations.trial.role == "fit"]
-    own = [0.0 if t.observations.camera is not None else 3 * t.observations.sigma**2 for t in trials]
+    own = [0.0 if t.observations.camera is not None else 3 * t.observations.white**2 for t in trials]
     return float(np.sqrt(np.mean(own) + noise_spread(fit) ** 2))
 
 

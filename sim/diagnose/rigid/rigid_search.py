@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..work import Work
-from .multiple_shooting import CONTACT_DEGREES_OF_FREEDOM, Fit, Model, Problem, Segment, SegmentedTrial, solve
+from .multiple_shooting import (
+    CONTACT_DEGREES_OF_FREEDOM,
+    Evaluation,
+    Fit,
+    Model,
+    Problem,
+    Segment,
+    SegmentedTrial,
+    solve,
+)
 from .observed_poses import frame_pose, observe_body
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings
 from .rigid_simulator import RigidWorlds, rigid_body
@@ -151,7 +160,7 @@ def body_problem(capture: Capture, index: int, work: Work) -> Problem:
             if pose is not None:
                 places.append(pose[0])
     middle = np.median(places, axis=0) if places else np.zeros(3)
-    scene = BodyScene(capture=capture, body=body, middle=middle)
+    scene = BodyScene(capture=capture, body=body, middle=middle, unscaled=all(s.hides_spin for s in seen))
     return Problem(scene=scene, simulator=simulator, trials=track_states(scene, simulator, seen))
 
 
@@ -194,7 +203,8 @@ def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: 
     problem = first.problem
     starts: list[Array] = [first.z]
     for candidate in new:
-        starts = [np.concatenate([z, s]) for z in starts for s in candidate.starts]
+        starts = [np.concatenate([z, s]) for z in starts for s in _starts(body, candidate)]
+    slopes = _reusable(body, candidates, slopes)
     if new[0].name not in CONTACTS:
         # Flight is nearly linear: contacts are added once the forces are about right.
         loose = _loosened(problem)
@@ -212,11 +222,24 @@ def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: 
     return begun[0]
 
 
+def _starts(body: BodyFits, candidate: CandidateEffect) -> tuple[tuple[float, ...], ...]:
+    """Return the starting values of ``candidate``. Without lift no path depends on a hidden spin, and without spin none
+    on lift: Magnus starts from a plausible lift there."""
+    return ((1.0,),) if candidate.name == "magnus" and body.problem.scene.unscaled else candidate.starts
+
+
+def _reusable(body: BodyFits, candidates: tuple[CandidateEffect, ...], slopes: Evaluation | None) -> Evaluation | None:
+    """Return ``slopes``, the nominal Jacobians, or None where paths depend on what the nominal model ignores."""
+    lifted = body.problem.scene.unscaled and any(c.name == "magnus" for c in candidates)
+    return None if lifted else slopes
+
+
 def finish(body: BodyFits, key: tuple[str, ...]) -> Fit:
     """Return the fit begun for ``key``, iterated to convergence."""
     nominal = body.fits[()]
     for fit in body.begun.pop(key, []):
         slopes = nominal.evaluation if fit.problem is body.problem else fit.evaluation
+        slopes = _reusable(body, fit.model.candidates, slopes)
         _keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS, held=slopes))
     return body.fits[key]
 
@@ -363,6 +386,44 @@ def refit_best(body: BodyFits) -> None:
                 body.work.skip((fit.model.candidates[0].name,), "followed through its own contacts")
 
 
+SHARPENED = 0.8
+"""Factor on the assumed noise below which all fits are repeated with what the closest one leaves."""
+
+
+def _residual(fit: Fit) -> float:
+    """Return the RMS residual in m of a coordinate of single points, for as many as no state fits."""
+    chi2, count = 0.0, 0
+    for segment in fit.evaluation.segments:
+        observations = fit.problem.trials[segment.trial].observations
+        chi2 += float(segment.chi2.sum()) * observations.sigma**2
+        count += 3 * int(np.isfinite(observations.seen[segment.frames]).all(axis=2).sum()) - 9
+    return float(np.sqrt(chi2 / max(count, 1)))
+
+
+def sharpen(body: BodyFits) -> bool:
+    """Replace the largest slow error of single points by the one that the closest fit leaves, and fit everything again.
+
+    Returns whether that made a difference.
+    """
+    if not body.problem.scene.unscaled:
+        return False
+    residual = min(_residual(fit) for fit in body.fits.values())
+    trials = [t.observations.sharpened(residual) for t in body.problem.trials]
+    if all(o.sigma > SHARPENED * t.observations.sigma for o, t in zip(trials, body.problem.trials, strict=True)):
+        return False
+    problems: dict[int, Problem] = {}
+    for fit in body.fits.values():
+        if id(fit.problem) not in problems:
+            own = [dataclasses.replace(t, observations=o) for t, o in zip(fit.problem.trials, trials, strict=True)]
+            problems[id(fit.problem)] = dataclasses.replace(fit.problem, trials=own)
+    sharp = {
+        key: solve(problems[id(fit.problem)], fit.model, fit.z, fit.states, rounds=ROUNDS)
+        for key, fit in body.fits.items()
+    }
+    body.problem, body.fits, body.flown, body.begun = problems[id(body.problem)], sharp, {}, {}
+    return True
+
+
 def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     """Fit pairs of effects: the best one or two with each other one, where a single effect leaves too much."""
     singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1]
@@ -370,11 +431,12 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
         return
     singles.sort(key=lambda item: -item[1].evidence)
     left = misfit(singles[0][1]).ratio
-    if left < PAIR_MISFIT or left > PAIR_SHARE * misfit(body.fits[()]).ratio:
-        return
+    open_end = PAIR_MISFIT <= left <= PAIR_SHARE * misfit(body.fits[()]).ratio
+    # A hidden spin differs between trials, so that no single effect takes its place: lift is always tried beside it.
+    others = wanted if open_end else [c for c in wanted if c.name == "magnus" and body.problem.scene.unscaled]
     tried = []
     for name, fit in singles[:2]:
-        for candidate in wanted:
+        for candidate in others:
             if candidate.name == name or tuple(sorted((name, candidate.name))) in {tuple(sorted(k)) for k in body.fits}:
                 continue
             if {name, candidate.name} == {"air_drag", "wind"}:

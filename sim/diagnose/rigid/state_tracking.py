@@ -116,6 +116,12 @@ LOST = 40.0
 GUESS_HEIGHT = 0.01
 """Standard deviation in m of a height estimated from one frame's pixels."""
 
+STILL_SPIN = 0.3
+"""Standard deviation in rad/s of the spin of a body with two tracked points, whose axis they hardly show."""
+
+SPIN_PARAMETER = 0.6
+"""Standard deviation of a spin that no point shows: surface speed over speed."""
+
 NOMINAL = Model(candidates=())
 
 
@@ -135,7 +141,7 @@ def first_state(scene: BodyScene, observations: ObservedBody, first: int = 0) ->
     state = np.zeros(13)
     state[3] = 1.0
     alone = observations.poses_alone
-    prior = np.repeat([1.0, 1.0, 20.0, 60.0] if alone else [1.0, 1e-3, 20.0, 0.3], 3)
+    prior = np.repeat([1.0, 1.0, 20.0, 60.0] if alone else [1.0, 1e-3, 20.0, STILL_SPIN], 3)
     if not poses:
         state[:3] = scene.middle
         return state, prior
@@ -147,6 +153,8 @@ def first_state(scene: BodyScene, observations: ObservedBody, first: int = 0) ->
         state[:3], state[7:10] = line[1], line[0]
     else:
         state[:3] = x[0]
+    if observations.hides_spin:
+        prior[9:12] = max(STILL_SPIN, SPIN_PARAMETER * float(np.linalg.norm(state[7:10])) / scene.body.bound)
     turns = [Rotation.from_matrix(p[2]) for p in poses]
     if alone and len(poses) >= 2:
         spins = [(b * a.inv()).as_rotvec() / (t[i + 1] - t[i]) for i, (a, b) in enumerate(pairwise(turns))]
@@ -267,7 +275,8 @@ def track_states(
             size = scene.body.bound
             prior = np.repeat([0.01, 0.01 / size, blow, blow / size], 3)
             if not trial.observations.poses_alone:
-                prior[3:6], prior[9:12] = 1e-3, 0.3
+                prior[3:6] = 1e-3
+                prior[9:12] = blow / size if trial.observations.hides_spin else STILL_SPIN
             trial.nodes.append(node + index)
             here[i] = SegmentedTrial(
                 observations=trial.observations,

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""Single tracked points: a spin that no marker shows is a state, and the noise is what the closest candidate leaves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
+from physgen.sim.diagnose.rigid import fit_rigid
+from physgen.sim.diagnose.rigid.observed_poses import observe_body
+from scipy.integrate import solve_ivp
+
+RADIUS, DENSITY, DRAG, LIFT, SIGMA = 0.02, 80.6, 0.125, 0.0056, 0.002
+"""A table tennis ball: drag per mass 1/m at a drag coefficient of 0.45, lift per mass at one of its spin parameter."""
+
+
+def rallies(seed, *, takes=6, spin=(40, 160), shown=0.6, duration=0.6):
+    """Flights of a ball seen as one point, each with a spin across its path; the last two are withheld in part."""
+    rng, trials, truth = np.random.default_rng(seed), [], {}
+    for number in range(takes + 2):
+        velocity = np.array([rng.uniform(4, 7), 0.6 * rng.normal(), rng.uniform(0.3, 2.0)])
+        axis = np.cross(velocity, rng.normal(size=3))
+        turning = axis / np.linalg.norm(axis) * rng.uniform(*spin)
+
+        def rate(_, y, turning=turning):
+            u = y[3:]
+            return [*u, *(np.array([0, 0, -9.81]) + LIFT * np.cross(turning, u) - DRAG * np.linalg.norm(u) * u)]
+
+        times = np.arange(0, duration, 1 / 120)
+        start = [0, 0, 1.2, *velocity]
+        way = solve_ivp(rate, (0, duration), start, t_eval=times, rtol=1e-9, atol=1e-10).y[:3].T
+        seen = way[:, None] + SIGMA * rng.normal(size=(len(times), 1, 3))
+        last = number >= takes
+        cut = int(len(times) * shown) if last else len(times)
+        trials.append(
+            Trial(
+                name=f"take{number}",
+                role="predict" if last else "fit",
+                times=times[:cut],
+                points=seen[:cut],
+                pixels=None,
+                object_index=np.zeros(1, dtype=np.int64),
+                rest_points=np.zeros((1, 3)),
+                predict_times=times[cut:] if last else None,
+            )
+        )
+        if last:
+            truth[f"take{number}"] = way[cut:, None]
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    belief = ObjectBelief(name="ball", mesh="ball.obj", density_kg_m3=DENSITY, stiffness="hard")
+    item = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    ground = Ground(point=(0.0, 0.0, -5.0), friction=0.3, restitution=0.8)
+    capture = Capture(
+        gravity=(0.0, 0.0, -9.81), ground=ground, objects=(item,), noise_sigma=SIGMA, camera=None, trials=tuple(trials)
+    )
+    return capture, truth
+
+
+def withheld(fits, fit, truth):
+    """RMS distance in m on the withheld part."""
+    found = fits.predict(fit)
+    return float(np.sqrt(np.mean([np.mean(np.sum((found[n] - way) ** 2, axis=-1)) for n, way in truth.items()])))
+
+
+def test_a_spin_that_no_marker_shows_is_found_beside_drag():
+    capture, truth = rallies(2)
+    fits = fit_rigid(capture, ["air_drag", "magnus", "gravity_tilt"])
+    weighed = compare_models(fits, ComparisonSettings())
+    assert set(weighed.verdict.effects) == {"air_drag", "magnus"} and weighed.verdict.probability > 0.8
+    found = weighed.best[weighed.verdict.effect]
+    drag = found.parameters["air_drag"]["drag_per_mass"]
+    assert drag.low < DRAG < drag.high and drag.value == pytest.approx(DRAG, rel=0.05)
+    alone = next(c for c in fits.candidates if c.effects == ("air_drag",))
+    assert withheld(fits, found, truth) < 0.025 < withheld(fits, alone, truth) < withheld(fits, fits.nominal, truth)
+    # The path tells what lift and spin make together, not each: take by take, across the motion.
+    fit = fits.bodies[0].fits[found.effects]
+    assert found.parameters["magnus"]["lift_per_mass"].value > 0
+    assert max(t.observations.sigma for t in fit.problem.trials) < 1.5 * SIGMA
+
+
+def test_lift_is_not_found_where_nothing_spins():
+    capture, _ = rallies(3, takes=3, spin=(0.0, 1e-6))
+    weighed = compare_models(fit_rigid(capture, ["air_drag", "magnus"]), ComparisonSettings())
+    assert weighed.verdict.effects == ("air_drag",)
+
+
+CAPTURE = rallies(1, takes=1)[0]
+
+
+@given(st.floats(0.0, 10.0), st.floats(0.0, 10.0))
+def test_noise_follows_what_is_left_between_the_stated_and_the_largest(residual, more):
+    seen = observe_body(CAPTURE, CAPTURE.trials[0], 0, np.zeros(3))
+    sharp, duller = seen.sharpened(residual), seen.sharpened(residual + more)
+    assert SIGMA <= sharp.sigma <= duller.sigma <= seen.sigma
+    assert seen.sharpened(0.5 * SIGMA).sigma == pytest.approx(SIGMA)
+    assert seen.hides_spin and not dataclasses.replace(seen, places=seen.places + 0.01).hides_spin
