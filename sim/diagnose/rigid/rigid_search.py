@@ -199,7 +199,7 @@ def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: 
     first = nominal if base is None else base
     model = Model(candidates=candidates)
     new = candidates[len(first.model.candidates) :]
-    slopes = nominal.evaluation if first.problem is problem else first.evaluation
+    slopes: Evaluation | None = nominal.evaluation if first.problem is problem else first.evaluation
     problem = first.problem
     starts: list[Array] = [first.z]
     for candidate in new:
@@ -238,8 +238,8 @@ def finish(body: BodyFits, key: tuple[str, ...]) -> Fit:
     """Return the fit begun for ``key``, iterated to convergence."""
     nominal = body.fits[()]
     for fit in body.begun.pop(key, []):
-        slopes = nominal.evaluation if fit.problem is body.problem else fit.evaluation
-        slopes = _reusable(body, fit.model.candidates, slopes)
+        known = nominal.evaluation if fit.problem is body.problem else fit.evaluation
+        slopes = _reusable(body, fit.model.candidates, known)
         _keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS, held=slopes))
     return body.fits[key]
 
