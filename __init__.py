@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .sim.app.compose_scene import compose
     from .sim.app.default_motion import DefaultMotion, default_motion
     from .sim.app.diagnose import diagnose
+    from .sim.app.import_capture import ImportRequest, import_capture
     from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
     from .sim.cache.bake_folder import Bake, load_bake
@@ -55,6 +56,7 @@ __all__ = [
     "DefaultMotion",
     "DiagnoseOptions",
     "Diagnosis",
+    "ImportRequest",
     "ObjectRequest",
     "PhysGenError",
     "Physics",
@@ -70,6 +72,7 @@ __all__ = [
     "compose",
     "default_motion",
     "diagnose",
+    "import_capture",
     "load_bake",
     "load_capture",
     "load_scene",
@@ -89,6 +92,7 @@ _HOMES = {
     "DefaultMotion": ".sim.app.default_motion",
     "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
     "Diagnosis": ".sim.diagnose.diagnosis",
+    "ImportRequest": ".sim.app.import_capture",
     "ObjectRequest": ".sim.reconstruct.reconstruct_options",
     "PhysGenError": ".sim.errors",
     "Physics": ".sim.app.reconstruct",
@@ -103,6 +107,7 @@ _HOMES = {
     "compose": ".sim.app.compose_scene",
     "default_motion": ".sim.app.default_motion",
     "diagnose": ".sim.app.diagnose",
+    "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",
     "load_scene": ".sim.scene.folder",

@@ -90,6 +90,8 @@ def build_parser() -> argparse.ArgumentParser:
     lack = "capture of a real motion → effects missing from its simulation"
     diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
     diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
+    tables = "tables of measured motion (CSV, Tracker, DeepLabCut) → capture folder"
+    diagnosis_commands.add_capture(command("capture", diagnosis_commands.run_capture, tables))
     examined = "test the diagnosis on simulated motion with withheld labels"
     diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
     listing = command("effects", _effects, "list physical effects with their equations and parameters")

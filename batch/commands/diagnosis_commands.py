@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The verbs ``track``, ``diagnose`` and ``blind-check`` (docs/diagnosis.md, docs/diagnosis.md)."""
+"""The verbs ``track``, ``capture``, ``diagnose`` and ``blind-check`` (docs/diagnosis.md, docs/own-recordings.md)."""
 
 from __future__ import annotations
 
 import argparse
 import re
+import sys
 from pathlib import Path
+from typing import Any
 
 from ...sim.diagnose.track import track_command
 from ...sim.errors import InputError
@@ -46,6 +48,69 @@ def run_track(options: argparse.Namespace, terminal: Terminal, cancelled: IsCanc
     done = track_command.run_command(options, terminal, cancelled)
     terminal(done)
     terminal.line(done["summary"])
+    return 0
+
+
+def parse_column(text: str) -> tuple[str, str]:
+    """Return (our name, heading of the table) in ``time=Zeit``."""
+    ours, equals, theirs = text.partition("=")
+    if not (ours and equals and theirs):
+        raise argparse.ArgumentTypeError(f"{text!r} is no mapping: write time=HEADING")
+    return ours, theirs
+
+
+_IMPORT_FIELDS: tuple[tuple[str, Any, str], ...] = (
+    ("diameter", float, "of a ball, m"),
+    ("mesh", Path, "of a rigid body, m"),
+    ("density", float, "kg/m³"),
+    ("mass", float, "kg"),
+    ("name", str, "of the body (default: body)"),
+    ("rest", Path, "CSV name,x,y,z: places of the markers on the mesh, m"),
+    ("time-unit", str, "s, ms, us or ns"),
+    ("length-unit", str, "m, cm, mm or px"),
+    ("up", str, "axis that points up: z, y, -y or -z (write --up=-y)"),
+    ("scale", float, "m per pixel"),
+    ("fps", float, "frames per second, where rows are frames"),
+    ("ground", float, "height of the ground, m (default: 0)"),
+    ("friction", float, "of the ground (default: 0.5)"),
+    ("restitution", float, "of the ground, if known"),
+    ("noise", float, "standard deviation of a coordinate, m (default: measured)"),
+    ("hold-out", float, "share of the last take that is shown; the rest is withheld"),
+)
+
+
+def add_capture(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen capture``."""
+    parser.add_argument("action", choices=("import",), help="what to do")
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="CSV, Tracker's .trk, DeepLabCut's CSV")
+    parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="new folder for the capture")
+    mapped = "our name and the table's heading, such as time=Zeit x=X"
+    parser.add_argument("--column", nargs="+", type=parse_column, default=[], metavar="OURS=THEIRS", help=mapped)
+    for name, kind, text in _IMPORT_FIELDS:
+        parser.add_argument(f"--{name}", type=kind, metavar="VALUE", help=text)
+
+
+def run_capture(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen capture import``; the exit code. On a terminal, guesses are asked."""
+    from ...sim.app.import_capture import ImportRequest, import_capture
+
+    named = {name.replace("-", "_") for name, _, _ in _IMPORT_FIELDS}
+    given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
+    if "up" in given:
+        given["up"] = given["up"].strip()
+    asks = sys.stdin.isatty() and not options.json
+
+    def confirm(question: str) -> bool:
+        terminal.line(f"{question} [y/N]")
+        return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+    request = ImportRequest(columns=dict(options.column), **given)
+    capture = import_capture(
+        options.files, request, out=options.out, confirm=confirm if asks else None, on_event=terminal
+    )
+    trials = [trial.name for trial in capture.trials]
+    terminal({"event": "done", "out": str(options.out), "trials": trials, "noise_m": capture.noise_sigma})
+    terminal.line(f"capture: {options.out} ({', '.join(trials)})\nnext: physgen diagnose {options.out} --out DIR")
     return 0
 
 
