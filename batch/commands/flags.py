@@ -179,9 +179,9 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
     ):
         text = f"adapter for {what} (docs/extending.md; default: built-in)"
         parser.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
-    text = "folder with the weights of sam, sam2, depth-anything or depth-pro, which --segmenter and --depth name"
+    text = f"folder with the weights of {', '.join(FOLDERS)}, which --segmenter, --depth or --inpainter names"
     parser.add_argument("--weights", type=Path, metavar="DIR", help=text)
-    text = "fetch the weights that --segmenter or --depth names, after showing size, source and licence; agrees to them"
+    text = "fetch the weights that --segmenter, --depth or --inpainter names, after showing size, source and licence"
     parser.add_argument("--download", action="store_true", help=text)
     text = "also write SCENE/report.html, with images of every stage"
     parser.add_argument("--report", action="store_true", help=text)
@@ -278,11 +278,11 @@ def _take_models(changes: dict[str, Any], weights: Path | None) -> None:
             raise InputError(f"--depth {name} and --depth-estimator {changes['depth_estimator']}: give one of them")
         changes["depth"] = None
         changes["depth_estimator"] = name
-    named = [stage for stage in ("segmenter", "depth_estimator") if changes.get(stage) in FOLDERS]
+    named = [stage for stage in ("segmenter", "depth_estimator", "inpainter") if changes.get(stage) in FOLDERS]
     if weights is None:
         return
     if not named:
-        raise InputError(f"--weights: is for {', '.join(FOLDERS)}; name one by --segmenter or --depth")
+        raise InputError(f"--weights: is for {', '.join(FOLDERS)}; name one by --segmenter, --depth or --inpainter")
     for stage in named:
         changes[stage] = f"{changes[stage]}:{weights_folder(changes[stage], weights).resolve()}"
 

@@ -135,10 +135,11 @@ def fetch_models(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     """Install the models that the command names, as ``--download`` asks for. Raises InputError where it names none."""
     if not options.download:
         return
-    named = [name for name in (options.segmenter, str(options.depth)) if name in FOLDERS]
+    named = [name for name in (options.segmenter, str(options.depth), options.inpainter) if name in FOLDERS]
     if not named or options.weights is not None:
         raise InputError(
-            f"--download: is for {', '.join(FOLDERS)} without --weights; name one by --segmenter or --depth"
+            f"--download: is for {', '.join(FOLDERS)} without --weights; name one by --segmenter, --depth or "
+            "--inpainter"
         )
     for model in map(known_model, named):
         status = model_folder.model_status(model)

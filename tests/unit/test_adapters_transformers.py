@@ -379,6 +379,6 @@ def test_download_is_for_models_that_the_command_names(tmp_path, capfd):
     photo = tmp_path / "photo.png"
     photo.write_bytes(b"")
     words = ["reconstruct", str(photo), "--box", "1,1,9,9", "--out", str(tmp_path / "scene"), "--download"]
-    assert main(words) == 3 and "name one by --segmenter or --depth" in capfd.readouterr().err
+    assert main(words) == 3 and "name one by --segmenter, --depth or --inpainter" in capfd.readouterr().err
     assert main([*words, "--segmenter", "sam2", "--weights", str(tmp_path)]) == 3
     assert "without --weights" in capfd.readouterr().err

@@ -193,15 +193,17 @@ PRESETS = Path(__file__).resolve().parents[3] / "presets" / "meshers"
 VARIABLE = "PHYSGEN_ADAPTERS"
 GROUP = "physgen.adapters"
 PATHS = ("command", "lama", "picture", "isnet")
-FOLDERS = ("sam", "sam2", "depth-anything", "depth-pro")
-"""Adapter types whose target is a folder of weights for transformers."""
 """Adapter types whose target is a file."""
+DIFFUSERS = "diffusers-inpaint"
+FOLDERS = ("sam", "sam2", "depth-anything", "depth-pro", DIFFUSERS)
+"""Adapter types whose target is a folder of weights for transformers or diffusers."""
 PROGRAMS = ("sam-3d-objects", "trellis", "hunyuan3d", "triposg")
 """Adapter types whose target is the folder of a program that makes meshes; ``presets/meshers`` says how each is run."""
 ADAPTER_TYPES = (*PATHS, *FOLDERS, *PROGRAMS, "python")
 OF_STAGE = {
     "lama": "inpainter",
     "picture": "inpainter",
+    DIFFUSERS: "inpainter",
     "isnet": "segmenter",
     "sam": "segmenter",
     "sam2": "segmenter",
@@ -235,7 +237,12 @@ def program_python(folder: Path) -> Path:
 
 def weights_folder(kind: str, folder: Path) -> Path:
     """Return where the weights of ``kind`` are in ``folder``: in the part of that name if there is one, else there."""
-    return folder / kind if (folder / kind / "config.json").is_file() else folder
+    return folder / kind if (folder / kind / weights_index(kind)).is_file() else folder
+
+
+def weights_index(kind: str) -> str:
+    """Return the file that says what a folder of weights of ``kind`` holds."""
+    return "model_index.json" if kind == DIFFUSERS else "config.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,7 +304,7 @@ def spec_files(stage: str, spec: str, names: Path | None = None) -> list[Path]:
         parts = split_spec(named[0]) if named else None
     if parts is not None and parts[0] in FOLDERS:
         # The weights themselves are gigabytes: their configuration stands for them.
-        found.append(Path(parts[1]).expanduser().absolute() / "config.json")
+        found.append(Path(parts[1]).expanduser().absolute() / weights_index(parts[0]))
     elif parts is not None:
         kind, target = parts
         path = target if kind in PATHS else target.rpartition(":")[0]
@@ -442,12 +449,13 @@ def _problem(stage: str, kind: str, target: str) -> str | None:
             return str(error)
         return None
     if kind in FOLDERS:
-        from .transformers_adapter import folder_problem, missing_packages
+        from . import diffusers_adapter, transformers_adapter
 
-        lacking = missing_packages()
-        return folder_problem(kind, path) or (
-            f"needs {', '.join(lacking)}; install physgen[models]" if lacking else None
-        )
+        if kind == DIFFUSERS:
+            found, lacking = diffusers_adapter.pipeline_problem(path), diffusers_adapter.missing_packages()
+        else:
+            found, lacking = transformers_adapter.folder_problem(kind, path), transformers_adapter.missing_packages()
+        return found or (f"needs {', '.join(lacking)}; install physgen[models]" if lacking else None)
     if not path.is_file():
         return "there is no such file"
     if kind in ("lama", "isnet") and onnxruntime_version() is None:

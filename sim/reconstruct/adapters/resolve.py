@@ -6,6 +6,7 @@ command:FILE.toml a program (``command_adapter``)
 lama:FILE.onnx inpainting by LaMa through onnxruntime (``lama_adapter``)
 isnet:FILE.onnx segmentation by IS-Net through onnxruntime (``isnet_adapter``)
 sam:FOLDER, sam2:FOLDER, depth-anything:FOLDER, depth-pro:FOLDER through transformers (``transformers_adapter``)
+diffusers-inpaint:FOLDER inpainting through diffusers (``diffusers_adapter``)
 sam-3d-objects:FOLDER, trellis:FOLDER, hunyuan3d:FOLDER, triposg:FOLDER programs that make meshes
 picture:FILE inpainting from a picture without the objects (``picture_adapter``)
 NAME one of these by name (``adapter_registry``)
@@ -24,6 +25,7 @@ from ..models import known_models
 from ..models.model_folder import models_folder
 from .adapter_registry import (
     ADAPTER_TYPES,
+    DIFFUSERS,
     FOLDERS,
     OF_STAGE,
     PROGRAMS,
@@ -140,6 +142,10 @@ def _of_kind(stage: str, kind: str, target: str, cancelled: IsCancelled) -> Any:
         raise InputError(f"{where}: {other_stage(kind, stage)}")
     if kind in PROGRAMS:
         return MesherCommand(program_command(kind, path), cancelled)
+    if kind == DIFFUSERS:
+        from .diffusers_adapter import open_diffusers
+
+        return open_diffusers(path, where)
     if kind in FOLDERS:
         # Imported here: few have torch, and it takes seconds.
         from .transformers_adapter import open_transformers

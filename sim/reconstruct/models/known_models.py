@@ -58,17 +58,15 @@ class PackagedModel(KnownModel):
 
 @dataclass(frozen=True, kw_only=True)
 class HubModel(KnownModel):
-    """Weights for transformers in a repository of the Hugging Face hub. size: of model.safetensors, about."""
+    """Weights in a repository of the Hugging Face hub. size: of all files, about. files: names of those in it."""
 
     repository: str
+    files: tuple[str, ...] = ("config.json", "model.safetensors")
 
     def description(self) -> list[str]:
         """Return name, size, source and licence, a line each."""
         first, _, *rest = super().description()
         return [first, f"size: about {megabytes(self.size)}", *rest]
-
-
-HUB_FILES = ("config.json", "model.safetensors")
 
 
 def megabytes(size: int) -> str:
@@ -143,7 +141,31 @@ DEPTH_PRO = HubModel(
     licence="Apple's licence for machine learning research models (apple-amlr): research only",
     repository="apple/DepthPro-hf",
 )
-KNOWN: tuple[KnownModel, ...] = (ISNET, SAM2, SAM, DEPTH_ANYTHING, DEPTH_PRO)
+INPAINT = HubModel(
+    name="diffusers-inpaint",
+    title="Stable Diffusion 1.5 inpainting, half precision",
+    stage="inpainter",
+    use="the background behind objects",
+    size=2_140_000_000,
+    source=_HUB.format("stable-diffusion-v1-5/stable-diffusion-inpainting"),
+    licence="CreativeML Open RAIL-M: free, with restrictions on use",
+    repository="stable-diffusion-v1-5/stable-diffusion-inpainting",
+    files=(
+        "model_index.json",
+        "scheduler/scheduler_config.json",
+        "text_encoder/config.json",
+        "text_encoder/model.fp16.safetensors",
+        "tokenizer/merges.txt",
+        "tokenizer/special_tokens_map.json",
+        "tokenizer/tokenizer_config.json",
+        "tokenizer/vocab.json",
+        "vae/config.json",
+        "vae/diffusion_pytorch_model.fp16.safetensors",
+        "unet/config.json",
+        "unet/diffusion_pytorch_model.fp16.safetensors",
+    ),
+)
+KNOWN: tuple[KnownModel, ...] = (ISNET, SAM2, SAM, DEPTH_ANYTHING, DEPTH_PRO, INPAINT)
 
 
 def known_model(name: str) -> KnownModel:

@@ -22,7 +22,7 @@ from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...files import MOST_HASHED, open_file
 from . import known_models
-from .known_models import HUB_FILES, HubModel, KnownModel, PackagedModel, megabytes
+from .known_models import HubModel, KnownModel, PackagedModel, megabytes
 from .model_archive import ArchiveReader
 
 VARIABLE = "PHYSGEN_MODELS"
@@ -69,7 +69,7 @@ def model_status(model: KnownModel) -> ModelStatus:
     opened."""
     path = model_file(model)
     if isinstance(model, HubModel):
-        lacking = [name for name in HUB_FILES if not (path / name).is_file()]
+        lacking = [name for name in model.files if not (path / name).is_file()]
         problem = f"has no {lacking[0]}: install it again" if lacking else None
         return ModelStatus(model=model, path=path, is_installed=path.is_dir(), problem=problem)
     try:
@@ -166,10 +166,10 @@ def _downloaded(model: HubModel, on_event: OnEvent, cancelled: IsCancelled) -> P
     with replacing(path) as partial:
         partial.mkdir()
         script = Path(__file__).with_name("hub_download.py")
-        command = [sys.executable, str(script), model.repository, str(partial), *HUB_FILES]
+        command = [sys.executable, str(script), model.repository, str(partial), *model.files]
         # What this process may have been told about staying offline does not hold for this one.
         online = (("HF_HUB_OFFLINE", "0"), ("HF_HUB_DISABLE_TELEMETRY", "1"), ("HF_HUB_DISABLE_PROGRESS_BARS", "1"))
-        output = partial / HUB_FILES[-1]
+        output = partial / model.files[-1]
         run_command(
             command, partial, online, FETCH_SECONDS, output, 3 * model.size, cancelled, f"{model.name}: download"
         )
