@@ -95,6 +95,17 @@ def draw_cutouts(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row.operator(PHYSGEN_OT_remove_model.bl_idname, text="", icon="TRASH")
 
 
+def draw_models(layout: bpy.types.UILayout, state: Any) -> None:
+    """Draw the choice among the models that the command line knows, each stage's."""
+    column = _part(layout, "photo_models", "Models")
+    if column is None:
+        return
+    if not model_status(ISNET).is_installed:
+        column.prop(state, "segmenter")
+    column.prop(state, "depth_estimator")
+    column.prop(state, "inpainter")
+
+
 def draw_camera(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
     """Draw camera settings."""
     column = _part(layout, "photo_camera", "Camera")
@@ -192,6 +203,7 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if 0 <= state.box_index < len(state.boxes):
         draw_details(layout, context, state.boxes[state.box_index])
     draw_cutouts(layout, context, state)
+    draw_models(layout, state)
     draw_camera(layout, context, state)
     draw_files(layout, context, state)
     draw_asking(layout, context, state)

@@ -88,6 +88,9 @@ def arguments(state: bpy.types.PropertyGroup, *, online: bool | None = None) -> 
     found += _of_camera(state)
     if state.segmenter != "auto":
         found += ["--segmenter", state.segmenter]
+    for flag, name in (("--depth-estimator", state.depth_estimator), ("--inpainter", state.inpainter)):
+        if name != "none":
+            found += [flag, name]
     if state.depth.strip():
         found += ["--depth", str(_file(state.depth, "Depth Map"))]
     if state.report:

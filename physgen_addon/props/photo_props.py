@@ -15,6 +15,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ...sim.reconstruct.models.known_models import KNOWN
 from ...sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from ..context import redraw
 from ..paths import RELATIVE
@@ -26,6 +27,12 @@ UP_ITEMS = [
     ("auto", "Automatic", "By file format and fit"),
     *((axis, axis.upper(), f"The axis {axis.upper()} of the file") for axis in ("+x", "-x", "+y", "-y", "+z", "-z")),
 ]
+
+
+def _models(stage: str, first: tuple[str, str, str]) -> list[tuple[str, str, str]]:
+    """Items of the models that the command line knows for ``stage``, after the way without any."""
+    known = [model for model in KNOWN if model.stage == stage]
+    return [first, *((m.name, m.title, f"Installed by: physgen models install {m.name}") for m in known)]
 
 
 def _on_box(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -188,8 +195,18 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
         description="What cuts out the objects in boxes without a mask",
         items=[
             ("auto", "Automatic", "The installed model (Improve Cut-outs), without one colour and texture"),
-            ("none", "Without a Model", "Colour and texture"),
+            *_models("segmenter", ("none", "Without a Model", "Colour and texture")),
         ],
+    )
+    depth_estimator: EnumProperty(
+        name="Depth",
+        description="What estimates the photo's depth, which tells ground and order",
+        items=_models("depth_estimator", ("none", "Without a Model", "Ground and order by the objects' outlines")),
+    )
+    inpainter: EnumProperty(
+        name="Background",
+        description="What fills the place behind the objects",
+        items=_models("inpainter", ("none", "Without a Model", "The background's own texture and edges")),
     )
     depth: StringProperty(
         name="Depth Map",

@@ -41,6 +41,7 @@ from physgen.physgen_addon.props.photo_props import PHYSGEN_PG_photo_box
 from physgen.physgen_addon.scene_io import import_physics
 from physgen.physgen_addon.scene_io.import_scene import import_scene
 from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.models.known_models import KNOWN
 from physgen.sim.reconstruct.reconstruct_options import BACKS, SHAPES, UP_AXES
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 from physgen.sim.scene.folder import load_scene, save_scene
@@ -129,6 +130,20 @@ def test_command_accepts_all_field_values(photo, end):
     for camera in ("PITCH", "HORIZON"):
         photo.camera = camera
         read(arguments(photo))
+
+
+def test_models_are_those_that_the_command_line_knows(photo):
+    for stage in ("segmenter", "depth_estimator", "inpainter"):
+        names = [model.name for model in KNOWN if model.stage == stage]
+        items = type(photo).bl_rna.properties[stage].enum_items.keys()
+        assert names and list(items)[-len(names) :] == names
+        for name in names:
+            setattr(photo, stage, name)
+            _, options = read(arguments(photo))
+            assert getattr(options, stage) == name
+        setattr(photo, stage, "none")
+    photo.segmenter = "auto"
+    assert not [word for word in arguments(photo) if word in ("--segmenter", "--inpainter", "--depth-estimator")]
 
 
 def test_tilt_has_one_option(photo):
