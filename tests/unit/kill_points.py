@@ -133,7 +133,16 @@ def do_correct_with_a_journal(folder):
     do_correct(folder)
 
 
+def do_bake(folder):
+    """Taichi is imported here: it does not survive a fork."""
+    from physgen.sim.app.bake import bake
+    from physgen.sim.app.bake_options import BakeOptions
+
+    bake(load_scene(folder / "scene"), out=folder / "bake", options=BakeOptions(frames=3, quality="preview"))
+
+
 SCENARIOS = {
+    "bake": do_bake,
     "correct": do_correct,
     "journal": do_correct_with_a_journal,
     "reconstruct": do_reconstruct,
@@ -154,17 +163,26 @@ def leftovers(folder):
     return [str(path.relative_to(folder)) for path in folder.rglob(".*")]
 
 
-def check(folder, whole):
+def caches(folder):
+    return {path.name: path.read_bytes() for path in (folder / "bake").glob("*.pc2")}
+
+
+def check(name, folder, whole, reference):
     """Return what is wrong after a kill and the next command's recovery."""
-    atomic.recover(folder / "scene")
-    atomic.recover(folder / "windy")
     atomic.recover(folder / "config" / "trusted.json")
     atomic.recover_scratch(folder / "scratch")
-    for name in ("scene", "windy"):
-        remove_dead_lock(folder / f".{name}{LOCK_FILE}")
-        remove_dead_lock(folder / name / LOCK_FILE)
+    for part in ("scene", "windy", "bake"):
+        atomic.recover(folder / part)
+        remove_dead_lock(folder / f".{part}{LOCK_FILE}")
+        remove_dead_lock(folder / part / LOCK_FILE)
     if state(folder) not in whole:
         return "neither the earlier scene nor the new one"
+    if name == "bake":
+        # The next run goes on from what is there, to the same bytes.
+        if forked(lambda: do_bake(folder)) != 0:
+            return "cannot be baked any more"
+        if caches(folder) != caches(reference):
+            return "another bake than without a kill"
     left = [*leftovers(folder), *(path.name for path in (folder / "scratch").iterdir())]
     return f"left over: {left[:4]}" if left else None
 
@@ -215,14 +233,14 @@ def main(name, folder, points):
     assert code == 0
     # The copies differ in nothing but their place.
     whole = [state(start), state(done)]
-    assert whole[0] != whole[1] or name == "variant"
-    wrong = [] if check(done, [whole[1]]) is None else ["the whole run left something"]
+    assert whole[0] != whole[1] or name in ("variant", "bake")
+    wrong = [] if check(name, done, [whole[1]], done) is None else ["the whole run left something"]
     first, last, step = points
     tried = 0
     for number in range(first, min(last, calls) + 1, step):
         copy, code, _ = attempt(number, number)
         tried += 1
-        problem = check(copy, whole) if code == -signal.SIGKILL else f"ended with {code}"
+        problem = check(name, copy, whole, done) if code == -signal.SIGKILL else f"ended with {code}"
         if problem is not None:
             wrong.append(f"killed before call {number} of {calls}: {problem}")
         shutil.rmtree(copy)

@@ -38,6 +38,12 @@ def test_killed_before_any_call_nothing_is_lost(tmp_path, scenario):
     assert found["wrong"] == [] and found["points"] == found["calls"] > 10
 
 
+@pytest.mark.long
+def test_a_bake_killed_before_some_calls_goes_on_to_the_same_bytes(tmp_path):
+    found = kill_points("bake", tmp_path, "3:1000:9")
+    assert found["wrong"] == [] and found["points"] >= 3
+
+
 @pytest.fixture
 def dead():
     """The mark of a process that has ended."""
