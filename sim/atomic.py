@@ -239,12 +239,18 @@ def recover_scratch(folder: Path | None = None) -> list[str]:
     """
     place, said = folder or Path(tempfile.gettempdir()), []
     for left in _entries(place):
-        found = _SCRATCH.fullmatch(left.name)
-        mark = parse_mark(found["mark"]) if found else None
-        if mark is not None and mark.is_dead and _is_ours(left):
+        # A child of the dead process may still be about to end.
+        if _is_dead_scratch(left) and all(_is_dead_scratch(inner) is not False for inner in _entries(left)):
             _remove(left)
             said.append(f"{left}: removed, left by a run that was killed")
     return said
+
+
+def _is_dead_scratch(path: Path) -> bool | None:
+    """Return whether the temporary folder ``path`` of ours is a dead process's; None if it is none of ours."""
+    found = _SCRATCH.fullmatch(path.name)
+    mark = parse_mark(found["mark"]) if found else None
+    return None if mark is None or not _is_ours(path) else mark.is_dead
 
 
 def scratch_prefix(what: str = "") -> str:

