@@ -229,3 +229,22 @@ def test_shadow_between_objects_is_split_by_distance():
     found = find_shadows(pixels, [first, second], CAMERA, fixed_threshold=50)
     assert ((found[0] | found[1]) == between).all()
     assert found[0][:, :110].sum() == found[0].sum() == 300
+
+
+def test_the_ground_around_a_contact_leaves_with_the_object_though_its_shadow_was_missed():
+    """The darkest quarter of a soft shadow, at the contact, would stay as a stain while its owner flies."""
+    pixels, masks, truths = draw(((0.0, 1.6, 0.28),), plain, share=0.0)
+    lit = pixels.copy()
+    # What a photo shows whose shadow was lightened by a flash: nothing is left to be found.
+    lit[truths[0] & ~masks[0]] = np.median(pixels[~truths[0] & ~masks[0] & (np.arange(HEIGHT) > 120)[:, None]], axis=0)
+    (cast,) = cast_shadows(lit, masks, CAMERA)
+    assert (cast.shadow & truths[0]).sum() < 0.3 * truths[0].sum()
+    foot = CAMERA.project(np.array([[0.0, 1.6, 0.0]]))[0, :2]
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    below = (
+        (abs(columns - foot[0]) < 8)
+        & (rows > np.flatnonzero(masks[0].any(axis=1))[-1] + 1)
+        & (rows < np.flatnonzero(masks[0].any(axis=1))[-1] + 4)
+    )
+    assert cast.expected[below].mean() > 0.9 and not cast.expected[masks[0]].any()
+    assert cast.expected.sum() < 0.6 * truths[0].sum()
