@@ -1,4 +1,4 @@
-# make demo | test | test-all | test-explore | fuzz | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
+# make demo | test | test-all | test-explore | fuzz | lock | audit | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
 # PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
 # BEST=1 renders the demo as the documentation shows it, WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
@@ -19,7 +19,7 @@ SEED ?= 0
 # Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup demo test test-all test-explore fuzz lint docs benchmark extension test-blender-app clean
+.PHONY: setup demo test test-all test-explore fuzz lint lock audit docs benchmark extension test-blender-app clean
 
 setup:
 	@test -n "$(PYTHON)" || exit 1
@@ -38,6 +38,16 @@ test-all: setup
 # Examples that no run has drawn before, for the tests that draw any. Failing ones are kept in .hypothesis/.
 test-explore: setup
 	HYPOTHESIS_PROFILE=explore $(PYTEST) -m "hypothesis and not slow" $(TESTS)
+
+# What `make setup` installs, anew: the newest versions that pyproject.toml allows, with their hashes; look at the diff.
+lock: setup
+	$(BIN)/python setup/lock.py
+
+# Known holes in what the lock names; needs a network, and an environment of its own so that nothing else changes.
+audit: setup
+	@test -d $(VENV)-audit || "$(PYTHON)" -m venv $(VENV)-audit
+	$(VENV)-audit/bin/pip install --quiet --disable-pip-version-check pip-audit
+	$(VENV)-audit/bin/pip-audit --require-hashes --disable-pip -r $$($(BIN)/python setup/lock.py --name)
 
 # Damaged and hostile files for every loader, N each; only its own errors may escape. SEED=… draws others.
 fuzz: setup

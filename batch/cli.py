@@ -26,6 +26,7 @@ from ..sim.trust import LIST_FILE, config_folder
 from ..sim.version import VERSION
 from . import stages
 from .commands import (
+    check_command,
     compose_commands,
     diagnosis_commands,
     doctor,
@@ -78,6 +79,8 @@ def build_parser() -> argparse.ArgumentParser:
     scene_commands.add_free(
         command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
     )
+    sound = "whether the files of a bake, scene or frames folder are what was written"
+    check_command.add_check(command("check", check_command.run_check, sound))
     previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
     scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
     photo_commands.add_render(

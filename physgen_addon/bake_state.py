@@ -27,7 +27,7 @@ MESSAGES = {
     "paused": "Incomplete. Resume continues it",
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
     "missing": "The bake was moved. Find its folder, or bake again",
-    "damaged": "Files of the bake are gone or damaged. Bake again, or find an undamaged copy",
+    "damaged": "Files of the bake are gone or damaged. Bake again, which computes that part anew, or find a good copy",
 }
 
 
@@ -247,7 +247,7 @@ def _look(scene: bpy.types.Scene) -> BakeState:
         status = "missing" if simulation.bake else "none"
         return BakeState(status, 0, frames, trouble=obstacle or _unreadable(scene), advice=MESSAGES[status])
     done = bake_record.playable(shown.path)
-    damage = bake_record.damage(shown.path, manifest)
+    damage = bake_record.damage(shown.path, manifest, wait=bpy.app.background)
     troubles = show_bake.misfits(scene, shown)
     if damage:
         return BakeState("missing", 0, manifest.frames, trouble=damage, advice=MESSAGES["damaged"])

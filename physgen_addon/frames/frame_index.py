@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...sim.atomic import write_json
+from ...sim.cache.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState
 from ...sim.errors import InputError
 from ...sim.scene.folder import file_hash
 from ...sim.validation import read_json
@@ -92,6 +93,27 @@ class FrameIndex:
         other = next((p for p in present if p.suffix != suffix), None)
         if other is not None:
             raise InputError(f"{folder}: holds frames as {other.name}; choose another folder for {suffix} files")
+
+    @classmethod
+    def of(cls, folder: Path) -> FrameIndex:
+        """Return the index of the frames that ``folder`` holds, whatever their format. Raises InputError."""
+        suffixes = {path.suffix for path in folder.iterdir() if FRAME_NAME.fullmatch(path.name)}
+        return cls(folder, suffix=".exr" if suffixes == {".exr"} else ".png")
+
+    def check(self) -> list[FileState]:
+        """Return the state of each frame that is recorded, or there."""
+        there = {path.name for path in self.folder.iterdir() if FRAME_NAME.fullmatch(path.name)}
+        found = []
+        for name in sorted(there | self._entries.keys()):
+            if name not in there:
+                found.append(FileState(file=name, state=MISSING))
+            elif name not in self._entries:
+                found.append(FileState(file=name, state=UNKNOWN))
+            elif self._intact(name):
+                found.append(FileState(file=name, state=OK))
+            else:
+                found.append(FileState(file=name, state=DAMAGED, text="is not what was rendered"))
+        return found
 
     def path(self, number: int) -> Path:
         """Return the path of frame ``number``."""

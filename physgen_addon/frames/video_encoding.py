@@ -84,6 +84,25 @@ def _staged(frames: Sequence[Path], folder: Path, cancelled: IsCancelled) -> lis
     return staged
 
 
+_TRACK_UID, _TAG_TRACK_UID = b"\x73\xc5\x88", b"\x63\xc5\x88"
+"""Matroska's elements of a track's number and of what refers to it, with their length of 8 bytes (RFC 9559)."""
+_HEADER_BYTES = 4096
+
+
+def _name_tracks_evenly(video: Path) -> None:
+    """Give the one track of a WebM file the number 1: FFmpeg draws one at random, and equal frames would give different
+    files.
+    """
+    content = video.read_bytes()
+    at = content.find(_TRACK_UID, 0, _HEADER_BYTES)
+    if at < 0:
+        return
+    drawn = content[at + 3 : at + 11]
+    for mark in (_TRACK_UID, _TAG_TRACK_UID):
+        content = content.replace(mark + drawn, mark + (1).to_bytes(8, "big"))
+    video.write_bytes(content)
+
+
 def _encode(frames: list[Path], video: Path, fps: float, progress: StageProgress) -> None:
     def written(current: bpy.types.Scene, _: object) -> None:
         progress.report(current.frame_current)
@@ -116,6 +135,10 @@ def _encode(frames: list[Path], video: Path, fps: float, progress: StageProgress
         ffmpeg.format, ffmpeg.codec = VIDEO_CODECS[video.suffix.lower()]
         ffmpeg.constant_rate_factor, ffmpeg.ffmpeg_preset = "HIGH", "GOOD"
         ffmpeg.gopsize, ffmpeg.audio_codec = 12, "NONE"
+        # Date, scene and the like would go into the file, and equal frames would give different videos.
+        for name in dir(render):
+            if name.startswith("use_stamp"):
+                setattr(render, name, False)
         render.filepath = str(video)
         try:
             bpy.app.handlers.render_write.append(written)
@@ -127,5 +150,7 @@ def _encode(frames: list[Path], video: Path, fps: float, progress: StageProgress
             bpy.app.handlers.render_write.remove(written)
         if not video.is_file() or video.stat().st_size == 0:
             raise RenderError(f"{video}: Blender wrote no video; its log has the reason")
+        if video.suffix.lower() == ".webm":
+            _name_tracks_evenly(video)
     finally:
         bpy.data.scenes.remove(scene)

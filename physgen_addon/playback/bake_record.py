@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.atomic import write_json
+from ...sim.cache.bake_check import damage_of
 from ...sim.cache.bake_folder import BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
@@ -193,14 +195,52 @@ def playable(folder: Path) -> int:
         return 0
 
 
-def damage(folder: Path, manifest: BakeManifest) -> str:
-    """Return what is wrong with the caches of a bake (Blender reports that on the console only); empty if nothing."""
+def damage(folder: Path, manifest: BakeManifest, *, wait: bool = True) -> str:
+    """Return what is wrong with the caches of a bake (Blender reports that on the console only); empty if nothing.
+
+    A complete bake is compared with its checksums, once for each state of its files: by a thread that is not waited for
+    unless ``wait``, so that a panel never is; a later call then says what it found.
+    """
     try:
         found = [_sound(folder / name, count).sample_count for name, count in manifest.files.items()]
     except InputError as error:
         return str(error)
     if manifest.state == "complete" and min(found, default=0) < manifest.frames:
         return f"{folder}: {min(found, default=0)} of {manifest.frames} frames are there; bake again"
+    return _unlike(folder, manifest, wait=wait) if manifest.state == "complete" and manifest.checksums else ""
+
+
+_compared: dict[Path, tuple[object, str | None]] = {}
+"""Bake folder → state of its files, and what the comparison with their checksums found; None: it is under way."""
+MOST_COMPARED = 64
+
+
+def _unlike(folder: Path, manifest: BakeManifest, *, wait: bool) -> str:
+    """Return which file of the bake ``folder`` is not what was written; empty if none, or not known yet."""
+
+    def compare() -> None:
+        try:
+            found = damage_of(folder, manifest)
+            words = f"{folder / found[0].file}: {found[0].text(manifest.frame_start)}" if found else ""
+        except InputError as error:
+            words = str(error)
+        _compared[folder] = (state, words)
+
+    try:
+        stats = [(folder / name).stat() for name in manifest.files]
+        state: object = (manifest.checksums, [(s.st_size, s.st_mtime_ns, s.st_ino) for s in stats])
+    except OSError as error:
+        return f"{folder}: {error.strerror or error}"
+    known, words = _compared.get(folder, (None, None))
+    if known == state and (words is not None or not wait):
+        return words or ""
+    if len(_compared) >= MOST_COMPARED:
+        _compared.clear()
+    _compared[folder] = (state, None)
+    if wait:
+        compare()
+        return _compared[folder][1] or ""
+    threading.Thread(target=compare, name="physgen-checksums", daemon=True).start()
     return ""
 
 

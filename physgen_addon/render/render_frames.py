@@ -17,6 +17,7 @@ import numpy as np
 
 from ...sim.app.clip_check import Clip, clip_notices
 from ...sim.atomic import recover, replacing
+from ...sim.cache.bake_check import require_intact
 from ...sim.cache.bake_folder import Bake
 from ...sim.cache.folder_lock import folder_lock
 from ...sim.composite.compositing import FrameLayers
@@ -250,6 +251,8 @@ def render_frames(
         point_caches.require_fit(cache, len(load_object_mesh(scene, source).vertices), source.name)
     remedy = opened.unfinished or f"bake more in {bake.root}, or ask for fewer"
     numbers = parse_frame_range(frames, opened.first_frame, opened.last_frame, there=f"baked; {remedy}")
+    # Motion blur and flow look at the neighbours, and what stands still is looked for from the first frame on.
+    require_intact(bake, range(max(numbers, default=0) - bake.first_frame + 2))
     traces = options.engine == "cycles"
     denoised = traces and options.denoise and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"

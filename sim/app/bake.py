@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_json
+from ..cache.bake_check import damage_of
 from ..cache.bake_folder import (
     CHECKPOINT_FILE,
     MANIFEST_FILE,
     METRICS_FILE,
+    TIMES_FILE,
     Bake,
     BakeManifest,
     load_manifest,
@@ -26,15 +28,18 @@ from ..cache.bake_folder import (
     remove_listed,
     save_manifest,
 )
+from ..cache.checksums import span_for
 from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import Cancelled, InputError, PhysGenError, SimulationError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
+from ..scene.scene_sums import changed_files
 from ..version import VERSION
 from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
 from .bake_estimate import disk_bytes, require_disk_space
+from .bake_mending import BakeSums, Mendable, OtherSamples, find_mendable
 from .bake_options import BakeOptions, inputs_hash
 from .bake_samples import ObjectSampler, baked_objects, load_object_splats
 from .world_setup import prepare_world
@@ -72,6 +77,8 @@ def _complete(scene: Scene, out: Path, options: BakeOptions) -> BakeManifest | N
                 return None
         if not all((out / name).is_file() for name in manifest.splat_frames(manifest.frames)):
             return None
+        if damage_of(out, manifest):
+            return None
     except InputError:
         return None
     return manifest
@@ -87,7 +94,8 @@ def bake(
 ) -> Bake:
     """Simulate ``scene`` and return its bake, the folder ``out``: one point cache per object.
 
-    Does nothing when ``out`` already holds this bake; a run that was stopped resumes from its last checkpoint.
+    Does nothing when ``out`` already holds this bake; a run that was stopped resumes from its last checkpoint, and of a
+    complete bake with damaged files only the frames up to the last damaged one are computed again.
     on_event receives progress and notices (dicts, ``sim/events.py``); cancelled is polled often and must be cheap.
 
     >>> import physgen
@@ -131,7 +139,13 @@ def _named_errors(out: Path) -> Iterator[None]:
 
 
 def _bake_locked(
-    folder: Scene, out: Path, options: BakeOptions, progress: StageProgress, cancelled: IsCancelled
+    folder: Scene,
+    out: Path,
+    options: BakeOptions,
+    progress: StageProgress,
+    cancelled: IsCancelled,
+    *,
+    may_mend: bool = True,
 ) -> BakeManifest:
     # Imported here, because opening Blender or rendering a frame must never pay for Taichi.
     from .simulation import build_world
@@ -140,6 +154,8 @@ def _bake_locked(
         if cancelled():
             raise Cancelled("bake cancelled before its first frame; run it again to start")
 
+    for name in changed_files(folder, [item.mesh for item in folder.model.objects]):
+        progress.notice(f"{folder.root / name}: is not what was written when the scene was made: damaged, or edited")
     progress.report(0, "sampling particles")
     meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
@@ -174,13 +190,30 @@ def _bake_locked(
     first, metrics, refused = resume(out, manifest, simulation.world)
     if refused is not None:
         progress.notice(refused)
+    mended = None if first or not may_mend else find_mendable(out, manifest)
     if first:
         progress.notice(f"continuing at frame {first + 1} of {options.frames}")
+        manifest = dataclasses.replace(manifest, checksums=load_manifest(out).checksums)
+    elif mended is not None:
+        progress.notice(f"{mended.text}: frames 1 to {mended.samples} are computed again, the others stay")
+        manifest = mended.manifest
     else:
         remove_listed(out)
-    run = _Run(out=out, manifest=manifest, simulation=simulation, samplers=samplers, metrics=metrics, frames_done=first)
+    run = _Run(
+        out=out,
+        manifest=manifest,
+        simulation=simulation,
+        samplers=samplers,
+        metrics=metrics,
+        frames_done=first,
+        mended=mended,
+    )
     run.save("running")
-    return run.frames(progress, cancelled)
+    try:
+        return run.frames(progress, cancelled)
+    except OtherSamples as other:
+        progress.notice(f"{other}: baking everything again")
+    return _bake_locked(folder, out, options, progress, cancelled, may_mend=False)
 
 
 @dataclasses.dataclass
@@ -189,6 +222,7 @@ class _Run:
 
     frames_done: samples that every cache holds.
     kept: the latest whole state of the engine and its ``frames_done``, for when it is stopped in the middle of a step.
+    mended: what is to be mended of a bake that was complete; None for a new one.
     """
 
     out: Path
@@ -202,16 +236,22 @@ class _Run:
     checkpoint_at: float = 0.0
     saved_at: float = 0.0
     frame_started: float = 0.0
+    mended: Mendable | None = None
+    sums: BakeSums | None = None
 
     def frames(self, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
         """Bake from sample ``frames_done`` to the end; return the final manifest."""
         try:
             with contextlib.ExitStack() as stack:
                 writers = {name: stack.enter_context(self._writer(name)) for name in self.manifest.files}
+                self.sums = BakeSums(self.out, self.manifest, writers, self.frames_done)
                 self._loop(writers, progress, cancelled)
-            write_json(self.out / METRICS_FILE, {"frames": self.metrics})
+            if self.mended is not None:
+                self.mended.require_same(self.sums)
+            if self.mended is None or self.mended.metrics:
+                self._write_metrics()
             drop_checkpoint(self.out)
-        except (Cancelled, SimulationError):
+        except (Cancelled, SimulationError, OtherSamples):
             raise
         except (OSError, PhysGenError):
             # The disk is full, or was taken away: what still can be kept is.
@@ -221,17 +261,29 @@ class _Run:
         if self.metrics and self.metrics[-1].get("outside"):
             progress.notice("material has left the box around the scene; it flies on, and the camera may not see it")
         progress.report(self.manifest.frames)
+        self.frames_done = self.manifest.frames
         return self.save("complete")
+
+    def _write_metrics(self) -> None:
+        """How long frames took is apart from what they are, so that the same bake has the same bytes."""
+        frames = [{key: value for key, value in frame.items() if key != "seconds"} for frame in self.metrics]
+        write_json(self.out / METRICS_FILE, {"frames": frames})
+        write_json(self.out / TIMES_FILE, {"seconds": [frame.get("seconds") for frame in self.metrics]})
 
     def _writer(self, name: str) -> Pc2Writer:
         count, start = self.manifest.files[name], self.manifest.frame_start
-        return Pc2Writer(self.out / name, vertex_count=count, start_frame=start, keep=self.frames_done)
+        over = 0 if self.mended is None else self.manifest.frames
+        span = span_for(self.manifest.frames)
+        return Pc2Writer(
+            self.out / name, vertex_count=count, start_frame=start, keep=self.frames_done, over=over, span=span
+        )
 
     def _loop(self, writers: Mapping[str, Pc2Writer], progress: StageProgress, cancelled: IsCancelled) -> None:
         self.checkpoint_at = time.monotonic()
         self._keep()
         try:
-            for index in range(first := self.frames_done, self.manifest.frames):
+            until = self.manifest.frames if self.mended is None else self.mended.samples
+            for index in range(first := self.frames_done, until):
                 progress.report(index, "compiling" if index <= max(first, 1) else "")
                 self.frame_started = time.monotonic()
                 self._advance_to(index, cancelled)
@@ -273,6 +325,8 @@ class _Run:
             samples |= found
         for name, sample in samples.items():
             writers[name].append(sample)
+        assert self.sums is not None
+        self.sums.add_splats(index)
         seconds = round(time.monotonic() - self.frame_started, 3)
         self.metrics.append({**self.simulation.metrics(), "frame": index + 1, "seconds": seconds})
         self.frames_done = index + 1
@@ -291,6 +345,9 @@ class _Run:
         if self.kept is not None and self.kept[0] > 0:
             frames_done, state = self.kept
             checkpoint = Checkpoint(frames_done=frames_done, metrics=self.metrics[:frames_done], state=state)
+            # What it stands for is on the disk before it.
+            if self.sums is not None:
+                self.sums.to_disk()
             save_checkpoint(self.out, self.manifest.inputs_hash, checkpoint)
         self.save("running")
 
@@ -308,5 +365,12 @@ class _Run:
         """Write the manifest as of now and return it."""
         self.saved_at = time.monotonic()
         self.manifest = dataclasses.replace(self.manifest, state=state, frames_done=self.frames_done)
+        if self.sums is None:
+            pass
+        elif self.mended is None:
+            checksums = self.sums.checksums(ended=state != "running", metrics=state == "complete")
+            self.manifest = dataclasses.replace(self.manifest, checksums=checksums)
+        elif state == "complete":
+            self.manifest = dataclasses.replace(self.manifest, checksums=self.mended.checksums(self.out))
         save_manifest(self.out, self.manifest)
         return self.manifest

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
-from ..cache.bake_folder import CHECKPOINT_FILE, BakeManifest, load_manifest
+from ..cache.bake_check import require_intact
+from ..cache.bake_folder import CHECKPOINT_FILE, Bake, BakeManifest, load_manifest
 from ..cache.pc2 import Pc2Reader
 from ..errors import InputError
 from ..files import is_file
@@ -83,7 +84,7 @@ def resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[dic
         checkpoint = _load(out / CHECKPOINT_FILE, manifest)
         if checkpoint is None:
             return 0, [], None
-        require_intact(out, before, manifest, checkpoint.frames_done)
+        _require_samples(out, before, manifest, checkpoint.frames_done)
     except (InputError, OSError) as error:
         return 0, [], f"starting again from frame 1: {error}"
     untouched = world.checkpoint()
@@ -96,7 +97,7 @@ def resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[dic
     return checkpoint.frames_done, checkpoint.metrics, None
 
 
-def require_intact(out: Path, before: BakeManifest, manifest: BakeManifest, samples: int) -> None:
+def _require_samples(out: Path, before: BakeManifest, manifest: BakeManifest, samples: int) -> None:
     """Raise InputError unless the first ``samples`` samples in ``out`` are there, and are what was written."""
     for name, count in manifest.files.items():
         cache = Pc2Reader(out / name)
@@ -105,6 +106,7 @@ def require_intact(out: Path, before: BakeManifest, manifest: BakeManifest, samp
     for name in manifest.splat_frames(samples):
         if not is_file(out / name):
             raise InputError(f"{out / name}: is missing")
+    require_intact(Bake(root=out, manifest=before), range(samples))
 
 
 def _load(path: Path, manifest: BakeManifest) -> Checkpoint | None:

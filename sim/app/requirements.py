@@ -21,15 +21,15 @@ MODULE = "sim.app.requirements"
 REQUIREMENTS = {
     "numpy": "numpy>=1.26",
     "taichi": "taichi>=1.7.4,<1.8",
-    "trimesh": "trimesh>=4.4,<6",
+    "trimesh": "trimesh>=5.0,<6",
     "scipy": "scipy>=1.11",
     "skimage": "scikit-image>=0.24",
-    "PIL": "pillow>=10.3",
+    "PIL": "pillow>=12.1.1",
     "patchmatch": "pypatchmatch>=2.0,<3",
     "cv2": "opencv-python-headless>=4.10",
     "OpenImageIO": "openimageio>=3.0",
     "yaml": "pyyaml>=6",
-    "jinja2": "jinja2>=3.1,<4",
+    "jinja2": "jinja2>=3.1.6,<4",
 }
 """Module → requirement for pip; the widest range of pyproject.toml."""
 

@@ -21,6 +21,7 @@ from ..process_identity import is_running
 from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 from ..version import VERSION
+from .checksums import Checksum
 from .folder_lock import folder_lock
 from .pc2 import MAX_VERTICES, Pc2Reader
 
@@ -32,6 +33,8 @@ CHECKPOINT_FILE = "checkpoints/state.npz"
 """The engine's state to resume from, replaced periodically during a bake, removed when it is complete."""
 
 METRICS_FILE = "metrics.json"
+TIMES_FILE = "times.json"
+"""Seconds that each frame took: the one file that is another when the same is baked again."""
 
 WORLD_SPACE, MESH_SPACE = "world", "mesh"
 SPACES = (WORLD_SPACE, MESH_SPACE)
@@ -111,6 +114,7 @@ class BakeManifest:
     particles: simulated particles of all objects together.
     geometry_hash: SHA-256 of the objects' meshes and transforms (``geometry_hash``, ibid.), which identifies bakes of
         other scenes; empty if unknown.
+    checksums: of its files, as far as they are written; none in older bakes.
     """
 
     inputs_hash: str
@@ -125,6 +129,7 @@ class BakeManifest:
     objects: tuple[BakedObject, ...]
     geometry_hash: str = ""
     slow: float = 1.0
+    checksums: tuple[Checksum, ...] = ()
 
     @property
     def rate(self) -> float:
@@ -243,7 +248,7 @@ def save_manifest(folder: Path, manifest: BakeManifest) -> None:
     write_json(folder / MANIFEST_FILE, {"format": MANIFEST_FORMAT, **to_json(manifest)})
 
 
-_PARTIAL = re.compile(r"\.(?:manifest|metrics|state)\.partial-[\d]+(?:-[0-9a-f]+){0,2}\.(?:json|npz)")
+_PARTIAL = re.compile(r"\.(?:manifest|metrics|times|state)\.partial-[\d]+(?:-[0-9a-f]+){0,2}\.(?:json|npz)")
 _LOCK_LEFTOVER = re.compile(r"\.lock-(?:dead-)?(\d+)-[0-9a-f]{8}")
 """Temporary files that earlier versions left behind."""
 _PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
@@ -251,7 +256,8 @@ _PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
 
 def listed_files(manifest: BakeManifest) -> list[str]:
     """Return the names of all files of a bake, whether they exist or not."""
-    return [*manifest.files, *manifest.splat_frames(manifest.frames), CHECKPOINT_FILE, METRICS_FILE, MANIFEST_FILE]
+    single = [CHECKPOINT_FILE, METRICS_FILE, TIMES_FILE, MANIFEST_FILE]
+    return [*manifest.files, *manifest.splat_frames(manifest.frames), *single]
 
 
 def disk_usage(folder: Path) -> int:

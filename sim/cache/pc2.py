@@ -21,12 +21,21 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files import open_file
+from .checksums import Checksum, RunningSums, sync
 
 _HEADER = struct.Struct("<12siiffi")
 _SIGNATURE = b"POINTCACHE2\0"
 MAX_VERTICES = 50_000_000
 """A header that claims more is refused; a sample of that size is 600 MB."""
 MAX_CACHE_BYTES = 2**44
+
+
+HEADER_BYTES = _HEADER.size
+
+
+def header(vertex_count: int, start_frame: int, samples: int) -> bytes:
+    """Return the header of a cache."""
+    return _HEADER.pack(_SIGNATURE, 1, vertex_count, float(start_frame), 1.0, samples)
 
 
 class Pc2Reader:
@@ -42,14 +51,14 @@ class Pc2Reader:
         try:
             with open_file(path, MAX_CACHE_BYTES, what="point cache") as file:
                 size = os.fstat(file.fileno()).st_size
-                header = file.read(_HEADER.size)
+                head = file.read(_HEADER.size)
         except FileNotFoundError:
             raise InputError(f"{path}: there is no such point cache; bake the scene again") from None
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
-        if len(header) < _HEADER.size or header[:12] != _SIGNATURE:
+        if len(head) < _HEADER.size or head[:12] != _SIGNATURE:
             raise InputError(f"{path}: not a PC2 point cache; bake the scene again")
-        _, version, vertices, start, rate, samples = _HEADER.unpack(header)
+        _, version, vertices, start, rate, samples = _HEADER.unpack(head)
         if version != 1 or not 0 < vertices <= MAX_VERTICES or samples < 0 or not 0 < rate < math.inf:
             raise InputError(
                 f"{path}: PC2 header of version {version}, {vertices} vertices, {samples} samples is invalid; rebake"
@@ -86,10 +95,13 @@ class Pc2Reader:
 class Pc2Writer:
     """Appends samples; the header is updated after each, so that a killed run leaves a readable file.
 
-    Opened on an existing cache, it keeps the first ``keep`` samples and drops the rest.
+    Opened on an existing cache, it keeps the first ``keep`` samples and drops the rest; with ``over`` it writes over
+    the existing samples and keeps those behind. span: samples that one checksum covers (``checksum``).
     """
 
-    def __init__(self, path: Path, *, vertex_count: int, start_frame: int = 1, keep: int = 0) -> None:
+    def __init__(
+        self, path: Path, *, vertex_count: int, start_frame: int = 1, keep: int = 0, over: int = 0, span: int = 1
+    ) -> None:
         if not 0 < vertex_count <= MAX_VERTICES:
             raise InputError(f"{path}: a cache of {vertex_count} vertices cannot be written")
         self.path = path
@@ -100,10 +112,19 @@ class Pc2Writer:
             existing = Pc2Reader(path)
             if existing.vertex_count != vertex_count or existing.sample_count < keep:
                 raise InputError(f"{path}: does not have the {keep} samples of {vertex_count} vertices to resume from")
-        self._file = path.open("r+b" if keep else "w+b")
-        # The header first: readers, and a resume after a kill between the two, always find the samples it promises.
-        self._write_header()
-        self._file.truncate(_HEADER.size + keep * vertex_count * 12)
+        self._sums = RunningSums(span)
+        self._over = over
+        self._file = path.open("r+b" if keep or (over and path.exists()) else "w+b")
+        try:
+            # The header first: readers, and a resume after a kill between the two, always find the samples it promises.
+            self._write_header()
+            self._file.truncate(_HEADER.size + max(keep, over) * vertex_count * 12)
+            self._file.seek(_HEADER.size)
+            for _ in range(keep):
+                self._sums.add(self._file.read(vertex_count * 12))
+        except BaseException:
+            self._file.close()
+            raise
 
     def append(self, positions: NDArray[np.floating]) -> None:
         """Append one sample of finite positions (V, 3)."""
@@ -112,15 +133,25 @@ class Pc2Writer:
             raise InputError(f"{self.path}: a sample of shape {sample.shape} does not fit {self.vertex_count} vertices")
         if not np.isfinite(sample).all():
             raise InputError(f"{self.path}: sample {self.sample_count} has positions that are not finite")
-        self._file.seek(0, os.SEEK_END)
-        self._file.write(sample.tobytes())
+        content = sample.tobytes()
+        self._file.seek(_HEADER.size + self.sample_count * len(content))
+        self._file.write(content)
+        self._sums.add(content)
         self.sample_count += 1
         self._write_header()
 
     def _write_header(self) -> None:
         self._file.seek(0)
-        self._file.write(_HEADER.pack(_SIGNATURE, 1, self.vertex_count, self._start_frame, 1.0, self.sample_count))
+        self._file.write(header(self.vertex_count, int(self._start_frame), max(self.sample_count, self._over)))
         self._file.flush()
+
+    def checksum(self, file: str, *, ended: bool) -> Checksum:
+        """Return the checksum, for the manifest, of the samples so far; of whole ranges alone unless ``ended``."""
+        return self._sums.checksum(file, ended=ended)
+
+    def to_disk(self) -> None:
+        """Wait until the samples so far are on the disk."""
+        sync(self._file)
 
     def close(self) -> None:
         """Flush to disk and close."""

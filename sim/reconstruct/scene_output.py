@@ -11,6 +11,7 @@ from ..atomic import recover, replacing_tree
 from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..scene.folder import SCENE_FILE
+from ..scene.scene_sums import SUMS_FILE, write_scene_sums
 from ..validation import read_json
 
 PHYSICS_FILE = "physics.json"
@@ -30,6 +31,7 @@ OWN_ENTRIES = frozenset(
         "albedo",
         "splats",
         "compose.json",
+        SUMS_FILE,
         "light",
         "stages",
         "report.html",
@@ -74,6 +76,7 @@ def replacing_folder(out: Path) -> Iterator[Path]:
                 raise InputError(f"{out}: is a file; choose a folder")
             with replacing_tree(out) as partial:
                 yield partial
+                write_scene_sums(partial)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"

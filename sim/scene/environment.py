@@ -191,6 +191,8 @@ def write_environment(path: Path, radiance: Radiance) -> None:
     height, width, channels = radiance.shape
     spec = oiio.ImageSpec(width, height, channels, "float")
     spec.attribute("compression", "zip")
+    # Otherwise the current time is written, and equal maps would give different files.
+    spec.attribute("DateTime", "")
     output = oiio.ImageOutput.create(str(path))
     written = (
         output is not None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import zipfile
@@ -111,8 +112,12 @@ def _files_beside(folder: Path) -> Any:
             self.folder = folder
 
         def get(self, name: str) -> bytes:
-            path = inside(folder, unquote(str(name)).replace("\\", "/").removeprefix("./").strip())
-            return read_bytes(path, MAX_MESH_BYTES, what="part of a mesh", folder=folder)
+            wanted = unquote(str(name)).replace("\\", "/").removeprefix("./").strip()
+            # As programs on other machines wrote it, with folders that are not here: the file of that name beside.
+            for candidate in (wanted, wanted.rpartition("/")[2]):
+                with contextlib.suppress(InputError, FileNotFoundError):
+                    return read_bytes(inside(folder, candidate), MAX_MESH_BYTES, what="part of a mesh", folder=folder)
+            raise FileNotFoundError(wanted)
 
         def keys(self) -> tuple[str, ...]:
             return ()

@@ -103,6 +103,23 @@ def test_the_same_again_does_nothing(job, photo):
     assert sum("up to date" in e.get("message", "") for e in events) >= 4
 
 
+def contents(work):
+    """Every file's bytes, but for how long the frames of the bake took, logs and locks."""
+    files = [p for p in work.rglob("*") if p.is_file() and p.name not in ("times.json", ".lock")]
+    return {str(p.relative_to(work)): p.read_bytes() for p in files if p.suffix != ".log"}
+
+
+def test_the_same_command_from_nothing_gives_the_same_bytes(job, photo, tmp_path):
+    work, _ = job
+    before = contents(work)
+    shutil.move(work, tmp_path / "before")
+    run(photo, work)
+    after = contents(work)
+    assert {"ball.mp4", "scene/scene.json", "scene/light/environment.exr", "bake/manifest.json"} <= before.keys()
+    assert after.keys() == before.keys()
+    assert [name for name in sorted(before) if after[name] != before[name]] == []
+
+
 @pytest.mark.long
 def test_another_material_bakes_again_without_reconstructing(job, photo):
     work, _ = job

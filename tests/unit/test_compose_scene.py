@@ -83,7 +83,8 @@ def test_penetration_is_resolved_and_other_objects_are_unchanged(scene, tmp_path
     # The frontmost stays, byte for byte, and so does everything that is no matter of places.
     assert (out / "meshes/left.glb").read_bytes() == (scene.root / "meshes/left.glb").read_bytes()
     assert sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()) == [
-        *("albedo/right.png", "compose.json", "meshes/left.glb", "meshes/right.glb", "scene.json", "splats/right.ply")
+        *("albedo/right.png", "checksums.json", "compose.json", "meshes/left.glb", "meshes/right.glb", "scene.json"),
+        "splats/right.ply",
     ]
     before, after = (read_textured_mesh(root / "meshes/right.glb") for root in (scene.root, out))
     assert np.array_equal(before.faces, after.faces) and np.array_equal(before.uv, after.uv)

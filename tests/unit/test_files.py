@@ -251,8 +251,7 @@ def test_a_mesh_opens_no_file_outside_its_folder(tmp_path, monkeypatch, inside):
 
     folder = tmp_path / "meshes"
     folder.mkdir()
-    for place in (tmp_path, folder):
-        Image.fromarray(np.full((4, 4, 3), 200, np.uint8)).save(place / "p.png")
+    Image.fromarray(np.full((4, 4, 3), 200, np.uint8)).save((folder if inside else tmp_path) / "p.png")
     an_obj(folder, "a.mtl", "p.png" if inside else "../p.png")
     (tmp_path / "b.mtl").write_text("newmtl m\nmap_Kd p.png\n")
     opened = []

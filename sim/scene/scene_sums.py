@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Checksums of a scene folder's files: ``checksums.json``, written when the folder is made.
+
+``scene.json`` is for people to edit and has none; what is added later has none either. A file that differs is damaged,
+or was edited on purpose: the two look the same, so it is said and nothing is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from ..atomic import write_json
+from ..cache.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState, file_sum
+from ..errors import InputError
+from ..files import is_file
+from ..validation import read_json
+from .folder import SCENE_FILE, Scene, inside
+
+SUMS_FILE = "checksums.json"
+SUMS_FORMAT = "physgen-checksums/1"
+MOST_FILES = 100_000
+_WITHOUT = (SCENE_FILE, SUMS_FILE)
+_CACHED = "stages"
+
+
+def write_scene_sums(folder: Path) -> None:
+    """Write the checksums of all files in the scene ``folder``, but for cached stages, which have their own."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    names = [path.relative_to(folder).as_posix() for path in files]
+    kept = [name for name in names if name not in _WITHOUT and not name.startswith((".", f"{_CACHED}/"))]
+    sums = {name: file_sum(folder / name) for name in kept}
+    write_json(folder / SUMS_FILE, {"format": SUMS_FORMAT, "files": sums})
+
+
+def scene_sums(root: Path) -> dict[str, str]:
+    """Return the checksums of the scene folder ``root`` by file; none where it has none, or they are unreadable."""
+    try:
+        data = read_json(root / SUMS_FILE, folder=root)
+    except InputError:
+        return {}
+    files = data.get("files") if isinstance(data, dict) and data.get("format") == SUMS_FORMAT else None
+    if not isinstance(files, dict) or len(files) > MOST_FILES:
+        return {}
+    return {str(name): str(found) for name, found in files.items()}
+
+
+def check_scene(scene: Scene, names: Iterable[str] | None = None) -> list[FileState]:
+    """Return the state of the files ``names`` of ``scene``; None: of all that it has a checksum for, or needs."""
+    known = scene_sums(scene.root)
+    wanted = list(dict.fromkeys([*known, *scene.files()])) if names is None else list(names)
+    return [_state(scene.root, name, known.get(name)) for name in wanted]
+
+
+def changed_files(scene: Scene, names: Iterable[str]) -> list[str]:
+    """Return those of ``names`` that are not what was written when the scene was made."""
+    return [state.file for state in check_scene(scene, names) if state.state == DAMAGED]
+
+
+def _state(root: Path, name: str, known: str | None) -> FileState:
+    try:
+        path = inside(root, name)
+        if not is_file(path):
+            return FileState(file=name, state=MISSING)
+        if known is None:
+            return FileState(file=name, state=UNKNOWN)
+        same = file_sum(path) == known
+    except (InputError, OSError) as error:
+        return FileState(file=name[:200], state=DAMAGED, text=str(error)[:200])
+    return (
+        FileState(file=name, state=OK)
+        if same
+        else FileState(
+            file=name, state=DAMAGED, text="is not what was written when the scene was made: damaged, or edited"
+        )
+    )
