@@ -19,7 +19,7 @@ from ..sim.app.bake_options import BakeOptions
 from ..sim.cache.folder_lock import LOCK_FILE, release_all, remove_dead_lock
 from ..sim.children import kill_children
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
-from ..sim.errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
+from ..sim.errors import ANYWAY, OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.files import shown
 from ..sim.trust import LIST_FILE, config_folder
@@ -167,6 +167,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
     run: Command = options.run
+    if getattr(options, "anyway", False):
+        # For the processes that this one starts, too.
+        os.environ[ANYWAY] = "1"
     with stop_signals(lambda: end_at_last(terminal)) as stopped:
         try:
             with atomic.own_scratch():

@@ -9,6 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+ANYWAY = "PHYSGEN_ANYWAY"
+"""Environment variable, set by ``--anyway`` for a command and the processes that it starts: estimates of memory refuse
+nothing."""
+
 OUT_OF_MEMORY = (
     "memory ran out; nothing that was finished is lost: close other programs, choose a coarser quality or a smaller "
     "picture, and run it again"

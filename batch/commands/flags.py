@@ -105,6 +105,11 @@ OBJECT_FLAGS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
 """Flag → field of ObjectRequest, parser, metavar, help. Given as OBJECT=VALUE."""
 
 
+def add_anyway_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that lets a bake begin for which memory is estimated to be too little (``cli.main`` acts on it)."""
+    parser.add_argument("--anyway", action="store_true", help="bake although memory is estimated to be too little")
+
+
 def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> None:
     """Add properties of single objects. boxes: also boxes, and lists in their order."""
     parser.set_defaults(wrong_usage=parser.error)

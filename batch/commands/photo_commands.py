@@ -29,6 +29,7 @@ from ...sim.validation import to_json
 from .. import stages
 from ..terminal import Terminal
 from .flags import (
+    add_anyway_flag,
     add_bake_flags,
     add_environment_flags,
     add_object_flags,
@@ -52,6 +53,7 @@ from .render_commands import add_render_flags, render_options
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen run``."""
     parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_anyway_flag(parser)
     add_object_flags(parser)
     add_reconstruction_flags(parser)
     add_reasoning_flags(parser)

@@ -12,7 +12,7 @@ from ...sim.events import IsCancelled
 from ...sim.scene.folder import Scene, load_scene
 from .. import stages
 from ..terminal import Terminal
-from .flags import add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options
+from .flags import add_anyway_flag, add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options
 
 
 def add_bake(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +20,7 @@ def add_bake(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     parser.add_argument("--out", type=Path, metavar="BAKE", help="bake folder to write; an unfinished one is resumed")
     parser.add_argument("--estimate", action="store_true", help="only estimate the cost, as physgen estimate does")
+    add_anyway_flag(parser)
     parser.set_defaults(wrong_usage=parser.error)
     add_physics_flags(parser)
     add_bake_flags(parser)

@@ -31,7 +31,7 @@ from ..cache.bake_folder import (
 from ..cache.checksums import span_for
 from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader, Pc2Writer
-from ..errors import Cancelled, InputError, PhysGenError, SimulationError
+from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError, SimulationError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
@@ -132,6 +132,8 @@ def _named_errors(out: Path) -> Iterator[None]:
     """Turn an OSError into an InputError with a remedy."""
     try:
         yield
+    except MemoryError:
+        raise InputError(f"{out}: {OUT_OF_MEMORY}") from None
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror or error}); free space and run again to continue"
@@ -253,9 +255,9 @@ class _Run:
             drop_checkpoint(self.out)
         except (Cancelled, SimulationError, OtherSamples):
             raise
-        except (OSError, PhysGenError):
-            # The disk is full, or was taken away: what still can be kept is.
-            with contextlib.suppress(OSError, PhysGenError):
+        except (OSError, PhysGenError, MemoryError):
+            # The disk or the memory is full, or was taken away: what still can be kept is.
+            with contextlib.suppress(OSError, PhysGenError, MemoryError):
                 self._stop(keep_state=True)
             raise
         if self.metrics and self.metrics[-1].get("outside"):

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 
 from ..atomic import remove_unfinished
 from ..cache.folder_lock import release_all
-from ..errors import Cancelled, InputError, PhysGenError
+from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json
@@ -155,7 +155,17 @@ def main(arguments: list[str]) -> int:
     except PhysGenError as error:
         emit(_error(error))
         return error.exit_code
+    except (MemoryError, RuntimeError) as error:
+        # Taichi's allocations and NumPy's fail by different names.
+        if isinstance(error, RuntimeError) and not _ran_out(str(error)):
+            raise
+        emit(_error(InputError(f"bake: {OUT_OF_MEMORY}")))
+        return InputError.exit_code
     return 0
+
+
+def _ran_out(text: str) -> bool:
+    return any(words in text.lower() for words in ("out of memory", "bad_alloc", "cannot allocate", "mmap"))
 
 
 if __name__ == "__main__":

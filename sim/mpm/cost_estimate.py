@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..constitutive import DeformableMaterial
-from ..errors import InputError
+from ..errors import ANYWAY, InputError
 from .bodies import BodyParticles
 from .solver_options import SolverOptions
 
@@ -125,20 +125,23 @@ def refuse_excess(cost: Estimate, particles: int, available: int | None) -> None
 
 
 def require_memory(needed: int, particles: int, available: int | None) -> None:
-    """Raise InputError when ``needed`` bytes are more than ``available``; None: not known, so never."""
-    if available is not None and needed > available:
+    """Raise InputError when ``needed`` bytes are more than ``available``; None: not known, so never.
+
+    Nor where the user said ``--anyway`` (``ANYWAY``).
+    """
+    if available is not None and needed > available and not os.environ.get(ANYWAY):
         raise InputError(
             f"this would take about {needed / 2**30:.3g} GiB of memory for {particles} particles, and "
             f"{available / 2**30:.3g} GiB are available: choose a coarser quality, make more objects colliders, or "
-            "close other programs"
+            "close other programs; --anyway tries it"
         )
 
 
 def available_memory() -> int | None:
     """Bytes of main memory that a new process may take without swapping; None where that cannot be found out.
 
-    Linux: MemAvailable, and what the control group leaves. Windows: available physical memory. Elsewhere (macOS): half
-    of all physical memory, since free memory means little there.
+    Linux: MemAvailable, and what the control group and the limit on this process's address space leave. Windows:
+    available physical memory. Elsewhere (macOS): half of all physical memory, since free memory means little there.
     """
     try:
         if sys.platform == "win32":
@@ -160,7 +163,21 @@ def _linux_memory(meminfo: Path, group: Path) -> int | None:
             found.append(max(0, int(limit) - int((group / "memory.current").read_text())))
     except (OSError, ValueError):
         pass
+    left = _address_space_left()
+    if left is not None:
+        found.append(left)
     return min(found) if found else None
+
+
+def _address_space_left() -> int | None:
+    """Bytes that ``ulimit -v`` leaves this process, and those that it starts; None without a limit."""
+    import resource
+
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most == resource.RLIM_INFINITY:
+        return None
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    return max(0, most - used)
 
 
 def _windows_memory() -> int | None:
