@@ -7,7 +7,8 @@
 DIR holds pictures as ``reconstruct --pictures`` keeps them: the program gets their boxes, and its masks are compared
 with what is seen of each object (intersection over union). ``--photo`` adds a photo with boxes x0,y0,x1,y1, without
 truth, for the sheet: each object as photographed, and cut out by each segmenter. Without ``--segmenter``: ``none`` and
-the installed model. ``--quick`` draws its own picture.
+the installed model. ``--quick`` draws its own picture. ``--proposals`` looks instead for the objects without
+a box: recall is the share of them of which a proposal, or one that would be used, has half of the box' union in common.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from physgen.benchmarks.common import benchmark_parser
 from physgen.benchmarks.reconstruct_pictures.scoring import iou
+from physgen.sim.app.propose import SEARCHED, best_proposals
 from physgen.sim.events import ignore, never
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.adapters.adapter_registry import WITHOUT, chosen_segmenter
 from physgen.sim.reconstruct.photo import load_photo
 from physgen.sim.reconstruct.segmentation.object_masks import segment_objects
+from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
 from physgen.sim.reconstruct.stage_cache import StageCache, Steps
 from PIL import Image
 
@@ -108,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=960, metavar="PX", help=text)
     parser.add_argument("--report", type=Path, metavar="FILE", help="write the rows as JSON")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="write a contact sheet")
+    parser.add_argument("--proposals", action="store_true", help="recall of objects without a box, weight-free")
     options = parser.parse_args(arguments)
     installed = chosen_segmenter(None)
     compared = options.segmenter or [WITHOUT, *([installed] if installed else [])]
@@ -116,6 +120,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.quick:
             cases += rendered_cases(drawn(Path(folder)))
         cases += rendered_cases(options.pictures) if options.pictures else []
+        if options.proposals:
+            print(json.dumps({"rows": (found := [recall(case) for case in cases]), **totals(found)}))
+            return 0
         rows, columns = compare(cases, compared, options.size)
     means = {
         name: float(np.mean([row[name] for row in rows if name in row]))
@@ -159,6 +166,38 @@ def compare(
                     row[segmenter] = round(iou(masks[item], np.asarray(seen) > 127), 3)
             rows.append(row)
     return rows, columns
+
+
+def recall(case: Case) -> Row:
+    """Return how many objects of ``case``, which has true masks, are among the proposals, and among those used."""
+    name, photo, _, truth = case
+    assert truth is not None
+    found = propose_boxes(load_photo(photo, SEARCHED).pixels)
+    scale = max(load_photo(photo, SEARCHED).pixels.shape[:2]) / max(Image.open(photo).size)
+    used = [found[index] for index in best_proposals(found)]
+    row: Row = {"case": name, "objects": 0, "found": 0, "used": 0, "proposals": len(found)}
+    for file in sorted(truth.glob("*.png")):
+        seen = np.argwhere(np.asarray(Image.open(file).convert("L")) > 127) * scale
+        if not len(seen):
+            continue
+        box = (*seen.min(axis=0)[::-1], *(seen.max(axis=0)[::-1] + scale))
+        row["objects"] += 1
+        for key, items in (("found", found), ("used", used)):
+            row[key] += int(any(box_iou(item.box, box) > 0.5 for item in items))
+    return row
+
+
+def box_iou(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return the share of two boxes' union, x0, y0, x1, y1 each, that both have in common."""
+    width, height = (min(first[i + 2], second[i + 2]) - max(first[i], second[i]) for i in (0, 1))
+    common = max(0.0, width) * max(0.0, height)
+    return float(common / (sum((b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)) - common))
+
+
+def totals(rows: Sequence[Row]) -> dict[str, float]:
+    """Return the recall of proposals, and of those that would be used."""
+    objects = max(1, sum(row["objects"] for row in rows))
+    return {f"recall_{key}": round(sum(row[key] for row in rows) / objects, 3) for key in ("found", "used")}
 
 
 def drawn(root: Path) -> Path:

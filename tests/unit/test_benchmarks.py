@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from physgen.benchmarks import cutouts
 from physgen.benchmarks.__main__ import benchmarks, main
 
 FAST = (
@@ -61,3 +62,11 @@ def test_defaults_of_quick_yield_to_given_options():
     slow, quick = parser.parse_args(["--size", "5"]), parser.parse_args(["--size", "5", "--quick"])
     assert (slow.frames, slow.size, slow.quick) == (48, 5, False)
     assert (quick.frames, quick.size, quick.quick) == (2, 5, True)
+
+
+def test_the_recall_of_a_drawn_ring_without_a_box_is_one(tmp_path):
+    cases = cutouts.rendered_cases(cutouts.drawn(tmp_path))
+    rows = [cutouts.recall(case) for case in cases]
+    assert cutouts.totals(rows) == {"recall_found": 1.0, "recall_used": 1.0}
+    assert cutouts.box_iou((0, 0, 10, 10), (5, 0, 15, 10)) == pytest.approx(1 / 3)
+    assert cutouts.totals([{"objects": 2, "found": 1, "used": 0}]) == {"recall_found": 0.5, "recall_used": 0.0}
