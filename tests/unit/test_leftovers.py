@@ -32,6 +32,12 @@ def test_killed_before_some_calls_a_correction_loses_nothing(tmp_path, scenario,
 
 
 @pytest.mark.long
+def test_a_reconstruction_killed_before_some_calls_loses_nothing(tmp_path):
+    found = kill_points("reconstruct", tmp_path, "3:1000:29")
+    assert found["wrong"] == [] and found["points"] >= 3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["correct", "journal", "reconstruct", "light", "variant"])
 def test_killed_before_any_call_nothing_is_lost(tmp_path, scenario):
     found = kill_points(scenario, tmp_path, "1:100000:1")
