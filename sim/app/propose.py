@@ -11,8 +11,7 @@ from pathlib import Path
 from ..atomic import write_bytes, write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
-from ..reconstruct.adapters.adapter_registry import WITHOUT
-from ..reconstruct.reconstruct_options import Proposal
+from ..reconstruct.reconstruct_options import WITHOUT, Proposal
 from ..scene.folder import file_hash
 from ..trust import trusted_spec
 from ..validation import parse, read_json, to_json

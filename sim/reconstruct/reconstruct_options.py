@@ -17,6 +17,8 @@ from ..validation import quantity, require, require_quantities
 SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
 BACKS = ("auto", "symmetric", "flat")
 UP_AXES = ("auto", "+x", "-x", "+y", "-y", "+z", "-z")
+WITHOUT = "none"
+"""A segmenter's name that stands for the weight-free way, also where a model is installed."""
 Pixel = tuple[float, float]
 Stroke = tuple[Pixel, ...]
 MAX_STROKE_PLACES = 20_000

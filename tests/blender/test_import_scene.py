@@ -406,7 +406,7 @@ def test_boxes_become_the_commands_arguments(world, tmp_path):
     found = arguments(state)
     assert found == [
         *(str(photo), "--box", f"80,20,{state.width},{state.height}", "0,20,70,80"),
-        *("--name", "cup_1", "cup_1_2", "--size", "0.2", "--pitch=40"),
+        *("--name", "cup_1", "cup_1_2", "--size", "0.2", "--pitch=40", "--default-motion"),
     ]
     assert scene_folder(state) == tmp_path / "coffee cup_scene"
     box.x1 = 3

@@ -202,7 +202,7 @@ def _proposals(folder: Path) -> None:
     _json(folder / propose.LIST_FILE, {**propose.to_json(record), "proposals": listed})
 
 
-_add("proposals", propose.LIST_FILE, _proposals, lambda f: propose._earlier(f, "0"))
+_add("proposals", propose.LIST_FILE, _proposals, lambda f: propose._earlier(f, "0", "none"))
 
 
 # Meshes and splats

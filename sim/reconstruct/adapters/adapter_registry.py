@@ -30,6 +30,7 @@ from ...scene.meshes import MESH_SUFFIXES
 from ...trust import Spec, trusted_spec
 from ..models.known_models import PackagedModel
 from ..models.model_folder import list_models
+from ..reconstruct_options import WITHOUT
 from .protocols import MEANINGS, STAGES
 from .python_adapter import function_problem
 
@@ -311,10 +312,6 @@ def spec_files(stage: str, spec: str, names: Path | None = None) -> list[Path]:
         if kind in PATHS or path.endswith(".py"):
             found.append(Path(path).expanduser().absolute())
     return [path for path in found if path.is_file()]
-
-
-WITHOUT = "none"
-"""A segmenter's name that stands for the weight-free way, also where a model is installed."""
 
 
 def chosen_segmenter(asked: Spec | None) -> str | None:

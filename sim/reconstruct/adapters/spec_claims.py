@@ -10,7 +10,8 @@ from pathlib import Path
 from ...errors import InputError
 from ...trust import READS, RUNS, Claim, code_hash
 from ..models import known_models
-from .adapter_registry import PROGRAMS, WITHOUT, read_command_file, split_spec
+from ..reconstruct_options import WITHOUT
+from .adapter_registry import PROGRAMS, read_command_file, split_spec
 
 
 def spec_claim(stage: str, spec: str, where: str) -> Claim | None:
