@@ -66,6 +66,7 @@ def withheld(fits, fit, truth):
     return float(np.sqrt(np.mean([np.mean(np.sum((found[n] - way) ** 2, axis=-1)) for n, way in truth.items()])))
 
 
+@pytest.mark.long
 def test_a_spin_that_no_marker_shows_is_found_beside_drag():
     capture, truth = rallies(2)
     fits = fit_rigid(capture, ["air_drag", "magnus", "gravity_tilt"])

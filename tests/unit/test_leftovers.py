@@ -25,6 +25,7 @@ def kill_points(scenario, folder, points):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scenario", "least"), [("correct", 60), ("journal", 60)])
 def test_killed_before_some_calls_a_correction_loses_nothing(tmp_path, scenario, least):
     found = kill_points(scenario, tmp_path, "5:1000:33" if scenario == "correct" else "88:1000:7")
