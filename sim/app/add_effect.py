@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +33,11 @@ def found_effects(report: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     first = verdict.get("effect")
     if first in ("none", "unknown", None):
         raise InputError(f"the verdict is {first!r}: there is no effect to add to a scene")
-    names = verdict.get("effects") or [first]
-    listed = report.get("effects")
-    ranked = {item.get("name"): item for item in listed or [] if isinstance(item, dict)}
+    names, listed = verdict.get("effects") or [first], report.get("effects")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"report.json: verdict.effects is {str(names)[:80]}: expected names; diagnose again")
+    items = [item for item in listed if isinstance(item, dict)] if isinstance(listed, list) else []
+    ranked = {str(item.get("name")): item for item in items}
     found = {}
     for name in names:
         parameters = ranked.get(name, {}).get("parameters")
@@ -47,7 +49,8 @@ def found_effects(report: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 def _number(name: str, key: str, entry: Any) -> float:
     value = entry.get("value") if isinstance(entry, dict) else entry
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+    # math.isfinite fails on a whole number that no float can hold.
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= sys.float_info.max:
         raise InputError(f"report.json: effects: {name}.{key} is {value!r}: expected a number; diagnose again")
     return float(value)
 

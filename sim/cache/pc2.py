@@ -150,8 +150,12 @@ class Pc2Writer:
         return self._sums.checksum(file, ended=ended)
 
     def to_disk(self) -> None:
-        """Wait until the samples so far are on the disk."""
-        sync(self._file)
+        """Wait until the samples so far are on the disk, also after an error has closed the file."""
+        if not self._file.closed:
+            sync(self._file)
+            return
+        with self.path.open("r+b") as file:
+            os.fsync(file.fileno())
 
     def close(self) -> None:
         """Flush to disk and close."""

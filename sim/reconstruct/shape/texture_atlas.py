@@ -33,7 +33,7 @@ SQUARE = np.cos(np.radians(70.0))
 """Cosine of the angle to the camera above which a face shows the photo itself: a pixel covers up to 2.9 of its size."""
 GRAIN = (np.cos(np.radians(74.0)), np.cos(np.radians(68.0)))
 """Cosines between which grain is added to the photo's pixels: all up to the first, none from the second."""
-PURE = (1.0, 2.0)
+PURE = (-1.0, 2.0)
 """Pixels from the outline between which a pixel on a grazing side becomes free of the background."""
 OWN = (np.cos(np.radians(84.0)), np.cos(np.radians(80.0)))
 """Cosines between which a point's own pixel replaces the one inside the outline: beyond, it is mixed with the
