@@ -190,9 +190,12 @@ def _entries() -> list[dict[str, str]]:
     try:
         with (config_folder() / LIST_FILE).open("rb") as file:
             about = os.fstat(file.fileno())
-            others = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) or about.st_uid != os.getuid()
-            if os.name != "nt" and (others or not stat.S_ISREG(about.st_mode)):
-                # Others may write it: then it is not the user's word.
+            # Where others may write it, it is not the user's word; Windows keeps the folder to its user.
+            if os.name != "nt" and not (
+                stat.S_ISREG(about.st_mode)
+                and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+                and about.st_uid == os.getuid()
+            ):
                 return []
             content = file.read(MOST_LIST_BYTES + 1)
         if len(content) > MOST_LIST_BYTES:
