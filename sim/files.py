@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The gate through which files are read: regular files only, of bounded size, inside their folder.
 
-A name may lead to a pipe that nobody writes into, to a device without end, or to a terabyte. So a file is opened
+A name may lead to a pipe without a writer, to an endless device, or to a terabyte. So a file is opened
 without waiting, looked at through the open descriptor, and never read further than its kind may be long.
 """
 

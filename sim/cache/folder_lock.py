@@ -172,7 +172,7 @@ def _write_owner(file: int) -> None:
 
 
 def _release(path: Path, file: int) -> None:
-    """Remove the lock file while it is held, so that nobody else's is removed, then let it go."""
+    """Remove the lock file while holding it, so that it cannot be another process's, then release it."""
     with contextlib.suppress(OSError):
         if os.name != "nt" and _is_at(file, path):
             path.unlink()

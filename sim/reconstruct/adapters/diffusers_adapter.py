@@ -14,11 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ...errors import InputError
 from ...gaussians.guidance.pretrained_models import import_library, library_errors, package_version, read_json
-from .lama_adapter import blended, square_around
+from .lama_adapter import LEAST_SIDE, blended, filled_hole_by_hole, without_content
 from .protocols import Mask, Pixels, checked_pixels
 
 INSTALL = "pip install 'physgen[models]'"
@@ -45,25 +44,13 @@ class DiffusersInpainter:
 
     def __call__(self, pixels: Pixels, hole: Mask) -> Pixels:
         """As the protocol says. Raises InputError."""
-        result, left = pixels.copy(), hole.copy()
-        count, labels = cv2.connectedComponents(cv2.dilate(hole.astype(np.uint8), np.ones((5, 5), np.uint8)))
-        for label in range(1, count):
-            part = hole & (labels == label)
-            if not part.any():
-                continue
-            window = square_around(part, min(256, self.side))
-            filled = self._fill(result[window], left[window])
-            result[window][part[window]] = filled[part[window]]
-            left &= ~part
-        return checked_pixels(result, pixels, hole, self.where)
+        filled = filled_hole_by_hole(pixels, hole, min(LEAST_SIDE, self.side), self._fill)
+        return checked_pixels(filled, pixels, hole, self.where)
 
     def _fill(self, pixels: Pixels, hole: Mask) -> Pixels:
         """``pixels`` (h, w, 3) with ``hole`` inpainted at the pipeline's own size."""
         height, width = hole.shape
-        if not hole.all():
-            # Otherwise resizing would smear the hole's content over its border.
-            near = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
-            pixels = pixels[near[0], near[1]]
+        pixels = without_content(pixels, hole)
         size = (self.side, self.side)
         way = cv2.INTER_AREA if self.side < height else cv2.INTER_CUBIC
         picture = np.asarray(cv2.resize(pixels, size, interpolation=way), dtype=np.float32) / np.float32(255)

@@ -9,6 +9,7 @@ file or from its output.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,30 @@ _TYPES: dict[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tenso
 Array = NDArray[np.float32]
 
 
+def filled_hole_by_hole(pixels: Pixels, hole: Mask, least: int, fill: Callable[[Pixels, Mask], Pixels]) -> Pixels:
+    """Return ``pixels`` (H, W, 3) with each connected part of ``hole`` (H, W) filled in a square crop around it.
+
+    least: side of the smallest crop, in pixels. fill: fills the hole of a crop; later parts see earlier ones filled.
+    """
+    result, left = pixels.copy(), hole.copy()
+    count, labels = cv2.connectedComponents(cv2.dilate(hole.astype(np.uint8), np.ones((5, 5), np.uint8)))
+    for label in range(1, count):
+        part = hole & (labels == label)
+        window = square_around(part, least)
+        filled = fill(result[window], left[window])
+        result[window][part[window]] = filled[part[window]]
+        left &= ~part
+    return result
+
+
+def without_content(pixels: Pixels, hole: Mask) -> Pixels:
+    """Return ``pixels`` with the nearest colours outside in ``hole``, whose content resizing would smear."""
+    if hole.all():
+        return pixels
+    near = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
+    return np.asarray(pixels[near[0], near[1]])
+
+
 @dataclass(frozen=True, eq=False)
 class LamaInpainter:
     """``protocols.Inpainter`` by an ONNX model. size: height and width of its input, or None for any.
@@ -49,25 +74,14 @@ class LamaInpainter:
 
     def __call__(self, pixels: Pixels, hole: Mask) -> Pixels:
         """As the protocol says: hole by hole, each in a square crop around it. Raises InputError."""
-        result, left = pixels.copy(), hole.copy()
-        count, labels = cv2.connectedComponents(cv2.dilate(hole.astype(np.uint8), np.ones((5, 5), np.uint8)))
-        for label in range(1, count):
-            part = hole & (labels == label)
-            rows, columns = square_around(part, LEAST_SIDE if self.size is None else min(self.size))
-            window = (rows, columns)
-            filled = self._fill(result[window], left[window])
-            result[window][part[window]] = filled[part[window]]
-            left &= ~part
-        return checked_pixels(result, pixels, hole, self.where)
+        least = LEAST_SIDE if self.size is None else min(self.size)
+        return checked_pixels(filled_hole_by_hole(pixels, hole, least, self._fill), pixels, hole, self.where)
 
     def _fill(self, pixels: Pixels, hole: Mask) -> Pixels:
         """``pixels`` (h, w, 3) with ``hole`` inpainted at the model's own size."""
         height, width = hole.shape
         size = self.size or _free_size(height, width)
-        if not hole.all():
-            # Otherwise resizing would smear the hole's content over its border.
-            near = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
-            pixels = pixels[near[0], near[1]]
+        pixels = without_content(pixels, hole)
         way = cv2.INTER_AREA if size[0] < height else cv2.INTER_CUBIC
         picture = np.asarray(cv2.resize(pixels, size[::-1], interpolation=way), dtype=np.float32) / np.float32(255)
         # Every pixel of the model that overlaps the hole.
