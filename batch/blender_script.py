@@ -38,13 +38,13 @@ def provide_modules(packages: Path | None) -> str | None:
     first. Raises InputError if it is not a folder, RenderError with the remedy if modules are still missing.
     """
     _add_named(packages)
-    said = None
+    notice = None
     for where, folder in _places():
         if not _missing():
             break
         sys.path.append(str(folder))
         importlib.invalidate_caches()
-        said = f"modules missing from Blender's Python are taken from {where}: {folder}"
+        notice = f"modules missing from Blender's Python are taken from {where}: {folder}"
     lacking = _missing()
     if lacking:
         raise RenderError(_remedy(lacking))
@@ -58,7 +58,7 @@ def provide_modules(packages: Path | None) -> str | None:
                 f"{origin}: cannot be loaded by Python {_version()} ({error}); install {REQUIREMENTS[name]} for this "
                 "Python, and name the folder with --packages"
             ) from error
-    return said
+    return notice
 
 
 def _missing() -> list[str]:

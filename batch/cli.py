@@ -136,12 +136,12 @@ def _keep_negative_vectors(arguments: Sequence[str]) -> list[str]:
 def recover(options: argparse.Namespace, terminal: Terminal) -> None:
     """Put back or remove what killed runs left of the files and folders that the command names, and among the system's
     temporary files; say so."""
-    said = atomic.recover_scratch()
+    recovered = atomic.recover_scratch()
     for path in (*_named_paths(options), config_folder() / LIST_FILE):
-        said += atomic.recover(path)
+        recovered += atomic.recover(path)
         for lock in (path / LOCK_FILE, path.with_name(f".{path.name}{LOCK_FILE}")):
             remove_dead_lock(lock)
-    for sentence in said:
+    for sentence in recovered:
         terminal({"event": "notice", "stage": "recover", "message": sentence})
 
 

@@ -250,18 +250,19 @@ def measure(case: Case, root: Path, size: tuple[int, int], samples: int) -> dict
     if not (photo.is_file() and box_file.is_file()):
         box_file.write_text(json.dumps(photograph(case, photo, size, samples)))
     box = tuple(json.loads(box_file.read_text()))
-    said: list[str] = []
+    notices: list[str] = []
     started = time.process_time()
     scene = reconstruct(
         photo,
         [ObjectRequest(box=box, name=case.shape)],  # type: ignore[arg-type]
         out=root / "scene",
         options=ReconstructOptions(pitch_deg=case.pitch, fov_deg=FOV_DEG, mesh_vertices=4000),
-        on_event=lambda event: said.append(str(event.get("message", ""))) if event["event"] == "notice" else None,
+        on_event=lambda event: notices.append(str(event.get("message", ""))) if event["event"] == "notice" else None,
     )
     seconds = time.process_time() - started
     light = scene.model.light
-    return {**asdict(case), **judge(case, light), "light": asdict(light), "said": said, "cpu_s": round(seconds, 2)}
+    row = {**asdict(case), **judge(case, light), "light": asdict(light)}
+    return row | {"notices": notices, "cpu_s": round(seconds, 2)}
 
 
 def _line(number: int, row: dict[str, object]) -> str:

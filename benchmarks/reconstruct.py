@@ -87,10 +87,10 @@ def attempted(truth: Truth, folder: Path) -> dict[str, Any]:
         done = subprocess.run(command, stdout=sys.stderr, timeout=ATTEMPT_LIMIT_S)
     except subprocess.TimeoutExpired:
         return {**nothing, "error": f"timed out after {ATTEMPT_LIMIT_S:g} s", "cpu_s": ATTEMPT_LIMIT_S}
-    said = folder / attempt.ANSWER
-    if not said.is_file():
+    attempt_result = folder / attempt.ANSWER
+    if not attempt_result.is_file():
         return {**nothing, "error": f"exit code {done.returncode} without an answer"}
-    return json.loads(said.read_text())
+    return json.loads(attempt_result.read_text())
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -176,8 +176,8 @@ def measure(
         truth = load_truth(folder)
         place = scenes / truth.name
         answer = place / attempt.ANSWER
-        said = json.loads(answer.read_text()) if judge and answer.is_file() else attempted(truth, place)
-        row = scoring.judge(truth, place / attempt.SCENE, said)
+        attempt_result = json.loads(answer.read_text()) if judge and answer.is_file() else attempted(truth, place)
+        row = scoring.judge(truth, place / attempt.SCENE, attempt_result)
         if turntables is not None:
             viewed(draw(turntables, number), truth, place / attempt.SCENE, row, sheets)
         sys.stderr.write(table([row]).split("\n", 1)[1] + "\n")

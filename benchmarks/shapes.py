@@ -300,9 +300,9 @@ def measured(name: str, pitch_deg: float) -> tuple[dict[str, float | str], Point
     camera, place = view(pitch_deg)
     body = moved(BODIES[name](), SIZE * float(np.hypot(place[1], 1.0)), place)
     truth = seen_by(camera, body)
-    said: list[str] = []
+    notices: list[str] = []
     request = ObjectRequest(box=(0, 0, WIDTH, HEIGHT), name=name)
-    made = build_body(camera, truth.mask, request, ReconstructOptions(mesh_vertices=3000), said.append)
+    made = build_body(camera, truth.mask, request, ReconstructOptions(mesh_vertices=3000), notices.append)
     front, thickness = depths_of(camera, made.mesh.vertices, made.mesh.faces)
     both = truth.mask & np.isfinite(front) & np.isfinite(truth.front)
     mean = float(truth.thickness[truth.mask].mean())

@@ -264,8 +264,8 @@ class _Interpreter(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def _checked(python: str, packages: str) -> _Interpreter:
     """Return the interpreter if it can simulate (cached); raises _Unfit."""
-    code, said, complaints = _asked(own_command(MODULE, python=python, packages=packages))
-    lines = said.strip().splitlines()
+    code, output, complaints = _asked(own_command(MODULE, python=python, packages=packages))
+    lines = output.strip().splitlines()
     if code != 0 or not lines:
         words = complaints.strip().splitlines()
         raise _Unfit(words[-1][:300] if words else f"it ended with code {code} when Taichi was loaded")
@@ -303,11 +303,11 @@ def _asked(command: Sequence[str]) -> tuple[int, str, str]:
         )
     except OSError as error:
         raise _Unfit(str(error.strerror or error)) from None
-    said = [b"", b""]
+    output = [b"", b""]
 
     def read(index: int, stream: IO[bytes]) -> None:
-        said[index] = stream.read(_MOST_BYTES)
-        if len(said[index]) == _MOST_BYTES:
+        output[index] = stream.read(_MOST_BYTES)
+        if len(output[index]) == _MOST_BYTES:
             _kill(process)
 
     readers = [
@@ -325,9 +325,9 @@ def _asked(command: Sequence[str]) -> tuple[int, str, str]:
         process.wait()
     for reader in readers:
         reader.join(1.0)
-    if any(len(text) == _MOST_BYTES for text in said):
+    if any(len(text) == _MOST_BYTES for text in output):
         raise _Unfit("it is not Python: its output does not end")
-    out, complaints = (text.decode("utf-8", "replace") for text in said)
+    out, complaints = (text.decode("utf-8", "replace") for text in output)
     return code, out, complaints
 
 

@@ -180,14 +180,14 @@ def recover(path: Path) -> list[str]:
     Looks at temporary names of ``path`` beside it, and, where it is a folder, at all in it; never at others, through a
     link, or at what a living process or another machine's is writing. Each sentence is for the user.
     """
-    said: list[str] = []
+    notices: list[str] = []
     path = path.parent.resolve() / path.name
     for left in _dead_beside(path):
-        said.append(_put_back_or_removed(left))
+        notices.append(_put_back_or_removed(left))
     if path.is_dir() and not path.is_symlink():
         for left in _dead_within(path):
-            said.append(_put_back_or_removed(left))
-    return said
+            notices.append(_put_back_or_removed(left))
+    return notices
 
 
 def _put_back_or_removed(left: Path) -> str:
@@ -237,13 +237,13 @@ def recover_scratch(folder: Path | None = None) -> list[str]:
 
     folder: in place of the system's, for tests.
     """
-    place, said = folder or Path(tempfile.gettempdir()), []
+    place, notices = folder or Path(tempfile.gettempdir()), []
     for left in _entries(place):
         # A child of the dead process may still be about to end.
         if _is_dead_scratch(left) and all(_is_dead_scratch(inner) is not False for inner in _entries(left)):
             _remove(left)
-            said.append(f"{left}: removed, left by a run that was killed")
-    return said
+            notices.append(f"{left}: removed, left by a run that was killed")
+    return notices
 
 
 def _is_dead_scratch(path: Path) -> bool | None:

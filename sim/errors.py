@@ -67,7 +67,7 @@ def openimageio_error(geterror: Callable[[], str]) -> str:
     the file that are not UTF-8.
     """
     try:
-        said = geterror()
+        reason = geterror()
     except UnicodeDecodeError:
         return "its header is damaged"
-    return (said.strip().splitlines() or ["no reason given"])[-1]
+    return (reason.strip().splitlines() or ["no reason given"])[-1]

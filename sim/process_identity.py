@@ -2,7 +2,7 @@
 """Identity of a process: number, start and machine, so that a reused number does not match another process.
 
 A ``Mark`` is written into names of temporary files and into locks. Whether its process still runs is known for this
-machine only; of another one's nothing is ever said to be dead.
+machine only; processes of another one never count as dead.
 """
 
 from __future__ import annotations

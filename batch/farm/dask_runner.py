@@ -144,7 +144,7 @@ def run_dask(plan: Plan, options: FarmOptions, on_event: OnEvent, cancelled: IsC
         crew.refuse_strangers()
         check_slots(plan, client)
         heard: Queue[tuple[str, Any]] = Queue()
-        client.subscribe_topic(run_name, lambda event: heard.put(("said", event[1])))
+        client.subscribe_topic(run_name, lambda event: heard.put(("event", event[1])))
         return _Run(plan, options, on_event, cancelled, client, crew, heard, run_name).outcomes()
 
 
@@ -202,7 +202,7 @@ class _Run:
                 kind, value = self._heard.get(timeout=LOOK_S)
             except Empty:
                 kind, value = "", None
-            if kind == "said":
+            if kind == "event":
                 self._hear(value)
             elif kind == "ended":
                 self._take(*value)

@@ -310,10 +310,10 @@ class Monitor:
         """Handle ``event``."""
         if event["event"] == "task":
             self._take(event)
-            said = {key: value for key, value in event.items() if key != "message"}
+            payload = {key: value for key, value in event.items() if key != "message"}
             if event["state"] == "failed":
-                said["message"] = f"{event['task']} failed: {event['message']}"
-            self._on_event(said)
+                payload["message"] = f"{event['task']} failed: {event['message']}"
+            self._on_event(payload)
             if event["state"] != "started":
                 self._ended += 1
                 self._progress.report(self._ended, str(event["task"]))

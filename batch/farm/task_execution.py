@@ -348,11 +348,11 @@ def _await_folders(task: Task, root: Path, cancelled: IsCancelled, on_event: OnE
     """
     folders = {inside(root, name).parent for name in task.produces}
     deadline = time.monotonic() + FOLDER_WAIT_S
-    said = False
+    reported = False
     while any(is_held(folder) for folder in folders) and time.monotonic() < deadline:
-        if not said:
+        if not reported:
             on_event({"event": "notice", "task": task.id, "stage": task.stage, "message": "waiting for another run"})
-            said = True
+            reported = True
         if cancelled():
             raise Cancelled("cancelled while waiting for another run's folder")
         time.sleep(LOOK_S)

@@ -4,7 +4,7 @@
     python -m physgen.benchmarks.reconstruct_pictures.attempt FOLDER
 
 FOLDER holds ``photo.jpg`` and ``request.json``: {"objects": [{"name", "box", "size_m" | null}, …]}. It gets
-``scene/`` and ``said.json``: {"error" | null, "cpu_s", "stages": {step: CPU seconds}, "notices": […]}.
+``scene/`` and ``result.json``: {"error" | null, "cpu_s", "stages": {step: CPU seconds}, "notices": […]}.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from physgen.sim.errors import PhysGenError
 from physgen.sim.events import Event
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 
-PHOTO, REQUEST, SCENE, ANSWER = "photo.jpg", "request.json", "scene", "said.json"
+PHOTO, REQUEST, SCENE, ANSWER = "photo.jpg", "request.json", "scene", "result.json"
 
 
 def attempt(folder: Path) -> dict[str, object]:
-    """Reconstruct what lies in ``folder``; what to write into ``said.json``."""
+    """Reconstruct what lies in ``folder``; what to write into ``result.json``."""
     wanted = [
         ObjectRequest(name=item["name"], box=tuple(item["box"]), size_m=item["size_m"])
         for item in json.loads((folder / REQUEST).read_text())["objects"]

@@ -180,13 +180,13 @@ def pairs_in_order(covers: dict[str, Mask], order: Sequence[str], found: dict[st
 
     covers: whole outlines (H, W); order: names from the front to the back; found: places, 0 in front.
     """
-    said = []
+    result = []
     for i, front in enumerate(order):
         for back in order[i + 1 :]:
             shared = int((covers[front] & covers[back]).sum())
             if shared > 0.01 * int(covers[back].sum()):
-                said.append(found[front] < found[back])
-    return said
+                result.append(found[front] < found[back])
+    return result
 
 
 def median(values: Sequence[float]) -> float | None:
@@ -207,7 +207,7 @@ def alias(truth: Truth) -> dict[str, str]:
     return {item.name: f"object_{number}" for number, item in enumerate(truth.objects, start=1)}
 
 
-def judge(truth: Truth, scene_root: Path, said: Row) -> Row:
+def judge(truth: Truth, scene_root: Path, result: Row) -> Row:
     """All numbers of a case; a case without a scene counts as 0, its errors as a whole."""
     row: Row = {
         "case": truth.name,
@@ -215,12 +215,12 @@ def judge(truth: Truth, scene_root: Path, said: Row) -> Row:
         "light": truth.fields["light"]["kind"],
         "exif": truth.exif,
         "vanishing_points": truth.vanishing_points,
-        "error": said["error"],
-        "cpu_s": said["cpu_s"],
-        "stages": said["stages"],
-        "notices": said["notices"],
+        "error": result["error"],
+        "cpu_s": result["cpu_s"],
+        "stages": result["stages"],
+        "notices": result["notices"],
     }
-    if said["error"] is not None:
+    if result["error"] is not None:
         return {**row, **_failed(truth)}
     folder = load_scene(scene_root)
     camera = folder.model.camera

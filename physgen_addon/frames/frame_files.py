@@ -193,10 +193,10 @@ def _write(path: Path, partial: Path, specs: Sequence[oiio.ImageSpec], pictures:
         if good and index > 0:
             good = target.open(str(partial), spec, "AppendSubimage")
         good = good and target.write_image(picture)
-    said = target.geterror()
+    cause = target.geterror()
     # Buffers are flushed here, so a full disk may show only now.
     if not (target.close() and good):
-        raise _unwritable(path, openimageio_error(lambda: said or target.geterror()))
+        raise _unwritable(path, openimageio_error(lambda: cause or target.geterror()))
 
 
 def _unwritable(path: Path, reason: str) -> InputError:

@@ -63,9 +63,9 @@ def _tick() -> float | None:
     if current is None:
         return None
     before = time.perf_counter()
-    said = (current.state, current.message)
+    shown = (current.state, current.message)
     if current.step():
-        redraw("VIEW_3D", *(("WINDOW", "UI") if (current.state, current.message) != said else ("WINDOW",)))
+        redraw("VIEW_3D", *(("WINDOW", "UI") if (current.state, current.message) != shown else ("WINDOW",)))
     longest_step_s[0] = max(longest_step_s[0], time.perf_counter() - before)
     return STEP_S
 

@@ -130,8 +130,8 @@ def require_graphics() -> str:
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise RenderError(f"whether Blender can draw is unknown ({error}); use --engine cycles") from error
-    said = result.stdout.decode(errors="replace").splitlines()
-    names = [line.removeprefix(_MARK) for line in said if line.startswith(_MARK)]
+    printed = result.stdout.decode(errors="replace").splitlines()
+    names = [line.removeprefix(_MARK) for line in printed if line.startswith(_MARK)]
     if not names:
         raise RenderError(
             "EEVEE needs a graphics card or Mesa's EGL, and Blender found neither: install libegl1 and "

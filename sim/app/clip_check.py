@@ -75,7 +75,7 @@ def seen_tracks(count: int, poses: Iterable[Sequence[Array]], cameras: Iterable[
 
 
 def leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip) -> str | None:
-    """Return what is to be said of a thing whose points (F, N, 3) are projected; None for nothing."""
+    """Return the warning about an object whose points (F, N, 3) are projected; None without one."""
     x, y, depth = np.moveaxis(track, -1, 0)
     beyond = np.stack([-x, x - camera.width, -y, y - camera.height])
     inside = np.mean((beyond.max(axis=0) <= 0) & (depth > 0), axis=1)
@@ -104,7 +104,7 @@ _LOWER = "give it a lower velocity (--velocity)"
 
 
 def _pace(tracks: Sequence[NDArray[np.float64]], cameras: Sequence[Camera], clip: Clip) -> list[str]:
-    """Return what is to be said of how long things move; tracks: of the projected points (F, N, 3) of each object."""
+    """Return the warning about how long objects move; tracks: projected points (F, N, 3) of each object."""
     if any(a != b for a, b in itertools.pairwise(cameras)):
         # A moving camera shows something all the time, and pixels do not tell which of the two moved.
         return []

@@ -419,9 +419,9 @@ def _sentence(model: SceneModel, moves: Sequence[Move], seconds: float, slow: fl
     change = "change it with --velocity, --spin, --slow, --frames; --still leaves everything at rest"
     if not moves:
         return f"none was given, and no object has room for one within the picture, so nothing moves; {change}"
-    said = [f"{move.name} {_what(model, move)}" for move in moves]
+    parts = [f"{move.name} {_what(model, move)}" for move in moves]
     clock = "at real speed" if slow == 1.0 else f"{slow:g} times slower than real"
-    return f"none was given, so {', then '.join(said)}; {clock}, {seconds:.2g} s. {change[0].upper()}{change[1:]}"
+    return f"none was given, so {', then '.join(parts)}; {clock}, {seconds:.2g} s. {change[0].upper()}{change[1:]}"
 
 
 def _what(model: SceneModel, move: Move) -> str:

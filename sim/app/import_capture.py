@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Everybody's recordings → capture folder: units and axes guessed from the motion, said, and never taken silently."""
+"""Recordings of other programs → capture folder; units and axes guessed from the motion are always reported."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ def import_capture(
 ) -> Capture:
     """Return the capture of the recordings ``files`` (CSV, Tracker's .trk, DeepLabCut's CSV), written to ``out``.
 
-    Every guess is said as a notice. One that changes numbers (milliseconds, millimetres, another axis up) needs a word:
-    ``confirm`` is asked with a sentence; None refuses, naming the option that answers.
+    Every guess is reported as a notice. One that changes numbers (milliseconds, millimetres, another axis up)
+    must be confirmed: ``confirm`` is asked with a sentence; None refuses, naming the option that answers.
 
     >>> import physgen
     >>> ball = physgen.ImportRequest(diameter=0.04, mass=0.0027)  # doctest: +SKIP

@@ -34,7 +34,7 @@ MOST_REHEARSALS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Rehearsed:
-    """motion: with the clip that ends when nothing is seen to move any more. leaving: what is to be said of each thing
+    """motion: with the clip that ends when nothing is seen to move any more. leaving: the warning about each object
     that leaves the picture within that clip.
     """
 

@@ -122,8 +122,8 @@ def _bounce(item: SceneObject, ground: SurfaceContact) -> float:
     """Restitution of the object's material where nothing else says one: 0 is none, infinite that the other's counts."""
     if item.role == "collider":
         return math.inf
-    said = item.restitution is not None or ground.restitution > 0
-    return 0.0 if said or item.material.law != "rigid" else item.material.rigid_restitution
+    given = item.restitution is not None or ground.restitution > 0
+    return 0.0 if given or item.material.law != "rigid" else item.material.rigid_restitution
 
 
 def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:

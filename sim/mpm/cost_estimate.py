@@ -127,7 +127,7 @@ def refuse_excess(cost: Estimate, particles: int, available: int | None) -> None
 def require_memory(needed: int, particles: int, available: int | None) -> None:
     """Raise InputError when ``needed`` bytes are more than ``available``; None: not known, so never.
 
-    Nor where the user said ``--anyway`` (``ANYWAY``).
+    Nor where the user gave ``--anyway`` (``ANYWAY``).
     """
     if available is not None and needed > available and not os.environ.get(ANYWAY):
         raise InputError(

@@ -84,23 +84,23 @@ class StageCache:
         """
         name = f"{stage}-{inputs_hash(stage, inputs)}.npz"
         found = _read(self._earlier / name)
-        said: list[str] = []
+        messages: list[str] = []
         if found is not None:
-            arrays, said = found
+            arrays, messages = found
             self.recalled.append(stage)
-            for message in said:
+            for message in messages:
                 self._notice(message)
             with replacing(self._folder / name) as partial:
                 shutil.copyfile(self._earlier / name, partial)
             return arrays
 
         def notice(message: str) -> None:
-            said.append(message)
+            messages.append(message)
             self._notice(message)
 
         arrays = dict(make(notice))
         with replacing(self._folder / name) as partial:
-            np.savez_compressed(partial, allow_pickle=False, **arrays, **{_NOTICES: np.array(json.dumps(said))})
+            np.savez_compressed(partial, allow_pickle=False, **arrays, **{_NOTICES: np.array(json.dumps(messages))})
         return arrays
 
 
@@ -136,9 +136,9 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], list[str]] | None:
     """The arrays and notices in ``path``; None if there is no file, or it is damaged."""
     try:
         arrays = read_npz(path, MAX_BYTES, own=True)
-        said = json_value(str(arrays.pop(_NOTICES)), str(path))
+        messages = json_value(str(arrays.pop(_NOTICES)), str(path))
     except (InputError, KeyError):
         return None
-    if not isinstance(said, list) or not all(isinstance(text, str) for text in said):
+    if not isinstance(messages, list) or not all(isinstance(text, str) for text in messages):
         return None
-    return arrays, said
+    return arrays, messages

@@ -2,7 +2,7 @@
 """Checksums of a scene folder's files: ``checksums.json``, written when the folder is made.
 
 ``scene.json`` is for people to edit and has none; what is added later has none either. A file that differs is damaged,
-or was edited on purpose: the two look the same, so it is said and nothing is refused.
+or was edited on purpose: the two look the same, so it is reported and nothing is refused.
 """
 
 from __future__ import annotations

@@ -178,8 +178,8 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
     if unknown:
         others = [*sorted(known), *FIELDS, "bake", "render", "matrix", "variants"]
         raise InputError(f"{where}.{unknown[0]}: unknown field; known are {', '.join(others)}")
-    said = parse(_Photo, {key: value for key, value in table.items() if key in known}, where)
-    require_name(said.name, f"{where}.name")
+    entry = parse(_Photo, {key: value for key, value in table.items() if key in known}, where)
+    require_name(entry.name, f"{where}.name")
     bake = _bake(_merged(defaults.bake, rest.get("bake"), f"{file}.defaults.bake", f"{where}.bake"), where)
     render_table = _merged(defaults.render, rest.get("render"), f"{file}.defaults.render", f"{where}.render")
     options, render = _render(render_table, root, f"{where}.render")
@@ -187,7 +187,7 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
         frames = tuple(parse_frame_range(render.frames, 1, bake.frames))
     except InputError as error:
         raise InputError(f"{where}.render.frames: {error}") from None
-    objects, reading, folder = _source(said, root, where)
+    objects, reading, folder = _source(entry, root, where)
     matrices = [(top.matrix, f"{file}.matrix"), (rest.get("matrix"), f"{where}.matrix")]
     variants = read_variants(
         read_physics(rest, where), [(t, w) for t, w in matrices if t is not None], rest.get("variants"), where
@@ -196,8 +196,8 @@ def _scene(table: Any, top: _Top, defaults: _Defaults, root: Path, where: str, f
     for variant in variants:
         _check_physics(variant.physics, names, folder, f"{where}, variant {variant.name}")
     return JobScene(
-        name=said.name,
-        photo=said.photo,
+        name=entry.name,
+        photo=entry.photo,
         objects=objects,
         reading=reading,
         folder=folder,
@@ -255,34 +255,36 @@ def _render(table: dict[str, Any], root: Path, where: str) -> tuple[RenderOption
     return options, settings
 
 
-def _source(said: _Photo, root: Path, where: str) -> tuple[tuple[ObjectRequest, ...], ReconstructOptions, Scene | None]:
+def _source(
+    entry: _Photo, root: Path, where: str
+) -> tuple[tuple[ObjectRequest, ...], ReconstructOptions, Scene | None]:
     """Return the source of a scene: objects and options of a photo, or an existing folder."""
-    if (said.photo is None) == (said.scene is None):
+    if (entry.photo is None) == (entry.scene is None):
         raise InputError(f"{where}: give either photo, with boxes, or scene, a scene folder")
-    if said.scene is not None:
-        extra = [f.name for f in fields(_Photo) if f.name not in ("name", "scene") and getattr(said, f.name)]
+    if entry.scene is not None:
+        extra = [f.name for f in fields(_Photo) if f.name not in ("name", "scene") and getattr(entry, f.name)]
         if extra:
             raise InputError(f"{where}.{extra[0]}: applies to a photo; leave it out with scene")
-        return (), ReconstructOptions(), load_scene(_inside(root, said.scene, f"{where}.scene"))
-    assert said.photo is not None
-    if not _inside(root, said.photo, f"{where}.photo").is_file():
-        raise InputError(f"{where}.photo: there is no {said.photo!r} in {root}; check its name")
-    if not said.boxes:
+        return (), ReconstructOptions(), load_scene(_inside(root, entry.scene, f"{where}.scene"))
+    assert entry.photo is not None
+    if not _inside(root, entry.photo, f"{where}.photo").is_file():
+        raise InputError(f"{where}.photo: there is no {entry.photo!r} in {root}; check its name")
+    if not entry.boxes:
         raise InputError(f"{where}.boxes: missing; give [x0, y0, x1, y1] in pixels, one per object")
     for name in ("names", "sizes"):
-        if len(getattr(said, name)) > len(said.boxes):
-            raise InputError(f"{where}.{name}: {len(getattr(said, name))} given for {len(said.boxes)} boxes")
+        if len(getattr(entry, name)) > len(entry.boxes):
+            raise InputError(f"{where}.{name}: {len(getattr(entry, name))} given for {len(entry.boxes)} boxes")
     try:
         objects = tuple(
             ObjectRequest(
                 box=box,
-                name=said.names[i] if i < len(said.names) else None,
-                size_m=said.sizes[i] if i < len(said.sizes) else None,
+                name=entry.names[i] if i < len(entry.names) else None,
+                size_m=entry.sizes[i] if i < len(entry.sizes) else None,
             )
-            for i, box in enumerate(said.boxes)
+            for i, box in enumerate(entry.boxes)
         )
         object_names(objects)
-        return objects, ReconstructOptions(horizon_y=said.horizon, pitch_deg=said.pitch, fov_deg=said.fov), None
+        return objects, ReconstructOptions(horizon_y=entry.horizon, pitch_deg=entry.pitch, fov_deg=entry.fov), None
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

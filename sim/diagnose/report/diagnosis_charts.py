@@ -275,11 +275,11 @@ def _band(band: Band, time: Scale, score: Scale, wide: bool) -> Markup:
     for interval in sorted(band.intervals, key=lambda i: (i.start_s, i.end_s)):
         start, end = time(interval.start_s), time(interval.end_s)
         phase = interval.phase if interval.phase in PHASES else "unnamed"
-        said = (
+        hint = (
             f"{PHASE_WORDS.get(interval.phase, interval.phase)}, {interval.start_s:.3f} to {interval.end_s:.3f} s: "
             f"{percent_text(interval.share)} of the discrepancy"
         )
-        parts.append(_hinted(said, start, max(end - start, 1.0), phase))
+        parts.append(_hinted(hint, start, max(end - start, 1.0), phase))
     for tick in score.ticks(2):
         y = score(tick)
         parts.append(element("line", x1=left, x2=right, y1=y, y2=y, class_="rule", stroke_width=0.6))
@@ -295,9 +295,9 @@ def _band(band: Band, time: Scale, score: Scale, wide: bool) -> Markup:
     return join(parts)
 
 
-def _hinted(said: str, x: float, width: float, phase: str) -> Markup:
+def _hinted(hint: str, x: float, width: float, phase: str) -> Markup:
     shape = element("rect", x=x, y=0, width=width, height=_BAND, class_=f"phase-{phase}")
-    return element("g", element("title", said), shape)
+    return element("g", element("title", hint), shape)
 
 
 def _mark(worst: Moment, time: Scale, score: Scale) -> Markup:

@@ -29,7 +29,7 @@ _STEPS = 120
 class Bar:
     """One error in m. class_: fill; quiet: a control instead of a stage of the model."""
 
-    said: str
+    caption: str
     value: float
     class_: str
     quiet: bool = False
@@ -40,18 +40,22 @@ def gap_bars(diagnosis: Diagnosis) -> list[Bar]:
     gap, controls = diagnosis.gap, diagnosis.controls
     found = found_effects(diagnosis.verdict)
     bars = [
-        Bar(said="nominal model", value=gap.before_rms_m, class_="nominal-fill"),
-        Bar(said="nominal model, re-fitted", value=gap.refitted_rms_m, class_="other-fill"),
-        Bar(said=found_label(diagnosis.verdict), value=gap.after_rms_m, class_="found-fill" if found else "other-fill"),
-        Bar(said="noise floor of the recording", value=gap.noise_floor_rms_m, class_="rule-fill"),
-        Bar(said="numerical error of the simulator", value=gap.numerics_rms_m, class_="rule-fill", quiet=True),
+        Bar(caption="nominal model", value=gap.before_rms_m, class_="nominal-fill"),
+        Bar(caption="nominal model, re-fitted", value=gap.refitted_rms_m, class_="other-fill"),
+        Bar(
+            caption=found_label(diagnosis.verdict),
+            value=gap.after_rms_m,
+            class_="found-fill" if found else "other-fill",
+        ),
+        Bar(caption="noise floor of the recording", value=gap.noise_floor_rms_m, class_="rule-fill"),
+        Bar(caption="numerical error of the simulator", value=gap.numerics_rms_m, class_="rule-fill", quiet=True),
     ]
     names = {
         "wrong_effect_rms_m": "control: rejected effect",
         "last_residual_rms_m": "control: last residual carried forward",
     }
     bars += [
-        Bar(said=names.get(key, key.replace("_", " ")), value=value, class_="other-fill", quiet=True)
+        Bar(caption=names.get(key, key.replace("_", " ")), value=value, class_="other-fill", quiet=True)
         for key, value in controls.items()
     ]
     return bars
@@ -67,7 +71,7 @@ def bars_picture(diagnosis: Diagnosis) -> Picture:
     ]
     y, floor = 24.0, diagnosis.gap.noise_floor_rms_m
     for bar in bars:
-        parts.append(label(shortened(bar.said, 58), 0, y + 13, class_="quiet" if bar.quiet else "ink"))
+        parts.append(label(shortened(bar.caption, 58), 0, y + 13, class_="quiet" if bar.quiet else "ink"))
         height = 8.0 if bar.quiet else 12.0
         if math.isfinite(bar.value):
             width = max(scale(bar.value), 1.5)
@@ -84,7 +88,7 @@ def bars_picture(diagnosis: Diagnosis) -> Picture:
         width=WIDTH,
         height=y + 6,
         title="Error before and after",
-        description="; ".join(f"{b.said} {quantity_text(b.value, 'm')}" for b in bars) + ".",
+        description="; ".join(f"{b.caption} {quantity_text(b.value, 'm')}" for b in bars) + ".",
         body=join(parts),
     )
 
@@ -183,7 +187,7 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
     if with_found:
         lines.append((data.found, "found", shortened(found_label(diagnosis.verdict), 30), None))
     at = left
-    said = []
+    captions = []
     for values, class_, words, dashes in lines:
         path = curve([x(t) for t in data.times], [y(v) if math.isfinite(v) else math.nan for v in values])
         parts.append(element("path", d=path, class_=f"line {class_}-line", stroke_width=2.2, stroke_dasharray=dashes))
@@ -194,8 +198,8 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
         at += 26 + 7 * len(words) + 22
         known = values[np.isfinite(values)]
         if len(known):
-            said.append(f"{words}: {quantity_text(float(known[-1]), data.unit)} at the end")
-    if not said:
+            captions.append(f"{words}: {quantity_text(float(known[-1]), data.unit)} at the end")
+    if not captions:
         parts.append(
             label("no error available", (left + right) / 2, (top + bottom) / 2, class_="quiet", anchor="middle")
         )
@@ -203,7 +207,7 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
         width=WIDTH,
         height=bottom + 42,
         title="Error over time since the start of a trial",
-        description=f"Mean of {data.trials} trials. {'; '.join(said) or 'No error available'}.",
+        description=f"Mean of {data.trials} trials. {'; '.join(captions) or 'No error available'}.",
         body=join(parts),
     )
 

@@ -210,18 +210,18 @@ def tracks_legend(diagnosis: Diagnosis) -> Picture:
         ),
     ]
     if found_effects(diagnosis.verdict):
-        said = shortened(found_label(diagnosis.verdict), 34)
-        entries.append((element("path", d="M0 0H20", class_="line found-line", stroke_width=2), said))
+        caption = shortened(found_label(diagnosis.verdict), 34)
+        entries.append((element("path", d="M0 0H20", class_="line found-line", stroke_width=2), caption))
     y, parts = 10.0, []
-    for mark, said in entries:
+    for mark, caption in entries:
         parts.append(element("g", mark, transform=f"translate(0 {short_number(y)})"))
-        parts.append(label(said, 28, y + 4))
+        parts.append(label(caption, 28, y + 4))
         y += 20
     return Picture(
         width=WIDTH,
         height=y,
         title="Legend",
-        description="; ".join(said for _, said in entries),
+        description="; ".join(caption for _, caption in entries),
         body=join(parts),
     )
 
@@ -269,20 +269,20 @@ def spaced(places: Array) -> list[tuple[float, float]]:
 
 def _parting(trial: TrialTracks, with_found: bool, found: str) -> str:
     """Return how far the simulated paths end from the observed one, or from each other where it is withheld."""
-    said = []
+    sentences = []
     if trial.role == "predict":
         for before, after in zip(trial.before, trial.after, strict=False):
             if with_found and len(before.centres) and np.isfinite(before.centres[-1] + after.centres[-1]).all():
                 apart = float(np.linalg.norm(before.centres[-1] - after.centres[-1]))
-                said.append(f"At the end of the prediction the two are {quantity_text(apart, trial.unit)} apart.")
-        return "".join(f" {s}" for s in said)
+                sentences.append(f"At the end of the prediction the two are {quantity_text(apart, trial.unit)} apart.")
+        return "".join(f" {s}" for s in sentences)
     for observed, nominal, better in zip(trial.observed, trial.nominal, trial.found, strict=True):
         for path, words in ((nominal, "the nominal model"), (better, found if with_found else "")):
             both = np.isfinite(observed + path.centres).all(axis=1)
             if words and both.any():
                 apart = float(np.linalg.norm((observed - path.centres)[both][-1]))
-                said.append(f"At the end {words} is {quantity_text(apart, trial.unit)} off.")
-    return "".join(f" {s}" for s in said)
+                sentences.append(f"At the end {words} is {quantity_text(apart, trial.unit)} off.")
+    return "".join(f" {s}" for s in sentences)
 
 
 def _way(place: _Placement, path: ProjectedPath, class_: str, dashes: str | None) -> Markup:

@@ -59,8 +59,8 @@ class ClipScores:
         with library_errors(self.name), self._torch.no_grad():
             most = self._model.config.text_config.max_position_embeddings
             ids = token_ids(self._tokenizer, prompt, most).to(self._device)
-            said = self._model.text_projection(self._model.text_model(ids).pooler_output)
-        return self._score(self._seen(picture), said)
+            embedding = self._model.text_projection(self._model.text_model(ids).pooler_output)
+        return self._score(self._seen(picture), embedding)
 
     def _score(self, a: Any, b: Any) -> float:
         return 100 * float(self._torch.nn.functional.cosine_similarity(a, b)[0])

@@ -56,38 +56,38 @@ def check_surface(surface: Surface, *, name: str, cell_size: float | None = None
         raise InputError(f"{name}: {error}") from error
     recalculate = "in Blender: Mesh > Normals > Recalculate Outside"
     unite = "unite them (in Blender: Boolean modifier, Union, Self Intersection)"
-    said = []
+    warnings = []
     if not oriented:
-        said.append(
+        warnings.append(
             f"{name}: faces are not consistently oriented, {found.reversed} of {len(triangles)} look inward; what lies "
             f"between an even number of walls counts as outside ({recalculate})"
         )
     elif found.reversed:
-        said.append(
+        warnings.append(
             f"{name}: {found.reversed} of {found.parts} parts are inside out; they are taken as if they were not "
             f"({recalculate})"
         )
     if found.buried:
-        said.append(f"{name}: {found.buried} of {found.parts} parts lie inside others and are ignored; delete them")
+        warnings.append(f"{name}: {found.buried} of {found.parts} parts lie inside others and are ignored; delete them")
     if found.overlapping:
         what = "the surface lies inside itself in part" if found.parts == 1 else "some parts overlap others"
-        said.append(f"{name}: {what}; what overlaps counts twice in the mass: {unite}")
+        warnings.append(f"{name}: {what}; what overlaps counts twice in the mass: {unite}")
     crossing, tested, total = _crossing_faces(points, triangles)
     if crossing:
-        said.append(f"{name}: the surface crosses itself at {crossing} or more pairs of faces: {unite}")
+        warnings.append(f"{name}: the surface crosses itself at {crossing} or more pairs of faces: {unite}")
     if tested < total:
-        said.append(
+        warnings.append(
             f"{name}: {tested} of about {total} pairs of neighbouring faces were tested for crossings; the mesh is "
             "very dense or tangled: simplify it (in Blender: Decimate or Remesh modifier)"
         )
     if cell_size is not None:
         share = thin_share(points, found.triangles, cell_size)
         if share > THIN_SHARE:
-            said.append(
+            warnings.append(
                 f"{name}: {100 * share:.0f} % of the surface is thinner than a grid cell of {cell_size:g} m; contact "
                 "there is inexact: thicken it or bake with a finer quality"
             )
-    return tuple(said)
+    return tuple(warnings)
 
 
 def _crossing_faces(points: Array, triangles: Faces) -> tuple[int, int, int]:

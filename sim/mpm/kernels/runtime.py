@@ -64,9 +64,9 @@ def _start(arguments: dict[str, object]) -> None:
     """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
     _leave_source_lines_out()
     _leave_call_stacks_out()
-    with contextlib.redirect_stdout(io.StringIO()) as said:
+    with contextlib.redirect_stdout(io.StringIO()) as output:
         ti.init(**arguments)
-    logger.debug("%s", said.getvalue().strip())
+    logger.debug("%s", output.getvalue().strip())
 
 
 def _leave_source_lines_out() -> None:

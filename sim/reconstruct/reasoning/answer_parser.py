@@ -391,7 +391,7 @@ def _assigned(
     """The answers in the order of the objects: by their numbers, the others in the remaining places."""
     numbers = _numbers([row.number for row, _, _ in kept], count)
     objects: list[ObjectAnswer | None] = [None] * count
-    said: list[list[str]] = [[] for _ in range(count)]
+    by_object: list[list[str]] = [[] for _ in range(count)]
     for (row, answer, wrong), number in zip(kept, numbers, strict=True):
         if number is None:
             continue
@@ -401,15 +401,15 @@ def _assigned(
         before = objects[number - 1]
         if before is not None and before != answer:
             unread.append(f"object {number}: answered more than once, the last counts: {_quoted(row.line)}")
-        objects[number - 1], said[number - 1] = answer, _problems(number, row, answer, wrong)
+        objects[number - 1], by_object[number - 1] = answer, _problems(number, row, answer, wrong)
     for (row, answer, wrong), number in zip(kept, numbers, strict=True):
         if number is None:
             if None not in objects:
                 unread.append(f"more lines than the {count} objects; left out: {_quoted(row.line)}")
                 continue
             free = objects.index(None)
-            objects[free], said[free] = answer, _problems(free + 1, row, answer, wrong)
-    unread += [problem for problems in said for problem in problems]
+            objects[free], by_object[free] = answer, _problems(free + 1, row, answer, wrong)
+    unread += [problem for problems in by_object for problem in problems]
     return objects
 
 

@@ -182,8 +182,8 @@ def _refused(reply: Reply, request: ChatRequest, key: str) -> Failure:
         return Failure(f"has no such path or model (404); check the URL and the model {request.model!r}", again=False)
     if 300 <= status < 400:
         return Failure(f"redirects (status {status}); give its target instead", again=False)
-    said = _server_message(reply.body, key)
-    reason = f"answers with status {status}" + (f": {said}" if said else "")
+    detail = _server_message(reply.body, key)
+    reason = f"answers with status {status}" + (f": {detail}" if detail else "")
     return Failure(reason, again=status in (408, 425, 429) or (status >= 500 and status not in (501, 505)))
 
 

@@ -150,8 +150,8 @@ class _Exchange:
             lost = isinstance(error, http.client.RemoteDisconnected)
             self.outcome.put(Failure("hung up without an answer" if lost else "does not speak HTTP", again=lost))
         except (OSError, http.client.HTTPException, zlib.error, ValueError) as error:
-            said = error.strerror if isinstance(error, OSError) and error.strerror else type(error).__name__
-            self.outcome.put(Failure(f"broke the connection off or could not be reached ({said})", again=True))
+            detail = error.strerror if isinstance(error, OSError) and error.strerror else type(error).__name__
+            self.outcome.put(Failure(f"broke the connection off or could not be reached ({detail})", again=True))
         finally:
             self._connection.close()
 

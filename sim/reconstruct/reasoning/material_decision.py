@@ -77,10 +77,10 @@ def decide_materials(
     from the next source, except that the numbers of a chosen preset stay as they are. Raises InputError for a preset
     that does not exist.
     """
-    said = answers.objects if answers is not None else ()
+    given = answers.objects if answers is not None else ()
     decided = []
     for i, (request, name) in enumerate(zip(requests, names, strict=True)):
-        answer = said[i] if i < len(said) else ObjectAnswer()
+        answer = given[i] if i < len(given) else ObjectAnswer()
         usual = next((found for word in (request.kind, name, answer.name) if (found := table.find(word))), None)
         decided.append(_decided(request, name, answer, usual))
     return tuple(decided)
