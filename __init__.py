@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .sim.app.compose_scene import compose
     from .sim.app.default_motion import DefaultMotion, default_motion
     from .sim.app.diagnose import diagnose
+    from .sim.app.evaluate import EvaluateOptions, evaluate
     from .sim.app.import_capture import ImportRequest, import_capture
     from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from .sim.diagnose.track.track_command import track
     from .sim.diagnose.track.track_input import TrackOptions, VideoTrial
     from .sim.errors import PhysGenError
+    from .sim.evaluate.evaluation import Evaluation
     from .sim.gaussians.compose.compose_options import ComposeRequest
     from .sim.importers.mesh_scene import scene_from_meshes
     from .sim.mpm.world import World
@@ -56,6 +58,8 @@ __all__ = [
     "DefaultMotion",
     "DiagnoseOptions",
     "Diagnosis",
+    "EvaluateOptions",
+    "Evaluation",
     "ImportRequest",
     "ObjectRequest",
     "PhysGenError",
@@ -72,6 +76,7 @@ __all__ = [
     "compose",
     "default_motion",
     "diagnose",
+    "evaluate",
     "import_capture",
     "load_bake",
     "load_capture",
@@ -92,6 +97,8 @@ _HOMES = {
     "DefaultMotion": ".sim.app.default_motion",
     "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
     "Diagnosis": ".sim.diagnose.diagnosis",
+    "EvaluateOptions": ".sim.app.evaluate",
+    "Evaluation": ".sim.evaluate.evaluation",
     "ImportRequest": ".sim.app.import_capture",
     "ObjectRequest": ".sim.reconstruct.reconstruct_options",
     "PhysGenError": ".sim.errors",
@@ -107,6 +114,7 @@ _HOMES = {
     "compose": ".sim.app.compose_scene",
     "default_motion": ".sim.app.default_motion",
     "diagnose": ".sim.app.diagnose",
+    "evaluate": ".sim.app.evaluate",
     "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",

@@ -30,6 +30,7 @@ from .commands import (
     compose_commands,
     diagnosis_commands,
     doctor,
+    evaluate,
     model_commands,
     photo_commands,
     render_commands,
@@ -97,6 +98,8 @@ def build_parser() -> argparse.ArgumentParser:
     diagnosis_commands.add_capture(command("capture", diagnosis_commands.run_capture, tables))
     examined = "test the diagnosis on simulated motion with withheld labels"
     diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
+    real = "how real a video is: against recordings, by itself; a page, JSON and tables"
+    evaluate.add_evaluate(command("evaluate", evaluate.run_evaluate, real))
     listing = command("effects", _effects, "list physical effects with their equations and parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
     kept = "list, install or remove models that improve the reconstruction"

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""Videos and folders of pictures as streams of frames, of bounded size, and at another frame rate."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..composite.srgb import read_rgb
+from ..diagnose.track.track_videos import MAX_SIDE, Video
+from ..errors import InputError
+from ..files import shown
+from ..validation import require_range
+
+Frame = NDArray[np.uint8]
+"""(H, W, 3), 8 bits, blue, green, red, as OpenCV has it."""
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+USUAL_FPS = 24.0
+"""Of a folder of pictures whose rate nobody says."""
+MOST_FRAMES = 20_000
+SAME_RATE = 0.002
+"""Rates that differ by less than this share are taken for the same: 29.97 and 30."""
+
+_NUMBER = re.compile(r"(\d+)(?!.*\d)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """A video file or a folder of pictures in the order of their numbers.
+
+    path: where it is. width, height: of a frame in pixels. fps: frames per second. pictures: of a folder, else empty.
+    notices: what was assumed.
+    """
+
+    path: Path
+    width: int
+    height: int
+    fps: float
+    pictures: tuple[Path, ...] = ()
+    notices: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the file or folder."""
+        return self.path.name
+
+    def frames(self, most: int = MOST_FRAMES) -> Iterator[Frame]:
+        """Yield the frames (H, W, 3) from the first, ``most`` at most, one in memory at a time.
+
+        Raises InputError for a frame of another size, or one that cannot be read.
+        """
+        for frame in self._pictures(most) if self.pictures else self._file(most):
+            if frame.shape[:2] != (self.height, self.width):
+                raise InputError(
+                    f"{shown(self.path)}: has a frame of {frame.shape[1]}x{frame.shape[0]} pixels and earlier ones of "
+                    f"{self.width}x{self.height}; give a video of one size"
+                )
+            yield frame
+
+    def count(self, most: int = MOST_FRAMES) -> int:
+        """Return how many frames can be read, ``most`` at most: containers are not to be believed."""
+        if self.pictures:
+            return min(len(self.pictures), most)
+        return sum(1 for _ in self._file(most))
+
+    def _file(self, most: int) -> Iterator[Frame]:
+        with Video(self.path) as video:
+            for frame in video.frames(0, most - 1):
+                yield frame.colour
+
+    def _pictures(self, most: int) -> Iterator[Frame]:
+        for path in self.pictures[:most]:
+            yield np.ascontiguousarray(read_rgb(path)[..., ::-1])
+
+
+def open_footage(path: Path, fps: float | None = None) -> Footage:
+    """Return the video file or folder of pictures ``path``, looked at but not read.
+
+    fps: frames per second of a folder of pictures, whose files do not say, or instead of what a video file says;
+    0.01 to 1000. Raises InputError for what is no video, an empty folder, or a rate out of range.
+    """
+    require_range("fps", fps, 0.01, 1000.0, "frames per second")
+    if path.is_dir():
+        return _folder(path, fps)
+    with Video(path) as video:
+        info = video.info
+        # What opens need not decode.
+        if next(video.frames(0, 0), None) is None:
+            raise InputError(f"{shown(path)}: no frame of it can be read; convert it to MP4 (H.264)")
+    if fps is None and info.fps <= 0:
+        raise InputError(f"{shown(path)}: does not say its frame rate; give --fps")
+    return Footage(path=path, width=info.width, height=info.height, fps=fps or info.fps)
+
+
+def _folder(path: Path, fps: float | None) -> Footage:
+    found = sorted((p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=_order)
+    found = [p for p in found if not p.name.startswith(".")]
+    if not found:
+        raise InputError(f"{shown(path)}: holds no pictures ({', '.join(PICTURES)}); name a video or its frames")
+    if len(found) > MOST_FRAMES:
+        raise InputError(f"{shown(path)}: holds {len(found)} pictures; give {MOST_FRAMES} at most")
+    first = read_rgb(found[0])
+    height, width = first.shape[:2]
+    if max(width, height) > MAX_SIDE:
+        raise InputError(f"{shown(found[0])}: is {width}x{height} pixels; give pictures up to {MAX_SIDE} a side")
+    said = () if fps else (f"{path.name}: pictures do not say their frame rate; taken as {USUAL_FPS:g} (--fps)",)
+    notices = (*said, *_gaps(path, found))
+    return Footage(path=path, width=width, height=height, fps=fps or USUAL_FPS, pictures=tuple(found), notices=notices)
+
+
+def _order(path: Path) -> tuple[int, str]:
+    """Return the last number in the name, then the name: 9.png comes before 10.png."""
+    found = _NUMBER.search(path.stem[:200])
+    return (int(found[1]) if found else 0, path.name)
+
+
+def _gaps(folder: Path, found: list[Path]) -> tuple[str, ...]:
+    """Return a notice where numbers are missing between the first picture and the last."""
+    numbers = [_order(path)[0] for path in found if _NUMBER.search(path.stem[:200])]
+    if len(numbers) < len(found) or len(set(numbers)) < len(numbers):
+        return ()
+    missing = numbers[-1] - numbers[0] + 1 - len(numbers)
+    return (f"{folder.name}: {missing} frames are missing between {found[0].name} and {found[-1].name}",) * bool(
+        missing
+    )
+
+
+def at_rate(footage: Footage, fps: float, most: int) -> Iterator[Frame]:
+    """Yield the frames of ``footage`` at ``fps``, ``most`` at most: blends of the two nearest, as Physics-IQ has them.
+
+    Of the n frames that the time takes m = ⌊n fps / its rate⌋ are made; frame j lies at j (n - 1)/(m - 1), so that the
+    first and the last are the video's own. The same rate gives the frames themselves.
+    """
+    if abs(footage.fps - fps) <= SAME_RATE * fps:
+        yield from footage.frames(most)
+        return
+    source = max(1, footage.count(min(MOST_FRAMES, math.ceil(most / fps * footage.fps))))
+    made = min(most, int(source / footage.fps * fps + 1e-6))
+    frames = footage.frames(source)
+    held, at = next(frames), 0
+    following = next(frames, held)
+    for j in range(made):
+        place = j * (source - 1) / max(made - 1, 1)
+        while at < int(place):
+            held, following, at = following, next(frames, following), at + 1
+        share = place - at
+        blend = (1 - share) * held.astype(np.float32) + share * following.astype(np.float32)
+        yield blend.astype(np.uint8)
+
+
+def reduced(frame: Frame, side: int) -> Frame:
+    """Return ``frame`` with no side longer than ``side`` pixels, averaged over areas; itself where it is not longer."""
+    height, width = frame.shape[:2]
+    longest = max(height, width)
+    if longest <= side:
+        return frame
+    size = max(1, round(width * side / longest)), max(1, round(height * side / longest))
+    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
