@@ -75,6 +75,11 @@ def look_through_camera(context: bpy.types.Context) -> None:
 
 def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
     """Make the viewports show ``scene`` through its camera, with plain textures and the whole image in view."""
+    show_whole(context, scene, colours="TEXTURE", light="FLAT")
+
+
+def show_whole(context: bpy.types.Context, scene: bpy.types.Scene, *, colours: str, light: str) -> None:
+    """Make the viewports show ``scene`` through its camera, the whole image in view, in these colours and light."""
     if context.window is None or context.window.scene != scene:
         return
     look_through_camera(context)
@@ -83,7 +88,7 @@ def show_photo(context: bpy.types.Context, scene: bpy.types.Scene) -> None:
         if area.type != "VIEW_3D" or space.region_3d is None:
             continue
         space.use_local_camera = False
-        space.shading.color_type, space.shading.light = "TEXTURE", "FLAT"
+        space.shading.color_type, space.shading.light = colours, light
         region = next((region for region in area.regions if region.type == "WINDOW"), None)
         with context.temp_override(window=context.window, area=area, region=region):
             if bpy.ops.view3d.view_center_camera.poll():

@@ -20,6 +20,24 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 """Options of a property whose path may begin with ``//``."""
 
 
+ADDON = __package__.removesuffix(".physgen_addon")
+"""Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` when installed."""
+
+
+def user_folder(name: str, *, create: bool = False) -> Path:
+    """Return the folder ``name`` among the user's files of this extension. Raises InputError if it cannot be made."""
+    try:
+        if ADDON.startswith("bl_ext."):
+            return Path(bpy.utils.extension_path_user(ADDON, path=name, create=create))
+        # Registered by a script: Blender has no folder for this extension.
+        folder = bpy.utils.user_resource("CONFIG", path=str(Path("physgen") / name), create=create)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be made ({error.strerror}); check the permissions") from error
+    if not folder:
+        raise InputError("Blender has no folder for the user's files; set BLENDER_USER_RESOURCES to one")
+    return Path(folder)
+
+
 def require_folder(path: str, what: str) -> Path:
     """Return ``path`` as an absolute path (``//`` is the .blend's folder); InputError if empty."""
     if not path.strip():

@@ -43,8 +43,8 @@ def _unfit(item: bpy.types.Object) -> str | None:
     return None
 
 
-def _add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | None) -> list[bpy.types.Object]:
-    """Add the selected objects as bodies; report unsuitable ones. ``role`` None keeps the object's role."""
+def add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | None) -> list[bpy.types.Object]:
+    """Add the selected objects as bodies and return them; report unsuitable ones. ``role`` None keeps theirs."""
     added = []
     for item in selected(context):
         trouble = _unfit(item)
@@ -69,7 +69,27 @@ def _is_sunk(item: bpy.types.Object, world: bpy.types.PropertyGroup) -> bool:
     return min(heights) < -SUNK * max(item.dimensions)
 
 
-class _OfSelected(OperatorMixin):
+def settle_ground(scene: bpy.types.Scene, added: list[bpy.types.Object]) -> str:
+    """Put the ground below ``added`` if one of them is in it and nobody has placed the ground; return what to report.
+
+    Blender's default cube is in it. It then has half its height to fall, so that a first bake shows a motion. Where
+    the ground was placed, or something else stands on it, it stays and the report says what to do. Empty: all is well.
+    """
+    world = scene.physgen.world
+    sunk = [item.name for item in added if _is_sunk(item, world)]
+    if not sunk:
+        return ""
+    if world.is_property_set("ground_point") or set(bodies(scene)) - set(added):
+        return f"{', '.join(sunk)}: below the ground. Lift it (G Z), or World > Ground > Put Below the Objects"
+    bounds = [rest_bounds(item) for item in added if item.physgen.role == "dynamic"]
+    low, high = min(low.z for low, _ in bounds), max(high.z for _, high in bounds)
+    world.ground_point = (0.0, 0.0, low - (high - low) / 2)
+    return f"The ground was at {', '.join(sunk)} and is below now (World > Ground)"
+
+
+class OfSelected(OperatorMixin):
+    """Mixin of operators on the selected objects."""
+
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
@@ -82,7 +102,7 @@ class _OfSelected(OperatorMixin):
         return context.mode == "OBJECT" and bool(selected(context))
 
 
-class PHYSGEN_OT_add_bodies(_OfSelected, bpy.types.Operator):
+class PHYSGEN_OT_add_bodies(OfSelected, bpy.types.Operator):
     """Add the selected meshes to the simulation"""
 
     bl_idname = "physgen.add_bodies"
@@ -90,19 +110,17 @@ class PHYSGEN_OT_add_bodies(_OfSelected, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Enable them."""
-        added = _add(self, context, None)
+        added = add(self, context, None)
         if not added:
             return {"CANCELLED"}
         self.report({"INFO"}, f"{count(len(added), 'object')} {'is' if len(added) == 1 else 'are'} in the simulation")
-        sunk = [item.name for item in added if _is_sunk(item, context.scene.physgen.world)]
-        if sunk:
-            # Blender's default cube is one of them; reported now rather than at the bake.
-            words = f"{', '.join(sunk)}: below the ground. Lift it (G Z), or World > Ground > Put Below the Objects"
+        words = settle_ground(context.scene, added)
+        if words:
             self.report({"WARNING"}, words)
         return {"FINISHED"}
 
 
-class PHYSGEN_OT_add_colliders(_OfSelected, bpy.types.Operator):
+class PHYSGEN_OT_add_colliders(OfSelected, bpy.types.Operator):
     """Add the selected meshes as colliders: obstacles that are not affected by collisions"""
 
     bl_idname = "physgen.add_colliders"
@@ -110,7 +128,7 @@ class PHYSGEN_OT_add_colliders(_OfSelected, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Enable them with that role."""
-        return {"FINISHED"} if _add(self, context, "collider") else {"CANCELLED"}
+        return {"FINISHED"} if add(self, context, "collider") else {"CANCELLED"}
 
 
 class PHYSGEN_OT_remove_body(bpy.types.Operator):

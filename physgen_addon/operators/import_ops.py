@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators: import scene folders, PhysGen3D folders and Gaussian splats (menus, file browser, drag and drop)."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import bpy
@@ -30,19 +31,25 @@ def show_scene(scene: bpy.types.Scene, root: Path, *, hide_others: bool = True) 
     """
     others = [] if scene.physgen.photo_root is not None or not hide_others else list(scene.objects)
     collection = import_scene(scene, root)
-    visible = [item for item in others if not item.hide_viewport]
-    for item in visible:
-        item.hide_viewport = item.hide_render = True
+    hidden = hide_all(others)
     found = bodies(scene)
-    _choose(scene, [item for item in found if item.name in collection.all_objects])
+    choose(scene, [item for item in found if item.name in collection.all_objects])
     show_photo(bpy.context, scene)
-    text = f"{count(len(found), 'object')} imported"
-    if visible:
-        text += f"; {', '.join(item.name for item in visible[:3])}{' …' if len(visible) > 3 else ''} hidden"
+    text = f"{count(len(found), 'object')} imported{hidden}"
     return ". ".join([text, *import_notes(collection)])
 
 
-def _choose(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> None:
+def hide_all(items: Iterable[bpy.types.Object]) -> str:
+    """Hide those of ``items`` that are visible, for the viewport and for renders; return the end of a report."""
+    visible = [item for item in items if not item.hide_viewport]
+    for item in visible:
+        item.hide_viewport = item.hide_render = True
+    if not visible:
+        return ""
+    return f"; {', '.join(item.name for item in visible[:3])}{' …' if len(visible) > 3 else ''} hidden"
+
+
+def choose(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> None:
     """Make the first of ``items`` active, the others unselected."""
     layer = bpy.context.view_layer
     if bpy.context.scene != scene or not items:

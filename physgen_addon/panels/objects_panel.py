@@ -127,7 +127,7 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
         if splats.find(item) is not None:
             column.row().prop(item.physgen, "splats_as", expand=True)
         if item.physgen.role == "dynamic":
-            _draw_preset(column, context, item.physgen.material)
+            draw_preset(column, context, item.physgen.material)
         if item.physgen.role == "collider":
             text.sentences(layout, context, "Other objects collide with it. It is static, or follows its keyframes.")
 
@@ -165,7 +165,8 @@ class PHYSGEN_PT_material(_Part, bpy.types.Panel):
             column.operator(PHYSGEN_OT_copy_material.bl_idname, icon="COPYDOWN")
 
 
-def _draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material: Any) -> None:
+def draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material: Any) -> None:
+    """Draw the menu of materials with its buttons, and what is unusual about the chosen one."""
     own = material_props.own_presets()
     name = material.preset_name
     row = layout.row(align=True)

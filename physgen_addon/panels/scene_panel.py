@@ -11,6 +11,7 @@ from .. import text
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
 from ..operators.photo_ops import PHYSGEN_OT_open_photo
+from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
@@ -57,6 +58,12 @@ def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> N
         row = box.row()
         row.scale_y = 1.3
         row.operator(operator.bl_idname, text=label, icon=icon)
+    box = layout.box()
+    text.sentences(box, context, "Nothing at hand: one of our own")
+    row = box.row(align=True)
+    row.scale_y = 1.3
+    row.operator(PHYSGEN_OT_open_sample.bl_idname, text="Sample Meshes", icon="SHADERFX").sample = "MESHES"
+    row.operator(PHYSGEN_OT_open_sample.bl_idname, text="Sample Photo", icon="IMAGE_REFERENCE").sample = "PHOTO"
     text.sentences(layout, context, "Then choose materials and velocities here, and press Bake (see Simulate).")
 
 

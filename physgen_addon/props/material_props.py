@@ -13,9 +13,9 @@ from bpy.props import EnumProperty, StringProperty
 from ...sim.constitutive import models
 from ...sim.errors import InputError
 from ...sim.scene.material import PRESET_FOLDER, Material, PresetFolder, read_presets
+from .. import paths
 from ..text import decimal, readable
 from .generated_properties import from_field
-from .preferences import ADDON
 
 CUSTOM = "custom"
 _SHIPPED = read_presets(PRESET_FOLDER)
@@ -28,16 +28,7 @@ _items: dict[tuple[str, str], tuple[str, str, str, str, int]] = {}
 
 def own_folder(*, create: bool = False) -> Path:
     """Return the folder of user presets. Raises InputError if it cannot be created."""
-    try:
-        if ADDON.startswith("bl_ext."):
-            return Path(bpy.utils.extension_path_user(ADDON, path="materials", create=create))
-        # Registered by a script: Blender has no folder for this extension.
-        folder = bpy.utils.user_resource("CONFIG", path=str(Path("physgen") / "materials"), create=create)
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be made ({error.strerror}); check the permissions") from error
-    if not folder:
-        raise InputError("Blender has no folder for the user's files; set BLENDER_USER_RESOURCES to one")
-    return Path(folder)
+    return paths.user_folder("materials", create=create)
 
 
 def own_presets() -> PresetFolder:

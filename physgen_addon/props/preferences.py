@@ -6,9 +6,7 @@ import bpy
 from .. import text
 from ..context import redraw
 from ..interpreter import TERMINAL, home_folder
-
-ADDON = __package__.removesuffix(".physgen_addon.props")
-"""Name of the extension's root package: ``physgen``, or ``bl_ext.<repository>.physgen`` when installed."""
+from ..paths import ADDON
 
 
 def _forget(self: "PHYSGEN_AP_preferences", context: bpy.types.Context) -> None:
@@ -47,9 +45,13 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
             row = layout.row(align=True)
             row.progress(factor=self.progress, text=self.progress_text)
             row.operator("physgen.cancel_job", text="", icon="X")
-        if not self.check:
-            return
-        box = layout.box()
+        _draw_check(self, context)
+        _draw_key(layout, context)
+
+
+def _draw_check(self: PHYSGEN_AP_preferences, context: bpy.types.Context) -> None:
+    if self.check:
+        box = self.layout.box()
         text.sentences(box, context, self.check_text, icon="CHECKMARK" if self.check == "YES" else "ERROR")
         if self.check_command:
             emptied = "empty the field above and " if self.python and str(home_folder()) in self.check_command else ""
@@ -58,6 +60,22 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
             row = box.row(align=True)
             row.prop(self, "check_command", text="")
             row.operator("physgen.copy_command", text="", icon="COPYDOWN").command = self.check_command
+
+
+PIE = "PHYSGEN_MT_pie"
+"""The pie menu, which its key opens."""
+
+
+def _draw_key(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the pie menu's key, to be changed here as in Preferences > Keymap."""
+    import rna_keymap_ui
+
+    user = context.window_manager.keyconfigs.user
+    keymap = user.keymaps.get("Object Mode") if user is not None else None
+    for item in keymap.keymap_items if keymap is not None else ():
+        if item.idname == "wm.call_menu_pie" and item.properties.name == PIE:
+            layout.label(text="Pie menu in the 3D viewport:")
+            rna_keymap_ui.draw_kmi([], user, keymap, item, layout, 0)
 
 
 def _own(context: bpy.types.Context) -> PHYSGEN_AP_preferences | None:
