@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Client of OpenAI-compatible chat endpoints: one question about one picture.
+"""Client of OpenAI-compatible chat endpoints: one question about one picture or several.
 
 The key is read from the environment when it is sent, is in no message, exception or field, and is redacted from server
 responses.
@@ -14,7 +14,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -44,7 +44,7 @@ class ChatRequest:
     timeout_s: for one attempt, from the start to the last byte of the answer, 0.05 to 3600.
     retries: further attempts if the endpoint is busy (429), fails (5xx) or cannot be reached, 0 to 10.
     backoff_s: pause before the second attempt, 0 to 60; it doubles with each further one.
-    consent: the user agrees that the photo is sent to this endpoint; must be True.
+    consent: the user agrees that the photo or the frames are sent to this endpoint; must be True.
     """
 
     url: str
@@ -57,7 +57,9 @@ class ChatRequest:
 
     def __post_init__(self) -> None:
         if self.consent is not True:
-            raise InputError("consent: not given; the photo is not sent without your agreement (--send-photo)")
+            raise InputError(
+                "consent: not given; no photo or frame is sent without your agreement (--send-photo, --send-frames)"
+            )
         parse_address(self.url)
         if not (0 < len(self.model) <= 200 and self.model.isprintable()):
             raise InputError(f"model is {self.model[:60]!r}: give the name that the endpoint knows")
@@ -80,6 +82,17 @@ class ChatRequest:
         return Address(address.scheme, address.host, address.port, path + mark + query)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Wording:
+    """What messages call the pictures that are sent, and what did not happen where no answer arrives."""
+
+    sent: str = "photo"
+    lost: str = "the objects were not identified"
+
+
+PHOTO = Wording()
+
+
 def complete_chat(
     request: ChatRequest,
     question: str,
@@ -87,22 +100,36 @@ def complete_chat(
     notice: Callable[[str], None],
     cancelled: IsCancelled = never,
 ) -> str:
-    """Return the answer of ``request.model`` to ``question`` about the picture ``jpeg``.
+    """Return the answer of ``request.model`` to ``question`` about the picture ``jpeg``, as ``complete_content`` does."""
+    return complete_content(request, (question, jpeg), notice, cancelled)
+
+
+def complete_content(
+    request: ChatRequest,
+    content: Sequence[str | bytes],
+    notice: Callable[[str], None],
+    cancelled: IsCancelled = never,
+    *,
+    temperature: float | None = 0.0,
+    wording: Wording = PHOTO,
+) -> str:
+    """Return the answer of ``request.model`` to one message of texts and JPEG files, in the order of ``content``.
 
     ``notice`` receives failed attempts and truncated answers; ``cancelled`` is polled between attempts and while
-    waiting. Raises InputError if no answer arrives, and Cancelled.
+    waiting. temperature: 0 for repeatable answers; None for the model's own. Raises InputError if no answer arrives,
+    and Cancelled.
     """
     key = _key(request.key_variable)
     place = address = request.address
     if address.scheme == "http" and not address.is_this_machine:
-        notice(f"{address}: photo{' and key' if key else ''} are sent unencrypted; use https")
-    # Temperature 0 for repeatable answers; a few models reject the parameter.
+        notice(f"{address}: {wording.sent}{' and key' if key else ''} are sent unencrypted; use https")
     body: dict[str, Any] = {
         "model": request.model,
-        "temperature": 0,
         "stream": False,
-        "messages": _messages(question, jpeg),
+        "messages": [{"role": "user", "content": [_part(piece) for piece in content]}],
     }
+    if temperature is not None:
+        body["temperature"] = temperature
     headers = {
         "Content-Type": "application/json",
         "Accept": "application/json",
@@ -120,8 +147,9 @@ def complete_chat(
             if 200 <= reply.status < 300:
                 return _content(reply, address, key, notice)
             if reply.status in (307, 308) and redirects < MAX_REDIRECTS:
-                place, redirects = _redirected(place, reply, key), redirects + 1
+                place, redirects = _redirected(place, reply, key, wording.sent), redirects + 1
                 continue
+            # A few models reject the parameter.
             if reply.status == 400 and "temperature" in body and b"temperature" in reply.body:
                 del body["temperature"]
                 continue
@@ -129,7 +157,7 @@ def complete_chat(
         pause = _pause(reply, request.backoff_s * 2.0**attempt)
         if not failure.again or attempt >= request.retries or pause > MAX_WAIT_S:
             tried = f" (tried {attempt + 1} times)" if attempt else ""
-            raise InputError(f"{address}: {failure.reason}{tried}; the objects were not identified")
+            raise InputError(f"{address}: {failure.reason}{tried}; {wording.lost}")
         attempt += 1
         notice(f"{address}: {failure.reason}; attempt {attempt + 1} of {request.retries + 1} follows in {pause:.3g} s")
         _wait(pause, cancelled)
@@ -146,19 +174,24 @@ def _key(variable: str) -> str:
     return key
 
 
-def _messages(question: str, jpeg: bytes) -> list[dict[str, Any]]:
-    picture = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
-    parts = [{"type": "text", "text": question}, {"type": "image_url", "image_url": {"url": picture}}]
-    return [{"role": "user", "content": parts}]
+def _part(piece: str | bytes) -> dict[str, Any]:
+    if isinstance(piece, str):
+        return {"type": "text", "text": piece}
+    return {"type": "image_url", "image_url": {"url": picture_url(piece)}}
 
 
-def _redirected(address: Address, reply: Reply, key: str) -> Address:
+def picture_url(jpeg: bytes) -> str:
+    """Return a data URL of the JPEG file."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+
+
+def _redirected(address: Address, reply: Reply, key: str, sent: str) -> Address:
     """The target of a redirect. Raises InputError unless scheme, host and port stay the same."""
     found = _led_to(address, reply.headers.get("location", ""))
     if found is None or (found.scheme, found.host, found.port) != (address.scheme, address.host, address.port):
         where = f" to host {_shown(found.host, key, 80)!r}" if found is not None else ""
         raise InputError(
-            f"{address}: redirects{where}; the photo is sent only to the host that you gave; give the right one"
+            f"{address}: redirects{where}; {sent} and question go only to the host that you gave; give the right one"
         )
     return found
 
