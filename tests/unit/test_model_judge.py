@@ -83,9 +83,7 @@ def key(monkeypatch):
 def judge(url, notices=None, given=None, **options):
     request = ChatRequest(url=url, model="m", consent=True, timeout_s=5, retries=0, backoff_s=0.01)
     said = [] if notices is None else notices
-    return judge_videos(
-        given or videos(), PHOTO, PROMPT, request, options=JudgeOptions(**options), notice=said.append
-    )
+    return judge_videos(given or videos(), PHOTO, PROMPT, request, options=JudgeOptions(**options), notice=said.append)
 
 
 def test_all_videos_are_judged_together_in_another_order_each_time():
@@ -158,7 +156,9 @@ def test_what_stays_unreadable_has_no_score_and_is_said():
     assert sum("has one value less" in note for note in found.notes) == 2
     with Judge(lambda h, n: send(h, completion("no"))) as server:
         nothing = judge(server.url, repetitions=1, attempts=1)
-    assert math.isnan(nothing.scores["clip_dark"]["photorealism"].mean) and "none (n = 0)" in judgement_lines(nothing)[1]
+    assert (
+        math.isnan(nothing.scores["clip_dark"]["photorealism"].mean) and "none (n = 0)" in judgement_lines(nothing)[1]
+    )
     assert nothing.to_json()["videos"]["clip_dark"]["photorealism"] == {"mean": None, "spread": None, "values": []}
 
 
