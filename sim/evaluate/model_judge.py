@@ -40,14 +40,14 @@ You are asked to judge {count} generated from the same photo and the same text. 
 evenly spaced frames of each video, in order of time. The text says what should happen: '{prompt}'
 
 Judge each video by three criteria:
-- Physical realism: does the motion follow the laws of physics, and do things show real properties such as weight, \
-elasticity and friction? A video in which nothing moves must lose points here, even though stillness is possible.
-- Photorealism: the visual quality. Are there artefacts or jumps, and how well are light, shadow, texture and material of \
-the photo kept?
+- Physical realism: does the motion follow the laws of physics, and do things show real properties such as \
+weight, elasticity and friction? A video in which nothing moves must lose points here, even though stillness is possible.
+- Photorealism: the visual quality. Are there artefacts or jumps, and how well are light, shadow, texture and \
+material of the photo kept?
 - Semantic consistency: how well does what happens agree with the text?
 
-Give a score from 0 to 1 for each criterion, 1 being the best. Write one line for each video, exactly in this form, with \
-a ';' after each score, and nothing else:
+Give a score from 0 to 1 for each criterion, 1 being the best. Write one line for each video, exactly in this form, \
+with a ';' after each score, and nothing else:
 {lines}
 """
 _LINE = "Video {}: Physical Realism Score: [score]; Photorealism Score: [score]; Semantic Consistency Score: [score];"

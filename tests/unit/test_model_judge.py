@@ -110,7 +110,7 @@ def test_all_videos_are_judged_together_in_another_order_each_time():
     assert not found.notes and "60 frames" not in notices[0] and "30 frames of 3 videos" in notices[0]
     assert KEY not in json.dumps(found.to_json()) + "".join(notices)
     assert any("clip_dark: physical realism" in text for text in judgement_lines(found))
-    again = {order: None for order in found.orders}
+    again = dict.fromkeys(found.orders)
     with Judge(honest) as server:
         assert dict.fromkeys(judge(server.url, repetitions=6).orders) == again, "orders follow from the seed"
 

@@ -100,7 +100,7 @@ def complete_chat(
     notice: Callable[[str], None],
     cancelled: IsCancelled = never,
 ) -> str:
-    """Return the answer of ``request.model`` to ``question`` about the picture ``jpeg``, as ``complete_content`` does."""
+    """Return the answer of ``request.model`` to ``question`` about ``jpeg``, as ``complete_content`` does."""
     return complete_content(request, (question, jpeg), notice, cancelled)
 
 
