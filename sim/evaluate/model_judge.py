@@ -41,7 +41,7 @@ evenly spaced frames of each video, in order of time. The text says what should 
 
 Judge each video by three criteria:
 - Physical realism: does the motion follow the laws of physics, and do things show real properties such as \
-weight, elasticity and friction? A video in which nothing moves must lose points here, even though stillness is possible.
+weight, elasticity and friction? A video in which nothing moves must lose points here, even though stillness is real.
 - Photorealism: the visual quality. Are there artefacts or jumps, and how well are light, shadow, texture and \
 material of the photo kept?
 - Semantic consistency: how well does what happens agree with the text?
