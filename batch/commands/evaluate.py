@@ -12,7 +12,8 @@ from ..terminal import Terminal
 
 def add_evaluate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen evaluate``."""
-    parser.add_argument("video", type=Path, metavar="VIDEO", help=".mp4, .webm or a folder of pictures")
+    video = ".mp4, .webm or a folder of pictures; or a bake folder"
+    parser.add_argument("video", type=Path, metavar="VIDEO", help=video)
     real = "recording of the real event from the same camera; twice: two takes of it"
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="REAL", help=real)
     out = "folder for report.html, evaluation.json and tables (default: VIDEO_evaluation beside the video)"
@@ -20,17 +21,33 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, metavar="S", help="only the first so many seconds (Physics-IQ: 5)")
     rate = "frames per second of a folder of pictures, or instead of what a video file says"
     parser.add_argument("--fps", type=float, metavar="F", help=rate)
+    photo = "the photo that the video was made from, which its first frame should equal"
+    parser.add_argument("--photo", type=Path, metavar="FILE", help=photo)
+    parser.add_argument("--bake", type=Path, metavar="DIR", help="the bake that the video shows, for physical checks")
+    scene = "the scene that was baked (default: the folder scene beside the bake)"
+    parser.add_argument("--scene", type=Path, metavar="DIR", help=scene)
+    network = "network for optical flow as an ONNX file (default: DIS, without weights)"
+    parser.add_argument("--flow", type=Path, metavar="FILE", help=network)
 
 
 def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen evaluate``; the exit code."""
-    from ...sim.app.evaluate import EvaluateOptions, evaluate
+    from ...sim.app.evaluate import EvaluateOptions, evaluate, is_bake
     from ...sim.evaluate.evaluation import evaluation_json, summary
 
     out = options.out or options.video.with_name(f"{options.video.stem}_evaluation")
-    settings = EvaluateOptions(seconds=options.seconds, fps=options.fps)
+    settings = EvaluateOptions(seconds=options.seconds, fps=options.fps, flow=options.flow)
+    bake = options.video if is_bake(options.video) else options.bake
     found = evaluate(
-        options.video, out=out, against=options.against, options=settings, on_event=terminal, cancelled=cancelled
+        None if bake is options.video else options.video,
+        out=out,
+        against=options.against,
+        photo=options.photo,
+        bake=bake,
+        scene=options.scene,
+        options=settings,
+        on_event=terminal,
+        cancelled=cancelled,
     )
     terminal({"event": "done", "stage": "evaluate", "out": str(out), **evaluation_json(found)})
     terminal.line(f"{summary(found)}\n{out}")

@@ -8,12 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..atomic import replacing_tree
+from ..cache.bake_folder import MANIFEST_FILE, Bake, load_bake
 from ..cache.folder_lock import lock_beside
 from ..errors import Cancelled, InputError
 from ..evaluate.against import against as against_section
+from ..evaluate.alone import alone
+from ..evaluate.bake_physics import bake_physics
 from ..evaluate.evaluation import JSON_FILE, Evaluation, Section, write_evaluation
-from ..evaluate.footage import MOST_FRAMES, Footage, open_footage
+from ..evaluate.flow import dis_flow, network_flow
+from ..evaluate.footage import MOST_FRAMES, Footage, Frame, open_footage
+from ..evaluate.report import strip_frames, write_page
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ..files import is_file
+from ..scene.folder import SCENE_FILE, Scene, load_scene
 from ..validation import quantity, require_quantities
 
 STAGE = "evaluate"
@@ -25,29 +32,36 @@ class EvaluateOptions:
 
     seconds: only the first so many seconds of every video; None: all that the videos have in common, Physics-IQ has 5.
     fps: frames per second of a folder of pictures, or instead of what a video file says; None: as it says.
+    flow: ONNX file of a network for optical flow (docs/evaluation.md); None: DIS.
     """
 
     seconds: float | None = quantity(None, 0.01, 3600.0, "seconds")
     fps: float | None = quantity(None, 0.01, 1000.0, "frames per second")
+    flow: Path | None = None
 
     def __post_init__(self) -> None:
         require_quantities(self, "")
 
 
 def evaluate(
-    video: str | Path,
+    video: str | Path | None,
     *,
     out: str | Path,
     against: Sequence[str | Path] = (),
+    photo: str | Path | None = None,
+    bake: str | Path | Bake | None = None,
+    scene: str | Path | Scene | None = None,
     options: EvaluateOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> Evaluation:
     """Return how real ``video`` is, and write the evaluation folder ``out``, whole or not at all.
 
-    video: .mp4, .webm or another file that OpenCV reads, or a folder of pictures. against: recordings of the real
-    event from the same camera, one, or two takes. ``out`` holds report.html, evaluation.json, measures.csv and
-    curves.csv (docs/evaluation.md); an earlier evaluation there is replaced.
+    video: .mp4, .webm or another file that OpenCV reads, a folder of pictures, or None where a bake is given. against:
+    recordings of the real event from the same camera, one, or two takes. photo: what the first frame should equal.
+    bake: what the video shows, for physical checks; scene: what was baked, by default the folder ``scene`` beside the
+    bake where it has the same objects. ``out`` holds report.html, evaluation.json, measures.csv and curves.csv
+    (docs/evaluation.md); an earlier evaluation there is replaced.
 
     >>> import physgen
     >>> found = physgen.evaluate("video.mp4", against=["take1.mp4"], out="evaluation")  # doctest: +SKIP
@@ -57,23 +71,60 @@ def evaluate(
     Raises InputError for what is no video, for videos too short to compare, and where ``out`` holds something else;
     Cancelled when cancelled, and nothing is written then.
     """
-    options, out, path = options or EvaluateOptions(), Path(out), Path(video)
+    options, out = options or EvaluateOptions(), Path(out)
     require_evaluation_folder(out)
-    progress = StageProgress(on_event, STAGE, 2)
-    footage = open_footage(path, options.fps)
+    if video is None and bake is None:
+        raise InputError("nothing to evaluate: give a video or a bake")
+    if video is None and (against or photo is not None):
+        raise InputError("against, photo: compare a video, and none is given; give one beside the bake")
+    progress = StageProgress(on_event, STAGE, 3)
     sections: list[Section] = []
-    if against:
-        recordings = [open_footage(Path(other)) for other in against]
-        sections.append(against_section(footage, recordings, most_frames(footage, options)))
+    strip: list[Frame] = []
+    subject = ""
+    if video is not None:
+        footage = open_footage(Path(video), options.fps)
+        subject, most = footage.name, most_frames(footage, options)
+        if against:
+            recordings = [open_footage(Path(other)) for other in against]
+            sections.append(against_section(footage, recordings, most))
+        progress.report(1)
+        flow = dis_flow() if options.flow is None else network_flow(options.flow)
+        named = "DIS" if options.flow is None else options.flow.name
+        still = None if photo is None else Path(photo)
+        sections.append(alone(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled))
+        strip = strip_frames(footage, most)
     if cancelled():
         raise Cancelled("the evaluation was cancelled; nothing was written")
-    progress.report(1)
-    found = Evaluation(root=out, subject=footage.name, sections=tuple(sections))
+    progress.report(2)
+    if bake is not None:
+        baked = bake if isinstance(bake, Bake) else load_bake(bake)
+        subject = subject or baked.root.resolve().name
+        sections.append(bake_physics(baked, _scene_of(baked, scene), cancelled=cancelled))
+    found = Evaluation(root=out, subject=subject, sections=tuple(sections))
     for notice in found.notices:
         progress.notice(notice)
-    save(found, out)
-    progress.report(2)
+    save(found, out, strip)
+    progress.report(3)
     return found
+
+
+def is_bake(path: Path) -> bool:
+    """Return whether ``path`` is a bake folder."""
+    return is_file(path / MANIFEST_FILE)
+
+
+def _scene_of(bake: Bake, scene: str | Path | Scene | None) -> Scene | None:
+    """Return the scene that is given, or that lies beside ``bake`` as a run leaves it; None for none of its objects."""
+    if isinstance(scene, Scene):
+        return scene
+    if scene is not None:
+        return load_scene(scene)
+    beside = bake.root.resolve().with_name("scene")
+    if not is_file(beside / SCENE_FILE):
+        return None
+    found = load_scene(beside)
+    known = bake.manifest.geometry_hash
+    return found if not known or found.geometry_hash() == known else None
 
 
 def most_frames(footage: Footage, options: EvaluateOptions) -> int:
@@ -89,11 +140,15 @@ def require_evaluation_folder(out: Path) -> None:
         raise InputError(f"{out}: is there and holds no evaluation; choose another folder")
 
 
-def save(found: Evaluation, out: Path) -> None:
-    """Write ``found`` as the folder ``out``, whole or not at all. Raises InputError where it cannot be written."""
+def save(found: Evaluation, out: Path, strip: Sequence[Frame] = ()) -> None:
+    """Write ``found`` as the folder ``out``, whole or not at all; ``strip``: frames for its page.
+
+    Raises InputError where it cannot be written.
+    """
     try:
         with lock_beside(out), replacing_tree(out) as partial:
             write_evaluation(found, partial)
+            write_page(found, strip, partial)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"

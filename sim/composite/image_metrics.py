@@ -47,6 +47,16 @@ def ssim(a: Picture, b: Picture) -> float:
     return ssim_and_slope(a, b)[0]
 
 
+def ssim_map(a: Picture, b: Picture) -> Picture:
+    """Return the structural similarity (H, W) of images (H, W, C) with values 0 to 1 around each pixel, of ``ssim``."""
+    mean_a, mean_b = windowed(a), windowed(b)
+    product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    shared = windowed(a * b) - product
+    spread = windowed(a * a) + windowed(b * b) - squares
+    similarity = (2 * product + C1) * (2 * shared + C2) / ((squares + C1) * (spread + C2))
+    return np.asarray(similarity.mean(axis=2))
+
+
 def ssim_and_slope(a: Picture, b: Picture) -> tuple[float, Picture]:
     """Return ``ssim`` and its exact gradient (H, W, C) with respect to ``a``, in the precision of the images.
 
