@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ...sim.errors import InputError
 from ...sim.events import IsCancelled
 from ..terminal import Terminal
 
@@ -13,7 +14,9 @@ from ..terminal import Terminal
 def add_evaluate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen evaluate``."""
     video = ".mp4, .webm or a folder of pictures; or a bake folder"
-    parser.add_argument("video", type=Path, metavar="VIDEO", help=video)
+    parser.add_argument("video", type=Path, nargs="?", metavar="VIDEO", help=video)
+    many = "videos for the Physics-IQ benchmark, in the place of VIDEO: its table (--against: the benchmark)"
+    parser.add_argument("--physics-iq", type=Path, metavar="DIR", help=many)
     real = "recording of the real event from the same camera; twice: two takes of it"
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="REAL", help=real)
     out = "folder for report.html, evaluation.json and tables (default: VIDEO_evaluation beside the video)"
@@ -32,23 +35,32 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen evaluate``; the exit code."""
-    from ...sim.app.evaluate import EvaluateOptions, evaluate, is_bake
+    from ...sim.app.evaluate import EvaluateOptions, evaluate, evaluate_physics_iq, is_bake
     from ...sim.evaluate.evaluation import evaluation_json, summary
 
-    out = options.out or options.video.with_name(f"{options.video.stem}_evaluation")
-    settings = EvaluateOptions(seconds=options.seconds, fps=options.fps, flow=options.flow)
-    bake = options.video if is_bake(options.video) else options.bake
-    found = evaluate(
-        None if bake is options.video else options.video,
-        out=out,
-        against=options.against,
-        photo=options.photo,
-        bake=bake,
-        scene=options.scene,
-        options=settings,
-        on_event=terminal,
-        cancelled=cancelled,
-    )
+    if (options.video is None) == (options.physics_iq is None):
+        raise InputError("give VIDEO, or --physics-iq DIR in its place")
+    subject = options.physics_iq or options.video
+    out = options.out or subject.with_name(f"{subject.stem}_evaluation")
+    if options.physics_iq is not None:
+        if len(options.against) > 1:
+            raise InputError("--against: with --physics-iq it is one folder, the benchmark's")
+        benchmark = next(iter(options.against), None)
+        found = evaluate_physics_iq(subject, benchmark=benchmark, out=out, on_event=terminal, cancelled=cancelled)
+    else:
+        settings = EvaluateOptions(seconds=options.seconds, fps=options.fps, flow=options.flow)
+        bake = subject if is_bake(subject) else options.bake
+        found = evaluate(
+            None if bake is subject else subject,
+            out=out,
+            against=options.against,
+            photo=options.photo,
+            bake=bake,
+            scene=options.scene,
+            options=settings,
+            on_event=terminal,
+            cancelled=cancelled,
+        )
     terminal({"event": "done", "stage": "evaluate", "out": str(out), **evaluation_json(found)})
     terminal.line(f"{summary(found)}\n{out}")
     return 0

@@ -3,20 +3,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
-from ..atomic import replacing_tree
+from ..atomic import replacing_tree, write_bytes
 from ..cache.bake_folder import MANIFEST_FILE, Bake, load_bake
 from ..cache.folder_lock import lock_beside
 from ..errors import Cancelled, InputError
 from ..evaluate.against import against as against_section
 from ..evaluate.alone import alone
 from ..evaluate.bake_physics import bake_physics
-from ..evaluate.evaluation import JSON_FILE, Evaluation, Section, write_evaluation
+from ..evaluate.evaluation import JSON_FILE, Evaluation, Section, table, write_evaluation
 from ..evaluate.flow import dis_flow, network_flow
 from ..evaluate.footage import MOST_FRAMES, Footage, Frame, open_footage
+from ..evaluate.physics_iq_folder import (
+    ViewRow,
+    physics_iq_section,
+    read_benchmark,
+    read_submission,
+    score_views,
+    view_table,
+)
 from ..evaluate.report import strip_frames, write_page
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file
@@ -108,6 +117,42 @@ def evaluate(
     return found
 
 
+VIEWS_FILE = "physics_iq.csv"
+
+
+def evaluate_physics_iq(
+    folder: str | Path,
+    *,
+    benchmark: str | Path | None,
+    out: str | Path,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Evaluation:
+    """Return the Physics-IQ table of the generated videos in ``folder``, and write the evaluation folder ``out``.
+
+    benchmark: the folder physics-IQ-benchmark with the real videos; None only checks names, rates and lengths. ``out``
+    also has ``physics_iq.csv``, a row for each view. What is wrong with a video is a notice; videos that cannot be read
+    or have no name of the benchmark's are left out, and the score then says of how many views it is.
+
+    Raises InputError where nothing can be compared; Cancelled on request.
+    """
+    folder, out = Path(folder), Path(out)
+    require_evaluation_folder(out)
+    submission = read_submission(folder)
+    rows: list[ViewRow] = []
+    if benchmark is not None:
+        views = read_benchmark(Path(benchmark), submission.fps)
+        progress = StageProgress(on_event, STAGE, max(1, len(set(views) & set(submission.videos))))
+        rows = score_views(submission, views, on_row=progress.report, cancelled=cancelled)
+        if not rows:
+            raise InputError(f"{folder}: none of its numbers is one of {benchmark}; name the same benchmark")
+    found = Evaluation(root=out, subject=folder.name, sections=(physics_iq_section(submission, rows, folder),))
+    for notice in found.notices:
+        on_event({"event": "notice", "stage": STAGE, "message": notice})
+    save(found, out, tables={VIEWS_FILE: table(view_table(rows))} if rows else {})
+    return found
+
+
 def is_bake(path: Path) -> bool:
     """Return whether ``path`` is a bake folder."""
     return is_file(path / MANIFEST_FILE)
@@ -140,15 +185,19 @@ def require_evaluation_folder(out: Path) -> None:
         raise InputError(f"{out}: is there and holds no evaluation; choose another folder")
 
 
-def save(found: Evaluation, out: Path, strip: Sequence[Frame] = ()) -> None:
-    """Write ``found`` as the folder ``out``, whole or not at all; ``strip``: frames for its page.
+def save(
+    found: Evaluation, out: Path, strip: Sequence[Frame] = (), tables: Mapping[str, bytes] = MappingProxyType({})
+) -> None:
+    """Write ``found`` as the folder ``out``, whole or not at all.
 
-    Raises InputError where it cannot be written.
+    strip: frames for its page. tables: further files, by name. Raises InputError where it cannot be written.
     """
     try:
         with lock_beside(out), replacing_tree(out) as partial:
             write_evaluation(found, partial)
             write_page(found, strip, partial)
+            for name, content in tables.items():
+                write_bytes(partial / name, content)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
