@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from .sim.diagnose.track.track_input import TrackOptions, VideoTrial
     from .sim.errors import PhysGenError
     from .sim.evaluate.evaluation import Evaluation
+    from .sim.evaluate.questionnaire import QuestionnaireOptions, make_questionnaire
+    from .sim.evaluate.questionnaire_answers import CollectOptions, collect_questionnaire
     from .sim.gaussians.compose.compose_options import ComposeRequest
     from .sim.importers.mesh_scene import scene_from_meshes
     from .sim.mpm.world import World
@@ -54,6 +56,7 @@ __all__ = [
     "BakeOptions",
     "Capture",
     "ChatRequest",
+    "CollectOptions",
     "ComposeRequest",
     "DefaultMotion",
     "DiagnoseOptions",
@@ -65,6 +68,7 @@ __all__ = [
     "PhysGenError",
     "Physics",
     "Proposal",
+    "QuestionnaireOptions",
     "ReconstructOptions",
     "RenderOptions",
     "Scene",
@@ -73,6 +77,7 @@ __all__ = [
     "World",
     "__version__",
     "bake",
+    "collect_questionnaire",
     "compose",
     "default_motion",
     "diagnose",
@@ -81,6 +86,7 @@ __all__ = [
     "load_bake",
     "load_capture",
     "load_scene",
+    "make_questionnaire",
     "propose",
     "reconstruct",
     "render",
@@ -93,6 +99,7 @@ _HOMES = {
     "BakeOptions": ".sim.app.bake_options",
     "Capture": ".sim.diagnose.capture",
     "ChatRequest": ".sim.reconstruct.reasoning.chat_client",
+    "CollectOptions": ".sim.evaluate.questionnaire_answers",
     "ComposeRequest": ".sim.gaussians.compose.compose_options",
     "DefaultMotion": ".sim.app.default_motion",
     "DiagnoseOptions": ".sim.diagnose.run_diagnosis",
@@ -104,6 +111,7 @@ _HOMES = {
     "PhysGenError": ".sim.errors",
     "Physics": ".sim.app.reconstruct",
     "Proposal": ".sim.reconstruct.reconstruct_options",
+    "QuestionnaireOptions": ".sim.evaluate.questionnaire",
     "ReconstructOptions": ".sim.reconstruct.reconstruct_options",
     "RenderOptions": ".physgen_addon.render.render_options",
     "Scene": ".sim.scene.folder",
@@ -111,6 +119,7 @@ _HOMES = {
     "VideoTrial": ".sim.diagnose.track.track_input",
     "World": ".sim.mpm.world",
     "bake": ".sim.app.bake",
+    "collect_questionnaire": ".sim.evaluate.questionnaire_answers",
     "compose": ".sim.app.compose_scene",
     "default_motion": ".sim.app.default_motion",
     "diagnose": ".sim.app.diagnose",
@@ -119,6 +128,7 @@ _HOMES = {
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",
     "load_scene": ".sim.scene.folder",
+    "make_questionnaire": ".sim.evaluate.questionnaire",
     "propose": ".sim.app.propose",
     "reconstruct": ".sim.app.reconstruct",
     "render": ".batch.stages",

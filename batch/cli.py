@@ -33,6 +33,7 @@ from .commands import (
     evaluate,
     model_commands,
     photo_commands,
+    questionnaire,
     render_commands,
     scene_commands,
 )
@@ -100,6 +101,8 @@ def build_parser() -> argparse.ArgumentParser:
     diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
     real = "how real a video is: against recordings, by itself; a page, JSON and tables"
     evaluate.add_evaluate(command("evaluate", evaluate.run_evaluate, real))
+    asked = "photos and videos → pages on which people judge them; with --collect: answers → results"
+    questionnaire.add_questionnaire(command("questionnaire", questionnaire.run_questionnaire, asked))
     listing = command("effects", _effects, "list physical effects with their equations and parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
     kept = "list, install or remove models that improve the reconstruction"
