@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 HERE = Path(__file__).parent
-NEEDS_INPUT = ("diagnosis", "first_frame", "rest")
+NEEDS_INPUT = ("diagnosis", "first_frame", "published", "rest")
 """Benchmarks of the user's own files; ``--quick`` makes some."""
 
 

@@ -12,6 +12,7 @@ import dataclasses
 import gzip
 import io
 import json
+import sys
 import tarfile
 import tomllib
 from collections.abc import Callable
@@ -90,6 +91,10 @@ from physgen.sim.scene.overrides import apply_overrides
 from physgen.sim.scene.textured_mesh import read_textured_mesh, write_moved_mesh
 from physgen.sim.version import VERSION
 from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from loaders_evaluate import EVALUATE
 
 RANDOM = np.random.default_rng(0)
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -809,3 +814,6 @@ _add(
     lambda f: (f / "a.txt").write_text(ANSWER),
     lambda f: read_answer(_text_of(f / "a.txt").decode("utf-8", "replace"), 2),
 )
+
+for _name, (_files, _writes, _reads) in EVALUATE.items():
+    _add(_name, _files, _writes, _reads)

@@ -25,7 +25,7 @@ FAST = (
     "splats",
     "worlds",
 )
-SLOW = ("compose", "demo", "first_frame", "light", "reconstruct", "thin_parts")
+SLOW = ("compose", "demo", "first_frame", "light", "published", "reconstruct", "thin_parts")
 NEEDS = {
     **dict.fromkeys((*SLOW, "main_thread", "playback", "render"), "bpy"),
     "farm_dask": "distributed",
