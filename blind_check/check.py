@@ -47,16 +47,18 @@ class PlannedCase:
     effects: tuple[str, ...]
 
 
-def plan_cases(count: int, rng: np.random.Generator) -> tuple[PlannedCase, ...]:
+def plan_cases(count: int, rng: np.random.Generator, *, two_share: float = TWO_SHARE) -> tuple[PlannedCase, ...]:
     """Return ``count`` cases in random order.
 
-    At least a fifth ``none``, a seventh ``unknown``, about a tenth two causes and a quarter soft; the rest cycles
-    through all effects. Raises InputError for fewer than ``LEAST_CASES`` or more than ``MOST_CASES``.
+    At least a fifth ``none``, a seventh ``unknown``, about ``two_share`` (0 to 0.5) two causes and a quarter soft; the
+    rest cycles through all effects. Raises InputError for fewer than ``LEAST_CASES`` or more than ``MOST_CASES``.
     """
     if not LEAST_CASES <= count <= MOST_CASES:
         raise InputError(f"cases is {count}: give {LEAST_CASES} to {MOST_CASES}, so that every kind of case occurs")
+    if not 0 <= two_share <= 0.5:
+        raise InputError(f"the share of two causes is {two_share}: give 0 to 0.5")
     none, unknown = math.ceil(count * NONE_SHARE), math.ceil(count * UNKNOWN_SHARE)
-    two = max(1, math.floor(count * TWO_SHARE))
+    two = max(1, math.floor(count * two_share))
     single = count - none - unknown - two
     soft = round(count * SOFT_SHARE)
     # Soft bodies get their share of each kind; cases of two causes are rigid.
@@ -139,6 +141,22 @@ def make_case(planned: PlannedCase, rng: np.random.Generator, cancelled: IsCance
     return maker(planned.effects, rng, cancelled)
 
 
+def make_any(
+    item: PlannedCase, seed: Sequence[int], cancelled: IsCancelled, make: MakeCase = make_case, attempts: int = 4
+) -> BlindCase:
+    """Return the planned case from the first of ``attempts`` draws that makes its effects visible.
+
+    Raises SimulationError where none does.
+    """
+    for attempt in range(attempts):
+        try:
+            return make(item, np.random.default_rng([*seed, attempt]), cancelled)
+        except SimulationError:
+            if attempt == attempts - 1:
+                raise
+    raise AssertionError
+
+
 def blind_check(
     options: BlindCheckOptions, on_event: OnEvent, cancelled: IsCancelled, *, make: MakeCase = make_case
 ) -> BlindScore:
@@ -188,7 +206,7 @@ def _prepare(
     for index, item in enumerate(planned):
         if cancelled():
             raise Cancelled("cancelled while the captures were made")
-        case = _made(item, seed, index, cancelled, make)
+        case = make_any(item, [seed, 1, index], cancelled, make)
         name = f"case-{index + 1:03d}"
         truths[name] = case.truth.arrays()
         labels[name] = {**case.truth.label(), "arrays": _arrays_digest(truths[name])}
@@ -197,18 +215,6 @@ def _prepare(
     for path in sorted((place / "captures").rglob("*")):
         os.utime(path, (_SAME_TIME, _SAME_TIME))
     return truths, seal(labels, sealed_path)
-
-
-def _made(
-    item: PlannedCase, seed: int, index: int, cancelled: IsCancelled, make: MakeCase, attempts: int = 4
-) -> BlindCase:
-    for attempt in range(attempts):
-        try:
-            return make(item, np.random.default_rng([seed, 1, index, attempt]), cancelled)
-        except SimulationError:
-            if attempt == attempts - 1:
-                raise
-    raise AssertionError
 
 
 def _diagnose_all(

@@ -88,8 +88,8 @@ class Discrepancy:
     directions: Mapping[str, float]
 
 
-class Fits(Protocol):
-    """All candidates fitted to one capture.
+class FittedModels(Protocol):
+    """What a verdict is decided from: all candidates fitted to one capture.
 
     nominal: the model as given. refitted: the same with its own parameters fitted. candidates: one or two effects each.
     floor_rms_m: noise floor, distance in m that noise alone leaves on held-out data.
@@ -97,11 +97,34 @@ class Fits(Protocol):
         model's prediction of held-out data.
     """
 
-    nominal: CandidateFit
-    refitted: CandidateFit
-    candidates: tuple[CandidateFit, ...]
-    floor_rms_m: float
-    grain_rms_m: float
+    @property
+    def nominal(self) -> CandidateFit:
+        """Return the model as given."""
+        ...
+
+    @property
+    def refitted(self) -> CandidateFit:
+        """Return the nominal model with its own parameters fitted."""
+        ...
+
+    @property
+    def candidates(self) -> tuple[CandidateFit, ...]:
+        """Return the fitted candidates."""
+        ...
+
+    @property
+    def floor_rms_m(self) -> float:
+        """Return the noise floor in m."""
+        ...
+
+    @property
+    def grain_rms_m(self) -> float:
+        """Return the simulator's uncertainty in m."""
+        ...
+
+
+class Fits(FittedModels, Protocol):
+    """The fits of one capture: what is decided from, and what the models predict."""
 
     def numerics_rms_m(self, fit: CandidateFit) -> float:
         """Return the distance in m by which predictions of ``fit`` change with resolution or time step."""
@@ -153,6 +176,31 @@ class RankedEffect:
     closed_fraction: float = math.nan
     misfit: float = math.nan
     reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedEffect:
+    """One of two causes. parameters: of the fit of both. without_rms_m: held-out error with the other one alone.
+
+    nats: log evidence that it adds to the other one alone.
+    """
+
+    effect: str
+    parameters: Mapping[str, Estimate]
+    without_rms_m: float
+    nats: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundPair:
+    """Two causes found, fitted together. probability: of the verdict. closed_fraction: NaN where not resolvable."""
+
+    effects: tuple[str, ...]
+    probability: float
+    heldout_rms_m: float
+    closed_fraction: float
+    misfit: float
+    adds: tuple[AddedEffect, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +277,7 @@ class Diagnosis:
     effects: all tested candidates, ``none`` and ``unknown``, most probable first; probabilities sum to 1.
     controls: ``wrong_effect_rms_m`` and ``last_residual_rms_m``.
     summary: the verdict in a sentence. warnings: of the capture and of the diagnosis. confirmation: verification runs.
+    pair: the fit of both causes where the verdict names two, else None.
     seconds: wall time, the only number that differs when the same capture is diagnosed again. work: budget and use.
     provenance: capture, command, version.
 
@@ -246,6 +295,7 @@ class Diagnosis:
     where: Localisation
     trials: Mapping[str, TrialArrays]
     summary: str
+    pair: FoundPair | None = None
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
     work: WorkRecord | None = None
@@ -275,16 +325,14 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of ``report.json`` as plain values; missing numbers are null."""
     effects = []
     for item in diagnosis.effects:
-        parameters = {
-            name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]} for name, e in item.parameters.items()
-        }
-        effects.append({**to_json(item), "parameters": parameters})
+        effects.append({**to_json(item), "parameters": _parameters_json(item.parameters)})
     return _plain(
         {
             "format": FORMAT,
             "verdict": to_json(diagnosis.verdict),
             "summary": diagnosis.summary,
             "effects": effects,
+            "pair": None if diagnosis.pair is None else _pair_json(diagnosis.pair),
             "gap": to_json(diagnosis.gap),
             "controls": dict(diagnosis.controls),
             "next_experiment": diagnosis.next_experiment,
@@ -300,6 +348,15 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "provenance": None if diagnosis.provenance is None else to_json(diagnosis.provenance),
         }
     )
+
+
+def _parameters_json(parameters: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]} for name, e in parameters.items()}
+
+
+def _pair_json(pair: FoundPair) -> dict[str, Any]:
+    adds = [{**to_json(a), "parameters": _parameters_json(a.parameters)} for a in pair.adds]
+    return {**to_json(pair), "adds": adds}
 
 
 def read_diagnosis(out: Path) -> tuple[dict[str, Any], Mapping[str, NDArray[Any]], Mapping[str, NDArray[Any]]]:

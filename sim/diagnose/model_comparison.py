@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..effects.registry import effects
-from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, Fits, Verdict
+from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, FittedModels, Verdict
 from .report.wording import effect_label
 
 
@@ -40,8 +40,10 @@ class ComparisonSettings:
     prior_none: prior probability that nothing is missing; the effects share the rest.
     containing: prior of an effect that contains another one (``CONTAINING``), relative to it: numbers that the trials
         leave open cost no evidence.
-    second_gain, second_misfit: a pair of effects counts only if it gains more than this many nats over each single
-        one, and each single one leaves more than this many times its misfit.
+    unseen_fee: nats that an effect pays more where it predicts held-out trials no better, and the nominal model's error
+        there is within noise and grain, so that they cannot judge; else it has no gain at all.
+    second_fee: nats that a second effect pays, beside its prior; with unseen_fee where the pair predicts held-out
+        trials no better than its better single effect.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
     many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
     alternative: effects with at least this fraction of the verdict's probability are named as alternatives.
@@ -55,8 +57,8 @@ class ComparisonSettings:
     sharpness: float = 8.0
     prior_none: float = 0.3
     containing: float = 0.2
-    second_gain: float = 15.0
-    second_misfit: float = 1.15
+    unseen_fee: float = 100.0
+    second_fee: float = 20.0
     predicted: tuple[float, float] = (0.9, 0.98)
     many: float = 3.0
     alternative: float = 0.1
@@ -94,10 +96,12 @@ class ModelComparison:
     reasons: Mapping[str, str]
 
 
-def compare_models(fits: Fits, weighing: ComparisonSettings) -> ModelComparison:
+def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelComparison:
     """Return verdict and probabilities. A pair of effects counts for its first effect."""
-    candidates = [nominal_or_refitted(fits), *(c for c in fits.candidates if _worth_it(c, fits.candidates, weighing))]
-    weights = _weights(candidates, weighing)
+    worth = (c for c in fits.candidates if _worth_it(c, fits.candidates))
+    candidates = [nominal_or_refitted(fits), *worth]
+    grain = math.hypot(fits.floor_rms_m, fits.grain_rms_m)
+    weights = _weights(candidates, weighing, grain)
     adequate = [_adequacy(c.misfit, candidates[0].misfit, weighing) for c in candidates]
     if _far_off(fits, weighing):
         adequate[0] = 0.0
@@ -143,20 +147,22 @@ def closed_fraction(before: float, after: float, floor: float) -> float:
     return min(max((before - after) / (before - floor), -1.0), 1.0)
 
 
-def _far_off(fits: Fits, weighing: ComparisonSettings) -> bool:
+def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> bool:
     """Return whether the nominal model's held-out error is many times noise and grain, so that something is missing."""
     error = min(fits.nominal.heldout_rms_m, nominal_or_refitted(fits).heldout_rms_m)
     return error > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m)
 
 
-def _predicted(fit: CandidateFit, fits: Fits, weighing: ComparisonSettings) -> float:
+def _predicted(fit: CandidateFit, fits: FittedModels, weighing: ComparisonSettings) -> float:
     """Return how far ``fit`` counts as an explanation because it predicts held-out trials: 0 to 1."""
     closed = closed_fraction(fits.nominal.heldout_rms_m, fit.heldout_rms_m, fits.floor_rms_m)
     low, high = weighing.predicted
     return min(max((closed - low) / (high - low), 0.0), 1.0) if fit.effects and math.isfinite(closed) else 0.0
 
 
-def _reason(fit: CandidateFit, best: Mapping[str, CandidateFit], fits: Fits, weighing: ComparisonSettings) -> str:
+def _reason(
+    fit: CandidateFit, best: Mapping[str, CandidateFit], fits: FittedModels, weighing: ComparisonSettings
+) -> str:
     """Return why ``fit`` is not the verdict, in a few words."""
     nominal = nominal_or_refitted(fits)
     if not fit.effects:
@@ -178,25 +184,38 @@ def _reason(fit: CandidateFit, best: Mapping[str, CandidateFit], fits: Fits, wei
     return f"leaves {fit.misfit:.1f} times the noise unexplained"
 
 
-def nominal_or_refitted(fits: Fits) -> CandidateFit:
+def nominal_or_refitted(fits: FittedModels) -> CandidateFit:
     """Return the model behind ``none``: nominal, or re-fitted within its plausible ranges if that has more evidence."""
     within = not fits.refitted.effects and fits.refitted.log_evidence > fits.nominal.log_evidence
     return fits.refitted if within else fits.nominal
 
 
-def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: ComparisonSettings) -> bool:
-    """Return whether a second effect explains what the first leaves; always True for single effects."""
+def _singles(fit: CandidateFit, candidates: Sequence[CandidateFit]) -> list[CandidateFit]:
+    """Return the single effects of the pair ``fit``; [] of a single effect."""
+    return [c for c in candidates if len(c.effects) == 1 < len(fit.effects) and c.effects[0] in fit.effects]
+
+
+def _worth_it(fit: CandidateFit, candidates: Sequence[CandidateFit]) -> bool:
+    """Return whether a pair leaves less than the better one of its effects; always True for single effects."""
     if len(fit.effects) < 2:
         return True
-    singles = [c for c in candidates if len(c.effects) == 1 and c.effects[0] in fit.effects]
+    singles = _singles(fit, candidates)
     if len(singles) < len(fit.effects):
         return False
-    gained = min((fit.log_evidence - c.log_evidence for c in singles), default=math.inf)
-    better = min((c.misfit for c in singles), default=math.inf) > weighing.second_misfit * fit.misfit
-    return bool(gained > weighing.second_gain and better)
+    best = max(singles, key=lambda c: c.log_evidence)
+    return fit.misfit < best.misfit and fit.log_evidence > best.log_evidence
 
 
-def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings) -> list[float]:
+def _second_fee(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing: ComparisonSettings) -> float:
+    """Return the nats that a pair pays for its second effect; 0 for a single effect."""
+    singles = _singles(fit, candidates)
+    if not singles:
+        return 0.0
+    shown = fit.heldout_rms_m < weighing.predicts * min(c.heldout_rms_m for c in singles)
+    return weighing.second_fee + (0.0 if shown else weighing.unseen_fee)
+
+
+def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings, grain: float) -> list[float]:
     nominal = candidates[0]
     logs = []
     for fit in candidates:
@@ -206,7 +225,8 @@ def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings) -
         if fit.effects and any(_same_motion(fit, other) for other in candidates):
             prior /= 2
         prior *= weighing.containing ** sum(name in CONTAINING for name in fit.effects)
-        logs.append(math.log(prior) + _gain(fit, nominal, weighing) / weighing.temperature)
+        gain = _gain(fit, nominal, weighing, grain) - _second_fee(fit, candidates, weighing)
+        logs.append(math.log(prior) + gain / weighing.temperature)
     highest = max(logs)
     raw = np.exp(np.array(logs) - highest)
     return [float(w) for w in raw / raw.sum()]
@@ -218,15 +238,16 @@ def _same_motion(fit: CandidateFit, other: CandidateFit) -> bool:
     return names == {"time_scale", "buoyancy"} and fit.log_evidence == other.log_evidence
 
 
-def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings) -> float:
-    """Return the nats over the nominal model that count for ``fit``."""
+def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings, grain: float) -> float:
+    """Return the nats over the nominal model that count for ``fit``. grain: noise and grain together, m."""
     if fit is nominal:
         return 0.0
     gain = fit.log_evidence - nominal.log_evidence
     if math.isnan(gain) or not math.isfinite(fit.log_evidence):
         return -math.inf
     if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m:
-        gain = min(gain, 0.0)
+        # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.
+        gain = min(gain, max(gain - weighing.unseen_fee, 0.0) if nominal.heldout_rms_m < grain else 0.0)
     return gain - weighing.fee
 
 
@@ -256,6 +277,10 @@ def _verdict(
     ][:MOST_ALTERNATIVES]
     if name in (NONE, UNKNOWN):
         return Verdict(effect=name, probability=top, alternatives=tuple(others))
+    if len(best[name].effects) > 1:
+        # Pairs are tried with one of two that are the same motion.
+        same = [t for n in best[name].effects if n not in ("air_drag", "wind") for t in TWINS.get(n, ())]
+        others += [t for t in same if t in best and t not in (*others, *best[name].effects)]
     return Verdict(effect=name, probability=top, alternatives=tuple(others), effects=best[name].effects)
 
 

@@ -14,7 +14,21 @@ from ..effects.registry import effects
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from .capture import Capture
-from .diagnosis import NONE, UNKNOWN, Array, CandidateFit, Diagnosis, Discrepancy, Fits, Gap, RankedEffect, TrialArrays
+from .diagnosis import (
+    NONE,
+    UNKNOWN,
+    AddedEffect,
+    Array,
+    CandidateFit,
+    Diagnosis,
+    Discrepancy,
+    Fits,
+    FittedModels,
+    FoundPair,
+    Gap,
+    RankedEffect,
+    TrialArrays,
+)
 from .gap_metrics import bootstrap_interval, localise, measure_gap, negative_controls
 from .model_comparison import (
     ComparisonSettings,
@@ -82,15 +96,18 @@ def diagnose(
     """
     options = options or DiagnoseOptions()
     started = time.monotonic()
-    work = _budget(capture, options)
-    fits = _fit(capture, options, work, on_event, cancelled)
+    work = allowed_work(capture, options)
+    fits = fit_candidates(capture, options, work, on_event, cancelled)
     weighed = compare_models(fits, ComparisonSettings())
     warnings = [*capture.warnings, *_left_out(fits, options, work)]
     for warning in warnings[len(capture.warnings) :]:
         on_event({"event": "notice", "stage": "diagnose", "message": warning})
-    verdict, found = weighed.verdict, _found(fits, weighed)
+    verdict, found = weighed.verdict, found_fit(fits, weighed)
     nominal_points, found_points = fits.simulate(fits.nominal), fits.simulate(found)
     gap = measure_gap(capture, fits, found, nominal_points)
+    if verdict.effect == NONE:
+        # Nothing was added, so there is no share to state.
+        gap = dataclasses.replace(gap, closed_fraction=math.nan)
     gap = dataclasses.replace(
         gap, closed_fraction_ci95=bootstrap_interval(capture, nominal_points, found_points, found, gap)
     )
@@ -105,6 +122,7 @@ def diagnose(
     return Diagnosis(
         verdict=verdict,
         effects=ranked,
+        pair=_found_pair(fits, weighed, found, gap),
         gap=gap,
         controls=negative_controls(capture, fits, weighed, found, nominal_points),
         next_experiment=next_experiment(verdict, kinds, resolvable=gap.resolvable, setting=recorded_setting(capture)),
@@ -124,7 +142,7 @@ def diagnose(
     )
 
 
-def _budget(capture: Capture, options: DiagnoseOptions) -> Work:
+def allowed_work(capture: Capture, options: DiagnoseOptions) -> Work:
     """Return the work that ``options`` allow for ``capture``."""
     rate = RIGID_RATE if all(item.belief.rigid for item in capture.objects) else SOFT_RATE
     return Work(limit=options.budget_s * rate if options.work is None else options.work, rate=rate)
@@ -145,7 +163,14 @@ def _left_out(fits: Fits, options: DiagnoseOptions, work: Work) -> list[str]:
     return said
 
 
-def _fit(capture: Capture, options: DiagnoseOptions, work: Work, on_event: OnEvent, cancelled: IsCancelled) -> Fits:
+def fit_candidates(
+    capture: Capture,
+    options: DiagnoseOptions,
+    work: Work,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Fits:
+    """Return all candidates fitted to ``capture``. Raises as ``diagnose`` does."""
     # Taichi is imported only here.
     rigid = [item.belief.rigid for item in capture.objects]
     if all(rigid):
@@ -163,7 +188,7 @@ def _fit(capture: Capture, options: DiagnoseOptions, work: Work, on_event: OnEve
     return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, work=work)
 
 
-def _found(fits: Fits, weighed: ModelComparison) -> CandidateFit:
+def found_fit(fits: FittedModels, weighed: ModelComparison) -> CandidateFit:
     """Return the fit that predicts ``after``: the verdict's.
 
     For ``none`` that is the nominal model, for ``unknown`` the re-fitted one where it predicts better.
@@ -255,6 +280,33 @@ def _ranking(weighed: ModelComparison, gap: Gap) -> tuple[RankedEffect, ...]:
             for item in items
         ]
     return tuple(sorted(items, key=lambda item: -item.probability))
+
+
+def _found_pair(fits: FittedModels, weighed: ModelComparison, found: CandidateFit, gap: Gap) -> FoundPair | None:
+    """Return the two causes of the verdict, and what each adds to the other; None where it names fewer."""
+    names = weighed.verdict.effects
+    alone = {c.effects[0]: c for c in fits.candidates if len(c.effects) == 1}
+    if len(names) != 2 or not all(n in alone for n in names):
+        return None
+    adds = []
+    for name, other in (names, names[::-1]):
+        rest = alone[other]
+        adds.append(
+            AddedEffect(
+                effect=name,
+                parameters=found.parameters[name],
+                without_rms_m=rest.heldout_rms_m,
+                nats=found.log_evidence - rest.log_evidence,
+            )
+        )
+    return FoundPair(
+        effects=names,
+        probability=weighed.verdict.probability,
+        heldout_rms_m=found.heldout_rms_m,
+        closed_fraction=gap.closed_fraction,
+        misfit=found.misfit,
+        adds=tuple(adds),
+    )
 
 
 def _arrays(

@@ -28,6 +28,8 @@ from physgen.batch.farm.planning.plan import load_plan, save_plan
 from physgen.batch.farm.planning.task_graph import make_plan
 from physgen.batch.farm.run_task import listed_task
 from physgen.batch.farm.task_execution import Record, load_record, record_path, save_record
+from physgen.blind_check.fit_records import FORMAT as FIT_RECORD
+from physgen.blind_check.fit_records import load_records
 from physgen.physgen_addon.frames.frame_files import Part, read_layers, read_picture, write_exr, write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex, gather_frames
 from physgen.physgen_addon.playback.bake_record import read_record
@@ -646,6 +648,19 @@ _add(
     lambda f: load_capture(f / "c"),
 )
 _add("diagnosis", ("report.json", "where.npz"), _diagnosis, _read_diagnosis)
+
+
+def _fit_record(folder: Path) -> None:
+    fit = {"effects": ["wind"], "log_evidence": 3.0, "heldout_rms_m": 0.01, "misfit": 1.0, "heldout_log_score": [1.0]}
+    fit["parameters"] = {"wind": {"wind_x": [2.0, 1.5, 2.5, "m/s"]}}
+    nominal = {**fit, "effects": [], "parameters": {}}
+    models = {"nominal": nominal, "refitted": nominal, "candidates": [fit], "withheld_rms_m": {"": 0.1, "wind": 0.01}}
+    truth = {"effect": "wind", "effects": ["wind"], "parameters": {}}
+    sizes = {"floor_rms_m": 0.001, "grain_rms_m": 0.001}
+    _json(folder / "case-0000.json", {"format": FIT_RECORD, "matter": "rigid", "truth": truth, **models, **sizes})
+
+
+_add("fit record", "case-0000.json", _fit_record, load_records)
 
 
 # Jobs, plans, records

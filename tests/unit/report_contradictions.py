@@ -13,7 +13,13 @@ def contradictions(report, page, *, dropped=False, lands=True):
 
     dropped, lands: whether nothing in the capture moved sideways, and whether anything reached the ground.
     """
-    return [*_probabilities(report), *_gap(report, page), *_rows(report), *_words(report, page, dropped, lands)]
+    return [
+        *_probabilities(report),
+        *_gap(report, page),
+        *_rows(report),
+        *_pair(report, page),
+        *_words(report, page, dropped, lands),
+    ]
 
 
 def _probabilities(report):
@@ -39,12 +45,14 @@ def _gap(report, page):
     high_floor = verdict != "none" and gap["resolvable"] and floor > 3 * gap["noise_rms_m"]
     if high_floor and "far above the tracking noise" not in page:
         yield "a noise floor far above the noise, unexplained"
-    if (closed is not None) != gap["resolvable"]:
+    if verdict == "none" and (closed is not None or low is not None):
+        yield "nothing is missing, and a share of the gap is closed"
+    if (closed is not None) != gap["resolvable"] and verdict != "none":
         yield "a share of a gap that is not resolvable, or none of one that is"
     if closed is not None:
         if not -1 <= closed <= 1:
             yield f"{closed:.0%} of a gap closed"
-        if closed > -1 and abs(closed - (before - after) / (before - floor)) > 1e-6:
+        if before > floor and closed > -1 and abs(closed - (before - after) / (before - floor)) > 1e-6:
             yield "a closed fraction that its errors do not give"
     if low is not None and (closed is None or not -1 <= low <= closed <= high <= 1):
         yield f"an interval {low} to {high} that is not around {closed}"
@@ -77,6 +85,28 @@ def _rows(report):
             schema = next(p for p in schemas[name].parameters if p.name == key)
             if not schema.low - TOLERANCE <= low <= estimate["value"] <= high <= schema.high + TOLERANCE:
                 yield f"{name}.{key}: {estimate['value']} in {low} to {high}, allowed {schema.low} to {schema.high}"
+
+
+def _pair(report, page):
+    pair, names = report.get("pair"), report["verdict"]["effects"]
+    if (pair is None) != (len(names) < 2):
+        yield "two causes without their line, or a line without two causes"
+    if pair is None:
+        return
+    if pair["effects"] != names or pair["probability"] != report["verdict"]["probability"]:
+        yield "the pair is not the verdict"
+    if [a["effect"] for a in pair["adds"]] != names:
+        yield "what each of two causes adds is not told"
+    if abs(pair["heldout_rms_m"] - report["gap"]["after_rms_m"]) > TOLERANCE:
+        yield "two errors of the pair"
+    for one in pair["adds"]:
+        if one["nats"] <= 0:
+            yield f"{one['effect']} adds nothing to the other cause"
+        for key, estimate in one["parameters"].items():
+            if not estimate["ci95"][0] <= estimate["value"] <= estimate["ci95"][1]:
+                yield f"{one['effect']}.{key}: outside its interval"
+            if key.replace("_", " ") not in page:
+                yield f"{one['effect']}.{key} is not on the page"
 
 
 def _words(report, page, dropped, lands):

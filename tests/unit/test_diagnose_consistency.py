@@ -172,6 +172,8 @@ DOCTORED = {
     ),
     "nothing lands there": doctored("drop", lambda r, p: r.update(next_experiment="Let the object bounce.")),
     "nothing is missing, with": doctored("plain", lambda r, p: r["gap"].update(before_rms_m=0.031, resolvable=True)),
+    "a share of the gap is closed": doctored("plain", lambda r, p: r["gap"].update(closed_fraction=0.4)),
+    "two causes without their line": doctored("drag", lambda r, p: r["verdict"].update(effects=["air_drag", "wind"])),
     "without a reason": doctored("drag", lambda r, p: _row(r, "buoyancy").update(reason="")),
     "is not on the page": doctored("drag", lambda r, p: p.replace(r["provenance"]["content_sha256"], "")),
     "unsaid": doctored("drag", lambda r, p: r["work"]["skipped"].update(tether="tried")),

@@ -97,6 +97,39 @@ def test_a_second_cause_has_to_earn_its_place():
     assert hardly.verdict.effects == ("friction",)
 
 
+def test_a_pair_is_judged_in_nats():
+    singles = fit("friction", evidence=900, misfit=1.2), fit("air_drag", evidence=20, misfit=4.0)
+    found = weighed(*singles, fit("friction", "air_drag", evidence=990, misfit=1.1, rms=0.004), nominal_misfit=5.0)
+    assert found.verdict.effects == ("friction", "air_drag")
+    worse = weighed(*singles, fit("friction", "air_drag", evidence=990, misfit=1.3, rms=0.004), nominal_misfit=5.0)
+    assert worse.verdict.effects == ("friction",)
+
+
+def test_a_pair_names_what_is_the_same_motion():
+    singles = (
+        fit("time_scale", evidence=900, misfit=2.2),
+        fit("buoyancy", evidence=900, misfit=2.2),
+        fit("friction", evidence=20, misfit=4.0),
+    )
+    found = weighed(*singles, fit("time_scale", "friction", evidence=1300, rms=0.004), nominal_misfit=5.0)
+    assert found.verdict.effects == ("time_scale", "friction") and found.verdict.alternatives == ("buoyancy",)
+
+
+def test_chaotic_held_out_motion_does_not_veto_a_large_gain():
+    """An adhesion that gains 472 nats, on bounces whose prediction wanders by twice the gap."""
+    nominal = fit(misfit=1.9, rms=0.0134)
+    adhesion, little = (fit("adhesion", evidence=e, misfit=0.9, rms=0.0142) for e in (472.0, 60.0))
+
+    def verdict(candidate, grain):
+        models = Found(
+            nominal=nominal, refitted=nominal, candidates=(candidate,), floor_rms_m=0.0017, grain_rms_m=grain
+        )
+        return compare_models(models, ComparisonSettings()).verdict.effect
+
+    assert verdict(adhesion, 0.0237) == "adhesion"
+    assert verdict(adhesion, 0.0) == UNKNOWN and verdict(little, 0.0237) in (NONE, UNKNOWN)
+
+
 @given(
     st.lists(
         st.tuples(

@@ -14,6 +14,7 @@ from physgen.sim.diagnose.rigid.observed_poses import as_matrix, perturbed, stat
 from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
 from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
+from physgen.sim.diagnose.rigid.start_numbers import MissingForces, tether_start
 from physgen.sim.effects.registry import effect
 
 RADIUS = 0.04
@@ -165,6 +166,38 @@ def test_an_offset_centre_moves_the_centre_of_mass():
     values = freedom.values(scene, setting, z)
     row = scene.numbers([setting])[0]
     assert row[SLOTS["center"]] == pytest.approx([values["fraction"] * values["offset_x"], 0, 0])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda d: np.linalg.norm(d) > 0.1))
+def test_a_hidden_mass_reaches_the_surface_and_not_beyond(way):
+    sides = np.array([0.06, 0.1, 0.2])
+    brick, ball = rigid_body(box(tuple(sides))), rigid_body(sphere())
+    direction = np.array(way) / np.linalg.norm(way)
+    wanted = np.min(0.5 * sides / np.maximum(np.abs(direction), 1e-12))
+    assert brick.reach(direction) == pytest.approx(wanted, rel=1e-6)
+    assert ball.reach(direction) == pytest.approx(ball.radius)
+    freedom, scene = CANDIDATE_EFFECTS["mass_offset"], scene_of(box(tuple(sides)))
+    values = freedom.values(scene, scene.base, np.array([*(3.0 * direction), -3.0]))
+    place = np.array([values[f"offset_{a}"] for a in "xyz"])
+    assert np.linalg.norm(place) <= wanted * (1 + 1e-9)
+
+
+def test_missing_forces_point_to_the_tether():
+    rng = np.random.default_rng(4)
+    anchor, stiffness, length = np.array([0.3, -0.4, 0.9]), 0.8, 0.25
+    places = rng.uniform(-0.5, 0.5, (20, 3)) + np.array([0, 0, 0.3])
+    line = anchor - places
+    distance = np.linalg.norm(line, axis=1)
+    forces = (stiffness * np.maximum(distance - length, 0) / distance)[:, None] * line + rng.normal(0, 0.01, (20, 3))
+    found = tether_start(
+        MissingForces(places=places, forces=forces, deviations=np.full(20, 0.01)), middle=np.array([0, 0, 0.3])
+    )
+    assert found is not None
+    assert found[2] == pytest.approx(anchor, abs=0.1) and found[0] == pytest.approx(stiffness, rel=0.3)
+    pushed = MissingForces(places=places, forces=-forces, deviations=np.full(20, 0.01))
+    nothing = MissingForces(places=places, forces=0.0 * forces, deviations=np.full(20, 0.01))
+    assert tether_start(pushed, np.zeros(3)) is None and tether_start(nothing, np.zeros(3)) is None
 
 
 def flights(lift=0.0, drag=0.0, sigma=2e-4, takes=4):

@@ -125,11 +125,15 @@ def ranking_picture(diagnosis: Diagnosis, *, width: float) -> Picture:
     left, right = 190.0, width - 60.0
     scale = Scale(low=0.0, high=1.0, start=0.0, end=max(right - left, 10.0))
     parts: list[Markup] = []
-    for row, item in enumerate(diagnosis.effects):
+    verdict = diagnosis.verdict
+    # Two causes share a bar.
+    items = [item for item in diagnosis.effects if item.name not in verdict.effects[1:]]
+    names = {verdict.effect: "+".join(verdict.effects)} if verdict.effects else {}
+    for row, item in enumerate(items):
         y = row * _ROW + 17
         class_ = bar_class(diagnosis, item)
         parts += [
-            label(shortened(effect_label(item.name), 28), left - 10, y, anchor="end"),
+            label(shortened(effect_label(names.get(item.name, item.name)), 28), left - 10, y, anchor="end"),
             element("rect", x=left, y=y - 11, width=scale.end, height=14, rx=2, class_="panel"),
             element("rect", x=left, y=y - 11, width=max(scale(item.probability), 1.0), height=14, rx=2, class_=class_),
             label(percent_text(item.probability), right + 8, y, class_="ink"),
@@ -139,7 +143,7 @@ def ranking_picture(diagnosis: Diagnosis, *, width: float) -> Picture:
     first = ", ".join(f"{effect_label(e.name)} {percent_text(e.probability)}" for e in diagnosis.effects[:5])
     return Picture(
         width=width,
-        height=max(len(diagnosis.effects), 1) * _ROW + 6,
+        height=max(len(items), 1) * _ROW + 6,
         title="Probability of each cause",
         description=first or "No candidates were tested.",
         body=join(parts),

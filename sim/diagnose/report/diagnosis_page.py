@@ -95,6 +95,10 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
     others = [item for item in effects if item.reason != SAME]
     shown = [item for i, item in enumerate(others) if i < ALWAYS or _finite(item.probability) >= LEAST]
     folded = others[len(shown) :]
+    if diagnosis.pair is not None:
+        # One line for two causes that were found together.
+        shown = [i for i in shown if i.name not in diagnosis.pair.effects]
+        folded = [i for i in folded if i.name not in diagnosis.pair.effects]
     intervals = sorted(diagnosis.where.intervals, key=lambda i: -_finite(i.share))[:MAX_ROWS]
     kinds = {item.name: item.kind for item in effects}
     observed = [effect_label(name) for name in found_effects(verdict) if kinds.get(name) == "observation"]
@@ -118,7 +122,7 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         folded_probability=sum(_finite(item.probability) for item in folded),
         alike=listed([effect_label(item.name) for item in alike], "and"),
         alike_probability=sum(_finite(item.probability) for item in alike),
-        second={name: effect_label(verdict.effect) for name in found_effects(verdict)[1:]},
+        pair=diagnosis.pair,
         provenance=diagnosis.provenance,
         closure=closure_sentence(diagnosis),
         gap_bars=gap_bars(diagnosis),

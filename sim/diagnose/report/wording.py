@@ -269,6 +269,8 @@ def alternatives_sentence(verdict: Verdict) -> str | None:
 def closure_sentence(diagnosis: Diagnosis) -> str:
     """Return the sentence on how much of the gap is closed, or why no number is given."""
     gap = diagnosis.gap
+    if diagnosis.verdict.effect == NONE:
+        return "No effect was added, so there is no gap to close."
     if not gap.resolvable:
         return (
             "Not resolvable: the nominal model is already so close to the noise floor "
@@ -276,8 +278,6 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
             "would be meaningless."
         )
     if not found_effects(diagnosis.verdict):
-        if diagnosis.verdict.effect == NONE:
-            return "No effect was added, so there is no gap to close."
         return (
             f"The gap on held-out trials is {_length(gap.before_rms_m)}, of which noise explains only "
             f"{_length(gap.noise_floor_rms_m)}. Nothing was added.{_floor(gap)}"

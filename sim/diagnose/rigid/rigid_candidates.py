@@ -205,6 +205,12 @@ def _tether_numbers(scene: BodyScene, z: Array) -> tuple[float, float, Array]:
     return stiffness, length, scene.middle + np.array([0.0, 0.0, 0.5]) + 0.5 * z[2:5]
 
 
+def tether_numbers(scene: BodyScene, stiffness: float, length: float, anchor: Array) -> tuple[float, ...]:
+    """Return the numbers (5,) of a tether: stiffness per mass 1/s², rest length m, anchor (3,) m."""
+    place = (anchor - scene.middle - np.array([0.0, 0.0, 0.5])) / 0.5
+    return (float(np.log(stiffness)) / 1.2, float(np.log(length / 0.3)) / 0.6, *map(float, place))
+
+
 def _tether(scene: BodyScene, s: WorldSettings, z: Array) -> WorldSettings:
     return dataclasses.replace(s, tether=_tether_numbers(scene, z))
 
@@ -239,8 +245,9 @@ def _adhesion(scene: BodyScene, s: WorldSettings, z: Array) -> WorldSettings:
 def _offset_numbers(scene: BodyScene, z: Array) -> tuple[Array, float]:
     center = 0.06 * scene.body.bound * z[:3]
     fraction = 0.15 * float(np.exp(0.5 * np.clip(z[3], -4, 3)))
-    # The pellet must lie within the body.
-    return center, float(np.clip(max(fraction, np.linalg.norm(center) / (0.7 * scene.body.bound)), 0.005, 0.9))
+    # The pellet lies within the body, at most at its surface.
+    least = float(np.linalg.norm(center)) / scene.body.reach(center)
+    return center, float(np.clip(max(fraction, least), 0.005, 0.9))
 
 
 def _offset(scene: BodyScene, s: WorldSettings, z: Array) -> WorldSettings:

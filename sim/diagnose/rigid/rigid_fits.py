@@ -18,7 +18,15 @@ from ..capture import Capture, Trial
 from ..diagnosis import CandidateFit, Discrepancy, Estimate
 from ..work import Work
 from .multiple_shooting import Fit
-from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect
+from .pair_search import search_pairs
+from .rigid_candidates import (
+    BELIEFS,
+    CANDIDATE_EFFECTS,
+    FRICTION_SPREAD,
+    RESTITUTION_SPREAD,
+    BodyScene,
+    CandidateEffect,
+)
 from .rigid_localisation import localise_discrepancies
 from .rigid_prediction import (
     HeldOutScore,
@@ -45,7 +53,6 @@ from .rigid_search import (
     refine_promising,
     refit_beliefs,
     refit_best,
-    search_pairs,
     sharpen,
 )
 
@@ -61,9 +68,6 @@ SHARPENINGS = 3
 
 WORSE = 1.2
 """Factor on the nominal error of complete trials up to which the mean over plausible contacts is preferred."""
-
-PAIR_GAIN, PAIR_CLEARS = 15.0, 0.85
-"""Nats by which a pair must beat the best single effect, and fraction of its misfit that it must stay below."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -231,27 +235,27 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     )
 
 
+SHARED = 4.0
+"""Factor on the variance of parameters: trials of one recording share model errors. The same as the temperature of the
+comparison, and what the truth's distance from the fits shows (docs/measurements.md)."""
+
+PAIRS_SHOWN = 3
+"""Best pairs that are judged."""
+
+
 def _worth(bodies: list[BodyFits], keys: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return ``keys`` without pairs whose second effect explains almost nothing."""
+    """Return ``keys`` without pairs that are no better than the best single effect, and with the best few others."""
 
     def evidence(key: tuple[str, ...]) -> float:
         return sum(b.fits[key].evidence for b in bodies)
 
-    def left(key: tuple[str, ...]) -> float:
-        found = [misfit(b.fits[key]) for b in bodies]
-        squares = sum(m.flight + m.contact for m in found)
-        return math.sqrt(squares / max(1, sum(m.flight_count + m.contact_count for m in found)))
-
-    singles = [k for k in keys if len(k) == 1]
-    if not singles:
-        return keys
-    best = max(singles, key=evidence)
-    enough, most = evidence(best) + PAIR_GAIN, PAIR_CLEARS * min(left(best), left(()))
-    return [k for k in keys if len(k) < 2 or (evidence(k) > enough and left(k) < most)]
+    best = max((evidence(k) for k in keys if len(k) == 1), default=math.inf)
+    pairs = sorted((k for k in keys if len(k) > 1 and evidence(k) > best), key=lambda k: -evidence(k))
+    return [k for k in keys if len(k) < 2 or k in pairs[:PAIRS_SHOWN]]
 
 
 def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
-    """Equalise the evidence of a slow clock and a lighter body, which are the same motion."""
+    """Equalise evidence and held-out error of a slow clock and a lighter body, which are the same motion."""
     clock, weight = made.get(("time_scale",)), made.get(("buoyancy",))
     if clock is None or weight is None:
         return
@@ -259,8 +263,9 @@ def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
     fraction = weight.parameters["buoyancy"]["fraction"].value
     if abs(rate**2 - (1 - fraction)) < 0.1 * abs(fraction) + 1e-4:
         best = max(clock.log_evidence, weight.log_evidence)
-        made["time_scale",] = dataclasses.replace(clock, log_evidence=best)
-        made["buoyancy",] = dataclasses.replace(weight, log_evidence=best)
+        error = min(clock.heldout_rms_m, weight.heldout_rms_m)
+        made["time_scale",] = dataclasses.replace(clock, log_evidence=best, heldout_rms_m=error)
+        made["buoyancy",] = dataclasses.replace(weight, log_evidence=best, heldout_rms_m=error)
 
 
 def _candidate(
@@ -269,7 +274,7 @@ def _candidate(
     first = max(bodies, key=lambda b: float(np.trace(b.fits[key].schur.sum(axis=0))))
     fit = first.fits[key]
     scene = fit.problem.scene
-    cover = np.linalg.inv(np.eye(fit.model.size) + fit.schur.sum(axis=0))
+    cover = np.linalg.inv(np.eye(fit.model.size) + fit.schur.sum(axis=0) / SHARED)
     spread = 0.5 * (cover + cover.T)
     rng = np.random.default_rng(0)
     values, vectors = np.linalg.eigh(spread)
@@ -311,6 +316,13 @@ def _amount(fit: Fit, name: str) -> float:
     return 0.0
 
 
+def _other_contact(name: str, value: float, normal: Array) -> Array:
+    """Return ``value`` of a contact coefficient as other contact models would have it, for draws ``normal`` (N,)."""
+    if name == "friction":
+        return np.asarray(value * np.exp(FRICTION_SPREAD * normal))
+    return value + RESTITUTION_SPREAD * normal if name == "restitution" else np.full_like(normal, value)
+
+
 def _estimates(scene: BodyScene, fit: Fit, name: str, draws: Array) -> dict[str, Estimate]:
     schema = {p.name: p for p in effect(name).parameters}
 
@@ -324,8 +336,10 @@ def _estimates(scene: BodyScene, fit: Fit, name: str, draws: Array) -> dict[str,
         return {k: float(np.clip(v, schema[k].low, schema[k].high)) for k, v in setting.items()}
 
     best, many = values(fit.z), [values(d) for d in draws]
-    found = {}
+    found, normal = {}, np.random.default_rng(1).normal(size=len(draws))
     for k, v in best.items():
-        low, high = np.percentile([m[k] for m in many], (2.5, 97.5))
+        spread = _other_contact(name, v, normal) - v
+        low, high = np.percentile(np.array([m[k] for m in many]) + spread, (2.5, 97.5))
+        low, high = np.clip((low, high), schema[k].low, schema[k].high)
         found[k] = Estimate(value=v, unit=schema[k].unit, low=float(min(low, v)), high=float(max(high, v)))
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Search for each candidate's parameters: single effects from the nominal fit, pairs from the best single ones.
+"""Search for each candidate's parameters: from the nominal fit, or from another effect (``pair_search``).
 
 ``misfit`` measures whether a fit leaves more than noise and contact uncertainty would: smooth remainders in flight,
 defects at contacts."""
@@ -25,8 +25,9 @@ from .multiple_shooting import (
     solve,
 )
 from .observed_poses import frame_pose, observe_body
-from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings
+from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings, tether_numbers
 from .rigid_simulator import RigidWorlds, rigid_body
+from .start_numbers import missing_forces, tether_start
 from .state_tracking import initial_camera, track_states, weight_contacts
 
 Array = NDArray[np.float64]
@@ -53,23 +54,31 @@ class Misfit:
         return float(np.sqrt((self.flight + self.contact) / count)) if count else 1.0
 
 
+OUTLYING = 3.0
+"""A trial's misfit counts at most as this many times the median trial's: one in which the body was lost, or tumbled
+chaotically, does not decide for all."""
+
+
 def misfit(fit: Fit) -> Misfit:
     """Return the misfit of ``fit``."""
     problem = fit.problem
-    flight = contact = 0.0
-    flights = contacts = 0
+    sums = np.zeros((len(problem.trials), 4))
     setting = fit.model.setting(problem.scene, fit.z)
     for segment in fit.evaluation.segments:
-        trial = problem.trials[segment.trial]
+        trial, own = problem.trials[segment.trial], sums[segment.trial]
         free = np.flatnonzero(segment.record[:, 15] <= 0)
         if len(free) >= LEAST_FRAMES:
-            gain, count = _remainder(problem, trial, segment, free, setting)
-            flight, flights = flight + gain, flights + count
+            own[:2] += _remainder(problem, trial, segment, free, setting)
         if segment.defect is not None:
             cover = trial.covers[segment.index]
-            contact += float(segment.defect @ np.linalg.solve(cover, segment.defect))
-            contacts += 12
-    return Misfit(flight=flight, flight_count=flights, contact=contact, contact_count=contacts)
+            own[2:] += float(segment.defect @ np.linalg.solve(cover, segment.defect)), 12
+    count = sums[:, 1] + sums[:, 3]
+    square = (sums[:, 0] + sums[:, 2]) / np.maximum(count, 1)
+    if (count > 0).sum() >= 3:
+        most = OUTLYING**2 * float(np.median(square[count > 0]))
+        sums[:, [0, 2]] *= np.minimum(1.0, most / np.maximum(square, 1e-12))[:, None]
+    flight, flights, contact, contacts = (float(x) for x in sums.sum(axis=0))
+    return Misfit(flight=flight, flight_count=int(flights), contact=contact, contact_count=int(contacts))
 
 
 def _remainder(
@@ -110,6 +119,9 @@ PROMISING = 12.0
 FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
 """Nats over the nominal model, and misfit, above which an effect is re-tracked with its own nodes."""
 
+FOLLOWED = 3
+"""Best single effects that are followed through their own contacts."""
+
 RECONSIDERED = 3
 """Best effects from whose states the nominal model is restarted."""
 
@@ -119,15 +131,8 @@ MOVED_GUESS = 0.3
 MOVED_MISFIT = 3.0
 """Misfit of the nominal model above which ``camera_pose`` is re-tracked."""
 
-PAIR_SHARE = 0.85
-"""Fraction of the nominal misfit that the best single effect must stay below: where it explains almost nothing, a
-second one does not help, and the cause is a different one."""
-
-PAIR_MISFIT = 1.6
-"""Misfit of the best single effect above which pairs are tested."""
-
-PAIRS_FINISHED = 3
-"""Pairs that are fitted to convergence."""
+MINIMA, APART = 3, 0.75
+"""Starts of a contact effect from its grid, and their least distance in prior standard deviations."""
 
 BEHIND, BEHIND_SHARE = 60.0, 0.5
 """Nats, and fraction of the best gain, behind which an effect is not fitted to convergence."""
@@ -203,32 +208,42 @@ def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: 
     problem = first.problem
     starts: list[Array] = [first.z]
     for candidate in new:
-        starts = [np.concatenate([z, s]) for z in starts for s in _starts(body, candidate)]
-    slopes = _reusable(body, candidates, slopes)
+        starts = [np.concatenate([z, s]) for z in starts for s in starts_of(body, candidate, first)]
+    slopes = reusable(body, candidates, slopes)
     if new[0].name not in CONTACTS:
         # Flight is nearly linear: contacts are added once the forces are about right.
-        loose = _loosened(problem)
+        loose = loosened(problem)
         flown = [solve(loose, model, z, first.states, rounds=3, held=slopes) for z in starts]
         flown = sorted(flown, key=lambda f: -f.evidence)[:2]
         fits = [(f.z, f.states) for f in flown]
     else:
-        z, free = _scanned(body, first, model, new[-1])
-        fits = [(z, free), (z, first.states)]
+        found, free = scanned(body, first, model, new[-1])
+        fits = [*((z, free) for z in found), *((z, first.states) for z in (found[0], *starts[1:]))]
     begun = [solve(problem, model, z, s, rounds=2, held=slopes) for z, s in fits]
     begun.sort(key=lambda f: -f.evidence)
     key = tuple(f.name for f in candidates)
     body.begun[key] = [f for f in begun if f.evidence > begun[0].evidence - BEHIND]
-    _keep(body, key, begun[0])
+    keep(body, key, begun[0])
     return begun[0]
 
 
-def _starts(body: BodyFits, candidate: CandidateEffect) -> tuple[tuple[float, ...], ...]:
+def starts_of(body: BodyFits, candidate: CandidateEffect, base: Fit) -> tuple[tuple[float, ...], ...]:
     """Return the starting values of ``candidate``. Without lift no path depends on a hidden spin, and without spin none
-    on lift: Magnus starts from a plausible lift there."""
-    return ((1.0,),) if candidate.name == "magnus" and body.problem.scene.unscaled else candidate.starts
+    on lift: Magnus starts from a plausible lift there. A tether starts where the missing forces point to, too."""
+    known: tuple[tuple[float, ...], ...] = ()
+    if base.model.candidates and (candidate.name,) in body.fits:
+        # What it needs alone, where something else is already explained.
+        known = (tuple(map(float, body.fits[(candidate.name,)].z[BELIEFS.size :])),)
+    if candidate.name == "magnus" and body.problem.scene.unscaled:
+        return ((1.0,), *known)
+    if candidate.name == "tether":
+        found = tether_start(missing_forces(base), body.problem.scene.middle)
+        if found is not None:
+            return (tether_numbers(body.problem.scene, *found), *candidate.starts, *known)
+    return (*candidate.starts, *known)
 
 
-def _reusable(body: BodyFits, candidates: tuple[CandidateEffect, ...], slopes: Evaluation | None) -> Evaluation | None:
+def reusable(body: BodyFits, candidates: tuple[CandidateEffect, ...], slopes: Evaluation | None) -> Evaluation | None:
     """Return ``slopes``, the nominal Jacobians, or None where paths depend on what the nominal model ignores."""
     lifted = body.problem.scene.unscaled and any(c.name == "magnus" for c in candidates)
     return None if lifted else slopes
@@ -239,8 +254,8 @@ def finish(body: BodyFits, key: tuple[str, ...]) -> Fit:
     nominal = body.fits[()]
     for fit in body.begun.pop(key, []):
         known = nominal.evaluation if fit.problem is body.problem else fit.evaluation
-        slopes = _reusable(body, fit.model.candidates, known)
-        _keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS, held=slopes))
+        slopes = reusable(body, fit.model.candidates, known)
+        keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS, held=slopes))
     return body.fits[key]
 
 
@@ -258,20 +273,21 @@ def finish_best(body: BodyFits) -> None:
             body.work.skip(key, "fitted to convergence")
 
 
-def _keep(body: BodyFits, key: tuple[str, ...], fit: Fit) -> None:
+def keep(body: BodyFits, key: tuple[str, ...], fit: Fit) -> None:
+    """Take ``fit`` as the fit of ``key`` where it is the best one so far."""
     if key not in body.fits or body.fits[key].evidence < fit.evidence:
         body.fits[key] = fit
 
 
-def _scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffect) -> tuple[Array, list[Array]]:
-    """Return start numbers and states of a contact effect: states from flights alone, numbers from a grid.
+def scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffect) -> tuple[list[Array], list[Array]]:
+    """Return start numbers, best first, and states of a contact effect: states from flights, numbers from a grid.
 
-    States of the nominal fit are biased by its wrong contacts.
+    States of the nominal fit are biased by its wrong contacts. Up to ``MINIMA`` numbers, apart by ``APART``.
     """
     problem = begin.problem
     key = tuple(f.name for f in begin.model.candidates)
     if key not in body.flown:
-        body.flown[key] = solve(_loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
+        body.flown[key] = solve(loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
     flown = body.flown[key]
     spreads = _arrival_spreads(problem, flown)
     base = begin.z.copy()
@@ -296,7 +312,14 @@ def _scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffec
     for segment in flown.evaluation.segments:
         if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
             states[segment.trial][segment.index] = flown.states[segment.trial][segment.index]
-    return tried[int(np.argmin(costs))], states
+    order = np.argsort(costs)
+    best = [tried[int(order[0])]]
+    for k in order[1:]:
+        if len(best) == MINIMA or costs[k] > costs[order[0]] + 2 * BEHIND:
+            break
+        if all(float(np.abs(tried[k] - z).max()) >= APART for z in best):
+            best.append(tried[k])
+    return best, states
 
 
 def _arrival_spreads(problem: Problem, flown: Fit) -> list[Array | None]:
@@ -324,24 +347,25 @@ def fit_camera_pose(body: BodyFits) -> None:
     model = Model(candidates=(candidate,))
     guess = initial_camera(problem)
     if float(np.abs(guess).max()) > MOVED_GUESS:
-        _followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
+        followed(body, model, np.concatenate([np.zeros(BELIEFS.size), guess]))
 
 
-def _followed(body: BodyFits, model: Model, z: Array) -> Fit:
+def followed(body: BodyFits, model: Model, z: Array) -> Fit:
     """Return ``model`` fitted from ``z`` with nodes at its own contacts, if that is better."""
     problem = body.problem
     trials = track_states(problem.scene, problem.simulator, [t.observations for t in problem.trials], model=model, z=z)
     other = dataclasses.replace(problem, trials=trials)
     weight_contacts(other, model, z)
-    flown = solve(_loosened(other), model, z, [t.states for t in trials], rounds=3)
+    flown = solve(loosened(other), model, z, [t.states for t in trials], rounds=3)
     begin = flown.z if model.candidates[-1].name not in CONTACTS else z
     fit = solve(other, model, begin, flown.states, rounds=2)
     fit = solve(other, model, fit.z, fit.states, rounds=ROUNDS, held=fit.evaluation)
-    _keep(body, tuple(f.name for f in model.candidates), fit)
+    keep(body, tuple(f.name for f in model.candidates), fit)
     return fit
 
 
-def _loosened(problem: Problem) -> Problem:
+def loosened(problem: Problem) -> Problem:
+    """Return ``problem`` with contacts so uncertain that flights alone determine the states."""
     trials = [dataclasses.replace(t, covers=[c * LOOSE**2 for c in t.covers]) for t in problem.trials]
     return dataclasses.replace(problem, trials=trials)
 
@@ -374,14 +398,15 @@ def refit_beliefs(body: BodyFits) -> None:
 def refit_best(body: BodyFits) -> None:
     """Fit the best effects again with their own nodes, where those of the nominal model may be unsuitable."""
     nominal = body.fits[()]
-    singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:2]
+    singles = sorted((f for k, f in body.fits.items() if len(k) == 1), key=lambda f: -f.evidence)[:FOLLOWED]
     for fit in singles:
-        if fit.evidence < singles[0].evidence - BEHIND:
+        gain = singles[0].evidence - nominal.evidence
+        if fit.evidence < singles[0].evidence - max(BEHIND, BEHIND_SHARE * gain):
             return
         gained = fit.evidence - nominal.evidence
         if fit.problem is body.problem and gained > FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
             if body.work.left():
-                _followed(body, fit.model, fit.z)
+                followed(body, fit.model, fit.z)
             else:
                 body.work.skip((fit.model.candidates[0].name,), "followed through its own contacts")
 
@@ -422,32 +447,3 @@ def sharpen(body: BodyFits) -> bool:
     }
     body.problem, body.fits, body.flown, body.begun = problems[id(body.problem)], sharp, {}, {}
     return True
-
-
-def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
-    """Fit pairs of effects: the best one or two with each other one, where a single effect leaves too much."""
-    singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1]
-    if not singles:
-        return
-    singles.sort(key=lambda item: -item[1].evidence)
-    left = misfit(singles[0][1]).ratio
-    open_end = PAIR_MISFIT <= left <= PAIR_SHARE * misfit(body.fits[()]).ratio
-    # A hidden spin differs between trials, so that no single effect takes its place: lift is always tried beside it.
-    others = wanted if open_end else [c for c in wanted if c.name == "magnus" and body.problem.scene.unscaled]
-    tried = []
-    for name, fit in singles[:2]:
-        for candidate in others:
-            if candidate.name == name or tuple(sorted((name, candidate.name))) in {tuple(sorted(k)) for k in body.fits}:
-                continue
-            if {name, candidate.name} == {"air_drag", "wind"}:
-                continue
-            if not body.work.left():
-                body.work.skip((name, candidate.name), "tried")
-                continue
-            begin_search(body, (CANDIDATE_EFFECTS[name], candidate), fit)
-            tried.append((name, candidate.name))
-    for key in sorted(tried, key=lambda k: -body.fits[k].evidence)[:PAIRS_FINISHED]:
-        if body.work.left():
-            finish(body, key)
-        else:
-            body.work.skip(key, "fitted to convergence")

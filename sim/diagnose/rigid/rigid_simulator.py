@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,20 @@ class RigidBody:
     def mass(self) -> float:
         """Return the mass in kg."""
         return self.density * self.volume
+
+    @cached_property
+    def _faces(self) -> Array:
+        """Return the hull's outward normals and offsets (F, 4): inside where normal · x + offset < 0."""
+        return np.unique(ConvexHull(self.corners).equations, axis=0)
+
+    def reach(self, direction: Array) -> float:
+        """Return the distance in m from the centre of mass to the surface along ``direction`` (3,)."""
+        length = float(np.linalg.norm(direction))
+        if self.round or length < 1e-12:
+            return self.bound
+        leans = self._faces[:, :3] @ (direction / length)
+        ahead = leans > 1e-9
+        return float(np.min(-self._faces[ahead, 3] / leans[ahead]))
 
 
 def rigid_body(item: CaptureObject) -> RigidBody:

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: MIT
+"""Calibration of verdicts on recorded fits: reliability, intervals, pairs, and constants chosen without their effects.
+
+Nothing here is blind: the truth lies beside the fits. It sets constants and measures them; ``blind_check`` examines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sim.diagnose.diagnosis import NONE, UNKNOWN, CandidateFit
+from ..sim.diagnose.model_comparison import ComparisonSettings, ModelComparison, compare_models, nominal_or_refitted
+from .fit_records import FitRecord
+from .scoring import calibration_error
+
+Array = NDArray[np.float64]
+
+TRUE_VALUES: Mapping[str, tuple[str, str]] = {
+    "air_drag": ("drag_per_mass", "drag_per_mass_1_per_m"),
+    "wind": ("drag_per_mass", "drag_per_mass_1_per_m"),
+    "magnus": ("lift_per_mass", "lift_per_mass"),
+    "buoyancy": ("fraction", "fraction"),
+    "gravity_tilt": ("angle", "angle"),
+    "tether": ("stiffness_per_mass", "stiffness_per_mass"),
+    "friction": ("friction", "mu"),
+    "restitution": ("restitution", "e"),
+    "adhesion": ("pull_per_mass", "pull_per_mass"),
+    "time_scale": ("rate", "rate"),
+    "stiffness": ("youngs_modulus", "E"),
+}
+"""Effect → (its main parameter, the generator's name for it)."""
+
+FOLDED: Mapping[str, str] = {"wind": "air_drag", "time_scale": "buoyancy"}
+"""Effects that are left out together: one contains the other, or is the same motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedCase:
+    """A record and its verdict. right: the first cause is a true one (or ``none``, ``unknown``). pair: two named.
+
+    both: both causes of two named. closed: share of the withheld gap that the verdict's model closes; NaN without one.
+    """
+
+    record: FitRecord
+    verdict: str
+    probability: float
+    unknown: float
+    right: bool
+    among: bool
+    pair: bool
+    both: bool
+    closed: float
+
+
+def judge(record: FitRecord, settings: ComparisonSettings) -> JudgedCase:
+    """Return ``record`` judged with ``settings``."""
+    found = compare_models(record, settings)
+    verdict = found.verdict
+    wanted = set(record.effects) or {record.effect}
+    names = {verdict.effect, *verdict.effects}
+    before = record.withheld_rms_m.get("", math.nan)
+    after = record.withheld_rms_m.get(_model(record, found), math.nan)
+    return JudgedCase(
+        record=record,
+        verdict=verdict.effect,
+        probability=verdict.probability,
+        unknown=found.probabilities.get(UNKNOWN, 0.0),
+        right=verdict.effect in wanted,
+        among=bool(wanted & {*names, *verdict.alternatives}),
+        pair=len(verdict.effects) > 1,
+        both=len(verdict.effects) > 1 and wanted == names,
+        closed=1.0 - after / before if before > 0 and record.effect != NONE else math.nan,
+    )
+
+
+def _model(record: FitRecord, found: ModelComparison) -> str:
+    """Return the key of the verdict's model in ``withheld_rms_m``."""
+    if found.verdict.effects:
+        return "+".join(found.best[found.verdict.effect].effects)
+    refitted = record.refitted.heldout_rms_m < record.nominal.heldout_rms_m
+    return "refitted" if found.verdict.effect == UNKNOWN and refitted else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reliability:
+    """Quality of verdicts on N cases; shares are in [0, 1], NaN where no case applies.
+
+    verdict_error, unknown_error: expected calibration error of the verdict's probability, and of that of ``unknown``
+    against whether the cause lies outside the vocabulary. rows: of the reliability table, (low, high, cases, mean
+    probability, share right) for verdicts, then for unknown.
+    """
+
+    cases: int
+    first: float
+    among: float
+    false_alarms: float
+    abstains: float
+    verdict_error: float
+    unknown_error: float
+    closed_median: float
+    pairs_first: float
+    pairs_both: float
+    false_pairs: float
+    covered: tuple[int, int]
+    rows: tuple[tuple[tuple[float, float, int, float, float], ...], tuple[tuple[float, float, int, float, float], ...]]
+
+    def text(self) -> str:
+        """Return a table of everything."""
+        lines = [
+            f"cases {self.cases}; first right {_percent(self.first)}, with alternatives {_percent(self.among)}",
+            f"false alarms {_percent(self.false_alarms)}, abstains on unknown {_percent(self.abstains)}",
+            f"two causes: first {_percent(self.pairs_first)}, both {_percent(self.pairs_both)}; "
+            f"false pairs on one cause {_percent(self.false_pairs)}",
+            f"withheld gap closed, median {self.closed_median:.2f}; "
+            f"95 % intervals hold the truth {self.covered[0]} of {self.covered[1]}",
+            f"expected calibration error: verdicts {self.verdict_error:.3f}, unknown {self.unknown_error:.3f}",
+        ]
+        for title, rows in zip(("verdict", "unknown"), self.rows, strict=True):
+            lines.append(f"probability of the {title}: cases, mean, share right")
+            lines += [f"  {a:.1f} to {b:.1f}: {n:4d}  {mean:.2f}  {share:.2f}" for a, b, n, mean, share in rows]
+        return "\n".join(lines)
+
+
+def reliability(cases: Sequence[JudgedCase]) -> Reliability:
+    """Return the reliability of ``cases``."""
+    p, right = np.array([c.probability for c in cases]), np.array([c.right for c in cases], dtype=float)
+    q = np.array([c.unknown for c in cases])
+    outside = np.array([c.record.effect == UNKNOWN for c in cases], dtype=float)
+    two = [c for c in cases if len(c.record.effects) > 1]
+    inside = [covered(c.record) for c in cases if len(c.record.effects) == 1]
+    known = [i for i in inside if i is not None]
+    return Reliability(
+        cases=len(cases),
+        first=_share(c.right for c in cases),
+        among=_share(c.among for c in cases),
+        false_alarms=_share(c.verdict != NONE for c in cases if c.record.effect == NONE),
+        abstains=_share(c.verdict == UNKNOWN for c in cases if c.record.effect == UNKNOWN),
+        verdict_error=calibration_error(p, right),
+        unknown_error=calibration_error(q, outside),
+        closed_median=float(np.nanmedian([c.closed if c.record.effects else math.nan for c in cases] or [math.nan])),
+        pairs_first=_share(c.right for c in two),
+        pairs_both=_share(c.both for c in two),
+        false_pairs=_share(c.pair for c in cases if len(c.record.effects) == 1),
+        covered=(sum(known), len(known)),
+        rows=(_bins(p, right), _bins(q, outside)),
+    )
+
+
+def covered(record: FitRecord) -> bool | None:
+    """Return whether the true cause's 95 % interval holds its main parameter; None where that is not defined."""
+    names = TRUE_VALUES.get(record.effect)
+    fit = next((c for c in record.candidates if c.effects == (record.effect,)), None)
+    truth = dict(record.truth.get("parameters") or {})
+    if names is None or fit is None or names[1] not in truth or names[0] not in fit.parameters[record.effect]:
+        return None
+    estimate = fit.parameters[record.effect][names[0]]
+    return bool(estimate.low <= float(truth[names[1]]) <= estimate.high)
+
+
+GRID: Mapping[str, Sequence[Any]] = {
+    "temperature": (2.0, 4.0, 8.0, 16.0),
+    "enough": (1.4, 1.7, 2.2),
+    "enough_explained": (2.0, 3.0, 4.5),
+    "sharpness": (4.0, 8.0),
+    "predicted": ((0.7, 0.95), (0.8, 0.95), (0.9, 0.98)),
+}
+"""Constants that ``cross_validated`` chooses among."""
+
+
+def cross_validated(
+    records: Sequence[FitRecord],
+    base: ComparisonSettings,
+    report: Callable[[str], None] = lambda line: None,
+) -> tuple[list[JudgedCase], ComparisonSettings]:
+    """Return ``records`` judged with constants chosen without their effect, and the constants chosen with all.
+
+    The loss is the mean logarithmic score of the truth's probability, every effect counting the same.
+    """
+    choices = [dict(zip(GRID, values, strict=True)) for values in itertools.product(*GRID.values())]
+    groups = [_group(r) for r in records]
+    table = np.array(
+        [[_loss(r, dataclasses.replace(base, **choice)) for r in records] for choice in choices], dtype=float
+    )
+    chosen: list[JudgedCase] = []
+    for group in sorted(set(groups)):
+        others = [i for i, g in enumerate(groups) if g != group]
+        best = choices[int(np.argmin(_balanced(table[:, others], [groups[i] for i in others])))] if others else {}
+        report(f"without {group}: {best}")
+        settings = dataclasses.replace(base, **best)
+        chosen += [judge(r, settings) for r, g in zip(records, groups, strict=True) if g == group]
+    return chosen, dataclasses.replace(base, **choices[int(np.argmin(_balanced(table, groups)))])
+
+
+def _balanced(table: Array, groups: Sequence[str]) -> Array:
+    """Return the mean loss (choices,) of the groups' mean losses."""
+    names = sorted(set(groups))
+    own = np.array(groups)
+    return np.asarray(np.mean([table[:, own == n].mean(axis=1) for n in names], axis=0))
+
+
+def _group(record: FitRecord) -> str:
+    if len(record.effects) > 1:
+        return "two causes"
+    return FOLDED.get(record.effect, record.effect)
+
+
+def _loss(record: FitRecord, settings: ComparisonSettings) -> float:
+    found = compare_models(record, settings)
+    wanted = set(record.effects) or {record.effect}
+    if len(record.effects) == 1 and record.truth.get("ambiguous_with"):
+        wanted |= set(record.truth["ambiguous_with"])
+    return -math.log(max(sum(found.probabilities.get(n, 0.0) for n in wanted), 1e-3))
+
+
+def pair_gain(record: FitRecord) -> tuple[tuple[str, ...], float, CandidateFit | None]:
+    """Return the best pair, its nats over the best model of at most one effect, and that model."""
+    singles = [c for c in record.candidates if len(c.effects) == 1]
+    pairs = [c for c in record.candidates if len(c.effects) > 1]
+    single = max([*singles, nominal_or_refitted(record)], key=lambda c: c.log_evidence)
+    if not pairs:
+        return (), -math.inf, single
+    best = max(pairs, key=lambda c: c.log_evidence)
+    return best.effects, best.log_evidence - single.log_evidence, single
+
+
+def _bins(p: Array, right: Array) -> tuple[tuple[float, float, int, float, float], ...]:
+    number = np.minimum((p * 10).astype(int), 9)
+    rows = []
+    for k in range(10):
+        own = number == k
+        if own.any():
+            rows.append((k / 10, (k + 1) / 10, int(own.sum()), float(p[own].mean()), float(right[own].mean())))
+    return tuple(rows)
+
+
+def _share(values: Iterable[bool]) -> float:
+    found = [float(v) for v in values]
+    return float(np.mean(found)) if found else math.nan
+
+
+def _percent(share: float) -> str:
+    return "–" if math.isnan(share) else f"{100 * share:.0f} %"

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Pairs of effects: fitted jointly, from the nodes and numbers of the best single effects.
+
+A pair is tried wherever the best single effect leaves structure, in flight or at contacts, whether or not that effect
+predicts held-out trials. What a pair is worth is decided later, in nats (``sim.diagnose.model_comparison``)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .multiple_shooting import Fit, Model, solve
+from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, CandidateEffect
+from .rigid_search import FOLLOWED_GAIN, FOLLOWED_MISFIT, BodyFits, begin_search, finish, followed, keep, misfit
+
+BASES = 3
+"""Single effects from which pairs start."""
+
+BASE_GAIN = 8.0
+"""Nats over the nominal model below which a single effect is no base: the entry fee of an effect."""
+
+PAIRS_FINISHED, PAIRS_REFINED = 4, 2
+"""Pairs that are fitted to convergence, and refined with their own Jacobians."""
+
+FLIGHT_STRUCTURE, CONTACT_STRUCTURE = 1.15, 0.9
+"""Misfits, of flights and of contacts, above which the best single effect leaves structure. Fitted states absorb a part
+of every contact's defect, so that what explains contacts leaves less than 1 there."""
+
+ONE_TRACE = (
+    {"air_drag", "wind"},
+    {"buoyancy", "time_scale"},
+    {"restitution", "adhesion"},
+)
+"""Pairs that no recording of one body can tell from one of the two alone."""
+
+
+def leaves_structure(fit: Fit) -> bool:
+    """Return whether flights or contacts of ``fit`` leave more than noise and contact uncertainty would."""
+    left = misfit(fit)
+    flight = (left.flight / max(left.flight_count, 1)) ** 0.5
+    contact = (left.contact / max(left.contact_count, 1)) ** 0.5
+    return flight > FLIGHT_STRUCTURE or contact > CONTACT_STRUCTURE
+
+
+def _bases(body: BodyFits) -> list[tuple[str, Fit]]:
+    """Return the best single effects, best first, one of each ``ONE_TRACE``."""
+    least = body.fits[()].evidence + BASE_GAIN
+    singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1 and f.evidence > least]
+    found: list[tuple[str, Fit]] = []
+    for name, fit in sorted(singles, key=lambda item: -item[1].evidence):
+        if not any({name, other} in ONE_TRACE for other, _ in found):
+            found.append((name, fit))
+    return found[:BASES]
+
+
+def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
+    """Fit pairs of the best single effects with every other one; those that still gain are fitted to convergence."""
+    bases = _bases(body)
+    hidden = [c for c in wanted if c.name == "magnus" and body.problem.scene.unscaled]
+    if not bases:
+        # Hidden spins differ between trials, so that no single effect takes their place.
+        singles = [(k[0], f) for k, f in body.fits.items() if len(k) == 1] if hidden else []
+        bases = sorted(singles, key=lambda item: -item[1].evidence)[:1]
+    if not bases:
+        return
+    others = wanted if leaves_structure(bases[0][1]) else hidden
+    tried: list[tuple[str, str]] = []
+    for name, fit in bases:
+        for other in others:
+            same = name == other.name or {name, other.name} in ONE_TRACE
+            if same or (name, other.name) in body.fits or (other.name, name) in body.fits:
+                continue
+            if not body.work.left():
+                body.work.skip((name, other.name), "tried")
+                continue
+            begin_search(body, (CANDIDATE_EFFECTS[name], other), fit)
+            tried.append((name, other.name))
+    ranked = sorted(tried, key=lambda key: -body.fits[key].evidence)[:PAIRS_FINISHED]
+    for key in ranked:
+        if body.work.left():
+            finish(body, key)
+        else:
+            body.work.skip(key, "fitted to convergence")
+    _refine(body, sorted(ranked, key=lambda key: -body.fits[key].evidence)[:PAIRS_REFINED], bases[0][1].evidence)
+
+
+def _refine(body: BodyFits, keys: list[tuple[str, str]], single: float) -> None:
+    """Refine the pairs ``keys``, best first, with their own Jacobians; follow the best through its own contacts."""
+    for number, key in enumerate(keys):
+        fit = body.fits[key]
+        if fit.evidence < single + BASE_GAIN:
+            continue
+        if not body.work.left():
+            body.work.skip(key, "refined")
+            continue
+        keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=4))
+        fit = body.fits[key]
+        if number == 0 and fit.evidence > single + FOLLOWED_GAIN and misfit(fit).ratio > FOLLOWED_MISFIT:
+            followed(body, fit.model, fit.z)
+        _reconsider_singles(body, body.fits[key])
+
+
+def _reconsider_singles(body: BodyFits, pair: Fit) -> None:
+    """Restart both single effects of ``pair`` from its nodes and states; keep them where they are better.
+
+    A pair contains both. What gains because it has found better states is no second cause.
+    """
+    at = BELIEFS.size
+    for candidate in pair.model.candidates:
+        own = pair.z[at : at + candidate.size]
+        at += candidate.size
+        if (candidate.name,) in body.fits and body.work.left():
+            z = np.concatenate([pair.z[: BELIEFS.size], own])
+            keep(body, (candidate.name,), solve(pair.problem, Model(candidates=(candidate,)), z, pair.states))
