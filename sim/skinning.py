@@ -89,12 +89,19 @@ def compact_weights(distance: Array) -> Array:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def deform(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> Array:
+def deform(
+    binding: Binding,
+    positions: NDArray[np.floating],
+    gradients: NDArray[np.floating],
+    *,
+    keep: NDArray[np.bool_] | None = None,
+) -> Array:
     """Return vertex positions (V, 3) for particle ``positions`` (N, 3) and deformation ``gradients`` (N, 3, 3), metres.
 
-    Particles that are not finite count as floaters. A vertex all of whose particles are lost keeps its rest place.
+    keep: (V, k) which particles carry each vertex at all; None: all of them. Particles that are not finite count as
+    floaters. A vertex all of whose particles are lost keeps its rest place.
     """
-    return _votes(binding, positions, gradients).places(binding)
+    return _votes(binding, positions, gradients, keep).places(binding)
 
 
 def deform_locally(
@@ -144,11 +151,18 @@ class _Votes:
         return mean
 
 
-def _votes(binding: Binding, positions: NDArray[np.floating], gradients: NDArray[np.floating]) -> _Votes:
+def _votes(
+    binding: Binding,
+    positions: NDArray[np.floating],
+    gradients: NDArray[np.floating],
+    keep: NDArray[np.bool_] | None = None,
+) -> _Votes:
     x = np.asarray(positions, dtype=np.float64)[binding.particles]
     f = np.asarray(gradients, dtype=np.float64)[binding.particles]
     predicted = x + np.einsum("vkij,vkj->vki", f, binding.offsets)
     valid = np.isfinite(predicted).all(axis=2)
+    if keep is not None:
+        valid &= keep
     weights = np.where(valid, binding.weights, 0.0)
     predicted = np.where(valid[..., None], predicted, binding.rest[:, None, :])
     centre = _median(predicted, valid)

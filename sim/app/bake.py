@@ -26,9 +26,10 @@ from ..cache.bake_folder import (
     load_manifest,
     remove_leftovers,
     remove_listed,
+    remove_matter,
     save_manifest,
 )
-from ..cache.checksums import span_for
+from ..cache.checksums import Checksum, span_for
 from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError, SimulationError
@@ -75,7 +76,8 @@ def _complete(scene: Scene, out: Path, options: BakeOptions) -> BakeManifest | N
             cache = Pc2Reader(out / name)
             if cache.sample_count < manifest.frames or cache.vertex_count != count:
                 return None
-        if not all((out / name).is_file() for name in manifest.splat_frames(manifest.frames)):
+        names = (*manifest.splat_frames(manifest.frames), *manifest.torn_skins)
+        if not all((out / name).is_file() for name in names):
             return None
         if damage_of(out, manifest):
             return None
@@ -240,6 +242,7 @@ class _Run:
     frame_started: float = 0.0
     mended: Mendable | None = None
     sums: BakeSums | None = None
+    torn_sums: tuple[Checksum, ...] = ()
 
     def frames(self, progress: StageProgress, cancelled: IsCancelled) -> BakeManifest:
         """Bake from sample ``frames_done`` to the end; return the final manifest."""
@@ -252,6 +255,9 @@ class _Run:
                 self.mended.require_same(self.sums)
             if self.mended is None or self.mended.metrics:
                 self._write_metrics()
+            if self.mended is None:
+                self._tear(progress, cancelled)
+            remove_matter(self.out, self.manifest)
             drop_checkpoint(self.out)
         except (Cancelled, SimulationError, OtherSamples):
             raise
@@ -323,6 +329,8 @@ class _Run:
             if cancelled():
                 raise Cancelled("asked to stop")
             found = sampler.samples(index)
+            if sampler.tears is not None and self.mended is None:
+                sampler.tears.record(self.out, index)
             sampler.write_splats(self.out, self.manifest.frame_start + index, found)
             samples |= found
         for name, sample in samples.items():
@@ -363,6 +371,18 @@ class _Run:
         finally:
             self.save("cancelled")
 
+    def _tear(self, progress: StageProgress, cancelled: IsCancelled) -> None:
+        """Write the skins of what has parted, and name them in the manifest."""
+        objects, checksums = [], []
+        for sampler, baked in zip(self.samplers, self.manifest.objects, strict=True):
+            found = sampler.tears.finish(self.out, baked, self.manifest, cancelled) if sampler.tears else None
+            if found is not None:
+                progress.notice(f"{baked.name} tears from frame {found[0].torn_from + self.manifest.frame_start} on")
+                checksums += found[1]
+            objects.append(baked if found is None else found[0])
+        self.manifest = dataclasses.replace(self.manifest, objects=tuple(objects))
+        self.torn_sums = tuple(checksums)
+
     def save(self, state: str) -> BakeManifest:
         """Write the manifest as of now and return it."""
         self.saved_at = time.monotonic()
@@ -371,7 +391,7 @@ class _Run:
             pass
         elif self.mended is None:
             checksums = self.sums.checksums(ended=state != "running", metrics=state == "complete")
-            self.manifest = dataclasses.replace(self.manifest, checksums=checksums)
+            self.manifest = dataclasses.replace(self.manifest, checksums=(*checksums, *self.torn_sums))
         elif state == "complete":
             self.manifest = dataclasses.replace(self.manifest, checksums=self.mended.checksums(self.out))
         save_manifest(self.out, self.manifest)

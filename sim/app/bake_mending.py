@@ -82,13 +82,16 @@ def find_mendable(out: Path, manifest: BakeManifest) -> Mendable | None:
     """
     try:
         before = load_manifest(out)
-        plain = dataclasses.replace(before, checksums=(), state="running", frames_done=0)
+        objects = tuple(item.without_tears() for item in before.objects)
+        plain = dataclasses.replace(before, checksums=(), state="running", frames_done=0, objects=objects)
         if before.state != "complete" or not before.checksums or plain != manifest:
             return None
         found = damage_of(out, before)
     except (InputError, OSError):
         return None
-    if not found:
+    # Torn skins follow from all samples together.
+    torn = {item.torn_file for item in before.objects} | set(before.torn_skins)
+    if not found or any(damage.file in torn for damage in found):
         return None
     metrics = any(damage.file == METRICS_FILE for damage in found)
     span = span_for(before.frames)

@@ -29,6 +29,7 @@ from ..scene.meshes import ObjectMesh
 from ..scene.model import SceneObject
 from ..skinning import bind, deform
 from .bake_options import BakeOptions
+from .bake_tearing import Tears
 from .world_setup import PreparedWorld
 
 if TYPE_CHECKING:
@@ -164,6 +165,9 @@ class ObjectSampler:
         self._binding = None if self._rest is None else bind(mesh.vertices, self._rest)
         self._mesh_from_world = np.linalg.inv(world_from_mesh) if baked.space == MESH_SPACE else None
         self._splats = None if splats is None else MovingSplats(splats, world_from_mesh, mesh.vertices, self._rest)
+        self.tears = (
+            None if self._body is None else Tears.of(simulation, self._body, baked, mesh, self._mesh_from_world)
+        )
 
     def samples(self, index: int) -> dict[str, Array]:
         """Return by file name the points of sample ``index``, (V, 3) or (N, 3) in the space of the bake.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -28,6 +28,9 @@ from .pc2 import MAX_VERTICES, Pc2Reader
 MANIFEST_FORMAT = "physgen-bake/1"
 MANIFEST_FILE = "manifest.json"
 STATES = ("running", "complete", "cancelled")
+
+MATTER_FILES = "checkpoints/{name}.{sample:05d}.matter.npy"
+"""Particles in a sample in which they are far apart, until the bake is complete; ``name``: of the object."""
 
 CHECKPOINT_FILE = "checkpoints/state.npz"
 """The engine's state to resume from, replaced periodically during a bake, removed when it is complete."""
@@ -62,6 +65,10 @@ class BakedObject:
     points_as: how the particles are shown, ``grains`` or ``surface``.
     splats_file: PC2 of its ``splats`` Gaussian splats, four points each: centre and ends of the half axes.
     splats_folder: of their PLY files, one per frame. None, None and 0 without splats.
+    torn_file: PC2 of the skin cut open where the matter parts, ``torn`` vertices, of which the first ``vertices`` are
+        the mesh's own; torn_skin: its triangles (``read_torn_skin``); torn_from: the first sample with an open
+        crack. None,
+        None, 0 and 0 where nothing parts.
     """
 
     name: str
@@ -74,9 +81,13 @@ class BakedObject:
     splats_file: str | None = None
     splats_folder: str | None = None
     splats: int = 0
+    torn_file: str | None = None
+    torn_skin: str | None = None
+    torn: int = 0
+    torn_from: int = 0
 
     def __post_init__(self) -> None:
-        counts = (self.vertices, self.points, SPLAT_POINTS * self.splats)
+        counts = (self.vertices, self.points, SPLAT_POINTS * self.splats, self.torn)
         if self.vertices < 1 or min(counts) < 0 or max(counts) > MAX_VERTICES:
             raise InputError(f"object {self.name}: {counts} are no numbers of points of its caches; bake again")
         if self.points_as not in (GRAINS, SURFACE):
@@ -87,6 +98,15 @@ class BakedObject:
             raise InputError(f"object {self.name}: {self.points} points in {self.points_file!r}; bake again")
         if not (self.splats_file is None) == (self.splats_folder is None) == (self.splats == 0):
             raise InputError(f"object {self.name}: {self.splats} splats in {self.splats_file!r}; bake again")
+        if (
+            not (self.torn_file is None) == (self.torn_skin is None) == (self.torn == 0)
+            or not 0 <= self.torn_from < 2**31
+        ):
+            raise InputError(f"object {self.name}: {self.torn} vertices in {self.torn_file!r}; bake again")
+
+    def without_tears(self) -> BakedObject:
+        """Return it as it is before it is known what tears."""
+        return replace(self, torn_file=None, torn_skin=None, torn=0, torn_from=0)
 
     @property
     def files(self) -> dict[str, int]:
@@ -96,6 +116,8 @@ class BakedObject:
             files[self.points_file] = self.points
         if self.splats_file is not None:
             files[self.splats_file] = SPLAT_POINTS * self.splats
+        if self.torn_file is not None:
+            files[self.torn_file] = self.torn
         return files
 
     def splat_frame(self, frame: int) -> str | None:
@@ -140,6 +162,11 @@ class BakeManifest:
     def files(self) -> dict[str, int]:
         """All PC2 files, with the number of points per sample."""
         return {name: count for item in self.objects for name, count in item.files.items()}
+
+    @property
+    def torn_skins(self) -> list[str]:
+        """Files with the triangles of torn skins."""
+        return [item.torn_skin for item in self.objects if item.torn_skin is not None]
 
     def splat_frames(self, samples: int) -> list[str]:
         """Return all splat PLY files of the first ``samples`` samples."""
@@ -238,7 +265,7 @@ def load_manifest(folder: Path) -> BakeManifest:
         raise InputError(
             f"{error}; PhysGen {author} wrote it, this is {VERSION}: use that one, or bake again"
         ) from None
-    for name in (*manifest.files, *manifest.splat_frames(1)):
+    for name in (*manifest.files, *manifest.torn_skins, *manifest.splat_frames(1)):
         inside(folder, name)
     return manifest
 
@@ -257,7 +284,7 @@ _PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
 def listed_files(manifest: BakeManifest) -> list[str]:
     """Return the names of all files of a bake, whether they exist or not."""
     single = [CHECKPOINT_FILE, METRICS_FILE, TIMES_FILE, MANIFEST_FILE]
-    return [*manifest.files, *manifest.splat_frames(manifest.frames), *single]
+    return [*manifest.files, *manifest.torn_skins, *manifest.splat_frames(manifest.frames), *single]
 
 
 def disk_usage(folder: Path) -> int:
@@ -310,11 +337,22 @@ def remove_listed(folder: Path) -> None:
         manifest = load_manifest(folder)
     except InputError:
         return
+    remove_matter(folder, manifest)
     for name in listed_files(manifest):
         # Never through a link.
         parents = list(PurePosixPath(name).parents)[:-1]
         if name != MANIFEST_FILE and not any((folder / parent).is_symlink() for parent in parents):
             (folder / name).unlink(missing_ok=True)
+
+
+def remove_matter(folder: Path, manifest: BakeManifest) -> None:
+    """Delete what an unfinished bake kept of its particles."""
+    place = (folder / CHECKPOINT_FILE).parent
+    if place.is_symlink() or not place.is_dir():
+        return
+    for item in manifest.objects:
+        for path in place.glob(f"{item.name}.*.matter.npy"):
+            path.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: MIT
+"""Matter as cubic blocks on a lattice at rest, the bonds between neighbours, and when each of them opens.
+
+A bond is the line between the mean places of two neighbouring blocks' particles. It is broken once it is ``BROKEN``
+times as long as at rest, with nothing in its middle, and longer than the matter's own deformation says: what flows is
+filled up by its neighbours, and what is merely stretched knows that it is. It counts as open from the sample on in
+which it began to part, and for good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import InputError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SIDE = 1.6
+"""Side of a block over the particle spacing: about four particles, none of which says alone where it is."""
+BROKEN, OPENING = 3.0, 1.3
+"""Length of a bond over that at rest from which on it is broken, and at which such a bond began to part."""
+UNEXPLAINED = 1.5
+"""Length of a broken bond over that which the deformation gradients of its two blocks predict, at least."""
+EMPTY = 1.0
+"""Distance in particle spacings from the middle of a broken bond to the nearest particle, at least."""
+NEVER = np.iinfo(np.int32).max
+"""Sample in which what never opens does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of N particles.
+
+    origin: (3,) corner of the lattice, m. side: of a block, m. spacing: of the particles, m. cells: (B, 3) place of
+    each block in the lattice. grid: lattice of block numbers, -1 where there is none; two cells wider than the matter
+    on all sides. of_particle: (N,) the block of each particle. bonds: (E, 2) neighbouring blocks, the second one step
+    further along ``axes`` (E,), 0 to 2. centres: (B, 3) mean place at rest of each block's particles, m.
+    """
+
+    origin: Array
+    side: float
+    spacing: float
+    cells: Indices
+    grid: Indices
+    of_particle: Indices
+    bonds: Indices
+    axes: Indices
+    centres: Array
+
+    def means(self, values: NDArray[np.floating]) -> Array:
+        """Return the mean (B, ...) over each block's particles of ``values`` (N, ...)."""
+        flat = np.asarray(values, dtype=np.float64).reshape(len(values), -1)
+        count = np.maximum(np.bincount(self.of_particle, minlength=len(self.cells)), 1)
+        sums = [np.bincount(self.of_particle, column, minlength=len(self.cells)) for column in flat.T]
+        return np.asarray((np.array(sums) / count).T.reshape(len(self.cells), *values.shape[1:]))
+
+    def lattice(self, points: NDArray[np.floating]) -> Indices:
+        """Return the cells (P, 3) in which ``points`` (P, 3) lie."""
+        return np.floor((points - self.origin) / self.side).astype(np.int64)
+
+
+def make_blocks(particles: NDArray[np.floating], volume: float) -> Blocks:
+    """Return the blocks of ``particles`` (N, 3) at rest, m, which fill ``volume`` m³ together.
+
+    Raises InputError for fewer than two particles, and what is not finite.
+    """
+    particles = np.asarray(particles, dtype=np.float64)
+    if len(particles) < 2 or not np.isfinite(particles).all() or not 0 < volume < np.inf:
+        raise InputError(f"tearing: {len(particles)} particles in {volume:g} m³ form no blocks; choose a finer quality")
+    spacing = (volume / len(particles)) ** (1.0 / 3.0)
+    side = SIDE * spacing
+    low = particles.min(axis=0)
+    # So that the matter's own middle is a lattice plane's: a symmetrical body gets symmetrical blocks.
+    count = np.ceil((particles.max(axis=0) - low) / side + 1e-9)
+    origin = 0.5 * (low + particles.max(axis=0)) - (0.5 * count + 2.0) * side
+    cell = np.floor((particles - origin) / side).astype(np.int64)
+    shape = tuple((count + 5).astype(int))
+    flat = np.ravel_multi_index(tuple(cell.T), shape)
+    taken, of_particle = np.unique(flat, return_inverse=True)
+    grid = np.full(shape, -1, dtype=np.int64)
+    grid.flat[taken] = np.arange(len(taken))
+    cells = np.stack(np.unravel_index(taken, shape), axis=1)
+    bonds, axes = [], []
+    for axis in range(3):
+        further = cells.copy()
+        further[:, axis] += 1
+        there = grid[tuple(further.T)]
+        first = np.flatnonzero(there >= 0)
+        bonds.append(np.stack([first, there[first]], axis=1))
+        axes.append(np.full(len(first), axis))
+    made = Blocks(
+        origin=origin,
+        side=float(side),
+        spacing=float(spacing),
+        cells=cells,
+        grid=grid,
+        of_particle=of_particle.reshape(-1),
+        bonds=np.concatenate(bonds),
+        axes=np.concatenate(axes),
+        centres=np.empty(0),
+    )
+    object.__setattr__(made, "centres", made.means(particles))
+    return made
+
+
+def stretches(blocks: Blocks, positions: NDArray[np.floating]) -> Array:
+    """Return the length (E,) of every bond over that at rest, with the particles at ``positions`` (N, 3); 1 if not
+    finite."""
+    now, rest = blocks.means(positions), blocks.centres
+    a, b = blocks.bonds.T
+    # Blocks at the skin may hold little: of two that nearly coincide at rest no ratio means anything.
+    before = np.maximum(np.linalg.norm(rest[b] - rest[a], axis=1), 0.7 * blocks.side)
+    found = np.linalg.norm(now[b] - now[a], axis=1) / before
+    return np.where(np.isfinite(found), found, 1.0)
+
+
+def broken(
+    blocks: Blocks, positions: NDArray[np.floating], gradients: NDArray[np.floating] | None, ratio: Array
+) -> NDArray[np.bool_]:
+    """Return which bonds (E,) are broken.
+
+    positions: (N, 3), m. gradients: (N, 3, 3) deformation gradients that know of stretching alone; None for matter
+    that has none. ratio: of ``stretches``.
+    """
+    result = np.zeros(len(ratio), dtype=np.bool_)
+    long = np.flatnonzero(ratio >= BROKEN)
+    if not len(long):
+        return result
+    now = blocks.means(positions)
+    a, b = blocks.bonds[long].T
+    sound = np.isfinite(positions).all(axis=1)
+    distance, _ = cKDTree(positions[sound]).query(0.5 * (now[a] + now[b]))
+    parted = distance > EMPTY * blocks.spacing
+    if gradients is not None:
+        usual = np.where(np.isfinite(gradients), gradients, 0.0)
+        mean = blocks.means(usual)
+        offset = blocks.centres[b] - blocks.centres[a]
+        said = np.linalg.norm(np.einsum("eij,ej->ei", 0.5 * (mean[a] + mean[b]), offset), axis=1)
+        parted &= np.linalg.norm(now[b] - now[a], axis=1) > UNEXPLAINED * said
+    result[long] = parted
+    return result
+
+
+class OpeningTimes:
+    """When each bond opens, from samples taken in order; samples that are left out count as closed."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        self._blocks = blocks
+        self._since = np.full(len(blocks.bonds), NEVER, dtype=np.int64)
+        self._opens = np.full(len(blocks.bonds), NEVER, dtype=np.int64)
+        self._last = -2
+
+    def add(self, sample: int, positions: NDArray[np.floating], gradients: NDArray[np.floating] | None) -> None:
+        """Take in ``sample``, later than all before; arguments as of ``broken``."""
+        ratio = stretches(self._blocks, positions)
+        if sample != self._last + 1:
+            self._since[:] = NEVER
+        self._last = sample
+        apart = ratio >= OPENING
+        self._since = np.where(apart, np.minimum(self._since, sample), NEVER)
+        fresh = broken(self._blocks, positions, gradients, ratio) & (self._opens == NEVER)
+        self._opens[fresh] = self._since[fresh]
+
+    @property
+    def opens(self) -> Indices:
+        """First sample (E,) in which each bond is open, ``NEVER`` for those that hold."""
+        return self._opens
+
+
+def opening_times(
+    blocks: Blocks, samples: Iterable[tuple[int, NDArray[np.floating], NDArray[np.floating] | None]]
+) -> Indices:
+    """Return the first sample (E,) in which each bond is open; ``samples``: number, positions, gradients in order."""
+    times = OpeningTimes(blocks)
+    for sample in samples:
+        times.add(*sample)
+    return times.opens
