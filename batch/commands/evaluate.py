@@ -5,10 +5,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ...sim.errors import InputError
 from ...sim.events import IsCancelled
+from ...sim.reconstruct.reasoning.chat_client import DEFAULT_KEY_VARIABLE, ChatRequest
 from ..terminal import Terminal
+
+if TYPE_CHECKING:
+    from ...sim.evaluate.judged_footage import JudgeRequest
+
+REPETITIONS = 5
 
 
 def add_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +38,48 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", type=Path, metavar="DIR", help=scene)
     network = "network for optical flow as an ONNX file (default: DIS, without weights)"
     parser.add_argument("--flow", type=Path, metavar="FILE", help=network)
+    url = "OpenAI-compatible chat endpoint of a model that scores the video, such as https://host/v1"
+    parser.add_argument("--judge", metavar="URL", help=url)
+    parser.add_argument("--judge-model", metavar="NAME", help="name of the endpoint's model; it must accept images")
+    consent = "consent to sending the photo, frames of the videos and --prompt to that endpoint"
+    parser.add_argument("--send-frames", action="store_true", help=f"{consent}; without it nothing is sent")
+    parser.add_argument("--prompt", metavar="TEXT", help="what should happen in the video, for --judge")
+    beside = "video of the same photo and prompt that is judged together with VIDEO; may be repeated"
+    parser.add_argument("--beside", type=Path, action="append", default=[], metavar="VIDEO", help=beside)
+    text = f"questions, each with another order of the videos (default {REPETITIONS})"
+    parser.add_argument("--repetitions", type=int, default=REPETITIONS, metavar="N", help=text)
+    text = f"environment variable with the API key (default {DEFAULT_KEY_VARIABLE})"
+    parser.add_argument("--key-variable", metavar="NAME", default=DEFAULT_KEY_VARIABLE, help=text)
+
+
+def judge_request(options: argparse.Namespace) -> JudgeRequest | None:
+    """Return who is to judge, or None. Raises InputError for an incomplete request or missing consent."""
+    from ...sim.evaluate.judged_footage import JudgeRequest
+    from ...sim.evaluate.model_judge import JudgeOptions
+
+    if options.judge is None:
+        if options.judge_model is not None or options.send_frames or options.prompt is not None or options.beside:
+            raise InputError("--judge-model, --send-frames, --prompt, --beside: need --judge URL; give it")
+        return None
+    if options.video is None:
+        raise InputError("--judge: needs VIDEO; a table of Physics-IQ is not judged")
+    if options.judge_model is None or options.prompt is None:
+        raise InputError("--judge: needs --judge-model NAME and --prompt TEXT, what should happen in the video")
+    if not options.send_frames:
+        raise InputError("--judge: frames are not sent without your agreement; give --send-frames")
+    return JudgeRequest(
+        endpoint=ChatRequest(
+            url=options.judge,
+            model=options.judge_model,
+            key_variable=options.key_variable,
+            consent=options.send_frames,
+            timeout_s=300.0,
+        ),
+        prompt=options.prompt,
+        photo=options.photo,
+        beside=tuple(options.beside),
+        options=JudgeOptions(repetitions=options.repetitions),
+    )
 
 
 def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
@@ -40,6 +89,7 @@ def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
 
     if (options.video is None) == (options.physics_iq is None):
         raise InputError("give VIDEO, or --physics-iq DIR in its place")
+    judge = judge_request(options)
     subject = options.physics_iq or options.video
     out = options.out or subject.with_name(f"{subject.stem}_evaluation")
     if options.physics_iq is not None:
@@ -57,6 +107,7 @@ def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
             photo=options.photo,
             bake=bake,
             scene=options.scene,
+            judge=judge,
             options=settings,
             on_event=terminal,
             cancelled=cancelled,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from ..evaluate.bake_physics import bake_physics
 from ..evaluate.evaluation import JSON_FILE, Evaluation, Section, table, write_evaluation
 from ..evaluate.flow import dis_flow, network_flow
 from ..evaluate.footage import MOST_FRAMES, Footage, Frame, open_footage
+from ..evaluate.judged_footage import JudgeRequest, judged
 from ..evaluate.physics_iq_folder import (
     ViewRow,
     physics_iq_section,
@@ -33,6 +35,7 @@ from ..scene.folder import SCENE_FILE, Scene, load_scene
 from ..validation import quantity, require_quantities
 
 STAGE = "evaluate"
+JUDGE_FILE = "judge.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +63,7 @@ def evaluate(
     photo: str | Path | None = None,
     bake: str | Path | Bake | None = None,
     scene: str | Path | Scene | None = None,
+    judge: JudgeRequest | None = None,
     options: EvaluateOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
@@ -69,8 +73,8 @@ def evaluate(
     video: .mp4, .webm or another file that OpenCV reads, a folder of pictures, or None where a bake is given. against:
     recordings of the real event from the same camera, one, or two takes. photo: what the first frame should equal.
     bake: what the video shows, for physical checks; scene: what was baked, by default the folder ``scene`` beside the
-    bake where it has the same objects. ``out`` holds report.html, evaluation.json, measures.csv and curves.csv
-    (docs/evaluation.md); an earlier evaluation there is replaced.
+    bake where it has the same objects. judge: a model that scores the video, if any. ``out`` holds report.html,
+    evaluation.json, measures.csv and curves.csv (docs/evaluation.md); an earlier evaluation there is replaced.
 
     >>> import physgen
     >>> found = physgen.evaluate("video.mp4", against=["take1.mp4"], out="evaluation")  # doctest: +SKIP
@@ -84,11 +88,12 @@ def evaluate(
     require_evaluation_folder(out)
     if video is None and bake is None:
         raise InputError("nothing to evaluate: give a video or a bake")
-    if video is None and (against or photo is not None):
-        raise InputError("against, photo: compare a video, and none is given; give one beside the bake")
+    if video is None and (against or photo is not None or judge is not None):
+        raise InputError("against, photo, judge: look at a video, and none is given; give one beside the bake")
     progress = StageProgress(on_event, STAGE, 3)
     sections: list[Section] = []
     strip: list[Frame] = []
+    tables: dict[str, bytes] = {}
     subject = ""
     if video is not None:
         footage = open_footage(Path(video), options.fps)
@@ -102,6 +107,12 @@ def evaluate(
         still = None if photo is None else Path(photo)
         sections.append(alone(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled))
         strip = strip_frames(footage, most)
+        if judge is not None:
+            section, judgement = judged(footage, most, judge, notice=progress.notice, cancelled=cancelled)
+            sections.append(section)
+            tables[JUDGE_FILE] = json.dumps(judgement.to_json(), indent=1, ensure_ascii=False).encode(
+                "utf-8", "replace"
+            )
     if cancelled():
         raise Cancelled("the evaluation was cancelled; nothing was written")
     progress.report(2)
@@ -112,7 +123,7 @@ def evaluate(
     found = Evaluation(root=out, subject=subject, sections=tuple(sections))
     for notice in found.notices:
         progress.notice(notice)
-    save(found, out, strip)
+    save(found, out, strip, tables)
     progress.report(3)
     return found
 

@@ -7,10 +7,12 @@ import json
 import math
 import re
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from physgen.batch.cli import main
 from physgen.sim.errors import InputError
 from physgen.sim.evaluate.model_judge import (
     CRITERIA,
@@ -235,3 +237,36 @@ def test_no_answer_breaks_the_reader(text):
 def test_the_question_keeps_to_one_line_of_prompt():
     text = question(1, 10, "a\n'quoted' line\x1b[0m")
     assert "one video" in text and "a ’quoted’ line [0m" in text and "\x1b" not in text
+
+
+def a_video(path, grey):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), 8, (64, 48))
+    for frame in range(12):
+        picture = np.full((48, 64, 3), grey, np.uint8)
+        cv2.circle(picture, (8 + 4 * frame, 24), 6, (30, 200, 240), -1)
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+def test_the_command_judges_files_beside_a_still_one_and_only_with_consent(tmp_path, capsys):
+    ours, other = a_video(tmp_path / "first_clip.webm", 60), a_video(tmp_path / "second_clip.webm", 180)
+    command = ["evaluate", str(ours), "--out", str(tmp_path / "out"), "--repetitions", "3", "--beside", str(other)]
+    with Judge(honest) as server:
+        asked = [*command, "--judge", server.url, "--judge-model", "m", "--prompt", PROMPT]
+        assert main(asked) == 3 and "give --send-frames" in capsys.readouterr().err
+        assert not server.received and not (tmp_path / "out").exists()
+        assert main([*command, "--send-frames"]) == 3 and "need --judge URL" in capsys.readouterr().err
+        assert main([*asked, "--send-frames"]) == 0
+    assert len(server.received) == 3
+    assert not any(b"clip" in body for _, _, body in server.received)
+    assert all(len(seen(body)[1]) == 5 for _, _, body in server.received), "two videos, and one that stands still"
+    sections = json.loads((tmp_path / "out" / "evaluation.json").read_text())["sections"]
+    found = {row["name"]: row for section in sections for row in section["measures"]}
+    assert found["judge_physical_realism"]["value"] == pytest.approx(60 / 250 - 0.01, abs=0.05)
+    assert found["judge_physical_realism"]["still"] == pytest.approx(60 / 250 - 0.01, abs=0.05)
+    assert found["judge_physical_realism: second_clip.webm"]["value"] == pytest.approx(180 / 250 - 0.01, abs=0.05)
+    kept = json.loads((tmp_path / "out" / "judge.json").read_text())
+    assert len(kept["answers"]) == 3 and kept["model"] == "m"
+    shown = "".join(p.read_text(errors="replace") for p in (tmp_path / "out").iterdir() if p.is_file())
+    assert KEY not in shown and "Judged by a model" in (tmp_path / "out" / "report.html").read_text()
