@@ -89,7 +89,7 @@ def evaluate(
     if video is None and bake is None:
         raise InputError("nothing to evaluate: give a video or a bake")
     if video is None and (against or photo is not None or judge is not None):
-        raise InputError("against, photo, judge: look at a video, and none is given; give one beside the bake")
+        raise InputError("against, photo, judge: compare a video, and none is given; give one beside the bake")
     progress = StageProgress(on_event, STAGE, 3)
     sections: list[Section] = []
     strip: list[Frame] = []
