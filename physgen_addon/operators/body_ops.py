@@ -4,13 +4,15 @@
 import bpy
 from mathutils import Matrix, Vector
 
+from ...sim.errors import InputError
 from ...sim.scene.material import delete_preset, save_preset
 from ..compat import OperatorMixin
 from ..context import active, selected
 from ..props import material_props
 from ..props.body_props import bodies, is_body
 from ..props.material_props import CUSTOM, get_material, set_material
-from ..scene_io.export_meshes import rest_bounds
+from ..scene_io import stand_ins
+from ..scene_io.export_meshes import mesh_trouble, rest_bounds
 from ..scene_io.export_scene import SUNK
 from ..text import count, report_errors
 
@@ -22,21 +24,12 @@ _MARGIN = 0.02
 """Margin of a pin beyond the surface, as a share of the object's size."""
 
 
-CONVERTIBLE = ("CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD")
-"""Types of objects that Blender converts to meshes."""
-
-
 def _unfit(item: bpy.types.Object) -> str | None:
     """Return why ``item`` cannot be simulated, or None."""
-    if item.type in CONVERTIBLE:
-        return f"{item.name!r} is no mesh: convert it first (Object > Convert > Mesh)"
-    if item.instance_type == "COLLECTION":
-        return (
-            f"{item.name!r} is an instance of a collection: add its meshes after Object > Apply > Make Instances Real"
-        )
-    if item.type != "MESH":
-        return f"{item.name!r} has no surface ({item.type.lower()}): only meshes are simulated"
-    if not item.data.polygons and not item.modifiers:
+    if item.type == "POINTCLOUD" or (item.type != "MESH" and item.type not in stand_ins.CONVERTIBLE):
+        if not stand_ins.is_instance(item):
+            return f"{item.name!r} has no surface ({item.type.lower()}): only what Blender shows as a mesh is simulated"
+    elif item.type == "MESH" and not item.data.polygons and not item.modifiers:
         return f"{item.name!r} has no faces"
     if not item.is_editable:
         return f"{item.name!r} is linked from another file: make it local first"
@@ -51,10 +44,28 @@ def add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | No
         if trouble is not None:
             operator.report({"WARNING"}, trouble)
             continue
-        item.physgen.enabled = True
-        if role is not None:
-            item.physgen.role = role
-        added.append(item)
+        wanted = role or item.physgen.role
+        why = "" if is_body(item) and item.physgen.original is not None else stand_ins.reason(item, wanted)
+        try:
+            items = stand_ins.make(context.scene, item) if why else [item]
+        except InputError as error:
+            operator.report({"WARNING"}, str(error))
+            continue
+        if why:
+            names = ", ".join(repr(made.name) for made in items)
+            operator.report({"INFO"}, f"{item.name!r} {why}: {names} stands in for it, and the original is hidden")
+        elif words := mesh_trouble(item):
+            operator.report({"WARNING"}, words)
+        for made in items:
+            made.physgen.enabled = True
+            if role is not None:
+                made.physgen.role = role
+        added += items
+    context.view_layer.update()
+    for item in added:
+        # Those that take over later are hidden until then.
+        if not item.select_get(view_layer=context.view_layer) and item.visible_get(view_layer=context.view_layer):
+            item.select_set(True)
     if added and context.view_layer.objects.active not in added:
         context.view_layer.objects.active = added[0]
     return added
@@ -132,7 +143,9 @@ class PHYSGEN_OT_add_colliders(OfSelected, bpy.types.Operator):
 
 
 class PHYSGEN_OT_remove_body(bpy.types.Operator):
-    """Remove the object from the simulation. It stays in the scene and keeps its settings"""
+    """Remove the object from the simulation. It stays in the scene and keeps its settings; a stand-in is deleted and
+    its original shown again
+    """
 
     bl_idname = "physgen.remove_body"
     bl_label = "Remove from Simulation"
@@ -146,7 +159,10 @@ class PHYSGEN_OT_remove_body(bpy.types.Operator):
         if not is_body(item):
             self.report({"WARNING"}, "The active object is not in the simulation: choose one in the list")
             return {"CANCELLED"}
-        item.physgen.enabled = False
+        if item.physgen.original is not None:
+            stand_ins.discard(item)
+        else:
+            item.physgen.enabled = False
         return {"FINISHED"}
 
 

@@ -90,6 +90,11 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
 
     enabled: BoolProperty(name="In Simulation", description="Simulate this object")
     source: StringProperty(description="Name of the object in the scene folder that it was imported from")
+    original: PointerProperty(
+        name="Stands In For",
+        description="Object whose evaluated mesh this one is; it is shown again when this one is removed",
+        type=bpy.types.Object,
+    )
     cache: StringProperty(description="Name of the object in its bakes, so that it can be renamed")
     role: from_field(
         SceneObject,

@@ -148,6 +148,15 @@ def require_sound(mesh: Triangles, name: str) -> None:
         )
 
 
+def mesh_trouble(item: bpy.types.Object) -> str:
+    """Return why the mesh of ``item`` cannot be simulated, with a remedy; empty if it can."""
+    try:
+        require_sound(closed(read_triangles(item.data)), item.name)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
 def closed(mesh: Triangles) -> Triangles:
     """Return ``mesh`` with small holes closed; unchanged if it has none, or larger ones."""
     if not (mesh.edges % 2 == 1).any() or not np.isfinite(mesh.points).all():

@@ -102,8 +102,8 @@ def require_still_settings(owner: bpy.types.ID, where: str) -> None:
 
 
 def require_evaluated(item: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Raise InputError if ``item`` is not evaluated because it is disabled."""
-    if not item.evaluated_get(depsgraph).is_evaluated:
+    """Raise InputError if ``item`` is not evaluated because it is disabled; a stand-in may be, until it takes over."""
+    if item.physgen.original is None and not item.evaluated_get(depsgraph).is_evaluated:
         raise InputError(
             f"object {item.name!r}: is disabled in viewports or excluded from the view layer: enable it in the "
             "outliner (the eye may stay closed), or take it out of the simulation"

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Anything goes in: what is no mesh, or shows another shape than its mesh, is simulated by a stand-in."""
+
+import math
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+import physgen
+from physgen.physgen_addon.props.body_props import bodies
+from physgen.physgen_addon.scene_io.export_scene import export_scene
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+
+
+@pytest.fixture(autouse=True)
+def addon(fresh_blender):
+    physgen.register()
+    bpy.context.scene.physgen.world.use_ground = False
+    yield
+    physgen.unregister()
+
+
+def a_text():
+    bpy.ops.object.text_add(location=(0, 0, 2))
+    item = bpy.context.object
+    item.data.body, item.data.extrude = "ab", 0.1
+    return item
+
+
+def a_curve():
+    bpy.ops.curve.primitive_bezier_circle_add(location=(0, 0, 2))
+    bpy.context.object.data.bevel_depth = 0.2
+    return bpy.context.object
+
+
+def a_metaball():
+    bpy.ops.object.metaball_add(type="BALL", location=(0, 0, 2))
+    return bpy.context.object
+
+
+def a_cube(**where):
+    bpy.ops.mesh.primitive_cube_add(size=1, **where)
+    return bpy.context.object
+
+
+def mirrored():
+    item = a_cube(location=(0.6, 0, 2))
+    item.data.transform(((1, 0, 0, 2), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)))
+    item.modifiers.new("Mirror", "MIRROR")
+    return item
+
+
+def arrayed():
+    item = a_cube(location=(0, 0, 2))
+    item.modifiers.new("Array", "ARRAY").relative_offset_displace = (1.5, 0, 0)
+    return item
+
+
+def keyed():
+    item = a_cube(location=(0, 0, 2))
+    item.shape_key_add(name="Basis")
+    tall = item.shape_key_add(name="Tall")
+    for point in tall.data:
+        point.co.z *= 2
+    tall.value = 0.5
+    return item
+
+
+def shown_bounds(item):
+    """Corners of what the object shows, in the world."""
+    graph = bpy.context.evaluated_depsgraph_get()
+    evaluated = item.evaluated_get(graph)
+    mesh = evaluated.to_mesh()
+    points = np.array([evaluated.matrix_world @ vertex.co for vertex in mesh.vertices])
+    evaluated.to_mesh_clear()
+    return points.min(axis=0), points.max(axis=0)
+
+
+@pytest.mark.parametrize("make", [a_text, a_curve, a_metaball, mirrored, arrayed, keyed])
+def test_the_evaluated_mesh_is_simulated_and_the_original_is_kept(tmp_path, make):
+    scene, item = bpy.context.scene, make()
+    bounds = shown_bounds(item)
+    assert bpy.ops.physgen.quick_jelly() == {"FINISHED"}
+    (body,) = bodies(scene)
+    assert body != item and body.physgen.original == item and item.hide_viewport and item.hide_render
+    assert np.allclose(shown_bounds(body), bounds, atol=1e-5)
+    model = export_scene(scene, tmp_path / "scene").model
+    assert math.isclose(model.objects[0].size_m, max(bounds[1] - bounds[0]), rel_tol=1e-5)
+    bpy.context.view_layer.objects.active = body
+    assert bpy.ops.physgen.remove_body() == {"FINISHED"}
+    assert not bodies(scene) and not item.hide_viewport and not item.hide_render
+
+
+def test_every_mesh_of_a_collection_instance_takes_part(tmp_path):
+    scene = bpy.context.scene
+    group = bpy.data.collections.new("pair")
+    for index in range(2):
+        mesh = a_cube(location=(3 * index, 0, 0))
+        scene.collection.objects.unlink(mesh)
+        group.objects.link(mesh)
+    empty = bpy.data.objects.new("instance", None)
+    scene.collection.objects.link(empty)
+    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", group, (0, 0, 5)
+    bpy.context.view_layer.update()
+    for item in bpy.context.view_layer.objects:
+        item.select_set(item == empty)
+    bpy.context.view_layer.objects.active = empty
+    assert bpy.ops.physgen.add_bodies() == {"FINISHED"}
+    places = sorted(tuple(item.matrix_world.translation) for item in bodies(scene))
+    assert places == [(0, 0, 5), (3, 0, 5)] and empty.hide_viewport
+    assert len(export_scene(scene, tmp_path / "scene").model.objects) == 2
+
+
+def test_an_animation_hands_over_at_the_current_frame(tmp_path):
+    scene, item = bpy.context.scene, a_cube(location=(0, 0, 2))
+    item.keyframe_insert("location", frame=1)
+    item.location = (2.4, 0, 2)
+    item.keyframe_insert("location", frame=25)
+    for layer in item.animation_data.action.layers:
+        for curve in layer.strips[0].channelbag(item.animation_data.action_slot).fcurves:
+            for point in curve.keyframe_points:
+                point.interpolation = "LINEAR"
+    scene.frame_set(11)
+    assert bpy.ops.physgen.quick_rigid() == {"FINISHED"}
+    (body,) = bodies(scene)
+    assert math.isclose(body.location.x, 1.0, abs_tol=1e-5) and body.physgen.start_frame == 11
+    # 0.1 m a frame at 24 frames a second.
+    assert np.allclose(body.physgen.velocity, (2.4, 0, 0), atol=1e-4)
+    marks = {}
+    for frame in (5, 10, 11, 20):
+        scene.frame_set(frame)
+        assert (item.hide_render, body.hide_render) == (frame >= 11, frame < 11)
+        marks[frame] = fingerprint(scene)
+        # While it is hidden, too.
+        model = export_scene(scene, tmp_path / "scene").model
+        assert math.isclose(model.objects[0].start_time, 10 / 24)
+        assert math.isclose(model.objects[0].world_from_mesh[0][3], 1.0, abs_tol=1e-5)
+    assert len(set(marks.values())) == 1
+    assert bpy.ops.physgen.remove_body(name=body.name) == {"FINISHED"}
+    scene.frame_set(20)
+    assert not item.hide_render and not item.hide_viewport
+
+
+def test_what_cannot_be_done_is_said_when_it_is_added():
+    item = a_text()
+    item.data.extrude = 0.0
+    assert bpy.ops.physgen.quick_jelly() == {"CANCELLED"}
+    assert not item.hide_viewport and not bodies(bpy.context.scene) and len(bpy.data.meshes) == 0
+
+
+def test_a_collider_keeps_its_modifiers_and_its_animation():
+    item = arrayed()
+    item.keyframe_insert("location", frame=1)
+    assert bpy.ops.physgen.add_colliders() == {"FINISHED"}
+    assert bodies(bpy.context.scene) == [item] and not item.hide_viewport
