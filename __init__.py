@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .sim.app.default_motion import DefaultMotion, default_motion
     from .sim.app.diagnose import diagnose
     from .sim.app.evaluate import EvaluateOptions, evaluate
+    from .sim.app.explain import Explanation, explain
     from .sim.app.import_capture import ImportRequest, import_capture
     from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from .sim.diagnose.capture import Capture, load_capture
     from .sim.diagnose.diagnosis import Diagnosis
     from .sim.diagnose.run_diagnosis import DiagnoseOptions
+    from .sim.diagnose.track.body_request import BodyRequest
     from .sim.diagnose.track.track_command import track
     from .sim.diagnose.track.track_input import TrackOptions, VideoTrial
     from .sim.errors import PhysGenError
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Bake",
     "BakeOptions",
+    "BodyRequest",
     "Capture",
     "ChatRequest",
     "CollectOptions",
@@ -63,6 +66,7 @@ __all__ = [
     "Diagnosis",
     "EvaluateOptions",
     "Evaluation",
+    "Explanation",
     "ImportRequest",
     "ObjectRequest",
     "PhysGenError",
@@ -82,6 +86,7 @@ __all__ = [
     "default_motion",
     "diagnose",
     "evaluate",
+    "explain",
     "import_capture",
     "load_bake",
     "load_capture",
@@ -97,6 +102,7 @@ __all__ = [
 _HOMES = {
     "Bake": ".sim.cache.bake_folder",
     "BakeOptions": ".sim.app.bake_options",
+    "BodyRequest": ".sim.diagnose.track.body_request",
     "Capture": ".sim.diagnose.capture",
     "ChatRequest": ".sim.reconstruct.reasoning.chat_client",
     "CollectOptions": ".sim.evaluate.questionnaire_answers",
@@ -106,6 +112,7 @@ _HOMES = {
     "Diagnosis": ".sim.diagnose.diagnosis",
     "EvaluateOptions": ".sim.app.evaluate",
     "Evaluation": ".sim.evaluate.evaluation",
+    "Explanation": ".sim.app.explain",
     "ImportRequest": ".sim.app.import_capture",
     "ObjectRequest": ".sim.reconstruct.reconstruct_options",
     "PhysGenError": ".sim.errors",
@@ -124,6 +131,7 @@ _HOMES = {
     "default_motion": ".sim.app.default_motion",
     "diagnose": ".sim.app.diagnose",
     "evaluate": ".sim.app.evaluate",
+    "explain": ".sim.app.explain",
     "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",

@@ -95,6 +95,8 @@ def build_parser() -> argparse.ArgumentParser:
     lack = "capture of a real motion → effects missing from its simulation"
     diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
     diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
+    why = "video of one plain body → why its simulation differs, with a video of both side by side"
+    diagnosis_commands.add_explain(command("explain", diagnosis_commands.run_explain, why))
     tables = "tables of measured motion (CSV, Tracker, DeepLabCut) → capture folder"
     diagnosis_commands.add_capture(command("capture", diagnosis_commands.run_capture, tables))
     examined = "test the diagnosis on simulated motion with withheld labels"

@@ -157,6 +157,57 @@ def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     return 0
 
 
+def add_explain(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen explain``."""
+    parser.add_argument("video", type=Path, metavar="VIDEO", help="one body that moves before a still background")
+    known = "the body, such as ball:diameter=0.04,mass=0.0027, cylinder:diameter=0.03,height=0.01 or box:x=…,y=…,z=…"
+    parser.add_argument("--object", required=True, metavar="BODY", help=known)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for video and report")
+    fps = "true frame rate of the recording (default: the file's own times)"
+    parser.add_argument("--fps-override", type=float, metavar="FPS", help=fps)
+    parser.add_argument("--start-frame", type=int, default=0, metavar="N", help="first frame to use (default 0)")
+    parser.add_argument("--end-frame", type=int, metavar="N", help="last frame to use (default: the last)")
+    budget = "time for the fits, such as 90s, counted as simulated work (default 60s)"
+    parser.add_argument("--budget", type=parse_duration, default=60.0, metavar="TIME", help=budget)
+    only = "candidate effects (default: those that one video of one body can show)"
+    parser.add_argument("--effects", type=parse_names, metavar="NAMES", help=only)
+
+
+def run_explain(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen explain``; the exit code."""
+    from ...sim.app.explain import DIAGNOSIS_FOLDER, VISIBLE, explain
+    from ...sim.diagnose.run_diagnosis import DiagnoseOptions
+    from ...sim.diagnose.track.track_input import VideoTrial
+
+    found = explain(
+        VideoTrial(
+            path=options.video,
+            start_frame=options.start_frame,
+            end_frame=options.end_frame,
+            fps_override=options.fps_override,
+        ),
+        options.object,
+        out=options.out,
+        options=DiagnoseOptions(budget_s=options.budget, effects=options.effects or VISIBLE, confirm=False),
+        on_event=terminal,
+        cancelled=cancelled,
+    )
+    verdict = found.diagnosis.verdict
+    terminal(
+        {
+            "event": "done",
+            "out": str(options.out),
+            "effect": verdict.effect,
+            "probability": verdict.probability,
+            "alternatives": list(verdict.alternatives),
+            "closed_fraction": found.closed if found.closed == found.closed else None,
+        }
+    )
+    report = options.out / DIAGNOSIS_FOLDER / "report.html"
+    terminal.line(f"{found.summary}\nvideo: {found.video}\nreport: {report}")
+    return 0
+
+
 def add_blind_check(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen blind-check``."""
     number = "how many captures, 4 or more (default 30)"

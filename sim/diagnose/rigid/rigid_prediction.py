@@ -215,6 +215,7 @@ def _from_first_half(fit: Fit, index: int) -> Array:
     trial = trials[index]
     end = min(_middle(trial), trial.end)
     kept = max(1, sum(n < end - 2 for n in trial.nodes))
+    end = min([end, *trial.nodes[kept : kept + 1]])
     weights = list(trial.weights[:kept])
     weights[-1] = weights[-1][: end - trial.nodes[kept - 1]]
     trials[index] = dataclasses.replace(

@@ -17,6 +17,7 @@ from ...errors import InputError
 from ...events import Event, IsCancelled, OnEvent, ignore, never
 from ...scene.folder import Scene, load_scene
 from ..capture import Capture, Trial, load_capture, save_capture
+from .body_request import BodyRequest, parse_body
 from .track_input import TrackOptions, VideoTrial
 
 
@@ -24,7 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``physgen track``."""
     defaults = TrackOptions()
     parser.add_argument("videos", type=Path, nargs="+", metavar="VIDEO", help="one trial each: MP4, MOV, AVI …")
-    parser.add_argument("--scene", type=Path, required=True, metavar="SCENE", help="scene folder that the videos show")
+    parser.add_argument("--scene", type=Path, metavar="SCENE", help="scene folder that the videos show")
+    plain = "without a scene: the one body that moves, such as ball:diameter=0.04 (docs/from-video.md)"
+    parser.add_argument("--object", metavar="BODY", help=plain)
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="new capture folder")
     objects = "names of the objects to track (default: all that move)"
     parser.add_argument("--objects", nargs="+", action="extend", default=[], metavar="NAME", help=objects)
@@ -60,6 +63,13 @@ def run_command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCan
         fps_overrides=options.fps_override,
         predict_from=options.predict_from,
     )
+    if (options.scene is None) == (options.object is None):
+        raise InputError("give either --scene SCENE or --object BODY, such as ball:diameter=0.04")
+    if options.object is not None:
+        if options.objects or options.withheld is not None or options.predict_from:
+            raise InputError("--objects, --predict-from and --withheld need --scene")
+        capture = track_plain(trials, parse_body(options.object), options.out, on_event, cancelled)
+        return {"event": "done", "stage": "track", "capture": str(options.out), "summary": summary(capture)}
     capture = track(
         load_scene(options.scene),
         trials,
@@ -71,6 +81,23 @@ def run_command(options: argparse.Namespace, on_event: OnEvent, cancelled: IsCan
         cancelled=cancelled,
     )
     return {"event": "done", "stage": "track", "capture": str(options.out), "summary": summary(capture)}
+
+
+def track_plain(
+    trials: Sequence[VideoTrial], body: BodyRequest, out: Path, on_event: OnEvent, cancelled: IsCancelled
+) -> Capture:
+    """Return the free motion of ``body`` in one video as a capture, written to ``out``; no scene is needed.
+
+    Raises InputError for more than one video, what ``follow_plain_body`` raises, and when ``out`` exists.
+    """
+    if len(trials) != 1:
+        raise InputError(f"{len(trials)} videos: with --object each becomes a capture of its own; give one")
+    if out.exists():
+        raise InputError(f"{out}: already exists; choose another folder")
+    from .plain_bodies import follow_plain_body
+
+    save_capture(follow_plain_body(trials[0], body, on_event=on_event, cancelled=cancelled).capture, out)
+    return load_capture(out)
 
 
 def parse_trials(
@@ -184,5 +211,6 @@ def summary(capture: Capture) -> str:
             f"{trial.name} ({trial.role}): {len(trial.times)} frames in {trial.times[-1] - trial.times[0]:.3g} s, "
             f"{trial.rest_points.shape[0]} points, {int(np.median(seen))} in a frame"
         )
-    lines.append(f"scatter of a coordinate: {capture.noise_sigma:.2g} px")
+    unit = "px" if capture.camera is not None else "m"
+    lines.append(f"scatter of a coordinate: {capture.noise_sigma:.2g} {unit}")
     return "\n".join(lines)

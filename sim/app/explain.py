@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""A video → its cause: followed, diagnosed, simulated as believed and with the cause, and shown side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import replacing_tree, write_json
+from ..cache.folder_lock import lock_beside
+from ..diagnose import run_diagnosis
+from ..diagnose.capture import load_capture, save_capture
+from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
+from ..diagnose.report import write_report
+from ..diagnose.run_diagnosis import DiagnoseOptions
+from ..diagnose.track.body_request import BodyRequest, parse_body
+from ..diagnose.track.track_input import VideoTrial
+from ..errors import InputError
+from ..events import IsCancelled, OnEvent, ignore, never
+
+FORMAT = "physgen-explain/1"
+EXPLAIN_FILE, VIDEO_FILE = "explain.json", "comparison.mp4"
+CAPTURE_FOLDER, DIAGNOSIS_FOLDER = "capture", "diagnosis"
+
+VISIBLE = (
+    "friction", "restitution", "rolling_resistance", "air_drag", "magnus", "buoyancy", "time_scale"
+)  # fmt: skip
+"""Effects that one video of one plain body can show: those across the picture plane and hidden masses it
+cannot, and a tilt of the ground is measured in the picture: in one run it would be the same motion as friction."""
+PLAYBACK_FPS, SHOWN_S = 20.0, 8.0
+"""Frames per second, and longest duration, of the comparison."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """What a video shows. diagnosis: of its capture. video: the comparison. setting: flight, slope or surface.
+
+    closed: share of the gap that the cause closes on withheld time, NaN where there is no gap to close. notes: what was
+    decided about scale, gravity, ground and clock.
+    """
+
+    diagnosis: Diagnosis
+    root: Path
+    video: Path
+    setting: str
+    closed: float
+    notes: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """Return the verdict in a sentence."""
+        return self.diagnosis.summary
+
+
+def explain(
+    video: VideoTrial | str | Path,
+    body: BodyRequest | str,
+    *,
+    out: str | Path,
+    options: DiagnoseOptions | None = None,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> Explanation:
+    """Return why the motion of ``body`` in ``video`` differs from its simulation; ``out`` is a new folder.
+
+    body: what is known of it, such as ``"ball:diameter=0.04,mass=0.0027"``. ``out`` holds ``comparison.mp4`` (real,
+    simulated as believed, with the cause found, and the distance of both from the real path), ``capture/``,
+    ``diagnosis/`` with its report, and ``explain.json``. The second half of the motion is withheld from the numbers
+    that are judged. options: None tries the effects that such a video can show, for a minute.
+
+    >>> import physgen
+    >>> found = physgen.explain("drop.mp4", "ball:diameter=0.04", out="why")  # doctest: +SKIP
+    >>> found.diagnosis.verdict.effect, found.closed  # doctest: +SKIP
+    ('restitution', 0.93)
+
+    Raises InputError for a video in which no such body moves freely, and when ``out`` exists; Cancelled on request.
+    """
+    from ..diagnose.track.plain_bodies import follow_plain_body
+
+    out = Path(out)
+    if out.exists():
+        raise InputError(f"{out}: already exists; choose another folder")
+    trial = video if isinstance(video, VideoTrial) else VideoTrial(path=Path(video))
+    request = parse_body(body) if isinstance(body, str) else body
+    options = options or DiagnoseOptions(budget_s=60.0, effects=VISIBLE, confirm=False)
+    notes: list[str] = []
+
+    def listen(event: dict[str, Any]) -> None:
+        if event.get("event") == "notice" and event.get("stage") == "track":
+            notes.append(str(event["message"]).removeprefix(f"{trial.path.name}: "))
+        on_event(event)
+
+    motion = follow_plain_body(trial, request, on_event=listen, cancelled=cancelled)
+    with lock_beside(out), replacing_tree(out) as partial:
+        partial.mkdir(parents=True, exist_ok=True)
+        save_capture(motion.capture, partial / CAPTURE_FOLDER)
+        capture = load_capture(partial / CAPTURE_FOLDER)
+        diagnosis = run_diagnosis.diagnose(capture, options, on_event, cancelled)
+        (partial / DIAGNOSIS_FOLDER).mkdir()
+        write_diagnosis(diagnosis, partial / DIAGNOSIS_FOLDER)
+        write_report(diagnosis, capture, partial / DIAGNOSIS_FOLDER)
+        _compare(trial, motion, diagnosis, partial / VIDEO_FILE)
+        gap = diagnosis.gap
+        closed = gap.closed_fraction if diagnosis.verdict.effect != NONE else math.nan
+        write_json(
+            partial / EXPLAIN_FILE,
+            {
+                "format": FORMAT,
+                "video": trial.path.name,
+                "setting": motion.view.kind,
+                "frames": [int(motion.frames[0]), int(motion.frames[-1])],
+                "pixels_per_metre": round(motion.view.scale, 3),
+                "effect": diagnosis.verdict.effect,
+                "probability": diagnosis.verdict.probability,
+                "closed_fraction": closed if math.isfinite(closed) else None,
+                "before_rms_m": gap.before_rms_m,
+                "after_rms_m": gap.after_rms_m,
+                "notes": notes,
+            },
+        )
+    return Explanation(
+        diagnosis=diagnosis,
+        root=out,
+        video=out / VIDEO_FILE,
+        setting=motion.view.kind,
+        closed=closed,
+        notes=tuple(notes),
+    )
+
+
+def title_of_cause(diagnosis: Diagnosis) -> str:
+    """Return the verdict with its numbers in a few words, in plain ASCII for drawing."""
+    verdict = diagnosis.verdict
+    if verdict.effect == NONE:
+        return "nothing is missing"
+    if verdict.effect == UNKNOWN:
+        return "no known effect; contacts re-fitted"
+    words = []
+    for name in verdict.effects or (verdict.effect,):
+        numbers = next((item.parameters for item in diagnosis.effects if item.name == name), {})
+        first = next(iter(numbers.values()), None)
+        words.append(name.replace("_", " ") + ("" if first is None else f" {first.value:.3g}"))
+    return "with " + " and ".join(words)
+
+
+def _compare(trial: VideoTrial, motion: Any, diagnosis: Diagnosis, path: Path) -> None:
+    """Write the comparison of ``motion``, a ``VideoMotion``."""
+    from ..composite.side_by_side import cut_out, write_comparison
+    from ..diagnose.track.moving_regions import aligned_frames
+
+    capture, view, found = motion.capture, motion.view, motion.found
+    arrays = next(iter(diagnosis.trials.values()))
+    times = capture.trials[0].times
+    step = max(1, math.ceil(len(times) / (PLAYBACK_FPS * SHOWN_S)))
+    picks = np.arange(0, len(times), step)
+    real3 = capture.trials[0].observed[:, 0]
+    before, after = arrays.nominal[:, 0], arrays.found[:, 0]
+    gaps = np.linalg.norm(before - real3, axis=1), np.linalg.norm(after - real3, axis=1)
+    scale = found.scale
+    areas = np.array([r.area for r in motion.regions])
+    typical = int(np.argmin(np.abs(areas - np.median(areas)) + 1e-3 * np.arange(len(areas))))
+    wanted = motion.frames[picks]
+    model = next(aligned_frames(trial.path, found, np.array([motion.frames[typical]])))
+    region = motion.regions[typical]
+    body = cut_out(model, region.outline, region.middle)
+    real: Iterator[NDArray[np.uint8]] = aligned_frames(trial.path, found, wanted)
+    write_comparison(
+        path,
+        real,
+        background=found.background,
+        body=body,
+        seen=motion.places[picks] * scale,
+        believed=view.pixels(before[picks]) * scale,
+        found=view.pixels(after[picks]) * scale,
+        times=times[picks],
+        gaps=(gaps[0][picks], gaps[1][picks]),
+        withheld=0.5 * float(times[0] + times[-1]),
+        titles=("real", "simulated as believed", title_of_cause(diagnosis)),
+        fps=PLAYBACK_FPS,
+    )

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: MIT
+"""Real motion and two simulations of it side by side, drawn into the video's own background, with the gap below."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Picture = NDArray[np.uint8]
+Array = NDArray[np.float64]
+
+PANEL = (420, 560)
+"""Largest width and height of a panel, px."""
+CURVE = 150
+"""Height of the curve below, px."""
+INK, FAINT, BEFORE, AFTER = (35, 35, 35), (170, 170, 170), (60, 60, 215), (60, 150, 40)
+"""Colours, BGR."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SimulatedBody:
+    """How a simulated body looks: its own pixels. sprite: (h, w, 3) BGR. cover: (h, w) opacity 0 to 1. anchor: (2,) px
+    of its centre in the sprite."""
+
+    sprite: Picture
+    cover: NDArray[np.float32]
+    anchor: Array
+
+
+def cut_out(picture: Picture, outline: Array, middle: Array) -> SimulatedBody:
+    """Return what lies within ``outline`` (N, 2) px of ``picture``, with its centre at ``middle`` (2,)."""
+    low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 3, (picture.shape[1], picture.shape[0]))
+    mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
+    cv2.fillConvexPoly(mask, np.round((outline - 0.5 - low) * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
+    sprite = picture[low[1] : high[1], low[0] : high[0]].copy()
+    return SimulatedBody(sprite=sprite, cover=(mask / 255).astype(np.float32), anchor=middle - low)
+
+
+def with_body(background: Picture, body: SimulatedBody, place: Array) -> Picture:
+    """Return ``background`` with the body's centre at ``place`` (2,) px, to a fraction of a pixel; cut at the rim."""
+    out = background.copy()
+    if not np.isfinite(place).all():
+        return out
+    corner = place - body.anchor
+    whole = np.floor(corner).astype(int)
+    shift = corner - whole
+    h, w = body.cover.shape
+    if whole[0] >= out.shape[1] or whole[1] >= out.shape[0] or whole[0] + w + 1 <= 0 or whole[1] + h + 1 <= 0:
+        return out
+    move = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
+    sprite = cv2.warpAffine(body.sprite, move, (w + 1, h + 1), borderMode=cv2.BORDER_REPLICATE)
+    cover = cv2.warpAffine(body.cover, move, (w + 1, h + 1))[..., None]
+    x0, y0 = max(0, whole[0]), max(0, whole[1])
+    x1, y1 = min(out.shape[1], whole[0] + w + 1), min(out.shape[0], whole[1] + h + 1)
+    part = (slice(y0 - whole[1], y1 - whole[1]), slice(x0 - whole[0], x1 - whole[0]))
+    under = out[y0:y1, x0:x1].astype(np.float32)
+    out[y0:y1, x0:x1] = (under + cover[part] * (sprite[part] - under)).round().astype(np.uint8)
+    return out
+
+
+def write_comparison(
+    path: Path,
+    real: Iterator[Picture],
+    *,
+    background: Picture,
+    body: SimulatedBody,
+    seen: Array,
+    believed: Array,
+    found: Array,
+    times: Array,
+    gaps: tuple[Array, Array],
+    withheld: float,
+    titles: Sequence[str],
+    fps: float = 20.0,
+) -> int:
+    """Write *real · simulated as believed · with the cause found* as a video at ``path``; return its frames.
+
+    real: T pictures of the size of ``background`` (H, W, 3). seen, believed, found: (T, 2) px. times: (T,) s. gaps: two
+    (T,) distances to the real centre in m. withheld: s from which nothing was fitted to. titles: of the three panels.
+    fps: of playback. Raises InputError when no video can be written there.
+    """
+    height, width = background.shape[:2]
+    scale = min(PANEL[0] / width, PANEL[1] / height, 2.0)
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    total = (3 * size[0] + 16, size[1] + 34 + CURVE)
+    total = (total[0] + total[0] % 2, total[1] + total[1] % 2)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, total)  # type: ignore[attr-defined]
+    if not writer.isOpened():
+        raise InputError(f"{path}: no video can be written there; choose another folder")
+    count = 0
+    try:
+        for k, picture in enumerate(real):
+            panels = [picture, with_body(background, body, believed[k]), with_body(background, body, found[k])]
+            sheet = np.full((total[1], total[0], 3), 250, np.uint8)
+            for i, panel in enumerate(panels):
+                how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+                shown = np.asarray(cv2.resize(panel, size, interpolation=how), np.uint8)
+                path_px = (believed, believed, found)[i] if i else seen
+                _trail(shown, path_px[: k + 1] * (size[0] / width), (INK, BEFORE, AFTER)[i])
+                if i:
+                    _ring(shown, seen[k] * (size[0] / width))
+                x = i * (size[0] + 8)
+                sheet[30 : 30 + size[1], x : x + size[0]] = shown
+                _text(sheet, titles[i], (x + 2, 20), size[0] - 4, (INK, BEFORE, AFTER)[i])
+            _curve(sheet, (34 + size[1], CURVE), times, gaps, k, withheld)
+            writer.write(sheet)
+            count += 1
+    finally:
+        writer.release()
+    return count
+
+
+def _text(sheet: Picture, text: str, at: tuple[int, int], width: int, colour: tuple[int, int, int]) -> None:
+    scale = 0.5
+    while scale > 0.3 and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width:
+        scale -= 0.03
+    while len(text) > 8 and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width:
+        text = text[:-5] + "..."
+    cv2.putText(sheet, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+
+
+def _trail(picture: Picture, places: Array, colour: tuple[int, int, int]) -> None:
+    places = places[np.isfinite(places).all(axis=1)]
+    if len(places) > 1:
+        dots = [np.round(np.clip(places, -2000, 6000) * 8).astype(np.int32).reshape(-1, 1, 2)]
+        cv2.polylines(picture, dots, False, colour, 1, cv2.LINE_AA, 3)
+
+
+def _ring(picture: Picture, place: Array) -> None:
+    """Mark where the real body is."""
+    if np.isfinite(place).all():
+        x, y = (int(v) for v in np.round(place))
+        for colour, thick in (((255, 255, 255), 3), (INK, 1)):
+            cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 11, thick, cv2.LINE_AA)
+
+
+def _curve(
+    sheet: Picture, band: tuple[int, int], times: Array, gaps: tuple[Array, Array], now: int, withheld: float
+) -> None:
+    top, height = band
+    left, right = 62, sheet.shape[1] - 12
+    low, high = top + height - 22, top + 22
+    most = max(float(np.nanmax(gaps[0])), float(np.nanmax(gaps[1])), 1e-6)
+    span = max(float(times[-1] - times[0]), 1e-9)
+
+    def at(t: float, g: float) -> tuple[int, int]:
+        return round(left + (t - times[0]) / span * (right - left)), round(low - min(g, most) / most * (low - high))
+
+    x = at(withheld, 0)[0]
+    cv2.rectangle(sheet, (x, high), (right, low), (232, 232, 232), -1)
+    _text(sheet, "withheld from the fit", (x + 4, high + 12), max(right - x - 6, 40), (110, 110, 110))
+    cv2.line(sheet, (left, low), (right, low), FAINT, 1)
+    unit, factor = ("mm", 1e3) if most < 0.5 else ("m", 1.0)
+    _text(sheet, f"{most * factor:.3g} {unit}", (4, high + 6), left - 6, INK)
+    _text(sheet, "0", (left - 14, low + 4), 12, INK)
+    _text(sheet, f"{span:.2f} s", (right - 46, low + 16), 46, INK)
+    _text(sheet, "distance to the real centre", (left, high - 6), 300, INK)
+    for gap, colour in zip(gaps, (BEFORE, AFTER), strict=True):
+        good = np.isfinite(gap)
+        line = np.array([at(t, g) for t, g in zip(times[good], gap[good], strict=True)], np.int32)
+        if len(line) > 1:
+            cv2.polylines(sheet, [line.reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA)
+        if np.isfinite(gap[now]):
+            cv2.circle(sheet, at(float(times[now]), float(gap[now])), 4, colour, -1, cv2.LINE_AA)

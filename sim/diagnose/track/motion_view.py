@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: MIT
+"""The path of a body in a picture → what kind of motion it is, which way gravity points, and where the ground is.
+
+Three settings cover what one still camera shows of a free body: a flight with bounces (gravity in the picture), a slope
+seen from the side, and motion on a level surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from .pose_estimation import Array
+
+GRAVITY = 9.81
+LEAST_PIECE = 6
+"""Frames of the shortest piece between two impacts."""
+JUMP_SHARE, PUSH_SHARE, JUMP_SIGMAS = 0.3, 0.6, 7.0
+"""Change of velocity that is an impact: as a share of the largest speed, on a surface (where an outline that turns
+wobbles), and in standard deviations."""
+DOWN_COSINE = 0.8
+"""Cosine to the picture's downward axis of an acceleration that may be gravity: phones are held upright."""
+FLIGHT_SHARE = (0.55, 1.7)
+"""Acceleration over g of a flight, with an inexact size and drag."""
+ALONG_COSINE = 0.94
+"""Cosine between acceleration and velocity of motion along a line."""
+SIZE_PX = 0.5
+"""Standard deviation of a diameter in px; a fiftieth of the diameter comes on top."""
+FLIGHT_SPREAD = 0.03
+"""Relative standard deviation of the scale that a flight gives: drag and a tilted picture plane."""
+LET_GO = 5.0
+"""Distance from the later motion, in its own scatter, up to which a body counts as let go."""
+REST_SHARE = 0.12
+"""Time at rest after a stop that is kept, as a share of the motion."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionView:
+    """Where the motion lies in the picture. Pixels are the video's.
+
+    kind: flight, slope or surface. first, last: samples of the path that are free motion. scale: px per m.
+    origin: (2,) px. matrix: (2, 3) px per m, from world axes (z up). points: (N, 3) m, the centre at those samples.
+    normal: (3,) of the ground, point: (3,) m on it. notes: what was decided, in words.
+    """
+
+    kind: str
+    first: int
+    last: int
+    scale: float
+    origin: Array
+    matrix: Array
+    points: Array
+    normal: Array
+    point: Array
+    notes: tuple[str, ...]
+
+    def pixels(self, points: Array) -> Array:
+        """Return px (..., 2) of world points (..., 3)."""
+        return np.asarray(self.origin + points @ self.matrix.T)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Piece:
+    """Samples ``first`` to ``last`` with one acceleration (px/s²); begin, end: velocities px/s."""
+
+    first: int
+    last: int
+    acceleration: Array
+    begin: Array
+    end: Array
+    miss: float
+
+
+def _parabola(times: Array, places: Array) -> tuple[Array, float]:
+    """Return coefficients (3, 2), highest power first, and the residual of a coordinate; robust to few outliers."""
+    t = times - times.mean()
+    weights = np.ones(len(t))
+    fit = np.zeros((3, 2))
+    off = np.zeros(len(t))
+    for _ in range(3):
+        fit = np.polyfit(t, places, 2, w=weights)
+        off = np.linalg.norm(places - (np.vander(t, 3) @ fit), axis=1)
+        usual = max(float(np.median(off)), 1e-6)
+        weights = 1.0 / np.maximum(1.0, off / (2.5 * usual))
+    return fit, float(np.sqrt(np.mean(np.minimum(off, 4 * np.median(off) + 1e-9) ** 2) / 2))
+
+
+def _piece(times: Array, places: Array, first: int, last: int) -> _Piece:
+    part = slice(first, last + 1)
+    t = times[part]
+    fit, miss = _parabola(t, places[part])
+    middle = t.mean()
+
+    def speed(at: float) -> Array:
+        return np.asarray(2 * fit[0] * (at - middle) + fit[1])
+
+    return _Piece(
+        first=first, last=last, acceleration=2 * fit[0], begin=speed(t[0]), end=speed(t[-1]), miss=miss
+    )  # fmt: skip
+
+
+def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
+    """Return the samples of impacts: where the straight lines before and after disagree in velocity."""
+    count = len(times)
+    width = int(np.clip(count // 24, 4, 9))
+    change = np.zeros(count)
+    sigma = noise_px(places)
+    for k in range(width, count - width):
+        before, after = slice(k - width, k + 1), slice(k, k + width + 1)
+        a = np.polyfit(times[before] - times[k], places[before], 2 if width > 5 else 1)
+        b = np.polyfit(times[after] - times[k], places[after], 2 if width > 5 else 1)
+        change[k] = float(np.linalg.norm(b[-2] - a[-2]))
+    steps = np.linalg.norm(places[width:] - places[:-width], axis=1) / np.maximum(times[width:] - times[:-width], 1e-9)
+    usual = float(np.percentile(steps, 97)) if len(steps) else 0.0
+    span = float(np.median(np.diff(times))) * width
+    blur = (4.0 if width > 5 else 1.8) * sigma / max(span, 1e-9) / np.sqrt(width)
+    limit = max(share * usual, JUMP_SIGMAS * blur)
+    found: list[int] = []
+    for k in (int(v) for v in np.argsort(-change)):
+        if change[k] < limit:
+            break
+        if all(abs(int(k) - f) > width for f in found):
+            found.append(int(k))
+    return sorted(found)
+
+
+def noise_px(places: Array) -> float:
+    """Return the noise of a coordinate from third differences, which smooth motion hardly has."""
+    third = np.abs(np.diff(places, 3, axis=0)).ravel()
+    return max(float(np.median(third)) / 0.6745 / np.sqrt(20), 0.02) if len(third) else 0.1
+
+
+def understand_motion(
+    times: Array,
+    places: Array,
+    *,
+    diameter_px: float,
+    diameter: float,
+    clearance: float,
+    elevation: float,
+    where: str,
+    rolls: bool = False,
+) -> MotionView:
+    """Return the view of the free motion in ``places`` (N, 2) px at ``times`` (N,) s.
+
+    diameter_px, diameter: a length of the body in px and m. clearance: m, of its centre above what it stands on.
+    elevation: rad, of the camera above a level surface; half a turn's quarter looks straight down.
+    Raises InputError where nothing moves freely for long enough.
+    """
+    scale = diameter_px / diameter
+    impacts = jumps(times, places)
+    pieces = _pieces(times, places, impacts)
+    flights = [p for p in pieces if _flies(p, scale)]
+    if flights and _longest(pieces, places) in flights:
+        return _flight(times, places, pieces, flights, impacts, scale, diameter_px, clearance, where)
+    pieces = _pieces(times, places, jumps(times, places, PUSH_SHARE))
+    if not pieces:
+        raise InputError(f"{where}: the body is followed for {len(times)} frames, too few between its impacts")
+    best = _longest(pieces, places)
+    if _runs_down(best, scale, places):
+        return _slope(times, places, best, scale, clearance)
+    return _surface(times, places, best, scale, clearance, elevation)
+
+
+def _pieces(times: Array, places: Array, impacts: list[int]) -> list[_Piece]:
+    edges = [0, *impacts, len(times) - 1]
+    return [
+        _piece(times, places, a + (a > 0), b - (b < len(times) - 1)) for a, b in pairwise(edges) if b - a >= LEAST_PIECE
+    ]
+
+
+def _longest(pieces: list[_Piece], places: Array) -> _Piece:
+    return max(pieces, key=lambda p: float(np.linalg.norm(places[p.last] - places[p.first])))
+
+
+def _flies(piece: _Piece, scale: float) -> bool:
+    size = float(np.linalg.norm(piece.acceleration))
+    if piece.last - piece.first < LEAST_PIECE or size <= 0 or piece.acceleration[1] / size < DOWN_COSINE:
+        return False
+    strength = size / scale / GRAVITY
+    if not FLIGHT_SHARE[0] < strength < FLIGHT_SHARE[1]:
+        return False
+    middle = 0.5 * (piece.begin + piece.end)
+    straight = abs(float(middle @ piece.acceleration)) / max(float(np.linalg.norm(middle)) * size, 1e-9)
+    # Straight and not upright: a slope.
+    return straight < ALONG_COSINE or piece.acceleration[1] / size > 0.985
+
+
+def _runs_down(piece: _Piece, scale: float, places: Array) -> bool:
+    way = places[piece.last] - places[piece.first]
+    way = way / max(float(np.linalg.norm(way)), 1e-9)
+    along = float(piece.acceleration @ way) / scale / GRAVITY
+    faster = float(piece.end @ way) > 1.3 * max(float(piece.begin @ way), 0.0)
+    return faster and along > 0.03 and way[1] > 0.05
+
+
+def _frame(down: Array) -> Array:
+    """Return the matrix (2, 3) of a picture plane with gravity along ``down``, in px per px."""
+    across = np.array([down[1], -down[0]])
+    if across[0] < 0:
+        across = -across
+    return np.stack([across, np.zeros(2), -down], axis=1)
+
+
+def _flight(
+    times: Array,
+    places: Array,
+    pieces: list[_Piece],
+    flights: list[_Piece],
+    impacts: list[int],
+    scale: float,
+    diameter_px: float,
+    clearance: float,
+    where: str,
+) -> MotionView:
+    main = max(flights, key=lambda p: p.last - p.first)
+    total = np.sum([p.acceleration * (p.last - p.first) ** 2 for p in flights], axis=0)
+    down = total / np.linalg.norm(total)
+    strengths = np.array([float(p.acceleration @ down) for p in flights])
+    weights = np.array([float(p.last - p.first) ** 2 for p in flights])
+    pull = float(np.average(strengths, weights=weights))
+    notes = [f"a flight: things fall with {pull / scale:.3g} m/s² by the body's size"]
+    by_flight, spread = pull / GRAVITY, float(np.hypot(0.02, SIZE_PX / diameter_px))
+    if abs(np.log(by_flight / scale)) < 2 * np.hypot(spread, FLIGHT_SPREAD):
+        # Size and flight both measure the scale; apart from each other they speak of a wrong clock, which stays a gap.
+        part = spread**2 / (spread**2 + FLIGHT_SPREAD**2)
+        scale = float(np.exp((1 - part) * np.log(scale) + part * np.log(by_flight)))
+        notes.append(f"scale {scale:.0f} px/m from the size and the flight")
+    else:
+        notes.append(f"scale {scale:.0f} px/m from the size; the flight would give {by_flight:.0f}: is the clock off?")
+    first, last = main.first, main.last
+    ordered = sorted(pieces, key=lambda p: p.first)
+    at = ordered.index(main)
+    for piece in reversed(ordered[:at]):
+        if piece not in flights or not _bounce(piece, ordered[ordered.index(piece) + 1], down):
+            break
+        first = piece.first
+    speed = float(np.linalg.norm(main.end))
+    previous = main
+    bounces: list[int] = []
+    for piece in ordered[at + 1 :]:
+        settled = np.linalg.norm(piece.begin) < 0.25 * speed
+        if not (_bounce(previous, piece, down) and (piece in flights or settled)):
+            break
+        last, previous = piece.last, piece
+    tail = [k for k in impacts if k > last]
+    if tail and last == previous.last and len(times) - 1 - last < 3 * LEAST_PIECE:
+        last = tail[0] - 1
+    matrix = _frame(down) * scale
+    origin = places[first]
+    world = (places - origin) @ matrix / scale**2
+    bounces = [k for k in impacts if first < k <= last]
+    lowest = float(world[first : last + 1, 2].min())
+    if bounces:
+        touched = [float(world[max(k - 1, 0) : k + 2, 2].min()) for k in bounces]
+        ground = float(np.min(touched)) - clearance
+        notes.append(f"{len(bounces)} bounce{'s' if len(bounces) > 1 else ''}; the ground lies there")
+    else:
+        ground = lowest - clearance - 1.0
+        notes.append("no bounce; the ground is put a metre below")
+    if last - first < 2 * LEAST_PIECE - 4:
+        raise InputError(f"{where}: only {last - first + 1} frames of free flight; film at a higher frame rate")
+    return MotionView(
+        kind="flight", first=first, last=last, scale=scale, origin=origin, matrix=matrix,
+        points=world[first : last + 1], normal=np.array([0.0, 0.0, 1.0]), point=np.array([0.0, 0.0, ground]),
+        notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _bounce(before: _Piece, after: _Piece, down: Array) -> bool:
+    """Return whether the velocity changes mostly upwards: a wall or a hand pushes sideways."""
+    change = after.begin - before.end
+    up = -float(change @ down)
+    return up > 0.75 * float(np.linalg.norm(change))
+
+
+def _slope(times: Array, places: Array, piece: _Piece, scale: float, clearance: float) -> MotionView:
+    first = _moving_from(times, places, piece)
+    part = places[first : piece.last + 1]
+    way = np.linalg.svd(part - part.mean(axis=0), full_matrices=False)[2][0]
+    way = way if way[1] > 0 else -way
+    matrix = _frame(np.array([0.0, 1.0])) * scale
+    origin = part.mean(axis=0)
+    world = (part - origin) @ matrix / scale**2
+    direction = np.array([way[0], 0.0, -way[1]])
+    normal = np.array([way[1], 0.0, way[0]]) * (1 if way[0] > 0 else -1)
+    angle = float(np.degrees(np.arctan2(way[1], abs(way[0]))))
+    # Across the slope the body keeps its height: what is left there is noise of the picture.
+    world = np.outer(world @ direction, direction)
+    return MotionView(
+        kind="slope", first=first, last=piece.last, scale=scale, origin=origin, matrix=matrix, points=world,
+        normal=normal, point=-clearance * normal,
+        notes=(f"a slope of {angle:.1f}° seen from the side, the picture's vertical taken as upright",
+               f"scale {scale:.0f} px/m from the size"),
+    )  # fmt: skip
+
+
+def _surface(
+    times: Array, places: Array, piece: _Piece, scale: float, clearance: float, elevation: float
+) -> MotionView:
+    first, last = _moving_from(times, places, piece), piece.last
+    matrix = np.array([[1.0, 0.0, 0.0], [0.0, -np.sin(elevation), -np.cos(elevation)]]) * scale
+    origin = places[first]
+    off = (places[first : last + 1] - origin) / scale
+    world = np.stack([off[:, 0], -off[:, 1] / np.sin(elevation), np.zeros(len(off))], axis=1)
+    notes = [f"motion on a level surface, seen from {np.degrees(elevation):.0f}° above it"]
+    notes.append(f"scale {scale:.0f} px/m from the size")
+    return MotionView(
+        kind="surface", first=first, last=last, scale=scale, origin=origin, matrix=matrix, points=world,
+        normal=np.array([0.0, 0.0, 1.0]), point=np.array([0.0, 0.0, -clearance]), notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _moving_from(times: Array, places: Array, piece: _Piece) -> int:
+    """Return the sample from which the body of ``piece`` is left alone: after the last push, at its greatest
+    acceleration along the way; on a slope, after it has begun to move."""
+    part: NDArray[np.int64] = np.arange(piece.first, piece.last + 1)
+    width = max(3, len(part) // 16)
+    if len(part) < 3 * width:
+        return piece.first
+    speed = np.linalg.norm(places[part[width:]] - places[part[:-width]], axis=1) / (
+        times[part[width:]] - times[part[:-width]]
+    )
+    top = float(np.percentile(speed, 97))
+    if speed[-1] > 0.8 * top:  # it gains speed: from where a tenth of it is reached
+        first = int(np.argmax(speed > 0.1 * top))
+    else:
+        first = min(int(np.argmax(speed > 0.93 * top)) + width // 2, len(part) - LEAST_PIECE)
+    # A hand lets go gradually: what the motion of the later three quarters does not go back to is left out.
+    kept = part[first:]
+    later = kept[len(kept) // 4 :]
+    if len(later) >= 2 * LEAST_PIECE and speed[-1] > 0.8 * top:
+        fit, miss = _parabola(times[later], places[later])
+        off = np.linalg.norm(places[kept] - np.vander(times[kept] - times[later].mean(), 3) @ fit, axis=1)
+        wrong = np.flatnonzero(off[: len(kept) // 2] > LET_GO * max(miss, noise_px(places[later])))
+        first += int(wrong[-1]) + 1 if len(wrong) else 0
+    return int(part[min(first, len(part) - LEAST_PIECE)])
+
+
+def stopped_at(times: Array, points: Array) -> int:
+    """Return the last sample worth keeping: shortly after the body has come to rest."""
+    left = np.linalg.norm(points - points[-1], axis=1)
+    moving = np.flatnonzero(left > 0.01 * max(float(left.max()), 1e-9))
+    if len(moving) == 0:
+        return len(points) - 1
+    end = times[moving[-1]] + REST_SHARE * (times[moving[-1]] - times[0])
+    return int(np.searchsorted(times, end, side="right")) - 1

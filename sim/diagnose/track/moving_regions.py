@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: MIT
+"""What moves in a video of a still scene: the background without it, and its regions in every frame.
+
+The background is the median over time. Where something covers a pixel for long, the value is taken that fits the
+surroundings, so that a slow body leaves no ghost. A camera that drifts is stabilised on the background's corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .pose_estimation import Array
+from .track_videos import Frame, Video
+
+Picture = NDArray[np.uint8]
+
+WORK_PIXELS = 520_000
+"""Pixels of a frame at which regions are found; larger videos are reduced, so that memory is bounded."""
+MOST_SAMPLES = 48
+"""Frames in memory for the background."""
+UNSURE = 10.0
+"""Grey levels between the quartiles of a pixel over time above which the median may show the moving body."""
+LIKE_AROUND, LEAST_SHARE = 22.0, 0.03
+"""Grey levels within which a value counts as that of the surroundings, and least share of them that it must have."""
+WIDE = 2.5
+"""Area of a hull over its contents from which it is no compact body."""
+LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
+"""Difference from the background that counts as moving: grey levels, and standard deviations of the pixel."""
+SHADOW = (0.45, 0.97, 0.09)
+"""A shadow: least and largest brightness over the background's, and largest difference between the channels."""
+LEAST_AREA = 7
+"""Pixels of the smallest region."""
+MOST_REGIONS = 12
+"""Largest regions of a frame that are kept."""
+DRIFT_PX = 0.4
+"""Motion of the background in working pixels from which frames are aligned to it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Region:
+    """A moving region of one frame, in pixels of the working picture (centres at halves).
+
+    middle: (2,) weighted centre. area: px. axes: (2,) standard deviations along its principal axes, larger first.
+    angle: rad, of the larger axis, from x towards y. outline: (N, 2) its convex hull. colour: (3,) BGR.
+    cut: whether it touches the picture's border. solid: its area over its hull's.
+    """
+
+    frame: int
+    middle: Array
+    area: float
+    axes: Array
+    angle: float
+    outline: Array
+    colour: Array
+    cut: bool
+    solid: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovingRegions:
+    """Everything that moves. regions: by frame. stamps: (T,) s of the container. change: (T,) mean difference from the
+    frame before, grey levels. background: (H, W, 3) BGR. scale: working pixels per pixel of the video. drift: largest
+    motion of the background, video px. to_background: (T, 2, 3) maps of frames onto the background; None: a still
+    camera."""
+
+    background: Picture
+    regions: list[list[Region]]
+    stamps: list[float]
+    change: Array
+    scale: float
+    drift: float
+    to_background: Array | None
+    first: int
+
+
+class _Aligner:
+    """Maps frames of a slowly drifting camera onto a reference by the background's corners."""
+
+    def __init__(self, reference: Picture) -> None:
+        self._grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY)
+        corners = cv2.goodFeaturesToTrack(self._grey, 240, 0.01, 12)
+        self._corners = np.empty((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+        self._last = np.eye(2, 3)
+
+    def map(self, frame: Picture) -> Array:
+        """Return the (2, 3) map from ``frame`` to the reference; the last one where nothing matches."""
+        if len(self._corners) < 12:
+            return self._last
+        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        back = cv2.invertAffineTransform(self._last)
+        guess = np.ascontiguousarray((self._corners[:, 0] @ back[:, :2].T + back[:, 2])[:, None], dtype=np.float32)
+        ends, found, _ = cv2.calcOpticalFlowPyrLK(
+            self._grey, grey, self._corners, guess, winSize=(21, 21), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        )
+        good = found[:, 0] > 0
+        if good.sum() < 10:
+            return self._last
+        matrix, inliers = cv2.estimateAffinePartial2D(
+            ends[good], self._corners[good], method=cv2.RANSAC, ransacReprojThreshold=1.0, maxIters=300
+        )
+        if matrix is not None and int(inliers.sum()) >= max(8, 0.4 * good.sum()):
+            self._last = np.asarray(matrix, np.float64)
+        return self._last
+
+
+def working_scale(width: int, height: int) -> float:
+    """Return working pixels per video pixel, at most 1."""
+    return min(1.0, float(np.sqrt(WORK_PIXELS / (width * height))))
+
+
+def reduced(frame: Frame, scale: float) -> Picture:
+    """Return the frame's colours (H, W, 3) at the working size."""
+    if scale >= 1:
+        return frame.colour
+    return np.asarray(cv2.resize(frame.colour, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _samples(path: Path, start: int, end: int | None, on_frame: Callable[[], None]) -> tuple[list[Picture], float]:
+    """Return frames spread evenly over the video, at the working size."""
+    kept: list[Picture] = []
+    stride, count = 1, 0
+    with Video(path) as video:
+        scale = working_scale(video.info.width, video.info.height)
+        for frame in video.frames(start, end):
+            on_frame()
+            if count % stride == 0:
+                kept.append(np.array(reduced(frame, scale)))
+                if len(kept) > MOST_SAMPLES:
+                    kept, stride = kept[::2], 2 * stride
+            count += 1
+    return kept, scale
+
+
+def _background(stack: NDArray[np.uint8]) -> tuple[Picture, Array]:
+    """Return the background (H, W, 3) of frames (N, H, W, 3), and each pixel's noise (H, W)."""
+    out = np.empty(stack.shape[1:], np.uint8)
+    wide = np.empty(stack.shape[1:3])
+    noise = np.empty(stack.shape[1:3])
+    levels = np.empty((5, *stack.shape[1:]), np.uint8)
+    for top in range(0, stack.shape[1], 64):  # in bands: percentiles copy what they sort
+        band = np.percentile(stack[:, top : top + 64], (4, 25, 50, 75, 96), axis=0)
+        levels[:, top : top + 64] = band.astype(np.uint8)
+        wide[top : top + 64] = (band[4] - band[0]).max(axis=-1)
+        noise[top : top + 64] = (band[3] - band[1]).max(axis=-1) / 1.35
+        out[top : top + 64] = band[2].astype(np.uint8)
+    unsure = cv2.morphologyEx((wide > UNSURE + 6 * np.median(noise)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
+    unsure = cv2.morphologyEx(unsure, cv2.MORPH_CLOSE, np.ones((9, 9)))
+    filled = np.zeros_like(unsure)
+    outlines, _ = cv2.findContours(unsure, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    for outline in outlines:
+        if cv2.contourArea(outline) > 30:
+            # A slow body covers some pixels all the time: they lie within the hull of those that it leaves.
+            hull = cv2.convexHull(outline)
+            compact = cv2.contourArea(hull) < WIDE * cv2.contourArea(outline)
+            cv2.drawContours(filled, [hull if compact else outline], -1, 1, cv2.FILLED)
+    filled = cv2.dilate(filled, np.ones((7, 7), np.uint8))
+    return _bare(out, noise, np.asarray(filled, np.uint8), levels) if filled.any() else (out, noise)
+
+
+def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint8]) -> tuple[Picture, Array]:
+    """Return background and noise with what covers ``holes`` for long taken away.
+
+    levels: (5, H, W, 3) percentiles over time. A value counts if its colour occurs around the hole, the median first;
+    where none does, the body was there all the time, and the hole is filled from its rim.
+    """
+    out, noise = median.copy(), noise.copy()
+    empty = np.zeros_like(holes)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes)
+    for k in range(1, count):
+        x, y, w, h = (int(v) for v in stats[k, :4])
+        pad = int(np.clip(0.25 * max(w, h), 8, 40))
+        rows, columns = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
+        inside = labels[rows, columns] == k
+        around = median[rows, columns][holes[rows, columns] == 0].astype(np.float32)
+        if len(around) < 20 or inside.sum() < 9:
+            continue
+        around = around[:: max(1, len(around) // 1500)]
+        rules = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 12, 1.0)
+        cv2.setRNGSeed(0)
+        _, groups, centres = cv2.kmeans(around, min(8, len(around)), None, rules, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+        shares = np.bincount(groups[:, 0], minlength=len(centres)) / len(around)
+        centres = centres[shares > LEAST_SHARE]
+        seen = levels[:, rows, columns][:, inside][[2, 1, 3, 0, 4]].astype(np.float32)
+        off = np.abs(seen[:, :, None] - centres[None, None]).max(axis=-1).min(axis=-1)
+        order = np.where(off[0] < LIKE_AROUND, 0, off.argmin(axis=0))
+        chosen = seen[order, np.arange(seen.shape[1])]
+        unknown = off[order, np.arange(seen.shape[1])] >= LIKE_AROUND
+        part = out[rows, columns]
+        part[inside] = chosen.astype(np.uint8)
+        # What a body covers for a while leaves the median to one side only; leaves in the wind do to both.
+        spread = np.minimum(np.abs(seen[1] - chosen).max(axis=-1), np.abs(seen[2] - chosen).max(axis=-1))
+        noise[rows, columns][inside] = np.where(order == 0, 1.5 * spread, 0.0)
+        if unknown.any():
+            # Beside what is never bare, pixels are bare too briefly to be trusted.
+            left, reach = np.zeros(inside.shape, np.uint8), 2 * int(0.06 * max(w, h)) + 3
+            left[inside] = unknown
+            left = cv2.morphologyEx(left, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+            left = cv2.dilate(left, np.ones((reach, reach), np.uint8))
+            empty[rows, columns] |= left & inside.astype(np.uint8)
+    if empty.any():
+        out = np.asarray(cv2.inpaint(out, empty, 5, cv2.INPAINT_TELEA), np.uint8)
+    return out, np.where(noise > 0, noise, float(np.median(noise)))
+
+
+def find_moving_regions(
+    path: Path, start: int = 0, end: int | None = None, on_frame: Callable[[], None] = lambda: None
+) -> MovingRegions:
+    """Return what moves in the video at ``path``; memory does not grow with its length, but for the regions' outlines.
+
+    on_frame: called for every frame read, twice in all. Raises InputError as ``Video`` does.
+    """
+    samples, scale = _samples(path, start, end, on_frame)
+    if len(samples) < 5:
+        return MovingRegions(
+            background=samples[0] if samples else np.zeros((1, 1, 3), np.uint8),
+            regions=[[] for _ in samples], stamps=[float("nan")] * len(samples), change=np.zeros(len(samples)),
+            scale=scale, drift=0.0, to_background=None, first=start,
+        )  # fmt: skip
+    height, width = samples[0].shape[:2]
+    aligner = _Aligner(samples[len(samples) // 2])
+    maps = [aligner.map(s) for s in samples]
+    edges = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
+    ways = [np.abs(edges @ m.T - edges[:, :2]).max() for m in maps]
+    drift = float(np.max(ways))
+    moving_camera = float(np.median(ways)) > DRIFT_PX
+    if moving_camera:
+        samples = [_warped(s, m) for s, m in zip(samples, maps, strict=True)]
+    stack = np.stack(samples)
+    del samples
+    background, noise = _background(stack)
+    del stack
+    limit = np.maximum(LEAST_CONTRAST, NOISE_FACTOR * cv2.GaussianBlur(noise, (5, 5), 0))
+    regions: list[list[Region]] = []
+    stamps: list[float] = []
+    change: list[float] = []
+    found_maps: list[Array] = []
+    before: Picture | None = None
+    aligner = _Aligner(background)
+    with Video(path) as video:
+        for index, frame in enumerate(video.frames(start, end)):
+            on_frame()
+            picture = reduced(frame, scale)
+            if moving_camera:
+                found_maps.append(aligner.map(picture).copy())
+                picture = _warped(picture, found_maps[-1])
+            change.append(0.0 if before is None else float(cv2.norm(picture, before, cv2.NORM_L1)) / picture.size)
+            before = picture
+            stamps.append(frame.time)
+            regions.append(list(_regions(picture, background, limit, index)))
+    return MovingRegions(
+        background=background,
+        regions=regions,
+        stamps=stamps,
+        change=np.array(change),
+        scale=scale,
+        drift=drift / scale,
+        to_background=np.array(found_maps) if moving_camera else None,
+        first=start,
+    )
+
+
+def _warped(picture: Picture, matrix: Array) -> Picture:
+    size = (picture.shape[1], picture.shape[0])
+    return np.asarray(cv2.warpAffine(picture, matrix, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def difference(picture: Picture, background: Picture) -> NDArray[np.float32]:
+    """Return (H, W) the largest difference of a channel, grey levels, smoothed over neighbours."""
+    return np.asarray(cv2.GaussianBlur(cv2.absdiff(picture, background).max(axis=-1).astype(np.float32), (3, 3), 0))
+
+
+def _regions(picture: Picture, background: Picture, limit: Array, index: int) -> Iterator[Region]:
+    away = difference(picture, background)
+    mask = (away > limit).astype(np.uint8)
+    if not mask.any():
+        return
+    mask &= ~_shadows(picture, background, away) if mask.mean() < 0.5 else mask
+    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    height, width = mask.shape
+    for outline in sorted(outlines, key=cv2.contourArea, reverse=True)[:MOST_REGIONS]:
+        x, y, w, h = cv2.boundingRect(outline)
+        inside = np.zeros((h, w), np.uint8)
+        cv2.drawContours(inside, [outline - (x, y)], -1, 1, cv2.FILLED)
+        if inside.sum() < LEAST_AREA:
+            continue
+        part = away[y : y + h, x : x + w]
+        strength = max(float(np.percentile(part[inside > 0], 70)), 1.0)
+        # Coverage: pixels of the rim count by how far they have left the background, about half of the way, so that
+        # blur and the coarse colours of compressed video do not widen the body.
+        firm = (part > 0.5 * strength).astype(np.uint8) & inside
+        rims, _ = cv2.findContours(firm, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(firm, rims, -1, 1, cv2.FILLED)
+        soft = np.clip((part / strength - 0.2) / 0.6, 0, 1) * inside
+        soft = np.maximum(soft, cv2.erode(firm, np.ones((3, 3), np.uint8)))
+        if soft.sum() <= 0:
+            continue
+        rows, columns = np.mgrid[0:h, 0:w] + 0.5
+        total = float(soft.sum())
+        mx, my = float((soft * columns).sum() / total), float((soft * rows).sum() / total)
+        dx, dy = columns - mx, rows - my
+        a, b, c = (float((soft * q).sum() / total) for q in (dx * dx, dx * dy, dy * dy))
+        spread, turns = np.linalg.eigh(np.array([[a, b], [b, c]]))
+        hull = cv2.convexHull(outline)[:, 0].astype(np.float64)
+        hull_area = max(float(cv2.contourArea(hull.astype(np.float32))) + 0.5 * len(hull), 1.0)
+        yield Region(
+            frame=index,
+            middle=np.array([x + mx, y + my]),
+            area=total,
+            axes=np.sqrt(np.maximum(spread[::-1], 1e-3)),
+            angle=float(np.arctan2(turns[1, 1], turns[0, 1])),
+            outline=hull + 0.5,
+            colour=np.asarray(cv2.mean(picture[y : y + h, x : x + w], inside)[:3]),
+            cut=bool(x <= 1 or y <= 1 or x + w >= width - 1 or y + h >= height - 1),
+            solid=min(1.0, float(inside.sum()) / hull_area),
+        )
+
+
+def _shadows(picture: Picture, background: Picture, away: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return (H, W): where the background is only darker, all colours alike; never all of what moves."""
+    low, high, apart = SHADOW
+    ratio = (picture.astype(np.float32) + 4) / (background.astype(np.float32) + 4)
+    ratio = np.asarray(cv2.blur(ratio, (3, 3)), np.float32)
+    dark = (ratio.max(axis=-1) < high) & (ratio.min(axis=-1) > low)
+    dark &= (ratio.max(axis=-1) - ratio.min(axis=-1)) < apart
+    strong = away > 0.55 * float(away.max())
+    return (dark & ~strong).astype(np.uint8)
+
+
+def aligned_frames(path: Path, found: MovingRegions, wanted: NDArray[np.int64]) -> Iterator[Picture]:
+    """Yield frames ``wanted`` (rising, counted from the first one used) at the working size, on the background."""
+    left = [int(k) for k in wanted]
+    with Video(path) as video:
+        for frame in video.frames(found.first, found.first + left[-1]):
+            if frame.index - found.first != left[0]:
+                continue
+            picture = reduced(frame, found.scale)
+            if found.to_background is not None:
+                picture = _warped(picture, found.to_background[left[0]])
+            left.pop(0)
+            yield picture
+            if not left:
+                return

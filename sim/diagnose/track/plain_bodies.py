@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""A video and the size of one body → a capture: no scene, no texture, no start at rest (docs/from-video.md)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from ...errors import Cancelled, InputError
+from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ..capture import Capture, CaptureObject, Ground, Trial
+from ..capture_checks import check_capture
+from .body_request import BodyRequest
+from .motion_view import MotionView, noise_px, stopped_at, understand_motion
+from .moving_regions import MovingRegions, Region, find_moving_regions
+from .pose_estimation import Array
+from .region_track import link_regions, true_times
+from .track_input import VideoTrial
+from .track_videos import Video
+
+STAGE = "track"
+MOST_FRAMES = 160
+"""Frames of a capture; more of a slow recording add work, not knowledge."""
+LEAST_FRAMES = 10
+ELEVATIONS = tuple(math.radians(a) for a in (0, 15, 25, 35, 45, 55, 65, 75, 90))
+"""Angles of the camera above the ground that are tried against outlines."""
+MISSHAPEN = 0.35
+"""Relative difference of an outline from the body's from which it is told."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoMotion:
+    """What was followed. capture: of one trial. view: where the motion lies in the picture. found: the video's regions.
+
+    frames: (T,) of the video, for the capture's samples. places: (T, 2) px of the centre. regions: those of the body.
+    """
+
+    capture: Capture
+    view: MotionView
+    found: MovingRegions
+    frames: Array
+    places: Array
+    regions: tuple[Region, ...]
+
+
+def follow_plain_body(
+    video: VideoTrial,
+    body: BodyRequest,
+    *,
+    on_event: OnEvent = ignore,
+    cancelled: IsCancelled = never,
+) -> VideoMotion:
+    """Return the free motion of ``body`` in ``video`` as a capture; gravity, ground and scale come from the video.
+
+    Raises InputError for an unreadable video, where nothing moves, nothing moves as one body, or too few frames are
+    left; Cancelled on request.
+    """
+    path, item = video.path, body.capture_object()
+    with Video(path) as source:
+        info = source.info
+    progress = StageProgress(on_event, STAGE, max(1, 2 * info.frames))
+    count = 0
+
+    def on_frame() -> None:
+        nonlocal count
+        count += 1
+        if cancelled():
+            raise Cancelled("tracking was cancelled; nothing was written")
+        if count % 10 == 0:
+            progress.report(min(count, max(1, 2 * info.frames)), path.name)
+
+    found = find_moving_regions(path, video.start_frame, video.end_frame, on_frame)
+    if len(found.stamps) < LEAST_FRAMES:
+        raise InputError(
+            f"{path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
+        )
+    paths = link_regions(found)
+    if not any(found.regions):
+        raise InputError(f"{path}: nothing moves in it; check --start-frame and --end-frame")
+    chosen = [p for p in paths if p.freedom() > 0]
+    if not chosen:
+        raise InputError(
+            f"{path}: nothing moves through it as one body of its own; film it alone before a still background"
+        )
+    times, fresh, notes = true_times(found.stamps, found.change, info.fps, video.fps_override)
+    warnings = [notes] if notes else []
+    if found.to_background is not None:
+        warnings.append(f"the camera drifts by up to {found.drift:.1f} px; frames are aligned to the background")
+    regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
+    if len(regions) < LEAST_FRAMES:
+        raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
+    clock = times[[r.frame for r in regions]]
+    places = np.array([r.middle for r in regions]) / found.scale
+    length_px, length, elevation, misfit = apparent_size(regions, body, item, found.scale)
+    if misfit > MISSHAPEN:
+        warnings.append(
+            f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
+            "its scale is rough"
+        )
+    standing = float(-item.vertices[:, 2].min())
+    view = understand_motion(
+        clock, places, diameter_px=length_px, diameter=length, clearance=standing, elevation=elevation, where=str(path)
+    )
+    last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
+    step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
+    kept = np.arange(view.first, last + 1, step)
+    if len(kept) < LEAST_FRAMES:
+        raise InputError(f"{path}: only {len(kept)} frames of free motion; film at a higher frame rate")
+    points = view.points[kept - view.first]
+    trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_px(places[view.first : view.last + 1]))
+    capture = check_capture(
+        Capture(
+            gravity=(0.0, 0.0, -9.81),
+            ground=Ground(
+                point=tuple(float(v) for v in view.point),  # type: ignore[arg-type]
+                normal=tuple(float(v) for v in view.normal),  # type: ignore[arg-type]
+                friction=body.friction,
+                restitution=body.restitution,
+            ),
+            objects=(item,),
+            noise_sigma=noise,
+            camera=None,
+            trials=(trial,),
+        )
+    )
+    for message in (*view.notes, *warnings):
+        progress.notice(f"{path.name}: {message}")
+    return VideoMotion(
+        capture=capture,
+        view=view,
+        found=found,
+        frames=np.array([regions[k].frame for k in kept]),
+        places=places[kept],
+        regions=tuple(regions[k] for k in kept),
+    )
+
+
+def _trial(
+    name: str, times: Array, points: Array, item: CaptureObject, view: MotionView, noise: float
+) -> tuple[Trial, float]:
+    """Return the trial, and its noise in m. A ball is its centre; other bodies keep their side to the ground."""
+    clean = "".join(c if c.isalnum() or c in "_-" else "_" for c in name).strip("_") or "take"
+    vertices = item.vertices
+    reach = np.linalg.norm(vertices, axis=1)
+    rest, turn = np.zeros((1, 3)), np.eye(3)
+    if reach.min() < 0.97 * reach.max():
+        half = vertices.max(axis=0)
+        rest = np.array([[0, 0, 0], [half[0], 0, 0], [0, half[1], 0], [0, 0, half[2]], [-half[0], 0, 0]], dtype=float)
+        across = np.array([0.0, 1.0, 0.0])
+        along = np.cross(across, view.normal)
+        turn = np.stack([along, across, view.normal], axis=1)
+    observed = points[:, None] + (rest @ turn.T)[None]
+    trial = Trial(
+        name=clean,
+        role="fit",
+        times=times - times[0],
+        points=observed,
+        pixels=None,
+        object_index=np.zeros(len(rest), dtype=np.int64),
+        rest_points=rest,
+    )
+    return trial, max(noise, 0.1) / view.scale
+
+
+def apparent_size(
+    regions: list[Region], body: BodyRequest, item: CaptureObject, scale: float
+) -> tuple[float, float, float, float]:
+    """Return a length in video px, the same in m, the camera's elevation in rad, and how badly the outline fits.
+
+    A ball is measured across its motion, so that blur does not widen it; other bodies by the area and proportions of
+    their outline, seen from every elevation. scale: working px per video px.
+    """
+    if body.kind == "ball":
+        across = float(np.median([4 * r.axes[1] for r in regions]))
+        wide = float(np.median([r.axes[0] / r.axes[1] for r in regions]))
+        assert body.diameter is not None
+        return across / scale, body.diameter, math.pi / 2, max(0.0, wide - 2.5)
+    area = float(np.median([r.area for r in regions]))
+    ratio = float(np.median([r.axes[0] / r.axes[1] for r in regions]))
+    best: tuple[float, float, float] | None = None
+    for elevation in ELEVATIONS:
+        seen = [_outline(item.vertices, elevation, yaw) for yaw in np.linspace(0, math.pi, 12, endpoint=False)]
+        areas, ratios = np.array([s[0] for s in seen]), np.array([s[1] for s in seen])
+        off = abs(math.log(ratio / float(np.median(ratios))))
+        if best is None or off < best[0] - 0.01:
+            best = off, elevation, float(np.sqrt(np.median(areas)))
+    assert best is not None
+    off, elevation, length = best
+    return math.sqrt(area) / scale, length, max(elevation, math.radians(20)), off
+
+
+def _outline(vertices: Array, elevation: float, yaw: float) -> tuple[float, float]:
+    """Return the area in m² and the ratio of the axes of the body's outline from afar."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    x = c * vertices[:, 0] - s * vertices[:, 1]
+    y = (s * vertices[:, 0] + c * vertices[:, 1]) * math.sin(elevation) + vertices[:, 2] * math.cos(elevation)
+    try:
+        hull = ConvexHull(np.stack([x, y], axis=1))
+    except QhullError:
+        raise InputError("object: the body is flat: give a closed body") from None
+    corners = np.stack([x, y], axis=1)[hull.vertices]
+    middle = corners.mean(axis=0)
+    a, b = corners - middle, np.roll(corners, -1, axis=0) - middle
+    part = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    total = float(part.sum())
+    centre = (part[:, None] * (a + b) / 3).sum(axis=0) / total
+    second = sum(
+        p / 6 * (np.outer(u, u) + np.outer(v, v) + 0.5 * (np.outer(u, v) + np.outer(v, u)))
+        for p, u, v in zip(part, a, b, strict=True)
+    ) / total - np.outer(centre, centre)
+    low, high = np.linalg.eigvalsh(second)
+    return abs(total), math.sqrt(max(high, 1e-18) / max(low, 1e-18))
