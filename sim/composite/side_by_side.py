@@ -156,7 +156,7 @@ def _curve(
 
     x = at(withheld, 0)[0]
     cv2.rectangle(sheet, (x, high), (right, low), (232, 232, 232), -1)
-    _text(sheet, "withheld from the fit", (x + 4, high + 12), max(right - x - 6, 40), (110, 110, 110))
+    _text(sheet, "second half", (x + 4, high + 12), max(right - x - 6, 40), (110, 110, 110))
     cv2.line(sheet, (left, low), (right, low), FAINT, 1)
     unit, factor = ("mm", 1e3) if most < 0.5 else ("m", 1.0)
     _text(sheet, f"{most * factor:.3g} {unit}", (4, high + 6), left - 6, INK)
