@@ -117,7 +117,11 @@ def _words(report, page, dropped, lands):
         yield f"nothing lands there: {advice}"
     if "closes" in report["summary"] and verdict["effect"] in ("none", "unknown"):
         yield f"closes without a cause: {report['summary']}"
+    if "do not trust this cause" in page and verdict["probability"] >= 0.95:
+        yield "almost certainly the cause, and not to be trusted"
     if verdict["effect"] not in ("none", "unknown"):
+        if gap["resolvable"] and gap["before_rms_m"] < gap["grain_rms_m"] and "chaotic" not in page:
+            yield "a share of a gap within the simulator's own uncertainty, unsaid"
         if gap["refitted_rms_m"] <= gap["after_rms_m"] and "does as well" not in page:
             yield "re-fitting does as well, unsaid"
         beaten = [v for v in report["controls"].values() if v is not None and v <= gap["after_rms_m"]]

@@ -9,8 +9,18 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.app.add_effect import found_effects
 from physgen.sim.app.diagnose import diagnose
-from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial, load_capture, save_capture
+from physgen.sim.diagnose.capture import (
+    Camera,
+    Capture,
+    CaptureObject,
+    Ground,
+    ObjectBelief,
+    Trial,
+    load_capture,
+    save_capture,
+)
 from physgen.sim.diagnose.diagnosis import read_diagnosis
 from physgen.sim.diagnose.provenance import content_hash
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions
@@ -21,7 +31,7 @@ RADIUS, SIGMA = 0.04, 1e-3
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-def flight(drag=0.0, kick=0.0, velocity=(2.0, 0.0, 3.0), start=(0.0, 0.0, 2.0), times=None):
+def flight(drag=0.0, kick=0.0, velocity=(2.0, 0.0, 3.0), start=(0.0, 0.0, 2.0), times=None, gravity=GRAVITY):
     """Positions of a ball under drag, with a push in mid-flight, in small steps."""
     times = np.arange(0, 0.6, 0.02) if times is None else times
     x, v, found, fine = np.array(start), np.array(velocity), [], 100
@@ -29,7 +39,7 @@ def flight(drag=0.0, kick=0.0, velocity=(2.0, 0.0, 3.0), start=(0.0, 0.0, 2.0), 
         found.append(x.copy())
         step = (times[min(i + 1, len(times) - 1)] - t) / fine
         for _ in range(fine):
-            v = v + step * (GRAVITY - drag * np.linalg.norm(v) * v)
+            v = v + step * (gravity - drag * np.linalg.norm(v) * v)
             x = x + step * v
         if i == len(times) // 2:
             v = v + np.array([0.0, kick, 0.0])
@@ -61,6 +71,22 @@ def trial(name, way, times, rng, *, points=6, sigma=SIGMA, role="fit", shown=Non
     )  # fmt: skip
 
 
+def filmed(trial, camera, rng):
+    """The trial as pixels of ``camera``."""
+    world = np.array(camera.world_from_camera)
+    local = (trial.points - world[:3, 3]) @ world[:3, :3]
+    pixels = local[..., :2] / local[..., 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return Trial(**{**trial.__dict__, "points": None, "pixels": pixels + rng.normal(0, PIXEL, pixels.shape)})
+
+
+PIXEL = 0.5
+CAMERA = Camera(
+    width=1280, height=720, fx=900.0, fy=900.0, cx=640.0, cy=360.0,
+    world_from_camera=((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -4.0), (0.0, -1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0)),
+)  # fmt: skip
+"""Looks along +y from four metres away."""
+
+
 def made(kind):
     """A capture, the candidates to try, and the setting for the checker."""
     rng = np.random.default_rng(5)
@@ -77,44 +103,80 @@ def made(kind):
         names = ("restitution", "friction", "air_drag")
         takes = [trial(f"drop{i}", bounces(0.6, h, times), times, rng) for i, h in enumerate((0.4, 0.5, 0.6))]
     else:
-        drag, kick = {"plain": (0.0, 0.0), "drag": (0.12, 0.0), "kick": (0.0, 1.5)}[kind]
-        takes = [trial(f"throw{i}", flight(drag, kick, v), times, rng) for i, v in enumerate(throws)]
+        drag, kick = {"plain": (0.0, 0.0), "kick": (0.0, 1.5)}.get(kind, (0.12, 0.0))
+        gravity = GRAVITY + ((0.3, -0.4, 0.0) if kind == "pair" else (0.0, 0.0, 0.0))
+        names = (*names, "gravity_tilt") if kind == "pair" else names
+        ways = [flight(drag, kick, v, gravity=gravity) for v in throws]
+        # Pixels gain noise of their own.
+        noise = 0.0 if kind == "pixels" else sigma
+        takes = [trial(f"throw{i}", w, times, rng, sigma=noise) for i, w in enumerate(ways)]
     last = takes[-1]
     takes[-1] = trial("last", last.points.mean(axis=1), times, rng, points=len(last.rest_points), sigma=1e-9,
                       role="predict", shown=len(times) // 3)  # fmt: skip
+    camera = CAMERA if kind == "pixels" else None
+    if camera is not None:
+        takes, sigma = [filmed(t, camera, rng) for t in takes], PIXEL
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
     belief = ObjectBelief(name="ball", mesh="ball.obj", density_kg_m3=150.0, stiffness="hard")
     item = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
     ground = Ground(point=(0.0, 0.0, foot), friction=friction, restitution=0.8)
     return Capture(
-        gravity=tuple(GRAVITY), ground=ground, objects=(item,), noise_sigma=sigma, camera=None, trials=tuple(takes)
+        gravity=tuple(GRAVITY), ground=ground, objects=(item,), noise_sigma=sigma, camera=camera, trials=tuple(takes)
     ), names, setting  # fmt: skip
 
 
-EXPECTED = {"plain": "none", "drag": "air_drag", "kick": "unknown", "drop": "air_drag", "bounce": "restitution"}
+EXPECTED = {
+    "plain": "none",
+    "drag": "air_drag",
+    "kick": "unknown",
+    "drop": "air_drag",
+    "bounce": "restitution",
+    "pair": "gravity_tilt",
+    "pixels": "air_drag",
+}
 
 
-@pytest.fixture(scope="module")
-def reports(tmp_path_factory):
-    """report.json, the page's text and the setting, by kind."""
-    root, found = tmp_path_factory.mktemp("reports"), {}
-    for kind in EXPECTED:
+class Reports(dict):
+    """report.json, the page's text and the setting, by kind; each is made when it is first asked for."""
+
+    def __init__(self, root):
+        super().__init__()
+        self.root = root
+
+    def __missing__(self, kind):
+        root = self.root
         capture, names, setting = made(kind)
         save_capture(capture, root / kind)
         options = DiagnoseOptions(effects=names, confirm=False)
         diagnose(load_capture(root / kind), out=root / f"{kind}_out", options=options)
         page = (root / f"{kind}_out" / "report.html").read_text(encoding="utf-8")
         words = html.unescape(re.sub(r"<[^>]+>", "", re.sub(r"<style>.*?</style>", "", page, flags=re.S)))
-        found[kind] = read_diagnosis(root / f"{kind}_out")[0], words, setting
-    return found
+        self[kind] = read_diagnosis(root / f"{kind}_out")[0], words, setting
+        return self[kind]
 
 
-@pytest.mark.parametrize("kind", EXPECTED)
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory):
+    return Reports(tmp_path_factory.mktemp("reports"))
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.long) if k == "pixels" else k for k in EXPECTED])
 def test_no_line_contradicts_another(reports, kind):
     report, page, setting = reports[kind]
     assert contradictions(report, page, **setting) == []
     verdict = report["verdict"]
     assert EXPECTED[kind] in (verdict["effect"], *verdict["alternatives"])
+
+
+def test_two_causes_are_told_on_one_line(reports):
+    """Drag of 0.12 1/m and ground that leans: both numbers come from the fit of both, and both go into a scene."""
+    report, page, _ = reports["pair"]
+    assert sorted(report["verdict"]["effects"]) == ["air_drag", "gravity_tilt"] == sorted(found_effects(report))
+    drag, tilt = sorted(report["pair"]["adds"], key=lambda one: one["effect"])
+    assert drag["parameters"]["drag_per_mass"]["value"] == pytest.approx(0.12, rel=0.1)
+    assert tilt["parameters"]["angle"]["value"] == pytest.approx(np.arctan2(0.5, 9.81), rel=0.1)
+    assert min(drag["without_rms_m"], tilt["without_rms_m"]) > report["gap"]["after_rms_m"]
+    assert page.count("Two causes, found together") == 1 and "nats" in page
 
 
 def test_capture_command_and_version_are_on_the_page(reports):
@@ -159,6 +221,11 @@ def _row(report, name):
 
 
 DOCTORED = {
+    "not to be trusted": doctored("drag", lambda r, p: p + " do not trust this cause"),
+    "own uncertainty, unsaid": doctored("drag", lambda r, p: r["gap"].update(grain_rms_m=9.0)),
+    "two errors of the pair": doctored("pair", lambda r, p: r["pair"].update(heldout_rms_m=0.5)),
+    "the pair is not the verdict": doctored("pair", lambda r, p: r["pair"].update(probability=0.01)),
+    "adds nothing to the other": doctored("pair", lambda r, p: r["pair"]["adds"][0].update(nats=-3.0)),
     "closes 100%": doctored("kick", lambda r, p: _row(r, "wind").update(closed_fraction=1.0, reason="x")),
     "closes 178%": doctored("drag", lambda r, p: _row(r, "wind").update(closed_fraction=1.78)),
     "not around": doctored("drag", lambda r, p: r["gap"].update(closed_fraction_ci95=[0.78, 1.87])),

@@ -286,7 +286,7 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
     spread = f" (95 %: {percent_text(low)} to {percent_text(high)})" if math.isfinite(low + high) else ""
     return (
         f"On held-out trials the error changes from {_length(gap.before_rms_m)} to "
-        f"{_length(gap.after_rms_m)}: {_closed(gap.closed_fraction)}{spread}.{_floor(gap)}"
+        f"{_length(gap.after_rms_m)}: {_closed(gap)}{spread}.{_floor(gap)}"
     )
 
 
@@ -308,9 +308,17 @@ def _length(value: float) -> str:
     return quantity_text(value, "m", digits=2)
 
 
-def _closed(fraction: float) -> str:
+def _chaotic(gap: Gap) -> bool:
+    """Return whether the simulator's own uncertainty moves the prediction by more than the gap."""
+    return gap.before_rms_m < gap.grain_rms_m
+
+
+def _closed(gap: Gap) -> str:
+    fraction = gap.closed_fraction
     if not math.isfinite(fraction):
         return "how much of the gap this closes is not known"
+    if fraction < 0 and _chaotic(gap):
+        return "the gap widens, but by less than the simulator's own uncertainty"
     if fraction < 0:
         return "the gap widens, so do not trust this cause"
     return f"{percent_text(min(fraction, 1.0))} of the gap above the noise floor is closed"
@@ -322,6 +330,12 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
         return []
     after, gap = diagnosis.gap.after_rms_m, diagnosis.gap
     said = []
+    if gap.resolvable and _chaotic(gap):
+        said.append(
+            f"Contacts make the held-out motion chaotic: the simulator's own uncertainty moves it by "
+            f"{_length(gap.grain_rms_m)}, more than the gap of {_length(gap.before_rms_m)}. The share of the gap "
+            "judges little here; the verdict rests on the fit."
+        )
     rivals = (
         ("wrong_effect_rms_m", "an effect that the evidence rejected"),
         ("last_residual_rms_m", "carrying the last observed error forward"),
