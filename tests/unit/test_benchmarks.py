@@ -53,6 +53,17 @@ def test_a_benchmark_runs_quickly_and_prints_json(name):
     assert isinstance(json.loads(done.stdout.strip().splitlines()[-1]), dict)
 
 
+@pytest.mark.slow
+def test_compositions_are_dropped_quickly():
+    for needed in ("bpy", "mujoco"):
+        pytest.importorskip(needed)
+    command = [sys.executable, "-m", "physgen.benchmarks.compose", "--quick", "--stand", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    rows = json.loads(done.stdout.strip().splitlines()[-1])["rows"]
+    assert [row["what"] for row in rows] == ["composed, held", "composed, free", "truth, held", "truth, free"]
+
+
 def test_defaults_of_quick_yield_to_given_options():
     from physgen.benchmarks.common import benchmark_parser
 
