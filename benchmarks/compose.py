@@ -7,8 +7,8 @@
 Every method gets the same start (splats fitted to Cycles renderings, then distorted so that the objects intersect), the
 same input picture, guidance (the ideal denoiser of pictures of O1) and number of steps. Default: 256², 20,000 splats,
 500 steps, which takes hours for all assets; ``--small``: minutes; ``--quick``: one asset, a few steps. Pictures and
-fits are kept in ``--cache``. ``--stand`` instead drops
-the compositions by PSE-SDS, and the truth beside them, in MuJoCo. ``--out`` gets table.md, table.json, a contact sheet, and the composed splats as PLY.
+fits are kept in ``--cache``. ``--stand`` instead drops the compositions by PSE-SDS, and the truth beside them, in
+MuJoCo. ``--out`` gets table.md, table.json, a contact sheet, and the composed splats as PLY; or standing.json.
 """
 
 from __future__ import annotations
