@@ -238,8 +238,10 @@ def solve_contact(
                         here = first_node + gp
                         if pinned:
                             place, rate = anchor_place(f, time, particles.anchors[p], worlds)
-                            back = RECOVERY * (place - rate * dt - here) / dt
-                            new = old + (rate + back - velocity) / share
+                            # The correction of its place is not kept as part of the impulse: it would be integrated
+                            # twice, which modes that the transfers hardly damp do not bear.
+                            beside = RECOVERY * (place - rate * dt - here) / (dt * share)
+                            new = old + (rate - velocity) / share
                         else:
                             surface = swelling * normal
                             give = 0.0

@@ -4,7 +4,8 @@
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Particle-grid transfers of a substep, and the windows between particles and grid nodes.
 
-MLS-MPM (Hu et al. 2018), APIC (Jiang et al. 2015), quadratic B-splines; lengths in cells (see ``layout``), seconds,
+MLS-MPM (Hu et al. 2018), APIC (Jiang et al. 2015) with second derivatives for solids (PolyPIC, Fu et al. 2017) and kept
+velocities for grains and fluids (Fei et al. 2021), quadratic B-splines; lengths in cells (see ``layout``), seconds,
 kilograms. A substep is
 
     advance_nodes      gather the windows, momentum -> velocity, forces: ``grid``
@@ -67,6 +68,10 @@ PIN, GOAL = 1.0, 2.0
 KEPT = 0.9
 """Share of the velocity and spin that the grid cannot carry which a particle of granular or fluid material keeps per
 substep (Fei et al. 2021). The transfers then damp a tenth of what they damp without; 1 would keep all noise."""
+
+CURVED = 0.95
+"""Share of the second derivatives of the velocity around a particle of a solid that it carries from substep to substep
+(PolyPIC, Fu et al. 2017). 0 is plain APIC; 1 would damp third derivatives only, and keep noise of one cell for long."""
 
 LEVELLED = 0.02
 """Share of the part of a fluid particle's ln J that the grid cannot carry which is removed per substep: pressures that
@@ -175,6 +180,112 @@ def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
 
 
 @ti.func
+def interpolate_curved(first: ti.i32, fx: vec3, window: Vectors4):
+    """As ``interpolate``, and second derivatives per cell²: a sixteenth of those along two axes (01, 02, 12), and
+    those along one (0, 1, 2)."""
+    w = weights(fx)
+    A = vec4(0.0)
+    B0 = vec4(0.0)
+    B1 = vec4(0.0)
+    B2 = vec4(0.0)
+    M01 = vec4(0.0)
+    M02 = vec4(0.0)
+    M12 = vec4(0.0)
+    D0 = vec4(0.0)
+    D1 = vec4(0.0)
+    D2 = vec4(0.0)
+    for i in ti.static(range(3)):
+        Ai = vec4(0.0)
+        B1i = vec4(0.0)
+        B2i = vec4(0.0)
+        M12i = vec4(0.0)
+        D1i = vec4(0.0)
+        D2i = vec4(0.0)
+        for j in ti.static(range(3)):
+            u0 = window[first + (i * 64 + j * 8)]
+            u1 = window[first + (i * 64 + j * 8 + 1)]
+            u2 = window[first + (i * 64 + j * 8 + 2)]
+            v1 = w[1][2] * u1
+            v2 = w[2][2] * u2
+            Aj = w[0][2] * u0 + v1 + v2
+            B2j = v1 + 2.0 * v2
+            Ai += w[j][1] * Aj
+            B2i += w[j][1] * B2j
+            D2i += w[j][1] * (u0 - 2.0 * u1 + u2)
+            if ti.static(j > 0):
+                B1i += (float(j) * w[j][1]) * Aj
+                M12i += (float(j) * w[j][1]) * B2j
+            if ti.static(j == 1):
+                D1i -= 2.0 * Aj
+            else:
+                D1i += Aj
+        A += w[i][0] * Ai
+        B1 += w[i][0] * B1i
+        B2 += w[i][0] * B2i
+        M12 += w[i][0] * M12i
+        D1 += w[i][0] * D1i
+        D2 += w[i][0] * D2i
+        if ti.static(i > 0):
+            B0 += (float(i) * w[i][0]) * Ai
+            M01 += (float(i) * w[i][0]) * B1i
+            M02 += (float(i) * w[i][0]) * B2i
+        if ti.static(i == 1):
+            D0 -= 2.0 * Ai
+        else:
+            D0 += Ai
+    C0 = B0 - fx[0] * A
+    C1 = B1 - fx[1] * A
+    C2 = B2 - fx[2] * A
+    # Moments about the particle from those about the first node.
+    E01 = M01 - fx[0] * B1 - fx[1] * C0
+    E02 = M02 - fx[0] * B2 - fx[2] * C0
+    E12 = M12 - fx[1] * B2 - fx[2] * C1
+    return A, C0, C1, C2, E01, E02, E12, D0, D1, D2
+
+
+@ti.func
+def spread_curved(
+    first: ti.i32,
+    fx: vec3,
+    b4: vec4,
+    c0: vec4,
+    c1: vec4,
+    c2: vec4,
+    e01: vec4,
+    e02: vec4,
+    e12: vec4,
+    d0: vec4,
+    d1: vec4,
+    d2: vec4,
+    window: Vectors4,
+):
+    """As ``spread``, with ij e01 + im e02 + jm e12 more, and along each axis a mode (1, -2, 1) d that carries neither
+    momentum nor angular momentum."""
+    w = weights(fx)
+    for i in ti.static(range(3)):
+        bi = b4 + float(i) * c0
+        c1i = c1 + float(i) * e01
+        c2i = c2 + float(i) * e02
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            bj = wij * (bi + float(j) * c1i)
+            if ti.static(i == 1):
+                bj -= (2.0 * w[j][1]) * d0
+            else:
+                bj += w[j][1] * d0
+            if ti.static(j == 1):
+                bj -= (2.0 * w[i][0]) * d1
+            else:
+                bj += w[i][0] * d1
+            cj = wij * (c2i + float(j) * e12)
+            dj = wij * d2
+            n = first + (i * 64 + j * 8)
+            window[n] = window[n] + (w[0][2] * bj + dj)
+            window[n + 1] = window[n + 1] + (w[1][2] * (bj + cj) - 2.0 * dj)
+            window[n + 2] = window[n + 2] + (w[2][2] * (bj + 2.0 * cj) + dj)
+
+
+@ti.func
 def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: Vectors4):
     """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
     w = weights(fx)
@@ -264,7 +375,8 @@ def advance_particles(
     and ``C``, which are otherwise recomputed before they are read.
 
     Granular and fluid materials store ``v`` and ``C`` every substep, to keep what the grid cannot carry. They still
-    move with the grid's velocity, so contacts hold as for all materials.
+    move with the grid's velocity, so contacts hold as for all materials. Solids carry second derivatives of the
+    velocity instead, in registers: they are dropped at a sort, and take no memory.
     """
     for kk in range(blocks.count * SPREAD):
         if kk % SPREAD == 0:
@@ -279,10 +391,13 @@ def advance_particles(
             dt_gather = ti.cast(worlds.control[c + STEP], ti.f32)
             dt_scatter = ti.cast(worlds.control[c + NEXT_STEP], ti.f32)
             flows = False
+            curved = CURVED
             law = 0
             if ti.static(laws.flowing):
                 law = law_of(blocks.starts[k], worlds, particles)
                 flows = material_flows(law)
+                if flows:
+                    curved = 0.0
             if gather:
                 load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
                 if ti.static(laws.flowing):
@@ -321,6 +436,8 @@ def advance_particles(
                 Fp = particles.F[p]
                 slope = vec3(0.0)
                 packing = 0.0
+                E01, E02, E12 = vec4(0.0), vec4(0.0), vec4(0.0)
+                D0, D1, D2 = vec4(0.0), vec4(0.0), vec4(0.0)
                 if ti.static(len(laws.volumetric) > 0):
                     packing = particles.memory[p]
                 if gather:
@@ -328,7 +445,7 @@ def advance_particles(
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
-                    A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                    A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
                     for r in ti.static(range(3)):
                         vp[r] = A[r]
                         Cp[r, 0] = 4.0 * B0[r]
@@ -414,7 +531,23 @@ def advance_particles(
                     c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
                     c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
                     c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
-                    spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                    if curved > 0.0:
+                        keep = curved * vec4(mass, mass, mass, 0.0)
+                        e01 = 16.0 * keep * E01
+                        e02 = 16.0 * keep * E02
+                        e12 = 16.0 * keep * E12
+                        # i j e01 stands for (i - x) (j - y) e01, and so on.
+                        b4 += (fx[0] * fx[1]) * e01 + (fx[0] * fx[2]) * e02 + (fx[1] * fx[2]) * e12
+                        c0 -= fx[1] * e01 + fx[2] * e02
+                        c1 -= fx[0] * e01 + fx[2] * e12
+                        c2 -= fx[0] * e02 + fx[1] * e12
+                        w3 = weights(fx)
+                        # Factor from a second derivative to the mode that is orthogonal to 1 and x under the weights.
+                        h = w3[0] * w3[1] * w3[2] / (w3[1] * w3[2] + 4.0 * w3[0] * w3[2] + w3[0] * w3[1])
+                        d0, d1, d2 = h[0] * keep * D0, h[1] * keep * D1, h[2] * keep * D2
+                        spread_curved(first, fx, b4, c0, c1, c2, e01, e02, e12, d0, d1, d2, nodes.scattered)
+                    else:
+                        spread(first, fx, b4, c0, c1, c2, nodes.scattered)
                     if ti.static(laws.flowing):
                         if flows:
                             packing = 0.0
