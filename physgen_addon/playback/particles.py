@@ -19,7 +19,7 @@ from .geometry_nodes import Tree, set_input
 
 POINTS_OF = "physgen_particles_of"
 """Custom property of objects created here: name of the object in the bake."""
-MODIFIER, UNTIL = "PhysGen particles", "PhysGen mesh until"
+MODIFIER, UNTIL, SINCE = "PhysGen particles", "PhysGen mesh until", "PhysGen mesh since"
 GRAINS_GROUP, SURFACE_GROUP, UNTIL_GROUP = "PhysGen grains", "PhysGen surface", "PhysGen mesh until"
 RADIUS, FROM, MATERIAL, BARE = "Radius", "From Frame", "Material", "Bare Vertices"
 GRAIN = 0.55
@@ -66,12 +66,26 @@ def show(
         _add_look(item, distance, surface=surface)
     point_caches.attach_as_first(item, cache, path, first_frame)
     set_input(item.modifiers[MODIFIER], FROM, from_frame)
+    cover(body, from_frame)
+    return item
+
+
+def cover(body: bpy.types.Object, from_frame: int) -> None:
+    """Show the mesh of ``body`` before ``from_frame`` only."""
     until = body.modifiers.get(UNTIL)
     if until is None:
         until = body.modifiers.new(UNTIL, "NODES")
-        until.node_group = _until_group()
+        until.node_group = _switch_group(UNTIL_GROUP, shown_first=True)
     set_input(until, FROM, from_frame)
-    return item
+
+
+def begin(item: bpy.types.Object, from_frame: int) -> None:
+    """Show ``item`` from ``from_frame`` on only."""
+    start = item.modifiers.get(SINCE)
+    if start is None:
+        start = item.modifiers.new(SINCE, "NODES")
+        start.node_group = _switch_group(SINCE, shown_first=False)
+    set_input(start, FROM, from_frame)
 
 
 def remove(item: bpy.types.Object) -> None:
@@ -196,10 +210,12 @@ def enclosing_surface(tree: Tree, points: Any, radius: Any) -> Any:
     return tree.out("GeometryNodeSetShadeSmooth", drawn_in)
 
 
-def _until_group() -> bpy.types.NodeTree:
-    """Return a group: the mesh before frame FROM, nothing afterwards."""
-    found = bpy.data.node_groups.get(UNTIL_GROUP)
+def _switch_group(name: str, *, shown_first: bool) -> bpy.types.NodeTree:
+    """Return the group ``name``: the mesh before frame FROM and nothing afterwards, or the other way round."""
+    found = bpy.data.node_groups.get(name)
     if found is not None:
         return found
-    tree = Tree(UNTIL_GROUP, {FROM: ("Int", 1)})
-    return tree.finish(switch(tree, begun(tree), tree.inputs["Geometry"], None))
+    tree = Tree(name, {FROM: ("Int", 1)})
+    geometry = tree.inputs["Geometry"]
+    first, then = (geometry, None) if shown_first else (None, geometry)
+    return tree.finish(switch(tree, begun(tree), first, then))

@@ -35,13 +35,28 @@ class Flow:
 
 
 @dataclass(frozen=True)
+class Tear:
+    """The skin of an object cut open where its matter parts. cache: its vertices; file: of its triangles; from_sample:
+    first sample with an open crack."""
+
+    cache: Pc2Reader
+    file: Path
+    from_sample: int
+
+    def shown_at(self, sample: int) -> bool:
+        """Return whether ``sample`` shows it in place of the whole mesh."""
+        return sample >= self.from_sample
+
+
+@dataclass(frozen=True)
 class OpenedBake:
-    """A bake that matches a scene: caches in the order of its objects, and particles (None: without)."""
+    """A bake that matches a scene: caches in the order of its objects, and particles and torn skins (None: without)."""
 
     folder: Path
     manifest: BakeManifest
     caches: tuple[Pc2Reader, ...]
     flows: tuple[Flow | None, ...]
+    tears: tuple[Tear | None, ...] = ()
 
     @property
     def first_frame(self) -> int:
@@ -56,7 +71,7 @@ class OpenedBake:
     @property
     def every(self) -> tuple[Pc2Reader, ...]:
         """All caches, particles last."""
-        return self.caches + tuple(flow.cache for flow in self.flows if flow is not None)
+        return self.caches + tuple(each.cache for each in (*self.flows, *self.tears) if each is not None)
 
     @property
     def unfinished(self) -> str:
@@ -80,6 +95,7 @@ def open_bake(bake: Bake, scene: Scene) -> OpenedBake:
     files = {item.name: item for item in manifest.objects}
     caches: list[Pc2Reader] = []
     flows: list[Flow | None] = []
+    tears: list[Tear | None] = []
     for item in scene.objects:
         if item.name not in files:
             raise InputError(f"{folder}: holds no cache of object {item.name!r}; bake the scene again")
@@ -87,7 +103,10 @@ def open_bake(bake: Bake, scene: Scene) -> OpenedBake:
         caches.append(Pc2Reader(folder / baked.file))
         particles = None if baked.points_file is None else Pc2Reader(folder / baked.points_file)
         flows.append(None if particles is None else Flow(cache=particles, surface=baked.points_as == SURFACE))
-    opened = OpenedBake(folder=folder, manifest=manifest, caches=tuple(caches), flows=tuple(flows))
+        tears.append(None)
+        if baked.torn_file is not None and baked.torn_skin is not None:
+            tears[-1] = Tear(Pc2Reader(folder / baked.torn_file), folder / baked.torn_skin, baked.torn_from)
+    opened = OpenedBake(folder=folder, manifest=manifest, caches=tuple(caches), flows=tuple(flows), tears=tuple(tears))
     for cache in opened.every:
         if cache.sample_count < 1:
             raise InputError(f"{cache.path}: holds no sample yet; let the bake run on")

@@ -34,8 +34,8 @@ Vertices = Sequence[NDArray[np.float32]]
 class Pose:
     """Positions in one sample of a bake, world metres.
 
-    skins: vertices (V, 3) of each object. particles: (N, 3) of each granular or fluid object, else None. flowing: which
-    objects show their particles.
+    skins: vertices (V, 3) of each object. particles: (N, 3) of each granular or fluid object, vertices of each torn
+    skin, else None. flowing: which objects show them.
     """
 
     skins: Vertices
@@ -63,10 +63,12 @@ class Pose:
 
 def pose(bake: OpenedBake, sample: int) -> Pose:
     """Return the positions in ``sample`` of ``bake``."""
+    tears = bake.tears or (None,) * len(bake.flows)
+    loose = [flow or tear for flow, tear in zip(bake.flows, tears, strict=True)]
     return Pose(
         skins=[cache.sample(sample) for cache in bake.caches],
-        particles=[None if flow is None else flow.cache.sample(sample) for flow in bake.flows],
-        flowing=tuple(flow is not None and flow.shown_at(sample) for flow in bake.flows),
+        particles=[None if each is None else each.cache.sample(sample) for each in loose],
+        flowing=tuple(each is not None and each.shown_at(sample) for each in loose),
     )
 
 

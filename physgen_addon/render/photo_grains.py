@@ -84,7 +84,7 @@ class PhotoGrains:
         self._states: dict[int, CloudState] = {}
         self._shown: tuple[tuple[int, int], ShownGrains] | None = None
         self.mesh = bpy.data.meshes.new(f"{target.item.name} grains")
-        self.mesh.materials.append(_material(target.item.data.materials[0]))
+        self.mesh.materials.append(coloured_material(target.item.data.materials[0]))
         self._item = bpy.data.objects.new(self.mesh.name, self.mesh)
         for collection in target.item.users_collection:
             collection.objects.link(self._item)
@@ -247,7 +247,7 @@ class _Skin:
         return np.asarray(found)
 
 
-def _material(skin: bpy.types.Material) -> bpy.types.Material:
+def coloured_material(skin: bpy.types.Material) -> bpy.types.Material:
     """Return the material of the ``skin`` in the colours of the attribute ``COLOUR``."""
     material = skin.copy()
     tree = material.node_tree

@@ -29,6 +29,7 @@ from .image_finish import ImageFinish
 from .lighting import GroundShadow, reflections
 from .motion_blur import Moment
 from .photo_grains import FADING_S, GROWN_S, PhotoGrains
+from .photo_torn import add_torn_skin
 from .render_options import RenderOptions
 from .render_regions import Box, ground_depth, object_box
 from .render_scene import BlenderScene, aim, build, everything, remove
@@ -294,6 +295,13 @@ class Renderer:
             gone, torn = flow.surface or not coherent, first + flow.from_sample
             photo_particles.open_skin(target, cache, torn, gone=gone, fading=(begins, ends))
             reach = max(reach, far)
+            if self._data_scene is not None:
+                self._data_scene.follow(item, number)
+        for number, (target, tear) in enumerate(zip(built.objects, self._bake.tears, strict=False), start=1):
+            if tear is None or any(flow is not None for flow in self._bake.flows[number - 1 : number]):
+                continue
+            item = add_torn_skin(target, tear, first)
+            self._steps.append(tear.cache)
             if self._data_scene is not None:
                 self._data_scene.follow(item, number)
         built.own += list(everything() - before)

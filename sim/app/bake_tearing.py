@@ -21,7 +21,7 @@ from ..errors import Cancelled, InputError
 from ..events import IsCancelled
 from ..files import open_file
 from ..scene.meshes import ObjectMesh
-from ..tearing.blocks import OPENING, Blocks, make_blocks, opening_times, stretches
+from ..tearing.blocks import OPENING, Blocks, make_blocks, opening_times, regrouped, stretches
 from ..tearing.torn_skin import TornMotion, tear
 
 if TYPE_CHECKING:
@@ -98,8 +98,10 @@ class Tears:
                 if found is not None:
                     yield sample, found[0], None if self._plastic else found[1]
 
-        opens = opening_times(self._blocks, read())
-        motion = tear(self._mesh.vertices, self._mesh.faces, self._rest, self._blocks, opens)
+        last = self._matter(out, kept[-1])
+        blocks = self._blocks if last is None else regrouped(self._blocks, self._rest, last[0])
+        opens = opening_times(blocks, read())
+        motion = tear(self._mesh.vertices, self._mesh.faces, self._rest, blocks, opens)
         if motion is None:
             return None
         skin, name = motion.skin, f"{self._name}.torn"

@@ -9,6 +9,7 @@ which it began to part, and for good.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -27,6 +28,8 @@ BROKEN, OPENING = 3.0, 1.3
 """Length of a bond over that at rest from which on it is broken, and at which such a bond began to part."""
 UNEXPLAINED = 1.5
 """Length of a broken bond over that which the deformation gradients of its two blocks predict, at least."""
+LEFT = 1.5
+"""Sides by which a particle has moved away from its block when it belongs to it no more."""
 EMPTY = 1.0
 """Distance in particle spacings from the middle of a broken bond to the nearest particle, at least."""
 NEVER = np.iinfo(np.int32).max
@@ -107,6 +110,37 @@ def make_blocks(particles: NDArray[np.floating], volume: float) -> Blocks:
     )
     object.__setattr__(made, "centres", made.means(particles))
     return made
+
+
+def regrouped(blocks: Blocks, particles: NDArray[np.floating], positions: NDArray[np.floating]) -> Blocks:
+    """Return ``blocks`` without blocks that a crack runs through: particles that have left most of their block by the
+    time they are at ``positions`` (N, 3) belong to the neighbouring block that they moved with. particles: (N, 3) at
+    rest, m."""
+    shift = np.asarray(positions, dtype=np.float64) - particles
+    order = np.argsort(blocks.of_particle, kind="stable")
+    start = np.searchsorted(blocks.of_particle[order], np.arange(len(blocks.cells)))
+    common = np.zeros((len(blocks.cells), 3))
+    for block, members in enumerate(np.split(order, start[1:])):
+        if len(members):
+            moved = shift[members]
+            # The member that the others are closest to.
+            apart = np.linalg.norm(moved[:, None] - moved, axis=2)
+            common[block] = moved[np.minimum(apart, LEFT * blocks.side).sum(axis=1).argmin()]
+    away = np.linalg.norm(shift - common[blocks.of_particle], axis=1)
+    left = np.flatnonzero(np.isfinite(away) & (away > LEFT * blocks.side))
+    if not len(left):
+        return blocks
+    steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = blocks.cells[blocks.of_particle[left]][:, None, :] + steps
+    there = blocks.grid[tuple(np.moveaxis(cells, -1, 0))]
+    off = np.linalg.norm(shift[left][:, None, :] - common[there], axis=2)
+    off = np.where((there >= 0) & np.isfinite(off), off, np.inf)
+    best = off.argmin(axis=1)
+    row = np.flatnonzero(off[np.arange(len(left)), best] < LEFT * blocks.side)
+    of_particle = blocks.of_particle.copy()
+    of_particle[left[row]] = there[row, best[row]]
+    made = dataclasses.replace(blocks, of_particle=of_particle)
+    return dataclasses.replace(made, centres=made.means(np.asarray(particles, dtype=np.float64)))
 
 
 def stretches(blocks: Blocks, positions: NDArray[np.floating]) -> Array:

@@ -15,7 +15,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.scene_object import Box
 from physgen.sim.skinning import bind, deform
-from physgen.sim.tearing.blocks import NEVER, make_blocks, opening_times
+from physgen.sim.tearing.blocks import NEVER, make_blocks, opening_times, regrouped
 from physgen.sim.tearing.torn_skin import tear
 
 CUBE = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
@@ -90,6 +90,23 @@ def test_texture_coordinates_of_the_skin_are_the_meshs():
     corners = np.einsum("tcb,tbi->tci", skin.corners[outer], CUBE.vertices[CUBE.faces[skin.source[outer]]])
     np.testing.assert_allclose(corners, rest[skin.faces[outer]], atol=1e-6)
     assert trimesh.Trimesh(rest, skin.faces[outer], process=False).area == pytest.approx(CUBE.area, rel=1e-6)
+
+
+def test_a_crack_through_the_middle_of_blocks_leaves_no_block_between():
+    axis = np.linspace(-0.5, 0.5, 17)
+    matter = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    still = np.tile(np.eye(3), (len(matter), 1, 1))
+
+    def at(sample):
+        return matter + np.sign(matter[:, :1] - 1e-9) * [0.3, 0, 0] * max(0, sample - 2)
+
+    blocks = make_blocks(matter, 1.0)
+    blocks = regrouped(blocks, matter, at(LAST))
+    opens = opening_times(blocks, [(s, at(s), still) for s in range(LAST + 1)])
+    motion = tear(CUBE.vertices, CUBE.faces, matter, blocks, opens)
+    places = motion.vertices(LAST, deform(bind(CUBE.vertices, matter), at(LAST), still), at(LAST), still)
+    assert (np.abs(places[:, 0]) > 0.5).all()  # nothing lies in the gap, 3 m wide
+    assert len(trimesh.Trimesh(places, motion.skin.faces).split(only_watertight=False)) == 2
 
 
 def test_what_stretches_as_its_gradients_say_does_not_tear():
