@@ -50,14 +50,21 @@ def jelly_decay(block, cells: int, *, damping_time: float) -> tuple[float, float
     return float(rate), abs(float(turn))
 
 
-MISSED = "23 % too fast: third derivatives and forces at the surface are still damped"
+MISSED = "23 and 17 % too fast: third derivatives and forces at the surface are still damped"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("cells", [pytest.param(6, marks=pytest.mark.xfail(strict=True, reason=MISSED))])
+@pytest.mark.parametrize(
+    "cells",
+    [
+        pytest.param(6, marks=pytest.mark.xfail(strict=True, reason=MISSED)),
+        pytest.param(8, marks=pytest.mark.xfail(strict=True, reason=MISSED)),
+        pytest.param(12, marks=pytest.mark.slow),
+    ],
+)
 def test_jelly_wobbles_as_long_as_its_damping_says(block, cells):
     """Kelvin–Voigt: a mode of angular frequency w decays at the rate t w² / 2; within 15 %, at the cells that
-    the coarsest quality gives its smallest object. t is that of a jelly which wobbles for 1.4 s."""
+    the three qualities give their smallest object. t is that of a jelly which wobbles for 1.4 s."""
     time = 2.6e-3
     rate, omega = jelly_decay(block, cells, damping_time=time)
     assert rate == pytest.approx(time * omega**2 / 2, rel=0.15)
