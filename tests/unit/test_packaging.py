@@ -47,7 +47,7 @@ def test_a_wheel_holds_every_module_and_nothing_else(wheel):
 
 
 def test_a_wheel_holds_the_data_that_the_program_reads(wheel):
-    presets = {name for name in tree({".toml"}) if name.startswith("physgen/presets/")}
-    others = tree({".html", ".js", ".typed"})
-    assert len(presets) > 15 and {Path(name).suffix for name in others} == {".html", ".js", ".typed"}
+    presets = {name for name in tree({".jpg", ".toml"}) if name.startswith("physgen/presets/")}
+    others = tree({".css", ".html", ".js", ".typed"})
+    assert len(presets) > 15 and {Path(name).suffix for name in others} == {".css", ".html", ".js", ".typed"}
     assert {name for name in wheel if not name.endswith(".py")} == presets | others
