@@ -307,3 +307,17 @@ def test_a_brown_thing_on_brown_wood_is_not_given_back_to_the_ground():
     pixels[ball] = lump[ball]
     found = segment(pixels, (88, 52, 222, 186), "clay")
     assert (found & ball).sum() / (found | ball).sum() > 0.9
+
+
+def test_pale_dial_that_the_rows_beside_do_not_show_is_no_hole():
+    """The colour of ground near by is not enough: what shows through goes on left and right of the object."""
+    photo = np.full((HEIGHT, WIDTH, 3), (150, 150, 150), np.uint8)
+    photo[120:] = (205, 200, 190)
+    ring = disc(160, 100, 60)
+    dial = disc(160, 90, 20)
+    photo[ring] = (20, 120, 120)
+    pierced = photo.copy()
+    photo[dial] = (205, 200, 190)
+    pierced[dial] = (150, 150, 150)
+    assert (fill_holes(photo, ring & ~dial) == ring).all()
+    assert not fill_holes(pierced, ring & ~dial)[dial].any()

@@ -16,6 +16,9 @@ SHADE = (0.28, 0.9)
 
 BOX_CORNERS, CORNER_CUT, BOX_OVERLAP = 6, 0.015, 0.96
 """A box' outline: most corners, how far off they may be over its length, and the least overlap with them."""
+BESIDE = 8.0
+"""Median distance in CIELAB, row by row, from the background beside above which a hole shows something else: 0.4 to 6 was
+measured in a strap, a handle, between slats, legs and limbs, 10 to 16 for a dial, a stripe and a shaded side."""
 PRINT_SHARE = 0.25
 """Largest share of a box that is a print: the opening of a frame is larger."""
 
@@ -130,9 +133,27 @@ def see_through(
         near, inside = near[:: max(1, len(near) // 600)], inside[:: max(1, len(inside) // 600)]
         distances = cKDTree(near).query(inside)[0]
         apart = float(np.linalg.norm(np.median(near, axis=0) - np.median(inside, axis=0)))
-        if (distances < likeness).mean() > share and apart < 1.5 * likeness:
+        if (distances < likeness).mean() > share and apart < 1.5 * likeness and _as_beside(lab, region, ring):
             result |= region
     return result
+
+
+def _as_beside(lab: NDArray[np.float32], region: Mask, ring: Mask) -> bool:
+    """Whether ``region`` has the colours of the background ``ring`` (both H, W) left and right of it, row by row.
+
+    A pale dial or a clay's side is like some ground somewhere near; what shows through goes on in the same rows. Rows
+    without background beside them say nothing.
+    """
+    middle = cv2.erode(region.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    if middle.sum() < 20:
+        middle = region
+    apart = []
+    for row in np.flatnonzero(middle.any(axis=1)):
+        rows = slice(max(0, row - 2), row + 3)
+        own, beside = lab[row][middle[row]], lab[rows][ring[rows]]
+        if len(own) > 2 and len(beside) > 5:
+            apart.append(float(np.linalg.norm(np.median(own, axis=0) - np.median(beside, axis=0))))
+    return len(apart) < 3 or float(np.median(apart)) < BESIDE
 
 
 def _lab(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
