@@ -17,8 +17,8 @@ SHADE = (0.28, 0.9)
 BOX_CORNERS, CORNER_CUT, BOX_OVERLAP = 6, 0.015, 0.96
 """A box' outline: most corners, how far off they may be over its length, and the least overlap with them."""
 BESIDE = 8.0
-"""Median distance in CIELAB, row by row, from the background beside above which a hole shows something else: 0.4 to 6 was
-measured in a strap, a handle, between slats, legs and limbs, 10 to 16 for a dial, a stripe and a shaded side."""
+"""Median distance in CIELAB, row by row, from the background beside above which a hole shows something else: 0.4 to 6
+was measured in a strap, a handle, between slats, legs and limbs, 10 to 16 for a dial, a stripe and a shaded side."""
 PRINT_SHARE = 0.25
 """Largest share of a box that is a print: the opening of a frame is larger."""
 
