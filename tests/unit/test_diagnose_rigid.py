@@ -64,6 +64,18 @@ def test_an_icosphere_is_a_sphere_and_a_cube_is_not():
     assert cube.inertia == pytest.approx(0.1**2 / 6 * np.eye(3), abs=1e-9)
 
 
+@pytest.mark.parametrize("height", [0.5, 1.0, 1.4, 2.0])
+def test_a_cylinder_of_many_corners_is_no_sphere(height):
+    """All its corners lie on one."""
+    made = trimesh.creation.cylinder(radius=RADIUS, height=height * RADIUS, sections=64)
+    assert not rigid_body(item(made)).round
+
+
+@pytest.mark.parametrize("count", [(6, 8), (8, 16), (32, 32)])
+def test_a_coarse_sphere_of_rings_is_a_sphere(count):
+    assert rigid_body(item(trimesh.creation.uv_sphere(radius=RADIUS, count=count))).round
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-8, 8)] * 3))
 def test_free_flight_is_the_parabola(velocity, spin):

@@ -140,7 +140,7 @@ BEHIND, BEHIND_SHARE = 60.0, 0.5
 
 @dataclass(kw_only=True, eq=False)
 class BodyFits:
-    """All fits of one body, by effects; flown: with states determined by flights alone.
+    """All fits of one body, by effects; flown: the problem searched, and a fit whose states flights alone determine.
 
     begun: unfinished fits to resume, by effects.
     """
@@ -148,7 +148,7 @@ class BodyFits:
     problem: Problem
     work: Work
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
-    flown: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    flown: dict[tuple[str, ...], tuple[Problem, Fit]] = field(default_factory=dict)
     begun: dict[tuple[str, ...], list[Fit]] = field(default_factory=dict)
 
 
@@ -286,9 +286,11 @@ def scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffect
     """
     problem = begin.problem
     key = tuple(f.name for f in begin.model.candidates)
-    if key not in body.flown:
-        body.flown[key] = solve(loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
-    flown = body.flown[key]
+    # Where a fit followed its own nodes, flights of the earlier nodes say nothing about these.
+    if key not in body.flown or body.flown[key][0] is not problem:
+        loose = solve(loosened(problem), begin.model, begin.z, begin.states, rounds=4, held=begin.evaluation)
+        body.flown[key] = (problem, loose)
+    flown = body.flown[key][1]
     spreads = _arrival_spreads(problem, flown)
     base = begin.z.copy()
     base[: BELIEFS.size] = 0.0
