@@ -5,7 +5,7 @@
 
 Each photo goes through the plain ``physgen run``, without boxes or settings, then through ``physgen.evaluate`` with the
 photo and the bake. With ``--work`` a second run goes on from what the first has made. The papers' figures are those in
-their text (PhyCAGE, tables 1 and 2) or measured on the videos that they publish (PhysGen3D's first frames); their
+their text (PhyCAGE, table 1) or measured on the videos that they publish (PhysGen3D's first frames); their
 figures of people, of a model as judge and of VBench's networks need people, an endpoint and weights, and are empty in
 our rows: `physgen evaluate` says how to get them (docs/evaluation.md).
 """
