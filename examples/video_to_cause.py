@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A video of a block that slides down a board, drawn here with a known friction of 0.2, and what `explain` finds.
+"""A video of a flat cylinder that slides down a board, drawn here with a known friction of 0.2, and what `explain` finds.
 
 python examples/video_to_cause.py WORK
 """
@@ -17,7 +17,7 @@ FPS, PIXELS_PER_METRE, ANGLE, FRICTION, EDGE = 120.0, 300.0, 25.0, 0.2, 0.05
 
 
 def film(path: Path) -> None:
-    """Write the video: a green cube of 5 cm on a board of 25 degrees, recorded at 120 and played at 30 fps."""
+    """Write the video: a green cylinder, 10 cm wide and 5 cm high, on a board of 25 degrees, recorded at 120 and played at 30 fps."""
     angle = np.radians(ANGLE)
     way = np.array([np.cos(angle), np.sin(angle)])
     up = np.array([way[1], -way[0]])
@@ -31,7 +31,7 @@ def film(path: Path) -> None:
         middle = board[0] + way * (230 + PIXELS_PER_METRE * 0.5 * pull * (k / FPS) ** 2)
         middle = middle + up * (2 + PIXELS_PER_METRE * EDGE / 2)
         half = PIXELS_PER_METRE * EDGE / 2
-        corners = [middle + a * half * way + b * half * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        corners = [middle + 2 * a * half * way + b * half * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         frame = wall.copy()
         cv2.fillConvexPoly(frame, np.round(np.array(corners) * 16).astype(np.int32), (40, 150, 50), cv2.LINE_AA, 4)
         writer.write(np.clip(frame + rng.normal(0, 1.5, frame.shape), 0, 255).astype(np.uint8))
@@ -43,7 +43,7 @@ def main(work: Path) -> physgen.Explanation:
     work.mkdir(parents=True, exist_ok=True)
     film(work / "slide.avi")
     video = physgen.VideoTrial(path=work / "slide.avi", fps_override=FPS)
-    found = physgen.explain(video, "box:x=0.05,y=0.05,z=0.05", out=work / "why")
+    found = physgen.explain(video, "cylinder:diameter=0.1,height=0.05", out=work / "why")
     print(found.summary)
     print(f"closed on withheld time: {found.closed:.2f}; see {found.video}")
     return found

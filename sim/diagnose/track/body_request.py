@@ -70,7 +70,7 @@ class BodyRequest:
             volume = math.pi * self.diameter**3 / 6
         elif self.kind == "cylinder":
             assert self.diameter is not None and self.height is not None
-            mesh = trimesh.creation.cylinder(radius=self.diameter / 2, height=self.height, sections=32)
+            mesh = trimesh.creation.cylinder(radius=self.diameter / 2, height=self.height, sections=16)
             volume = math.pi * self.diameter**2 / 4 * self.height
         elif self.kind == "box":
             mesh = trimesh.creation.box(extents=[float(v or 0.0) for v in (self.x, self.y, self.z)])

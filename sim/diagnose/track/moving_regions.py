@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from .pose_estimation import Array
 from .track_videos import Frame, Video
@@ -28,6 +29,8 @@ UNSURE = 10.0
 """Grey levels between the quartiles of a pixel over time above which the median may show the moving body."""
 LIKE_AROUND, LEAST_SHARE = 22.0, 0.03
 """Grey levels within which a value counts as that of the surroundings, and least share of them that it must have."""
+LIKE_RARE = 12.0
+"""Distance in grey levels (BGR) to any pixel of the surroundings, however rare, within which a value counts, too."""
 WIDE = 2.5
 """Area of a hull over its contents from which it is no compact body."""
 LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
@@ -191,6 +194,15 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
         order = np.where(off[0] < LIKE_AROUND, 0, off.argmin(axis=0))
         chosen = seen[order, np.arange(seen.shape[1])]
         unknown = off[order, np.arange(seen.shape[1])] >= LIKE_AROUND
+        if unknown.any():
+            # Thin things, as the edge of a board that the body slides on, have a small share and a colour of their own.
+            apart = cKDTree(around).query(seen[:, unknown])[0]
+            rare = np.where(apart[0] < LIKE_RARE, 0, apart.argmin(axis=0))
+            known = apart[rare, np.arange(len(rare))] < LIKE_RARE
+            at = np.flatnonzero(unknown)[known]
+            order[at] = rare[known]
+            chosen[at] = seen[order[at], at]
+            unknown[at] = False
         part = out[rows, columns]
         part[inside] = chosen.astype(np.uint8)
         # What a body covers for a while leaves the median to one side only; leaves in the wind do to both.
