@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A video of a flat cylinder that slides down a board, drawn here with a known friction of 0.2, and what `explain` finds.
+"""A video of a disc that slides down a board, drawn here with a known friction of 0.2, and what `explain` finds.
 
 python examples/video_to_cause.py WORK
 """
@@ -17,7 +17,7 @@ FPS, PIXELS_PER_METRE, ANGLE, FRICTION, EDGE = 120.0, 300.0, 25.0, 0.2, 0.05
 
 
 def film(path: Path) -> None:
-    """Write the video: a green cylinder, 10 cm wide and 5 cm high, on a board of 25 degrees, recorded at 120 and played at 30 fps."""
+    """Write the video: a green disc, 10 cm wide and 5 cm high, on a board of 25 degrees; 120 fps, played at 30 fps."""
     angle = np.radians(ANGLE)
     way = np.array([np.cos(angle), np.sin(angle)])
     up = np.array([way[1], -way[0]])
