@@ -78,6 +78,9 @@ def build_parser() -> argparse.ArgumentParser:
     scene_commands.add_bake(command("bake", scene_commands.run_bake, "scene folder → bake folder"))
     cost = "estimate time, memory and disk space of a bake; writes nothing"
     scene_commands.add_estimate(command("estimate", scene_commands.run_estimate, cost))
+    scene_commands.add_pack(
+        command("pack", scene_commands.run_pack, "a bake packed for the way, with --unpack back again")
+    )
     scene_commands.add_free(
         command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
     )

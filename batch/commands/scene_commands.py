@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from ...sim.app.reconstruct import set_physics, with_physics
-from ...sim.cache.bake_folder import free_bake
+from ...sim.cache.bake_folder import disk_usage, free_bake, load_bake
 from ...sim.events import IsCancelled
 from ...sim.scene.folder import Scene, load_scene
 from .. import stages
@@ -38,6 +38,26 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
 def add_free(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen free``."""
     parser.add_argument("bake", type=Path, metavar="BAKE", help="bake folder to delete")
+
+
+def add_pack(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen pack``."""
+    parser.add_argument("bake", type=Path, metavar="BAKE", help="complete bake folder, or packed one with --unpack")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new folder")
+    parser.add_argument("--unpack", action="store_true", help="turn a packed bake into one that plays and renders")
+
+
+def run_pack(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen pack``; the exit code."""
+    from ...sim.app.pack_bake import pack_bake, unpack_bake
+
+    if options.unpack:
+        size = disk_usage(unpack_bake(options.bake, out=options.out, cancelled=cancelled).root)
+    else:
+        size = pack_bake(load_bake(options.bake), out=options.out, cancelled=cancelled)
+    terminal({"event": "done", "stage": "pack", "bytes": size, "out": str(options.out)})
+    terminal.line(f"{size / 2**20:.1f} MiB: {options.out}")
+    return 0
 
 
 def add_preview(parser: argparse.ArgumentParser) -> None:
