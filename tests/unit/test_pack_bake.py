@@ -49,6 +49,7 @@ def baked(tmp_path):
         objects=(item,),
         checksums=(checksum,),
     )
+    (root / "metrics.json").write_text("{}")
     save_manifest(root, manifest)
     return Bake(root=root, manifest=manifest)
 
