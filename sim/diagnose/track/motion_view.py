@@ -143,12 +143,13 @@ def understand_motion(
     clearance: float,
     elevation: float,
     where: str,
-    rolls: bool = False,
+    from_above: bool = False,
 ) -> MotionView:
     """Return the view of the free motion in ``places`` (N, 2) px at ``times`` (N,) s.
 
     diameter_px, diameter: a length of the body in px and m. clearance: m, of its centre above what it stands on.
-    elevation: rad, of the camera above a level surface; half a turn's quarter looks straight down.
+    elevation: rad, of the camera above a level surface; half a turn's quarter looks straight down. from_above: the
+    body's outline shows its upper side, so that no slope is seen from its side.
     Raises InputError where nothing moves freely for long enough.
     """
     scale = diameter_px / diameter
@@ -161,7 +162,7 @@ def understand_motion(
     if not pieces:
         raise InputError(f"{where}: the body is followed for {len(times)} frames, too few between its impacts")
     best = _longest(pieces, places)
-    if _runs_down(best, scale, places):
+    if _runs_down(best, scale, places) and not from_above:
         return _slope(times, places, best, scale, clearance)
     return _surface(times, places, best, scale, clearance, elevation)
 

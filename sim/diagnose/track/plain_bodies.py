@@ -27,6 +27,8 @@ MOST_FRAMES = 160
 LEAST_FRAMES = 10
 ELEVATIONS = tuple(math.radians(a) for a in (0, 15, 25, 35, 45, 55, 65, 75, 90))
 """Angles of the camera above the ground that are tried against outlines."""
+CLEAR, FROM_ABOVE = 0.1, math.radians(55)
+"""Relative difference of an outline from the body's, and elevation, at which a body is surely seen from above."""
 MISSHAPEN = 0.35
 """Relative difference of an outline from the body's from which it is told."""
 
@@ -102,7 +104,14 @@ def follow_plain_body(
         )
     standing = float(-item.vertices[:, 2].min())
     view = understand_motion(
-        clock, places, diameter_px=length_px, diameter=length, clearance=standing, elevation=elevation, where=str(path)
+        clock,
+        places,
+        diameter_px=length_px,
+        diameter=length,
+        clearance=standing,
+        elevation=elevation,
+        where=str(path),
+        from_above=body.kind != "ball" and misfit < CLEAR and elevation >= FROM_ABOVE,
     )
     last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
     step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
