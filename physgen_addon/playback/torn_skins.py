@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ...sim.cache.bake_folder import BakedObject
 from ...sim.cache.pc2 import Pc2Reader
-from ...sim.cache.torn_skins import read_torn_skin
-from ...sim.tearing.torn_skin import TornSkin
+from ...sim.cache.torn_skins import TornSkin, read_torn_skin
 from .. import paths
 from . import particles, point_caches
 from .bake_record import BakeRecord

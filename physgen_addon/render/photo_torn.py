@@ -8,9 +8,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.cache.torn_skins import read_torn_skin
+from ...sim.cache.torn_skins import TornSkin, read_torn_skin
 from ...sim.composite.srgb import srgb_to_linear
-from ...sim.tearing.torn_skin import TornSkin
 from ..playback import particles, point_caches
 from ..playback.torn_skins import corner_values, new_mesh
 from .photo_grains import COLOUR, coloured_material

@@ -3,19 +3,40 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..atomic import replacing
 from ..errors import InputError
 from ..npz import read_npz
-from ..tearing.torn_skin import TornSkin
 from .pc2 import MAX_VERTICES
 
 MOST_BYTES = 2**32
 FIELDS = ("faces", "inside", "source", "corners", "parents", "weights", "first")
+
+
+@dataclass(frozen=True, eq=False)
+class TornSkin:
+    """Topology of a torn skin; its first V vertices are those of the object's mesh, T triangles are of the skin itself.
+
+    faces: (T + W, 3) vertices, walls last. inside: (T + W,) whether a triangle is a wall. source: (T + W,) triangle of
+    the object's mesh that each was cut from, or for walls is nearest to; corners: (T + W, 3, 3) barycentric coordinates
+    in it of each corner, for what the mesh has by corner, such as texture coordinates. parents, weights: (V', 3) three
+    vertices of the mesh, and shares, that each vertex gets what belongs to vertices from. first: sample in which the
+    first crack opens.
+    """
+
+    faces: NDArray[np.int32]
+    inside: NDArray[np.bool_]
+    source: NDArray[np.int32]
+    corners: NDArray[np.float32]
+    parents: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    first: int
 
 
 def write_torn_skin(path: Path, skin: TornSkin) -> None:

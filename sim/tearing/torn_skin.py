@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..cache.torn_skins import TornSkin
 from ..skinning import Binding, bind, deform
 from .blocks import NEVER, Blocks
 from .refinement import Refined, refine, touched_near
@@ -32,26 +33,6 @@ LEAST_BONDS = 4
 """Fewer broken bonds are stray particles, and tear nothing."""
 SKIRT = 1.8
 """Distance in sides from a crack in the skin to the rim of the wall beneath that is joined to it, at most."""
-
-
-@dataclass(frozen=True, eq=False)
-class TornSkin:
-    """Topology of a torn skin; its first V vertices are those of the object's mesh, T triangles are of the skin itself.
-
-    faces: (T + W, 3) vertices, walls last. inside: (T + W,) whether a triangle is a wall. source: (T + W,) triangle of
-    the object's mesh that each was cut from, or for walls is nearest to; corners: (T + W, 3, 3) barycentric coordinates
-    in it of each corner, for what the mesh has by corner, such as texture coordinates. parents, weights: (V', 3) three
-    vertices of the mesh, and shares, that each vertex gets what belongs to vertices from. first: sample in which the
-    first crack opens.
-    """
-
-    faces: NDArray[np.int32]
-    inside: NDArray[np.bool_]
-    source: NDArray[np.int32]
-    corners: NDArray[np.float32]
-    parents: NDArray[np.int32]
-    weights: NDArray[np.float32]
-    first: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,9 +25,10 @@ FAST = (
     "splats",
     "worlds",
 )
-SLOW = ("compose", "demo", "first_frame", "light", "published", "reconstruct", "thin_parts")
+SLOW = ("calibration", "compose", "demo", "first_frame", "light", "published", "reconstruct", "thin_parts")
 NEEDS = {
-    **dict.fromkeys((*SLOW, "main_thread", "playback", "render"), "bpy"),
+    **dict.fromkeys((*SLOW[1:], "main_thread", "playback", "render"), "bpy"),
+    "calibration": "mujoco",
     "farm_dask": "distributed",
 }
 

@@ -106,14 +106,16 @@ def test_the_zip_holds_the_program_and_nothing_else(archive):
     tops = {name.split("/")[0] for name in names}
     own = {"__init__.py", "blender_manifest.toml", "batch", "physgen_addon", "presets", "sim"}
     licences = {name for name in names if name.startswith("LICENSE")}
-    assert licences == {"LICENSE", "LICENSES/GPL-3.0-or-later.txt", "LICENSES/MIT.txt"}
+    assert licences == {"LICENSE", *(f"LICENSES/{name}.txt" for name in ("CC0-1.0", "GPL-3.0-or-later", "MIT"))}
     assert tops == own | {"README.md", "LICENSE", "LICENSES"}
     assert {PurePosixPath(name).suffix for name in names if name not in licences} == {
         ".py",
         ".toml",
         ".md",
         ".js",
+        ".css",
         ".html",
+        ".jpg",
     }
     tree = {
         p.relative_to(ROOT).as_posix() for top in ("batch", "physgen_addon", "sim") for p in ROOT.glob(f"{top}/**/*.py")

@@ -112,7 +112,9 @@ def test_steps_descend_and_elasticity_wants_back(ball, keep):
     stretch = float(np.median(body.gradients[:, 0, 0]))
     assert 1.05 < stretch < 1.25
     if keep == 0:
-        assert stretch == pytest.approx(1.2, abs=0.03)
+        # F at the surface is an average over a cell, so that the points themselves are judged.
+        extent = np.ptp(body.points[:, 0]) / np.ptp(ball.vertices[:, 0])
+        assert extent == pytest.approx(1.2, abs=0.005)
 
 
 def test_obstacle_that_moves_pushes_the_body(ball):
