@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -86,7 +87,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cases, settings = cross_validated(records, settings, lambda line: print(line, file=sys.stderr))
         print(f"constants from all: {settings}", file=sys.stderr)
     found = reliability(cases)
-    print(json.dumps(dataclasses.asdict(found)) if options.json else found.text())
+    if options.json:
+        # JSON has no NaN: what no case could show is null.
+        plain = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in dataclasses.asdict(found).items()}
+        print(json.dumps(plain, allow_nan=False))
+    else:
+        print(found.text())
     return 0
 
 

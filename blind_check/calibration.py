@@ -137,6 +137,7 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
     two = [c for c in cases if len(c.record.effects) > 1]
     inside = [covered(c.record) for c in cases if len(c.record.effects) == 1]
     known = [i for i in inside if i is not None]
+    closed = [c.closed for c in cases if c.record.effects and math.isfinite(c.closed)]
     return Reliability(
         cases=len(cases),
         first=_share(c.right for c in cases),
@@ -145,7 +146,7 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
         abstains=_share(c.verdict == UNKNOWN for c in cases if c.record.effect == UNKNOWN),
         verdict_error=calibration_error(p, right),
         unknown_error=calibration_error(q, outside),
-        closed_median=float(np.nanmedian([c.closed if c.record.effects else math.nan for c in cases] or [math.nan])),
+        closed_median=float(np.median(closed)) if closed else math.nan,
         pairs_first=_share(c.right for c in two),
         pairs_both=_share(c.both for c in two),
         false_pairs=_share(c.pair for c in cases if len(c.record.effects) == 1),
