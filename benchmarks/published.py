@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Our figures of a folder of photos beside those that the papers publish; what nobody can compute is left empty.
+"""Our figures of a folder of photos beside those that the papers publish; what cannot be computed is left empty.
 
     python -m physgen.benchmarks.published PHOTOS [--work DIR] [--frames N] [--scale S] [--json]
 

@@ -92,10 +92,17 @@ def short_number(value: float) -> str:
     return "0" if written == "-0.0" else written.removesuffix(".0")
 
 
-def page_head(title: str, style: str) -> Markup:
-    """Return the ``<head>`` of a page that may load nothing and run nothing but has the CSS ``style``."""
-    allowed = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
-    policy = f"default-src 'none'; style-src 'sha256-{allowed}'; img-src data:; base-uri 'none'; form-action 'none'"
+def page_head(title: str, style: str, *, script: str | None = None) -> Markup:
+    """Return the ``<head>`` of a page that has the CSS ``style`` and may load nothing.
+
+    script: the only one that the page may run, which may play media files beside it; None: it runs nothing.
+    """
+    runs = "" if script is None else f"script-src {_allowed(script)}; "
+    plays = "" if script is None else "media-src 'self' file:; "
+    policy = (
+        f"default-src 'none'; style-src {_allowed(style)}; {runs}img-src data:; {plays}base-uri 'none'; "
+        "form-action 'none'"
+    )
     return element(
         "head",
         element("meta", charset="utf-8"),
@@ -106,6 +113,11 @@ def page_head(title: str, style: str) -> Markup:
         element("title", title),
         element("style", Markup(style)),
     )
+
+
+def _allowed(text: str) -> str:
+    """Return the source expression of a policy that allows exactly ``text``."""
+    return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") + "'"
 
 
 def render(template: Path, **values: object) -> str:

@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...sim.diagnose.track import track_command
 from ...sim.errors import InputError
 from ...sim.events import IsCancelled
 from ..terminal import Terminal
+
+if TYPE_CHECKING:
+    from ...sim.diagnose.diagnosis import Verdict
 
 _UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -139,22 +143,23 @@ def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     found = diagnose(
         load_capture(options.capture), out=options.out, options=settings, on_event=terminal, cancelled=cancelled
     )
-    verdict = found.verdict
-    terminal(
-        {
-            "event": "done",
-            "out": str(options.out),
-            "effect": verdict.effect,
-            "probability": verdict.probability,
-            "alternatives": list(verdict.alternatives),
-            "seconds": found.seconds,
-        }
-    )
+    terminal(_verdict_event(options.out, found.verdict) | {"seconds": found.seconds})
     lines = [found.summary]
     if found.next_experiment:
         lines.append(f"next: {found.next_experiment}")
     terminal.line("\n".join([*lines, f"report: {options.out / 'report.html'}"]))
     return 0
+
+
+def _verdict_event(out: Path, verdict: Verdict) -> dict[str, Any]:
+    """Return the last event of a command that has found ``verdict``."""
+    return {
+        "event": "done",
+        "out": str(out),
+        "effect": verdict.effect,
+        "probability": verdict.probability,
+        "alternatives": list(verdict.alternatives),
+    }
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -192,17 +197,8 @@ def run_explain(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
         on_event=terminal,
         cancelled=cancelled,
     )
-    verdict = found.diagnosis.verdict
-    terminal(
-        {
-            "event": "done",
-            "out": str(options.out),
-            "effect": verdict.effect,
-            "probability": verdict.probability,
-            "alternatives": list(verdict.alternatives),
-            "closed_fraction": found.closed if found.closed == found.closed else None,
-        }
-    )
+    closed = found.closed if math.isfinite(found.closed) else None
+    terminal(_verdict_event(options.out, found.diagnosis.verdict) | {"closed_fraction": closed})
     report = options.out / DIAGNOSIS_FOLDER / "report.html"
     terminal.line(f"{found.summary}\nvideo: {found.video}\nreport: {report}")
     return 0

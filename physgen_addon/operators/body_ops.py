@@ -81,7 +81,7 @@ def _is_sunk(item: bpy.types.Object, world: bpy.types.PropertyGroup) -> bool:
 
 
 def settle_ground(scene: bpy.types.Scene, added: list[bpy.types.Object]) -> str:
-    """Put the ground below ``added`` if one of them is in it and nobody has placed the ground; return what to report.
+    """Put the ground below ``added`` if one of them is in it and it was not placed yet; return what to report.
 
     Blender's default cube is in it. It then has half its height to fall, so that a first bake shows a motion. Where
     the ground was placed, or something else stands on it, it stays and the report says what to do. Empty: all is well.

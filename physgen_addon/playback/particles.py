@@ -119,7 +119,12 @@ def _add(body: bpy.types.Object, name: str, rest: np.ndarray) -> bpy.types.Objec
     material = body.active_material
     if material is not None:
         mesh.materials.append(material)
-    item = bpy.data.objects.new(f"{body.name} particles", mesh)
+    return add_part(body, name, mesh, f"{body.name} particles")
+
+
+def add_part(body: bpy.types.Object, name: str, mesh: bpy.types.Mesh, label: str) -> bpy.types.Object:
+    """Return a new object ``label`` of ``mesh`` that stays with ``body`` and belongs to the baked object ``name``."""
+    item = bpy.data.objects.new(label, mesh)
     item[POINTS_OF] = name
     item.color = body.color
     for collection in body.users_collection:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...sim.cache.bake_folder import BakedObject
@@ -77,12 +76,4 @@ def _add(body: bpy.types.Object, name: str, cache: Pc2Reader, skin: TornSkin) ->
     for slot in body.material_slots:
         mesh.materials.append(slot.material)
     mesh.polygons.foreach_set("material_index", slots[polygons[skin.source]])
-    item = bpy.data.objects.new(mesh.name, mesh)
-    item[particles.POINTS_OF] = name
-    item.color = body.color
-    for collection in body.users_collection:
-        collection.objects.link(item)
-    item.parent = body
-    item.matrix_parent_inverse = Matrix.Identity(4)
-    item.hide_select = True
-    return item
+    return particles.add_part(body, name, mesh, mesh.name)

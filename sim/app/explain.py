@@ -18,6 +18,7 @@ from ..diagnose import run_diagnosis
 from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
+from ..diagnose.report.wording import found_effects
 from ..diagnose.run_diagnosis import DiagnoseOptions
 from ..diagnose.track.body_request import BodyRequest, parse_body
 from ..diagnose.track.track_input import VideoTrial
@@ -142,7 +143,7 @@ def title_of_cause(diagnosis: Diagnosis) -> str:
     if verdict.effect == UNKNOWN:
         return "no known effect; contacts re-fitted"
     words = []
-    for name in verdict.effects or (verdict.effect,):
+    for name in found_effects(verdict):
         numbers = next((item.parameters for item in diagnosis.effects if item.name == name), {})
         first = next(iter(numbers.values()), None)
         words.append(name.replace("_", " ") + ("" if first is None else f" {first.value:.3g}"))

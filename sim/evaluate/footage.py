@@ -24,7 +24,7 @@ Frame = NDArray[np.uint8]
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 USUAL_FPS = 24.0
-"""Of a folder of pictures whose rate nobody says."""
+"""Assumed frame rate of a folder of pictures."""
 MOST_FRAMES = 20_000
 SAME_RATE = 0.002
 """Rates that differ by less than this share are taken for the same: 29.97 and 30."""

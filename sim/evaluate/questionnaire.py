@@ -26,7 +26,7 @@ from ..diagnose.track.track_videos import Video
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file, open_file, read_toml, shown
-from ..html import FONT, PALETTES, Markup, element, render
+from ..html import FONT, PALETTES, Markup, page_head, render
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .model_judge import CRITERIA, MAX_PROMPT, MOST_VIDEOS, TITLES
@@ -266,7 +266,7 @@ def _page(number: int, cases: list[dict[str, Any]], print_of: str, options: Ques
     case = cases[number - 1] if number else None
     script, style = _SCRIPT.read_text(encoding="utf-8"), _style()
     shared = {
-        "head": _head(options.title, style, script),
+        "head": page_head(options.title, style, script=script),
         "title": options.title,
         "script": Markup(script),
         "count": len(cases),
@@ -307,28 +307,6 @@ def _style() -> str:
     plain = _STYLE.read_text(encoding="utf-8")
     dark = f"@media (prefers-color-scheme:dark){{{variables['dark']}}}"
     return f"{variables['light']}{dark}body{{font-family:{FONT}}}{plain}"
-
-
-def _head(title: str, style: str, script: str) -> Markup:
-    """The ``<head>`` of a page that runs its own script, shows its own files and reaches nothing else."""
-
-    def allowed(text: str) -> str:
-        return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") + "'"
-
-    policy = (
-        f"default-src 'none'; style-src {allowed(style)}; script-src {allowed(script)}; img-src data:; "
-        "media-src 'self' file:; base-uri 'none'; form-action 'none'"
-    )
-    return element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=policy),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="referrer", content="no-referrer"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", title),
-        element("style", Markup(style)),
-    )
 
 
 def load_key(path: Path) -> dict[str, Any]:

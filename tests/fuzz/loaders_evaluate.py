@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +63,7 @@ def _bake(folder: Path) -> None:
         particles=8,
         objects=(BakedObject(name="box", file="box.pc2", vertices=8),),
     )
-    save_manifest(folder, dataclasses.replace(manifest))
+    save_manifest(folder, manifest)
     frames = [{"kinetic_j": 1.0, "elastic_j": 0.5, "potential_j": 2.0, "frame": i} for i in range(3)]
     (folder / "metrics.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
 

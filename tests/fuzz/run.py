@@ -32,7 +32,7 @@ from types import FrameType
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import judge_loaders  # noqa: F401 - adds its loaders
+import loaders_judges  # noqa: F401 - adds its loaders
 from loaders import LOADERS, Loader
 from mutations import mutated
 from physgen.sim.errors import PhysGenError

@@ -81,7 +81,7 @@ def test_constants_are_chosen_without_the_effect_that_is_judged(folder):
     assert [line.split(":")[0] for line in said] == [
         "without air_drag", "without none", "without two causes", "without unknown"
     ]  # fmt: skip
-    # All choices are told apart by cases that are alike: leaving one effect out changes what its own cases get.
+    # All cases are alike: leaving one effect out changes what its own cases get.
     alone, _ = cross_validated([r for r in records if r.effect == "none"], ComparisonSettings())
     assert alone[0].probability == judge(records[0], ComparisonSettings()).probability
     assert dataclasses.is_dataclass(settings)

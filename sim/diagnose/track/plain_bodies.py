@@ -30,7 +30,7 @@ ELEVATIONS = tuple(math.radians(a) for a in (0, 15, 25, 35, 45, 55, 65, 75, 90))
 CLEAR, FROM_ABOVE = 0.1, math.radians(55)
 """Relative difference of an outline from the body's, and elevation, at which a body is surely seen from above."""
 MISSHAPEN = 0.35
-"""Relative difference of an outline from the body's from which it is told."""
+"""Relative difference between an outline and the body's from which a warning is given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
