@@ -45,11 +45,29 @@ def require_folder(path: str, what: str) -> Path:
     return Path(bpy.path.abspath(path.strip())).resolve()
 
 
+def require_file(path: str, what: str) -> Path:
+    """Return ``path`` as an absolute path (``//`` is the .blend's folder); InputError if it is no file."""
+    if not path.strip():
+        raise InputError(f"{what} is empty: choose a file")
+    file = absolute(path.strip())
+    if not file.is_file():
+        raise InputError(f"{what}: {file} is no file; choose another")
+    return file
+
+
 def folder_beside(path: Path, suffix: str) -> Path:
     """Return ``NAME_suffix`` beside ``path``. Raises InputError if the place is not writable."""
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path.parent}: cannot be written; choose another folder for the results")
     return path.with_name(f"{path.name}_{suffix}")
+
+
+def free_folder(path: Path) -> Path:
+    """Return ``path``, numbered if something has that name."""
+    candidate, number = path, 2
+    while candidate.exists():
+        candidate, number = path.with_name(f"{path.name}_{number}"), number + 1
+    return candidate
 
 
 def bake_folder(path: Path) -> Path:

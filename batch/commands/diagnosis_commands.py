@@ -180,7 +180,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
 
 def run_explain(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen explain``; the exit code."""
-    from ...sim.app.explain import DIAGNOSIS_FOLDER, VISIBLE, explain
+    from ...sim.app.explain import CAPTURE_FOLDER, DIAGNOSIS_FOLDER, VISIBLE, explain
     from ...sim.diagnose.run_diagnosis import DiagnoseOptions
     from ...sim.diagnose.track.track_input import VideoTrial
 
@@ -198,7 +198,9 @@ def run_explain(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
         cancelled=cancelled,
     )
     closed = found.closed if math.isfinite(found.closed) else None
-    terminal(_verdict_event(options.out, found.diagnosis.verdict) | {"closed_fraction": closed})
+    folders = {"capture": str(options.out / CAPTURE_FOLDER), "diagnosis": str(options.out / DIAGNOSIS_FOLDER)}
+    verdict = _verdict_event(options.out, found.diagnosis.verdict)
+    terminal(verdict | {"closed_fraction": closed, "video": str(found.video), **folders})
     report = options.out / DIAGNOSIS_FOLDER / "report.html"
     terminal.line(f"{found.summary}\nvideo: {found.video}\nreport: {report}")
     return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators: load a capture, diagnose it, add the effect that was found, compare two bakes."""
+"""Operators: explain a video, load a capture, diagnose it, add the effect that was found, compare two bakes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
 from ..context import look_through_camera, turn_to, viewports
 from ..interpreter import cli_command, find_python
-from ..paths import bake_folder, folder_beside, require_folder
+from ..paths import bake_folder, folder_beside, free_folder, require_file, require_folder
 from ..playback import capture_scene, capture_view
 from ..playback import capture_view as overlay
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
@@ -251,6 +251,47 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
         state.capture = str(final["capture"])
         show_capture(scene, out)
         state.report = str(out)
+        return str(state.summary)
+
+
+def body_text(video: bpy.types.PropertyGroup) -> str:
+    """Return the body of ``video`` as ``--object`` takes it. Raises InputError for a mesh without a file."""
+    if video.kind == "mesh":
+        return f"mesh:file={require_file(video.mesh, 'Mesh')}"
+    if video.kind == "box":
+        return "box:" + ",".join(f"{axis}={edge:.6g}" for axis, edge in zip("xyz", video.edges, strict=True))
+    height = f",height={video.height:.6g}" if video.kind == "cylinder" else ""
+    return f"{video.kind}:diameter={video.diameter:.6g}{height}"
+
+
+class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
+    """Follow the body in the video, and find why its motion differs from the simulation; no capture is needed"""
+
+    bl_idname = "physgen.explain_video"
+    bl_label = "Explain a Video"
+    bl_options = {"UNDO"}  # noqa: RUF012
+    job_title = "Explanation"
+
+    def request(self, context: bpy.types.Context) -> Work:
+        """Return tracking, diagnosis and comparison as a child process."""
+        video = context.scene.physgen_diagnose.video
+        source = require_file(video.file, "Video")
+        out = free_folder(folder_beside(source.with_suffix(""), "explained"))
+        rate = ("--fps-override", f"{video.fps:.9g}") if video.fps > 0 else ()
+        part = ("--start-frame", str(video.start), *(("--end-frame", str(video.end)) if video.end > 0 else ()))
+        arguments = ("explain", str(source), "--object", body_text(video), *rate, *part, "--out", str(out))
+        preferred = python(context)
+        return lambda on_event, cancelled: run_stage(
+            cli_command(find_python(preferred), *arguments), on_event, cancelled
+        )
+
+    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
+        """Show the capture with its diagnosis; the comparison can be played from the panel."""
+        state = scene.physgen_diagnose
+        state.capture, state.report = str(final["capture"]), str(final["diagnosis"])
+        state.video.comparison = str(final["video"])
+        show_capture(scene, Path(state.report))
+        turn_to(bpy.context, *capture_view.capture_bounds(state.root, state.trial))
         return str(state.summary)
 
 

@@ -14,6 +14,7 @@ from ..operators.diagnose_ops import (
     PHYSGEN_OT_clear_capture,
     PHYSGEN_OT_clear_overlay,
     PHYSGEN_OT_diagnose,
+    PHYSGEN_OT_explain_video,
     PHYSGEN_OT_follow,
     PHYSGEN_OT_load_capture,
     PHYSGEN_OT_load_diagnosis,
@@ -89,6 +90,30 @@ class PHYSGEN_PT_diagnose(Sidebar, bpy.types.Panel):
 
 class _Part(Sidebar):
     bl_parent_id = "PHYSGEN_PT_diagnose"
+
+
+class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
+    """A video instead of a capture: tracked, diagnosed, and compared side by side"""
+
+    bl_label = "From a Video"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the video, what is known of its body, and Explain a Video."""
+        layout, video = self.layout, context.scene.physgen_diagnose.video
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.prop(video, "file")
+        column.prop(video, "kind")
+        sizes = {"ball": ("diameter",), "cylinder": ("diameter", "height"), "box": ("edges",), "mesh": ("mesh",)}
+        for name in (*sizes[video.kind], "fps", "start", "end"):
+            column.prop(video, name)
+        if not draw_job(layout, context, "Explanation"):
+            row = layout.row()
+            row.scale_y = 1.4
+            row.operator(PHYSGEN_OT_explain_video.bl_idname, icon="VIEWZOOM")
+        if video.comparison:
+            layout.operator("wm.path_open", text="Play Comparison", icon="PLAY").filepath = video.comparison
 
 
 class PHYSGEN_PT_diagnose_show(_Part, bpy.types.Panel):

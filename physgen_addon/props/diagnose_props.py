@@ -11,6 +11,7 @@ from bpy.props import (
     CollectionProperty,
     EnumProperty,
     FloatProperty,
+    FloatVectorProperty,
     IntProperty,
     PointerProperty,
     StringProperty,
@@ -109,6 +110,43 @@ class PHYSGEN_PG_text(bpy.types.PropertyGroup):
     text: StringProperty()
 
 
+class PHYSGEN_PG_video(bpy.types.PropertyGroup):
+    """A video to be explained, and what is known of its body."""
+
+    file: StringProperty(
+        name="Video",
+        description="Video of one body that moves before a still background",
+        subtype="FILE_PATH",
+        options=RELATIVE,
+    )
+    kind: EnumProperty(
+        name="Body",
+        description="Shape of the body that moves",
+        items=[
+            ("ball", "Ball", "A ball of any surface"),
+            ("cylinder", "Cylinder", "A disc, puck or can that stands upright"),
+            ("box", "Box", "A box as it stands"),
+            ("mesh", "Mesh", "A body of any shape"),
+        ],
+    )
+    diameter: FloatProperty(name="Diameter", default=0.05, min=1e-4, max=20.0, precision=4, unit="LENGTH")
+    height: FloatProperty(name="Height", default=0.05, min=1e-4, max=20.0, precision=4, unit="LENGTH")
+    edges: FloatVectorProperty(
+        name="Size", default=(0.05, 0.05, 0.05), min=1e-4, max=20.0, precision=4, subtype="XYZ", unit="LENGTH"
+    )
+    mesh: StringProperty(name="Mesh", description="File in metres, z up", subtype="FILE_PATH", options=RELATIVE)
+    fps: FloatProperty(
+        name="True Frame Rate",
+        description="Frames a second of the recording, where it plays slower; 0: as the file says",
+        default=0.0,
+        min=0.0,
+        soft_max=1000.0,
+    )
+    start: IntProperty(name="First Frame", description="First frame to use, from 0", default=0, min=0)
+    end: IntProperty(name="Last Frame", description="Last frame to use; 0: the file's last", default=0, min=0)
+    comparison: StringProperty(subtype="FILE_PATH", options=RELATIVE)
+
+
 class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
     """State of the Diagnose panel, stored with the scene."""
 
@@ -124,6 +162,7 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options=RELATIVE,
     )
+    video: PointerProperty(type=PHYSGEN_PG_video)
     root: PointerProperty(type=bpy.types.Collection)
     trials: CollectionProperty(type=PHYSGEN_PG_trial)
     trial: EnumProperty(name="Trial", description="Shown trial", items=_trial_items, update=_on_trial)

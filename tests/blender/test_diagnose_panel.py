@@ -2,6 +2,7 @@
 """The Diagnose panel without its pixels: what its operators do, and what is in the scene at a frame."""
 
 import json
+import runpy
 import stat
 import sys
 import textwrap
@@ -494,6 +495,38 @@ def test_diagnosing_from_a_script_blocks_and_shows_what_was_found(throw, tmp_pat
     assert state.has_report and state.verdict == "air_drag"
     assert Path(state.report) == folder.with_name("throw_diagnosis")
     assert len(shown_points("nominal")) == 8
+
+
+def test_a_video_without_a_body_in_it_is_refused_and_leaves_nothing(tmp_path):
+    video = bpy.context.scene.physgen_diagnose.video
+    for name, message in (("", "Video is empty: choose a file"), (str(tmp_path / "no.mp4"), "no.mp4 is no file")):
+        video.file = name
+        with pytest.raises(RuntimeError, match=message):
+            bpy.ops.physgen.explain_video("EXEC_DEFAULT")
+    (tmp_path / "words.mp4").write_text("no video at all", encoding="utf-8")
+    video.file, video.kind = str(tmp_path / "words.mp4"), "mesh"
+    with pytest.raises(RuntimeError, match="Mesh is empty"):
+        bpy.ops.physgen.explain_video("EXEC_DEFAULT")
+    video.kind = "cylinder"
+    with pytest.raises(RuntimeError, match="not a readable video"):
+        bpy.ops.physgen.explain_video("EXEC_DEFAULT")
+    assert [f.name for f in tmp_path.iterdir()] == ["words.mp4"]
+    assert bpy.context.scene.physgen_diagnose.root is None
+
+
+@pytest.mark.long
+def test_a_video_of_a_slide_is_explained_and_shown(tmp_path):
+    film = runpy.run_path(str(Path(physgen.__file__).resolve().parent / "examples" / "video_to_cause.py"))
+    film["film"](tmp_path / "slide.avi")
+    state = bpy.context.scene.physgen_diagnose
+    video = state.video
+    video.file, video.kind, video.fps = str(tmp_path / "slide.avi"), "cylinder", film["FPS"]
+    video.diameter, video.height = 0.1, film["EDGE"]
+    assert bpy.ops.physgen.explain_video("EXEC_DEFAULT") == {"FINISHED"}
+    assert state.verdict == "friction" and state.closed > 0.8
+    assert Path(state.report) == tmp_path / "slide_explained" / "diagnosis"
+    assert Path(video.comparison).is_file()
+    assert state.has_motion and len(shown_points("found" if state.found.points else "nominal")) > 0
 
 
 def test_an_interpreter_that_cannot_simulate_is_named(throw, monkeypatch):
