@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...sim.composite import backdrop, disocclusion, srgb
 from ...sim.composite.backdrop import Backdrop, Proxy, Warp, borders_of, make_proxy
+from ...sim.composite.compositing import SOFT, ObjectLayer, behind
 from ...sim.composite.outpaint import Borders, inpaint_hole, outpaint
 from ...sim.composite.srgb import Linear
 from ...sim.errors import InputError
@@ -132,6 +133,24 @@ class CleanPlate:
             ]
         )
         self._cores: NDArray[np.bool_] = self.masks & ~np.logical_or.reduce(edges)
+        self._behind = self.photo
+
+    def show_behind(self, layer: ObjectLayer) -> None:
+        """Use at rest, behind the soft outlines of the objects, ``layer`` at rest, what the photo shows there."""
+        soft = self.masks & (layer.alpha < 1.0 - SOFT)
+        if not soft.any():
+            return
+        self._behind = behind(self.photo, layer)
+        self._rims = self._around(
+            [
+                np.maximum(
+                    disocclusion.rim_strength(mask, self.masks),
+                    (disocclusion.inner_rim(mask) | (soft & mask)).astype(np.float32),
+                )
+                for mask in self.object_masks
+            ]
+        )
+        self._cores = self._cores & ~soft
 
     def seen(self, view: PlateView, now: Sequence[NDArray[np.float32]]) -> Seen:
         """Return the plate as seen by ``view`` with the objects' vertices at ``now`` (V, 3)."""
@@ -139,7 +158,7 @@ class CleanPlate:
         if view.relief is None:
             for rim, positions in zip(self._rims, now, strict=True):
                 rim.apply(at_rest, self._pixels(positions))
-            return Seen(self.photo, self.background, at_rest, self._cores)
+            return Seen(self._behind, self.background, at_rest, self._cores)
         extended = self.extended(view.relief.borders)
         keep = np.where(self.masks, np.float32(0.0), np.float32(1.0))
         for halo, positions in zip(extended.halos, now, strict=True):

@@ -34,6 +34,8 @@ REST_LIGHT = "rest_light"
 """Vertex colour attribute: L₀ + k, radiance of a white surface at rest plus the ambient term."""
 COLOUR_LAYER = "texture"
 """Name of the pass with the photo's colours."""
+LACK_LAYER = "lack"
+"""Name of the pass with what the texture's alpha leaves uncovered; materials without it cover all."""
 AMBIENT_NODE = "ambient"
 UV = "photo"
 """Name of the texture coordinates."""
@@ -116,7 +118,7 @@ def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[N
     visual = read_mesh(folder.file(source.mesh)).visual
     uv, image = getattr(visual, "uv", None), _base_colour(visual)
     if uv is not None and image is not None and len(uv) == len(mesh.vertices) and np.isfinite(uv).all():
-        return np.asarray(uv, dtype=np.float64), _load_image(source.name, image.convert("RGB"))
+        return np.asarray(uv, dtype=np.float64), _load_image(source.name, image)
     with Image.open(folder.file(folder.model.photo_files[0])) as photo:
         return photo_uv(folder.model.camera, mesh.vertices), _load_image(source.name, photo.convert("RGB"))
 
@@ -131,10 +133,12 @@ def _load_image(name: str, image: Image.Image) -> bpy.types.Image:
     """Return a packed Blender image, so that a saved .blend needs no file beside it."""
     with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as folder:
         path = Path(folder) / "texture.png"
-        image.save(path, compress_level=0)
+        soft = image.mode == "RGBA"
+        (image if soft else image.convert("RGB")).save(path, compress_level=0)
         loaded = bpy.data.images.load(str(path))
         loaded.colorspace_settings.name = "sRGB"
-        loaded.alpha_mode = "NONE"
+        # Colours below a soft outline are whole, not premultiplied.
+        loaded.alpha_mode = "CHANNEL_PACKED" if soft else "NONE"
         loaded.pack()
     loaded.name = name
     return loaded
@@ -176,6 +180,10 @@ def _object_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     colour = new("ShaderNodeOutputAOV")
     colour.aov_name = COLOUR_LAYER
     link(texture.outputs["Color"], colour.inputs["Color"])
+    uncovered, lack = new("ShaderNodeInvert"), new("ShaderNodeOutputAOV")
+    lack.aov_name = LACK_LAYER
+    link(texture.outputs["Alpha"], uncovered.inputs["Color"])
+    link(uncovered.outputs["Color"], lack.inputs["Color"])
     return material
 
 
@@ -335,16 +343,19 @@ class BlenderScene:
     first_frame: int
     own: list[bpy.types.ID] = field(default_factory=list)
 
-    def colours(self, number: int, box: Box, folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the objects' colours (h, w, 3), premultiplied, and coverage (h, w) in ``box`` at frame ``number``.
+    def colours(
+        self, number: int, box: Box, folder: Path
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return the objects' colours (h, w, 3), premultiplied, coverage (h, w), and what of it their textures' alpha
+        leaves uncovered (h, w), in ``box`` at frame ``number``.
 
         ``folder`` takes temporary files. Raises RenderError if Blender fails.
         """
         if self.options.engine == "eevee":
             side = render_engines.subpixels(self.options)
-            return render_engines.colours(self.colour_scene, COLOUR_LAYER, number, box, side, folder)
+            return render_engines.colours(self.colour_scene, (COLOUR_LAYER, LACK_LAYER), number, box, side, folder)
         channels = render_engines.render_passes(self.colour_scene, number, box, folder)
-        return render_engines.stack(channels, COLOUR_LAYER), channels["Combined.A"]
+        return render_engines.stack(channels, COLOUR_LAYER), channels["Combined.A"], channels[f"{LACK_LAYER}.R"]
 
     def ground_light(self, number: int, box: Box, folder: Path) -> NDArray[np.float32]:
         """Return the light on the ground in ``box`` (h, w, 3) at frame ``number``, with nothing in front of it.
@@ -422,7 +433,8 @@ def _build(folder: Scene, bake: point_caches.OpenedBake | None, options: RenderO
         item.collection.children.link(collection)
         render_engines.set_up_passes(item)
         add_camera(item, scene.camera, drawn if item is colour_scene else render_size(scene.camera, light_scale))
-    colour_scene.view_layers[0].aovs.add().name = COLOUR_LAYER
+    for name in (COLOUR_LAYER, LACK_LAYER):
+        colour_scene.view_layers[0].aovs.add().name = name
     add_ground(shadow_scene, scene.ground_plane, scene.camera)
     if options.engine == "cycles":
         for item in scenes:

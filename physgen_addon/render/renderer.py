@@ -192,6 +192,7 @@ class Renderer:
         self._data_scene: DataScene | None = None
         self._grains: list[PhotoGrains] = []
         self._steps: list[Pc2Reader | PhotoGrains] = []
+        self._soft_px: float | None = None
         self._temporary = tempfile.TemporaryDirectory(prefix=scratch_prefix("render"))
         self._scratch = Path(self._temporary.name)
         self._size = render_size(self._scene.camera, options.scale)
@@ -205,6 +206,7 @@ class Renderer:
             if options.frame_format.layered:
                 self._data_scene = DataScene(self._built)
             self._reach = self._add_particles(self._built)
+            self._plate.show_behind(self._objects(self._scene.camera, rest))
             self._shadows = GroundShadow(self._scene, self._built, options, self._scratch)
             self._rest_shadow = self._shadows.ratio(rest, self._scene.camera, self._size)
             self._reflections = reflections(self._scene, self._built, options, self._objects)
@@ -359,7 +361,13 @@ class Renderer:
         for each in self._grains:
             each.let_see(grains=True, hull=False)
         self._open_shutter(self._built.colour_scene, moment, most_samples=2)
-        layer.texture[box.slices], layer.alpha[box.slices] = self._built.colours(moment.number, box, self._scratch)
+        lack = np.zeros_like(layer.alpha)
+        found = self._built.colours(moment.number, box, self._scratch)
+        layer.texture[box.slices], layer.alpha[box.slices], lack[box.slices] = found
+        if self._soft_px is None:
+            # The first call is of the rest pose by the photo's camera.
+            self._soft_px = compositing.soft_reach(layer.alpha, lack)
+        layer = compositing.matted(layer, lack, self._soft_px)
         for each in self._grains:
             each.let_see(grains=False, hull=True)
         self._open_shutter(self._built.light_scene, moment, most_samples=1)

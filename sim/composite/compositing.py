@@ -11,7 +11,7 @@ same at rest; w how much everything is still at rest there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -64,6 +64,47 @@ def empty_layer(width: int, height: int) -> ObjectLayer:
         alpha=np.zeros((height, width), np.float32),
         light=np.ones((height, width, 3), np.float32),
     )
+
+
+SOFT_BEYOND = 2.0
+"""Distance from the silhouette, over the reach of soft outlines, at which a texture's alpha counts no more."""
+
+
+def matted(layer: ObjectLayer, lack: NDArray[np.float32], reach: float) -> ObjectLayer:
+    """Return ``layer`` with the photo's soft outline, where its silhouette is.
+
+    lack: (H, W) what the texture's alpha leaves of each pixel's coverage uncovered, premultiplied by coverage. reach:
+    pixels inside the silhouette within which that counts. Further inside, where a body has turned, its former outline
+    lies before its own other side: nothing shines through there.
+    """
+    if not lack.any() or reach <= 0.0:
+        return layer
+    depth = cv2.distanceTransform((layer.alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 5)
+    weight = np.clip((SOFT_BEYOND - depth / np.float32(reach)) / (SOFT_BEYOND - 1.0), 0.0, 1.0)
+    alpha = np.clip(layer.alpha - lack * weight, 0.0, 1.0).astype(np.float32)
+    share = np.where(layer.alpha > 1e-6, alpha / np.maximum(layer.alpha, 1e-6), np.float32(1.0))
+    return replace(layer, texture=(layer.texture * share[..., None]).astype(np.float32), alpha=alpha)
+
+
+def soft_reach(alpha: NDArray[np.float32], lack: NDArray[np.float32]) -> float:
+    """Return how many pixels inside the silhouette of ``alpha`` (H, W) at rest outlines are soft; see ``matted``."""
+    soft = lack > SOFT * np.maximum(alpha, 1e-3)
+    if not soft.any():
+        return 0.0
+    depth = cv2.distanceTransform((alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 5)
+    return float(np.percentile(depth[soft], 95.0)) + 1.0
+
+
+SOFT = 0.02
+"""Uncovered share of a pixel from which it shows what is behind an object."""
+
+
+def behind(photo: Linear, layer: ObjectLayer) -> Linear:
+    """Return the colours (H, W, 3) that the ``photo`` shows behind the objects, ``layer`` at rest, where their outline
+    is soft: photo = T + (1 − A)·K solved for K, within 0 and 1. Elsewhere the photo."""
+    rest = 1.0 - layer.alpha[..., None]
+    found = np.clip((photo - layer.texture) / np.maximum(rest, SOFT), 0.0, 1.0)
+    return np.where((rest > SOFT) & (layer.alpha[..., None] > 0.0), found, photo).astype(np.float32)
 
 
 def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:

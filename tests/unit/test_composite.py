@@ -135,3 +135,38 @@ def test_contact_is_the_foot():
     assert contact.sum() == 2
     moved = vertices + np.array([0.3, 0.0, 0.0])
     assert disocclusion.contact_displacement(vertices, moved, contact, 1.0) == pytest.approx(0.3)
+
+
+def disc(size=40, radius=14.0):
+    """Coverage of a disc, and how much of it a soft border of 4 pixels leaves uncovered."""
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2.0
+    depth = radius - np.hypot(rows, columns)
+    alpha = np.clip(depth + 0.5, 0, 1).astype(np.float32)
+    return alpha, (alpha * np.clip(0.5 - depth / 8.0, 0, 1)).astype(np.float32), depth
+
+
+def test_a_soft_outline_at_rest_is_the_photo_whatever_lies_behind():
+    alpha, lack, _ = disc()
+    rng = np.random.default_rng(2)
+    own, back = rng.uniform(0.2, 0.9, (2, 40, 40, 3)).astype(np.float32)
+    cover = (alpha - lack)[..., None]
+    photo = cover * own + (1 - cover) * back
+    hard = compositing.ObjectLayer(texture=own * alpha[..., None], alpha=alpha, light=np.ones_like(own))
+    reach = compositing.soft_reach(alpha, lack)
+    assert 3 <= reach <= 6
+    layer = compositing.matted(hard, lack, reach)
+    soft = (layer.alpha > 0) & (layer.alpha < 1 - compositing.SOFT)
+    assert soft.sum() > 200
+    behind = compositing.behind(photo, layer)
+    assert np.abs(behind - back)[soft].max() < 1e-3
+    assert np.abs(compositing.compose(layer, behind) - photo)[soft].max() < 1e-5
+
+
+def test_a_soft_outline_that_has_turned_to_the_front_hides_what_is_behind():
+    alpha, lack, depth = disc()
+    reach = compositing.soft_reach(alpha, lack)
+    turned = np.where(np.abs(depth - 12.0) < 1.5, 0.8 * alpha, 0.0).astype(np.float32)
+    layer = compositing.ObjectLayer(texture=np.ones((40, 40, 3), np.float32), alpha=alpha, light=np.ones((40, 40, 3)))
+    assert compositing.matted(layer, turned, reach).alpha[turned > 0].min() == 1.0
+    assert compositing.matted(layer, lack, reach).alpha[lack > 0.3].max() < 0.7
+    assert compositing.matted(layer, np.zeros_like(alpha), reach) is layer

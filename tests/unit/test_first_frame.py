@@ -6,7 +6,9 @@ import math
 import cv2
 import numpy as np
 import pytest
+from physgen.sim.composite.compositing import ObjectLayer, behind, compose, matted, soft_reach
 from physgen.sim.composite.image_metrics import psnr
+from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.events import ignore, never
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.mesh_raster import visible_pixels
@@ -69,20 +71,22 @@ def a_photo(mask, finest):
     return np.clip(np.where(mask[..., None], blotches, ground), 0, 255).astype(np.uint8), ground
 
 
-def first_frame(surface, ground):
-    """What the camera sees, averaged over FINER² places in each pixel; and how much of the pixel is covered."""
+def first_frame(surface, photo):
+    """What is composited over the photo, averaged over FINER² places in each pixel; and how much the body covers."""
     seen = visible_pixels(VIEW, surface.vertices, surface.faces, FINER)
     uv = seen.interpolated(surface.faces, surface.uv)
     height, width = surface.picture.shape[:2]
     x, y = np.floor(uv[:, 0] * width).astype(int), np.floor((1.0 - uv[:, 1]) * height).astype(int)
-    picture = ground.repeat(FINER, axis=0).repeat(FINER, axis=1)
-    picture[seen.rows, seen.columns] = surface.picture[y.clip(0, height - 1), x.clip(0, width - 1)]
-    covered = np.zeros(picture.shape[:2])
-    covered[seen.rows, seen.columns] = 1.0
-    return (
-        picture.reshape(HEIGHT, FINER, WIDTH, FINER, 3).mean(axis=(1, 3)),
-        covered.reshape(HEIGHT, FINER, WIDTH, FINER).mean(axis=(1, 3)),
-    )
+    at = (y.clip(0, height - 1), x.clip(0, width - 1))
+    fine = np.zeros((HEIGHT * FINER, WIDTH * FINER, 5), np.float32)
+    fine[seen.rows, seen.columns, :3] = bytes_to_linear(surface.picture)[at]
+    fine[seen.rows, seen.columns, 3] = 1.0
+    fine[seen.rows, seen.columns, 4] = 1.0 - surface.alpha[at] / 255.0
+    mean = fine.reshape(HEIGHT, FINER, WIDTH, FINER, 5).mean(axis=(1, 3))
+    covered, lack = mean[..., 3], mean[..., 4]
+    layer = ObjectLayer(texture=mean[..., :3], alpha=covered, light=np.ones_like(mean[..., :3]))
+    layer = matted(layer, lack, soft_reach(covered, lack))
+    return linear_to_bytes(compose(layer, behind(bytes_to_linear(photo), layer))), covered
 
 
 @pytest.mark.parametrize("name", MASKS)
@@ -104,7 +108,7 @@ def test_a_body_shows_the_photo_up_to_its_outline(name, tmp_path):
     options = ReconstructOptions(mesh_vertices=6000)
     (body,) = make_bodies(layers, VIEW, [wanted], options, store, Steps(1, ignore, never))
     assert body.shape == SHAPES[name]
-    shown, covered = first_frame(body.surface, ground)
+    shown, covered = first_frame(body.surface, photo)
     assert psnr(shown, photo, mask) > REQUIRED_DB
     # Colours from elsewhere on the object are no less wrong than the ground behind it.
     assert psnr(shown, photo, mask & (covered == 1.0)) > INSIDE_DB

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from physgen.sim.composite.srgb import linear_to_bytes, srgb_to_linear
 from physgen.sim.reconstruct.segmentation import matting
 from physgen.sim.reconstruct.segmentation.matting import (
     Trimap,
     closed_form_alpha,
+    foreground_colours,
     outline_band,
     refine_alpha,
     soft_alpha,
@@ -64,6 +66,28 @@ def test_a_soft_outline_is_soft_and_a_sharp_one_stays_sharp():
     disc = np.hypot(*(np.mgrid[:HEIGHT, :WIDTH] - np.array([60, 80])[:, None, None])) < 40
     sharp = soft_alpha(over(disc.astype(float)), disc, width=8.0)
     assert np.abs(sharp - disc).mean() < 0.004
+
+
+def test_the_background_is_taken_out_of_a_soft_outline():
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] / 160.0
+    front = np.stack([0.75 + 0.1 * rows, 0.3 + 0.1 * columns, 0.2 + 0 * rows], axis=-1)
+    back = np.stack([0.2 + 0.1 * columns, 0.4 + 0.15 * rows, 0.6 - 0.1 * rows], axis=-1)
+    alpha = furry().astype(np.float32)
+    alpha[alpha > 0.995], alpha[alpha < 0.005] = 1.0, 0.0
+    # Light is what a lens mixes.
+    mixed = alpha[..., None] * srgb_to_linear(front) + (1 - alpha[..., None]) * srgb_to_linear(back)
+    pixels = linear_to_bytes(mixed)
+    found = foreground_colours(pixels, alpha)
+    assert (found[alpha == 1] == pixels[alpha == 1]).all()
+    border = (alpha > 0.1) & (alpha < 0.9)
+    assert border.sum() > 300
+    wrong, mixed_in = (np.abs(picture / 255.0 - front)[border].mean() for picture in (found, pixels))
+    assert wrong < 0.1 * mixed_in
+
+
+def test_colours_of_a_hard_outline_stay():
+    pixels = over(furry())
+    assert (foreground_colours(pixels, np.ones((HEIGHT, WIDTH), np.float32)) == pixels).all()
 
 
 def test_camouflage_keeps_its_outline():

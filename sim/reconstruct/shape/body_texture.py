@@ -215,11 +215,13 @@ MARGIN = 8
 
 @dataclass(frozen=True)
 class CropTexture:
-    """A part of the photo. pixels: (h, w, 3) uint8; left, top: photo pixels of its first corner."""
+    """A part of the photo. pixels: (h, w, 3) uint8; left, top: photo pixels of its first corner. alpha: (h, w) uint8,
+    255 where the object covers all of a pixel; None: everywhere."""
 
     pixels: NDArray[np.uint8]
     left: int
     top: int
+    alpha: NDArray[np.uint8] | None = None
 
     def uv(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return UV (n, 2), v upward as in OpenGL and Blender, of photo ``pixels`` (n, 2)."""
@@ -235,29 +237,40 @@ class CropTexture:
 
 @dataclass(frozen=True)
 class TexturedSurface:
-    """vertices: (V, 3); faces: (T, 3); uv: (V, 2), origin at the bottom left, into picture: (h, w, 3) uint8 sRGB."""
+    """vertices: (V, 3); faces: (T, 3); uv: (V, 2), origin at the bottom left, into picture: (h, w, 3) uint8 sRGB.
+    alpha: (h, w) uint8, how much of a texel the object covers where the photo shows its outline; None: all of each."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     uv: NDArray[np.float64]
     picture: NDArray[np.uint8]
+    alpha: NDArray[np.uint8] | None = None
 
 
 def textured(body: BodyMesh, texture: CropTexture) -> TexturedSurface:
     """Return ``body`` textured by the photo."""
     pixels = body.pixels if body.colours is None else body.colours
-    return TexturedSurface(body.vertices, body.faces, texture.uv(pixels), texture.pixels)
+    return TexturedSurface(body.vertices, body.faces, texture.uv(pixels), texture.pixels, texture.alpha)
 
 
-def crop_texture(photo: NDArray[np.uint8], mask: Mask) -> CropTexture:
-    """Return the photo around ``mask``: the photo inside it, the object's own colours extended outward around it."""
+def crop_texture(photo: NDArray[np.uint8], mask: Mask, alpha: NDArray[np.float32] | None = None) -> CropTexture:
+    """Return the photo around ``mask``: the photo inside it, the object's own colours extended outward around it.
+
+    alpha: (H, W) how much of each pixel the object covers. Where it is below 1 inside the mask, ``photo`` should have
+    the object's colours alone (``matting.foreground_colours``).
+    """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     top, left = max(0, int(rows[0]) - MARGIN), max(0, int(columns[0]) - MARGIN)
     window = (slice(top, int(rows[-1]) + 1 + MARGIN), slice(left, int(columns[-1]) + 1 + MARGIN))
     inside, colours = mask[window], photo[window].copy()
     carried = ndimage.gaussian_filter(inner_colours(colours.astype(np.float32), inside), (1.0, 1.0, 0.0))
     colours[~inside] = np.clip(carried[~inside] + 0.5, 0, 255).astype(np.uint8)
-    return CropTexture(pixels=colours, left=left, top=top)
+    if alpha is None:
+        return CropTexture(pixels=colours, left=left, top=top)
+    # Outside, the outline's own alpha is carried on, so that a body which reaches a little beyond has no hard rim.
+    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    cover = np.clip(alpha[window][tuple(nearest)] * 255.0 + 0.5, 0, 255).astype(np.uint8)
+    return CropTexture(pixels=colours, left=left, top=top, alpha=cover)
 
 
 def glb_bytes(
@@ -271,11 +284,13 @@ def glb_bytes(
     """Return ``surface`` as a GLB in metres, Y up (glTF's convention), its origin at ``base_centre`` (3,) in its own
     unit.
 
-    roughness, metallic: of its shader, 0 to 1. Its colour is the photo's, with the photo's light on it.
+    roughness, metallic: of its shader, 0 to 1. Its colour is the photo's, with the photo's light on it. The picture's
+    alpha is how soft the outline is in the photo; glTF viewers ignore it, for the material is opaque.
     """
     local = (surface.vertices - base_centre) * metres
     vertices = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]])
-    image = Image.fromarray(surface.picture)
+    picture = surface.picture if surface.alpha is None else np.dstack([surface.picture, surface.alpha])
+    image = Image.fromarray(picture)
     image.format = "PNG"  # trimesh embeds in this format; JPEG would change the photo's pixels
     material = PBRMaterial(
         name="photo",

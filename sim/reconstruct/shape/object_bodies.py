@@ -25,6 +25,7 @@ from ..adapters.resolve import resolve
 from ..camera.depth_map import DepthMap
 from ..photo_layers import Layers
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
+from ..segmentation.matting import foreground_colours, soft_alpha
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
 from .body_texture import TexturedSurface, colour_pixels, crop_texture
@@ -283,7 +284,7 @@ def make_bodies(
             made = store.run(
                 "fit", {**inputs, **given, "file": file}, partial(_fitted, own, full, seen, colours, item, mesher)
             )
-        surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"])
+        surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"], made.get("alpha"))
         bodies.append(Body(surface, str(made["shape"]), turned))
     bodies = _on_supports(view, layers.seen, bodies, objects, steps.notice)
     return _separated(view, layers.front_to_back, bodies, objects, steps.notice)
@@ -303,6 +304,7 @@ def _arrays(surface: TexturedSurface, shape: str) -> Arrays:
         "uv": surface.uv,
         "picture": surface.picture,
         "shape": np.array(shape),
+        **({} if surface.alpha is None else {"alpha": surface.alpha}),
     }
 
 
@@ -318,7 +320,12 @@ def _built(
     notice: Notice,
 ) -> Arrays:
     body = build_body(view, full, item, options, notice, seen=seen, pixels=colours, depth=depth, others=others)
-    return _arrays(textured_body(view, body.mesh, crop_texture(colours, full), full), body.shape)
+    alpha = soft_alpha(colours, full, others=others)
+    # Where something else hides the outline, the photo shows nothing of its edge.
+    guessed = cv2.dilate((full & ~seen).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    alpha[guessed & full] = 1.0
+    texture = crop_texture(foreground_colours(colours, alpha), full, alpha)
+    return _arrays(textured_body(view, body.mesh, texture, full), body.shape)
 
 
 def _fitted(

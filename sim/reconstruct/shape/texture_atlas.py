@@ -73,7 +73,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     photo = shown & (cosine > SQUARE)
     colours = body.pixels if body.colours is None else body.colours
     if photo.all():
-        return TexturedSurface(body.vertices, body.faces, texture.uv(body.pixels), texture.pixels)
+        return TexturedSurface(body.vertices, body.faces, texture.uv(body.pixels), texture.pixels, texture.alpha)
     rest = body.faces[~photo]
     normals, areas = _normals(body.vertices, body.faces)
     frame = surface_frame(normals, areas)
@@ -102,17 +102,23 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
     found = rasterise(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
     texel = found.interpolated(charts.faces, values[charts.source])
-    below = np.zeros((charts.size[1], size[0], 3), dtype=np.uint8)
+    soft = texture.alpha is not None
+    below = np.zeros((charts.size[1], size[0], 4 if soft else 3), dtype=np.uint8)
     if len(found.rows):
         colour = _colours(camera, texel, texture, inside, matter, light, frame, pixels)
+        if soft:
+            colour = np.column_stack([colour, _cover(camera, texel, texture)])
         below[found.rows, found.columns] = np.clip(colour + 0.5, 0, 255).astype(np.uint8)
         covered = np.zeros(below.shape[:2], dtype=bool)
         covered[found.rows, found.columns] = True
         nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
         below = below[tuple(nearest)]
-    above = np.pad(texture.pixels, ((0, 0), (0, size[0] - width), (0, 0)), mode="edge")
+    whole = texture.pixels if texture.alpha is None else np.dstack([texture.pixels, texture.alpha])
+    above = np.pad(whole, ((0, 0), (0, size[0] - width), (0, 0)), mode="edge")
     uv = np.column_stack([place[:, 0] / size[0], 1.0 - place[:, 1] / size[1]])
-    return TexturedSurface(body.vertices[source], faces, uv, np.concatenate([above, below]))
+    picture = np.concatenate([above, below])
+    alpha = np.ascontiguousarray(picture[..., 3]) if soft else None
+    return TexturedSurface(body.vertices[source], faces, uv, np.ascontiguousarray(picture[..., :3]), alpha)
 
 
 def _normals(vertices: Points, faces: NDArray[np.int64]) -> tuple[Points, NDArray[np.float64]]:
@@ -244,6 +250,15 @@ def _colours(
     photo = inner + share[:, None] * (photo - inner) + added
     plain[seen] += weight[seen] * (photo - plain[seen])
     return plain
+
+
+def _cover(camera: Camera, texel: Points, texture: CropTexture) -> NDArray[np.float64]:
+    """Alpha (P,), 0 to 255, of texels (P, 13; see ``_colours``): the photo's where they face its camera, else full."""
+    assert texture.alpha is not None
+    own = texel[:, 8:10] - (texture.left + 0.5, texture.top + 0.5)
+    towards = ((camera.position - texel[:, :3]) * texel[:, 3:6]).sum(axis=1) > 0
+    shown = towards * (1.0 - texel[:, 10])
+    return 255.0 - shown * (255.0 - _sampled(texture.alpha[..., None].astype(np.float32), own)[:, 0])
 
 
 def _without_light(colours: Points, light: Points) -> NDArray[np.float64]:
