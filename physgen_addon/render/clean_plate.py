@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...sim.composite import backdrop, disocclusion, srgb
 from ...sim.composite.backdrop import Backdrop, Proxy, Warp, borders_of, make_proxy
-from ...sim.composite.compositing import SOFT, ObjectLayer, behind
+from ...sim.composite.compositing import SOFT, ObjectLayer, behind, shadow_exponents
 from ...sim.composite.outpaint import Borders, inpaint_hole, outpaint
 from ...sim.composite.srgb import Linear
 from ...sim.errors import InputError
@@ -171,6 +171,15 @@ class CleanPlate:
             background=view.colours(extended.background),
             at_rest=view.warp(at_rest),
             masks=np.zeros(self.masks.shape, dtype=bool),
+        )
+
+    def shadow_exponents(self, rest_shadow: srgb.Linear) -> NDArray[np.float32]:
+        """Return the exponents (3,) that give rendered shadows the photo's colour and depth; ``rest_shadow`` (H, W, 3)
+        is that at rest."""
+        shaded = np.logical_or.reduce([self._mask(item.shadow) for item in self._scene.objects])
+        rims = np.maximum.reduce([disocclusion.rim_strength(mask, self.masks) for mask in self.object_masks])
+        return shadow_exponents(
+            self.photo, self.background, rest_shadow, shaded=shaded, known=~self.masks & (rims == 0.0)
         )
 
     def extended(self, borders: Borders) -> Extended:

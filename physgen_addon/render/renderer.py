@@ -208,7 +208,9 @@ class Renderer:
             self._reach = self._add_particles(self._built)
             self._plate.show_behind(self._objects(self._scene.camera, rest))
             self._shadows = GroundShadow(self._scene, self._built, options, self._scratch)
-            self._rest_shadow = self._shadows.ratio(rest, self._scene.camera, self._size)
+            bare = self._shadows.ratio(rest, self._scene.camera, self._size)
+            self._shade = self._plate.shadow_exponents(bare)
+            self._rest_shadow = bare**self._shade
             self._reflections = reflections(self._scene, self._built, options, self._objects)
             self._rest_reflection = (
                 None if self._reflections is None else self._reflections.layer(self._scene.camera, rest)
@@ -236,7 +238,7 @@ class Renderer:
             grains.show(sample, max(sample - 1, 0) if moment.shutter > 0 else sample, view.camera.position)
         seen = self._plate.seen(view, moment.now)
         rest_shadow = view.warp(self._rest_shadow)
-        shadow = rest_shadow if sample == 0 else self._shadows.ratio(moment, view.camera, self._size)
+        shadow = rest_shadow if sample == 0 else self._shadows.ratio(moment, view.camera, self._size) ** self._shade
         ground = compositing.ground_layer(
             photo=seen.photo,
             background=seen.background,

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.equirectangular import LUMINANCE
 from .pull_push import fill_gaps
 from .srgb import Linear
 
@@ -154,6 +155,46 @@ def ground_layer(
     kept = np.where(now == rest, photo, photo * (now / rest))
     kept = np.clip(kept, np.minimum(photo, revealed), np.maximum(photo, revealed))
     return np.where(weight == 1.0, kept, revealed + (kept - revealed) * weight).astype(np.float32)
+
+
+FEWEST_SHADED = 100
+"""Pixels of a photo's shadow from which its colour is told."""
+FAINT = 0.05
+"""Darkening, as a natural logarithm of luminance, below which a photo's shadow tells no colour."""
+DEPTHS, TINTS = (0.6, 1.5), (0.3, 3.0)
+"""Limits of a rendered shadow's depth over the photo's, and of one channel's over that of luminance, in logarithms."""
+BLACK = 0.004
+"""Linear light below which a photo's value is mostly noise: a 255th in sRGB is 0.0003, ten of them are 0.003."""
+
+
+def shadow_exponents(
+    photo: Linear, background: Linear, rest_shadow: Linear, *, shaded: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return the exponents (3,) that give a rendered shadow the colour and depth of the ``photo``'s own.
+
+    What light reaches a shadow has mostly been reflected by the ground and the things around before, so it has their
+    colour; the light of the scene knows nothing of that. The photo's shadow over the clean plate says it per channel.
+    rest_shadow: (H, W, 3) rendered at rest. shaded, known: (H, W) the photo's shadow, and pixels that show ground.
+    Depths are compared as totals, because both shadows need not lie on the same pixels. Ones where the photo has no
+    shadow that could tell.
+    """
+    ones = np.ones(3, np.float32)
+    shaded = shaded & known
+    if shaded.sum() < FEWEST_SHADED:
+        return ones
+
+    def darkening(lit: Linear, dark: Linear) -> NDArray[np.float64]:
+        values = np.log(np.maximum(lit, BLACK)) - np.log(np.maximum(dark, BLACK))
+        return np.asarray(values.astype(np.float64).sum(axis=0))
+
+    luminance = np.asarray(LUMINANCE, dtype=np.float32)
+    total = float(darkening(background[shaded] @ luminance, photo[shaded] @ luminance))
+    if total < FAINT * shaded.sum():
+        return ones
+    rendered = float(-np.log(np.maximum(rest_shadow[known] @ luminance, MIN_SHADOW)).astype(np.float64).sum())
+    depth = float(np.clip(total / max(rendered, 1e-6), *DEPTHS))
+    tint = np.clip(darkening(background[shaded], photo[shaded]) / total, *TINTS)
+    return np.asarray(depth * tint, dtype=np.float32)
 
 
 def compose(layer: ObjectLayer, ground: Linear) -> Linear:

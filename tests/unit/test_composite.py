@@ -170,3 +170,35 @@ def test_a_soft_outline_that_has_turned_to_the_front_hides_what_is_behind():
     assert compositing.matted(layer, turned, reach).alpha[turned > 0].min() == 1.0
     assert compositing.matted(layer, lack, reach).alpha[lack > 0.3].max() < 0.7
     assert compositing.matted(layer, np.zeros_like(alpha), reach) is layer
+
+
+def shaded_ground(seed=3):
+    """Textured ground, the same in a brown shadow, and a grey rendered shadow that lies beside it by 3 pixels."""
+    rng = np.random.default_rng(seed)
+    background = rng.uniform(0.3, 0.6, (30, 40, 3)).astype(np.float32)
+    shaded = np.zeros((30, 40), bool)
+    shaded[8:22, 10:30] = True
+    own = np.array([0.7, 0.55, 0.3], np.float32)
+    photo = np.where(shaded[..., None], own * background, background)
+    rendered = np.where(np.roll(shaded, 3, axis=1)[..., None], np.full(3, 0.4), 1.0).astype(np.float32)
+    return photo, background, rendered, shaded, own
+
+
+def test_a_rendered_shadow_takes_the_colour_and_depth_of_the_photos():
+    photo, background, rendered, shaded, own = shaded_ground()
+    known = np.ones_like(shaded)
+    exponents = compositing.shadow_exponents(photo, background, rendered, shaded=shaded, known=known)
+    assert np.log(0.4**exponents) == pytest.approx(np.log(own), rel=0.03)
+
+
+def test_without_a_telling_shadow_it_stays_as_rendered():
+    photo, background, rendered, shaded, _ = shaded_ground()
+    known = np.ones_like(shaded)
+    for dark, where in ((photo, np.zeros_like(shaded)), (background, shaded), (2.0 * photo / 0.3, shaded)):
+        found = compositing.shadow_exponents(dark, background, rendered, shaded=where, known=known)
+        assert (found == 1.0).all()
+    # What cannot be is bounded: a black shadow, and one of which the render has hardly any.
+    deep = compositing.shadow_exponents(0.0 * photo, background, rendered, shaded=shaded, known=known)
+    assert (deep <= compositing.DEPTHS[1] * compositing.TINTS[1]).all() and (deep > 0).all()
+    none = compositing.shadow_exponents(photo, background, np.ones_like(rendered), shaded=shaded, known=known)
+    assert np.isfinite(none).all() and none.max() <= compositing.DEPTHS[1] * compositing.TINTS[1]
