@@ -21,6 +21,7 @@ from ..sim.events import Event, IsCancelled, OnEvent
 from .compat import OperatorMixin
 from .context import redraw, scene_with
 from .interpreter import NoPython
+from .text import popup
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """The work of a job: called in a thread, without bpy; forwards events and returns the final event, or raises."""
@@ -201,7 +202,7 @@ class JobOperator(OperatorMixin):
         try:
             self.begin(context)
         except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, popup(str(error)))
             return {"CANCELLED"}
         try:
             while (result := self.tick()) is None:
@@ -220,7 +221,7 @@ class JobOperator(OperatorMixin):
         try:
             self.begin(context)
         except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, popup(str(error)))
             return {"CANCELLED"}
         self._timer = context.window_manager.event_timer_add(STEP_S, window=context.window)
         context.window_manager.modal_handler_add(self)
@@ -292,11 +293,12 @@ class JobOperator(OperatorMixin):
                 self.report({"WARNING"}, str(error))
 
     def _fail(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
-        # A popup is one line: the command that mends it is in the preferences, and buttons are in the panel.
+        # A command is nothing for a popup: it is in the preferences, and buttons are in the panel.
         words = str(error)
         if isinstance(error, NoPython) and not bpy.app.background:
             words = f"{error.reason}: install one (see the panel)"
-        self.report({"WARNING" if isinstance(error, Cancelled) else "ERROR"}, words)
+        is_stop = isinstance(error, Cancelled)
+        self.report({"WARNING" if is_stop else "ERROR"}, words if is_stop else popup(words))
         self.stopped(scene, error)
 
     def _end(self, scene: bpy.types.Scene) -> set[str]:
@@ -341,7 +343,7 @@ def start_chosen(
     try:
         job_operator(mode, **given)
     except RuntimeError as error:
-        # The error that the other operator has reported.
+        # The error that the other operator has reported, broken into lines.
         operator.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
         return {"CANCELLED"}
     return {"FINISHED"}

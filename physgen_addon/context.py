@@ -162,4 +162,20 @@ def _beside_viewport(context: bpy.types.Context) -> bpy.types.Area | None:
     new = next((area for area in context.window.screen.areas if area not in before), None)
     if new is not None:
         new.type = "IMAGE_EDITOR"
+        _split_off[:] = [new.as_pointer()]
     return new
+
+
+_split_off: list[int] = []
+"""The image editor that ``show_beside`` has split off, by its address, which is compared and never followed."""
+
+
+def close_beside() -> None:
+    """Close the image editor that ``show_beside`` has opened, if it is still one; the viewport takes its place."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.as_pointer() in _split_off and area.type == "IMAGE_EDITOR" and len(window.screen.areas) > 1:
+                with bpy.context.temp_override(window=window, area=area):
+                    bpy.ops.screen.area_close()
+                break
+    _split_off.clear()

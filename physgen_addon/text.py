@@ -19,6 +19,21 @@ def decimal(value: float) -> float:
     return float(f"{value:.7g}")
 
 
+POPUP = 80
+"""Characters on a line of a popup: 640 px, which is half of a laptop's window."""
+
+
+def popup(message: str) -> str:
+    """Return ``message`` broken into lines for a report that pops up: Blender breaks none, and lets them run off.
+
+    Unchanged without a window: scripts and logs take a message as one line.
+    """
+    if bpy.app.background:
+        return message
+    lines = (textwrap.wrap(line, POPUP, break_on_hyphens=False) for line in message.splitlines())
+    return "\n".join(part for wrapped in lines for part in wrapped)
+
+
 Execute = Callable[[Any, bpy.types.Context], set[str]]
 
 
@@ -31,7 +46,7 @@ def report_errors(execute: Execute) -> Execute:
         try:
             return execute(self, context)
         except PhysGenError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, popup(str(error)))
             return {"CANCELLED"}
 
     return guarded

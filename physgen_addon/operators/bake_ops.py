@@ -24,7 +24,7 @@ from ..props.preferences import python
 from ..scene_io.export_animation import clock, export_names
 from ..scene_io.export_scene import export_scene
 from ..scene_io.motion_fingerprint import fingerprint
-from ..text import count, duration, report_errors, storage
+from ..text import count, duration, popup, report_errors, storage
 
 
 def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
@@ -93,6 +93,7 @@ class Bake(JobOperator):
         looks = tuple(show_bake.look_of(item, names[item.name], start) for item in bodies(scene))
         record = BakeRecord(fingerprints=(fingerprint(scene),), frame_start=start, looks=looks)
         self._shown = 0
+        self._is_first = not scene.physgen.simulation.bake
         preferred, before = python(context), background_jobs.stopping()
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
@@ -162,11 +163,14 @@ class Bake(JobOperator):
         troubles = show_bake.show(scene, record)
         # Of the bake: settings may have been undone since it began.
         last = record.frame_start + load_manifest(folder).frames_done - 1
-        scene.frame_end = max(scene.frame_end, last)
+        ends = self._is_first and scene.frame_end > last and not _animated_after(last)
+        scene.frame_end = last if ends else max(scene.frame_end, last)
         waits = paths.is_unsaved_cache(scene)
         unsaved.settle(scene)
         bake_state.observe(scene)
         sentence = f"frames {record.frame_start} to {last} are baked"
+        if ends:
+            sentence += f", and playback now ends at {last}"
         if waits:
             sentence += "; they wait in a temporary folder until you save the file"
         return ". ".join([sentence, *troubles])
@@ -176,6 +180,11 @@ class Bake(JobOperator):
         bake_state.set_trouble(scene, "" if isinstance(error, Cancelled) else str(error))
         unsaved.settle(scene)
         bake_state.refresh(scene)
+
+
+def _animated_after(frame: int) -> bool:
+    """Return whether any animation of the file goes on after ``frame``."""
+    return any(action.frame_range[1] > frame for action in bpy.data.actions)
 
 
 class PHYSGEN_OT_bake(Bake, bpy.types.Operator):
@@ -303,7 +312,7 @@ class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
             with contextlib.suppress(PhysGenError):
                 show_bake.show(scene, bake_state.record_of(scene, folder))
             bake_state.observe(scene)
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, popup(str(error)))
             return {"CANCELLED"}
         bake_state.set_trouble(scene, "")
         bake_state.observe(scene)

@@ -192,7 +192,7 @@ def unregister_scene_menu() -> None:
     bpy.types.TOPBAR_MT_file_import.remove(_draw_scene_menu)
 
 
-FILES = "*.ply"
+FILES = ".ply"
 
 
 class _OfSplats:
@@ -265,7 +265,7 @@ class PHYSGEN_OT_choose_splats(_OfSplats, bpy.types.Operator):
     bl_label = "Import Gaussian Splats"
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=FILES, options={"HIDDEN"})
+    filter_glob: StringProperty(default=f"*{FILES}", options={"HIDDEN"})
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -273,14 +273,36 @@ class PHYSGEN_OT_choose_splats(_OfSplats, bpy.types.Operator):
         return PHYSGEN_OT_import_splats.poll(context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the file."""
+        """Ask for the file; of a dropped one, for its size."""
+        if self.filepath:
+            return context.window_manager.invoke_props_dialog(self, title=Path(self.filepath).name)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw size and direction."""
+        self.layout.use_property_split = True
+        self.layout.prop(self, "size_m")
+        self.layout.prop(self, "up")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start the job."""
         given = {"filepath": self.filepath, "size_m": self.size_m, "up": self.up}
         return start_chosen(self, context, bpy.ops.physgen.import_splats, given)
+
+
+class PHYSGEN_FH_splats(bpy.types.FileHandler):
+    """Drop of a .ply on a 3D viewport: Blender asks whether it is a mesh or splats."""
+
+    bl_idname = "PHYSGEN_FH_splats"
+    bl_label = "Gaussian Splats for PhysGen"
+    bl_import_operator = "physgen.choose_splats"
+    bl_file_extensions = FILES
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        """Accept drops on 3D viewports."""
+        return context.area is not None and context.area.type == "VIEW_3D"
 
 
 def _draw_splats_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:

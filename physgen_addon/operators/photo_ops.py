@@ -13,7 +13,7 @@ from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
 from ..background_jobs import JobOperator, Work
-from ..context import TAB, show_beside
+from ..context import TAB, active, close_beside, show_beside
 from ..interpreter import cli_command, find_python, photo_check
 from ..photo import photo_trust
 from ..photo.photo_image import (
@@ -79,8 +79,17 @@ class PHYSGEN_OT_open_photo(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
 
+def image_here(context: bpy.types.Context) -> bpy.types.Image | None:
+    """Return the image that the editor shows, or the one of the active empty: Blender makes one of a dropped file."""
+    if getattr(context.space_data, "type", "") == "IMAGE_EDITOR":
+        return context.space_data.image
+    item = active(context)
+    shows = item is not None and item.type == "EMPTY" and item.empty_display_type == "IMAGE"
+    return item.data if shows else None
+
+
 class PHYSGEN_OT_use_image(bpy.types.Operator):
-    """Start from the photo that this image editor shows"""
+    """Start from the photo that this image editor shows, or that the active empty shows"""
 
     bl_idname = "physgen.use_image"
     bl_label = "Use This Image"
@@ -89,7 +98,7 @@ class PHYSGEN_OT_use_image(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Enabled if the image is a file."""
-        image = getattr(context.space_data, "image", None)
+        image = image_here(context)
         if image is None or image.source != "FILE" or not image.filepath:
             cls.poll_message_set("The image shown is not a file")
             return False
@@ -98,9 +107,16 @@ class PHYSGEN_OT_use_image(bpy.types.Operator):
     @report_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Set it."""
-        path = bpy.path.abspath(context.space_data.image.filepath)
-        set_photo(context.scene, Path(path).resolve())
-        context.space_data.image = context.scene.physgen_photo.image
+        image = image_here(context)
+        if image is None:
+            raise InputError("no image is shown here; open one in an image editor, or select an empty that shows one")
+        set_photo(context.scene, Path(bpy.path.abspath(image.filepath)).resolve())
+        if getattr(context.space_data, "type", "") == "IMAGE_EDITOR":
+            context.space_data.image = context.scene.physgen_photo.image
+        else:
+            # The empty has done its work: the camera's view will show the photo.
+            active(context).hide_set(True)
+            show_beside(context, context.scene.physgen_photo.image, TAB)
         return {"FINISHED"}
 
 
@@ -356,6 +372,7 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         root, photo = Path(str(final["scene"])), photo_file(scene.physgen_photo)
         changed = find_edits(scene, photo)
         sentence = show_scene(scene, root)
+        close_beside()
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)

@@ -70,7 +70,9 @@ def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
 def _output_folder(scene: bpy.types.Scene) -> Path:
     path = scene.physgen.rendering.output
     if path.startswith("//") and not bpy.data.filepath:
-        raise InputError(f"Output is {path!r}, beside a file that is not saved yet: save it, or choose a folder")
+        # Where the bake of an unsaved file waits, too.
+        paths.make_unsaved_root()
+        return paths.unsaved_root() / paths.unsaved_key() / "rendered frames"
     return require_folder(path, "Output")
 
 
@@ -102,7 +104,7 @@ class _Render(JobOperator):
     def _work(self, scene: bpy.types.Scene, *choices: str) -> Work:
         bake = require_folder(scene.physgen.simulation.bake, "Bake")
         if not (bake / MANIFEST_FILE).is_file():
-            raise InputError(f"{bake}: holds no bake; bake again, or find it with Find Lost (see Simulate, Cache)")
+            raise InputError(f"{bake}: holds no bake; bake again, or press Find Lost (see Cache and Device)")
         photo, baked_scene = require_folder(scene.physgen.folder, "Scene Folder"), bake.parent.parent / "scene"
         names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)

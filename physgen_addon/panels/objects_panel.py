@@ -38,6 +38,7 @@ from .sidebar import (
     draw_job,
     draw_static_friction_note,
     is_in,
+    optional,
     settings,
 )
 
@@ -219,9 +220,7 @@ class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
         column = settings(self.layout, context)
         column.prop(body, "fill")
         if not body.fill:
-            column.prop(body, "shell_thickness")
-            if body.shell_thickness == 0:
-                text.sentences(column, context, "0: the thinnest wall that the quality resolves.")
+            optional(column, body, "own_wall", "shell_thickness", "Wall")
         law = body.material.law
         # Only deformable objects can turn to sand.
         if cohesion_of(law) in (SHAPED, COHERENT):
@@ -234,7 +233,7 @@ class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
     """Friction and bounce"""
 
     bl_parent_id = "PHYSGEN_PT_objects"
-    bl_label = "Surface"
+    bl_label = "Friction and Bounce"
     bl_order = 2
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
@@ -247,9 +246,10 @@ class PHYSGEN_PT_surface(Sidebar, bpy.types.Panel):
         """Draw its own values, or the ground's."""
         body = active_body(context).physgen
         column = settings(self.layout, context)
-        column.prop(body, "own_surface")
+        choice = column.row()
+        choice.use_property_split = False
+        choice.prop(body, "surface", expand=True)
         if not body.own_surface:
-            text.sentences(column, context, "Uses the ground's friction and bounce (see World).")
             return
         for name in SURFACE:
             column.prop(body, name)
@@ -341,7 +341,7 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
         return bool(bodies(context.scene))
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw velocity, spin and start."""
+        """Draw velocity and spin."""
         layout, item = self.layout, active_body(context)
         if item is None:
             text.sentences(layout, context, "Select an object of the simulation to set its initial motion.")
@@ -361,10 +361,6 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             split.label(text="")
             split.active = False
             split.label(text=f"{turns:.2g} turns/s")
-        column.prop(body, "start_frame")
-        column.prop(body, "asleep")
-        if body.asleep:
-            column.prop(body, "held")
         row = layout.row(align=True)
         draw_arrows(row, context)
         cleared = row.row(align=True)
@@ -372,11 +368,36 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
         cleared.operator(PHYSGEN_OT_clear_motion.bl_idname, text="", icon="LOOP_BACK")
 
 
+class PHYSGEN_PT_start(Sidebar, bpy.types.Panel):
+    """When the active object begins to move"""
+
+    bl_parent_id = "PHYSGEN_PT_motion"
+    bl_label = "Start"
+    bl_order = 0
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown if the active object is dynamic."""
+        item = active_body(context)
+        return item is not None and item.physgen.role == "dynamic"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the frame and sleep."""
+        body = active_body(context).physgen
+        column = settings(self.layout, context)
+        optional(column, body, "waits", "start_frame", "At Frame")
+        column.prop(body, "asleep")
+        if body.asleep:
+            column.prop(body, "held")
+
+
 class PHYSGEN_PT_pins(Sidebar, bpy.types.Panel):
     """Pins of the active object"""
 
     bl_parent_id = "PHYSGEN_PT_motion"
     bl_label = "Hold"
+    bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     @classmethod

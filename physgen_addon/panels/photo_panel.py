@@ -31,7 +31,7 @@ from ..operators.photo_ops import (
 )
 from ..photo.photo_consent import OFFLINE, is_allowed
 from ..photo.photo_request import made_folder, scene_folder
-from .sidebar import draw_job
+from .sidebar import draw_job, optional
 
 KEY_VARIABLE = "PHYSGEN_API_KEY"
 
@@ -243,7 +243,7 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     box = state.boxes[state.box_index]
     column = layout.column(align=True)
     column.use_property_split, column.use_property_decorate = True, False
-    column.prop(box, "size_m")
+    optional(column, box, "knows_size", "size_m", "Size")
     if not any(other.size_m > 0 for other in state.boxes):
         text.sentences(layout, context, "Set the size of one object; otherwise the scale is estimated.")
 

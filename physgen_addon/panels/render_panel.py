@@ -18,7 +18,7 @@ from ..operators.render_ops import (
     PHYSGEN_OT_render_video,
 )
 from ..render.render_options import VIDEO_CODECS
-from .sidebar import RENDER, Sidebar, draw_job
+from .sidebar import RENDER, Sidebar, draw_job, optional
 
 RESULTS = (".png", ".exr", *VIDEO_CODECS)
 """Suffixes of rendered files."""
@@ -51,15 +51,13 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     choices.prop(rendering, "engine")
     if rendering.engine == "cycles":
         choices.prop(rendering, "device")
-    choices.prop(rendering, "samples")
-    if not rendering.samples:
-        text.sentences(choices, context, "Samples 0: the engine's default.")
+    optional(choices, rendering, "own_samples", "samples", "Samples")
     choices.prop(rendering, "scale")
     choices.prop(rendering, "format")
     choices.prop(rendering, "video")
     choices.prop(rendering, "output")
     if rendering.output.startswith("//") and not bpy.data.filepath:
-        words = "This file is not saved yet, so there is no folder beside it: save it, or choose a folder."
+        words = "Until this file is saved, frames go to a temporary folder."
         text.sentences(layout, context, words, icon="INFO")
     if missing_modules():
         text.sentences(layout, context, "Rendered by the Python that simulates (see Preferences).", icon="INFO")
@@ -125,11 +123,9 @@ class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
         matched.prop(rendering, "grain")
         matched.prop(rendering, "match_sharpness")
         column.column(heading="Floor").prop(rendering, "reflections")
-        column.prop(rendering, "f_number")
-        if rendering.f_number:
-            column.prop(rendering, "focus_distance")
-            if not rendering.focus_distance:
-                text.sentences(column, context, "Focus 0: each object is in focus at rest.")
+        optional(column, rendering, "blurs_depth", "f_number", "F-Number")
+        if rendering.blurs_depth:
+            optional(column, rendering, "own_focus", "focus_distance", "Focus")
         text.sentences(column, context, "Frame 1 always equals the photo.")
 
 

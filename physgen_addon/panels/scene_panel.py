@@ -10,7 +10,7 @@ import bpy
 from .. import text
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
-from ..operators.photo_ops import PHYSGEN_OT_open_photo
+from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, image_here
 from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
@@ -39,13 +39,18 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
             _draw_beginning(layout, context)
             return
         what = text.count(len(found), "object")
-        text.sentences(layout, context, f"{what} in the simulation, without a photo.", icon="CHECKMARK")
+        text.sentences(layout, context, f"{what}, without a photo.", icon="CHECKMARK")
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo", icon="IMAGE_DATA")
         row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import", icon="IMPORT")
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    image = image_here(context)
+    if image is not None:
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator(PHYSGEN_OT_use_image.bl_idname, text=f"Start from {image.name}", icon="IMAGE_DATA")
     text.sentences(layout, context, "Objects that fall, bounce, deform and flow. Start with one of these:")
     for title, operator, label, icon in (
         ("Meshes: select some in the viewport", PHYSGEN_OT_add_bodies, "Simulate Selected", "PHYSICS"),

@@ -49,6 +49,15 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
     return column
 
 
+def optional(layout: bpy.types.UILayout, data: Any, switched_by: str, value: str, heading: str) -> None:
+    """Draw the checkbox ``switched_by`` and, beside it, the number ``value``, which counts while that is on."""
+    row = layout.row(heading=heading, align=True)
+    row.prop(data, switched_by, text="")
+    field = row.row(align=True)
+    field.enabled = getattr(data, switched_by)
+    field.prop(data, value, text="")
+
+
 def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Context, surface: Any) -> None:
     """Draw the effective static friction where ``surface`` (a body or the world) has less than sliding friction."""
     if surface.static_friction < surface.friction:

@@ -40,7 +40,6 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         row.operator(PHYSGEN_OT_frames_from_scene.bl_idname, text="", icon="TIME")
         frames.prop(simulation, "frame_end", text="To")
         column.prop(simulation, "slow")
-        column.prop(simulation, "device")
         _draw_length(layout, context, simulation)
         lacking = _lacking(scene)
         if not lacking:
@@ -142,20 +141,21 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
 
 
 class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
-    """Location of the bakes"""
+    """Location of the bakes, and what computes them"""
 
     bl_parent_id = "PHYSGEN_PT_simulate"
-    bl_label = "Cache"
+    bl_label = "Cache and Device"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw folder, seed, and relinking of lost bakes."""
+        """Draw folder, device, seed, and relinking of lost bakes."""
         layout, simulation = self.layout, context.scene.physgen.simulation
         column = settings(layout, context)
         column.prop(simulation, "cache", text="Folder")
         if simulation.cache.startswith("//") and not bpy.data.filepath:
             words = "Until this file is saved, bakes wait in a temporary folder."
             text.sentences(column, context, words, icon="INFO")
+        column.prop(simulation, "device")
         column.prop(simulation, "seed")
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find Lost", icon="FILE_FOLDER")

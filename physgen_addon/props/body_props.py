@@ -15,7 +15,7 @@ from mathutils import Vector
 
 from ...sim.scene.model import Ground, SceneObject
 from ..playback import splats
-from .generated_properties import from_field
+from .generated_properties import from_field, switch
 from .material_props import PHYSGEN_PG_material
 
 
@@ -85,6 +85,20 @@ def _show_splats(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
     splats.show_as(self.id_data, self.splats_as)
 
 
+SURFACES = [
+    ("GROUND", "The Ground's", "Friction and bounce are the ground's (World > Ground)"),
+    ("OWN", "Own", "Friction and bounce of its own"),
+]
+
+
+def _get_surface(self: "PHYSGEN_PG_body") -> int:
+    return int(self.own_surface)
+
+
+def _set_surface(self: "PHYSGEN_PG_body", number: int) -> None:
+    self.own_surface = bool(number)
+
+
 class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     """Simulation properties of an object; ``Object.physgen``."""
 
@@ -116,10 +130,19 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         min=0.0,
         soft_max=0.1,
     )
+    own_wall: switch("shell_thickness", "Own Wall", "Choose its thickness; off: the thinnest that is resolved", 0.01)
     sandy: BoolProperty(name="Turns to Sand", description="Turn the object into sand")
     sandy_frame: IntProperty(name="From Frame", description="First frame as sand", default=1, min=0, soft_max=250)
 
     own_surface: BoolProperty(name="Own Surface", description="Use own friction and bounce instead of the ground's")
+    surface: EnumProperty(
+        name="Friction and Bounce",
+        description="Whose friction and bounce count",
+        items=SURFACES,
+        get=_get_surface,
+        set=_set_surface,
+    )
+    """Shows ``own_surface``."""
     contact_mode: from_field(
         SceneObject,
         "contact_mode",
@@ -167,8 +190,9 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         SceneObject,
         "spin",
         "Spin",
-        "Initial angular velocity in radians a second about the centre of mass; one turn a second is 6.28",
-        subtype="XYZ",
+        "Initial angular velocity about the centre of mass, an angle per second: 360° is one turn a second",
+        subtype="EULER",
+        unit="ROTATION",
         soft_min=-50.0,
         soft_max=50.0,
     )
@@ -179,6 +203,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         min=0,
         soft_max=250,
     )
+    waits: switch("start_frame", "Waits", "Starts at a frame of its own; off: with the simulation", 2)
     asleep: from_field(
         SceneObject,
         "asleep",

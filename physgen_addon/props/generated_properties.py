@@ -38,6 +38,22 @@ def from_field(kind: type, field: str, name: str, description: str = "", **argum
     return TYPES[_type(kind, field)](**(own | arguments))
 
 
+def switch(field: str, name: str, description: str, on: float) -> Any:
+    """Return a checkbox that is off where the number ``field`` of its group is 0, and sets it to ``on``.
+
+    Nothing is stored besides the number, of which 0 means "automatic" or "none".
+    """
+
+    def get(self: Any) -> bool:
+        return bool(getattr(self, field))
+
+    def put(self: Any, wanted: bool) -> None:
+        if wanted != get(self):
+            setattr(self, field, on if wanted else 0)
+
+    return BoolProperty(name=name, description=description, get=get, set=put)
+
+
 def _unscaled(value: Any) -> Any:
     return value
 

@@ -65,19 +65,28 @@ def find_preset(name: str) -> Material | None:
 def preset_items(chosen: str) -> list[tuple[str, str, str, str, int]]:
     """Return the menu's entries, numbered by position; ``chosen`` is included even if missing."""
     own = own_presets()
-    rows = [(name, name.capitalize(), _SHIPPED.descriptions[name], "NONE") for name in _SHIPPED.good]
+    rows = [(name, preset_title(name), _SHIPPED.descriptions[name], "NONE") for name in _SHIPPED.good]
     rows += [(name, name, own.descriptions[name] or "User preset", "USER") for name in own.good]
     # The colon is in no valid name, so that a broken file never stands in for a preset.
     rows += [(f"broken:{name}", f"{name} (broken)", f"Unusable: {why}", "ERROR") for name, why in own.broken.items()]
-    rows.append((CUSTOM, "Custom", "Custom values", "NONE"))
+    rows.append((CUSTOM, preset_title(CUSTOM), "Numbers of no preset, such as those that a photo's object got", "NONE"))
     if chosen not in (row[0] for row in rows):
         rows.append((chosen, f"{chosen} (missing)", "Not on this computer; the object keeps its values", "ERROR"))
     return [_items.setdefault((row[0], repr((row, index))), (*row, index)) for index, row in enumerate(rows)]
 
 
+TITLES = {
+    "hard": "Plastic (hard)",
+    "medium": "Rubber (medium)",
+    "soft": "Fabric (soft)",
+    CUSTOM: "Own Values",
+}
+"""Display names of presets whose own name says no material."""
+
+
 def preset_title(name: str) -> str:
     """Return the display name of the preset ``name``."""
-    return name.capitalize() if name in _SHIPPED.good or name == CUSTOM else name
+    return TITLES.get(name) or (name.capitalize() if name in _SHIPPED.good else name)
 
 
 def _summary(model: type) -> str:

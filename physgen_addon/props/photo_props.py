@@ -21,7 +21,7 @@ from ..context import redraw
 from ..paths import RELATIVE
 from ..photo.photo_consent import agree, forget, is_agreed
 from ..photo.photo_maths import USUAL_FOV, USUAL_PITCH
-from .generated_properties import from_field
+from .generated_properties import from_field, switch
 
 UP_ITEMS = [
     ("auto", "Automatic", "By file format and fit"),
@@ -64,6 +64,7 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         soft_max=2.0,
         precision=3,
     )
+    knows_size: switch("size_m", "Known Size", "Give the object's size; off: estimated from the photo", 0.15)
     kind: StringProperty(
         name="What It Is",
         description=(

@@ -11,7 +11,7 @@ from ...sim.validation import range_of
 from ..paths import RELATIVE
 from ..render.render_options import RenderOptions
 from ..text import decimal
-from .generated_properties import from_field, help_text
+from .generated_properties import from_field, help_text, switch
 
 LEAST_F_NUMBER = range_of(RenderOptions, "f_number")[0]
 """Of a real lens; 0 stands for none."""
@@ -61,7 +61,16 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         min=0,
         soft_max=256,
     )
-    scale: from_field(RenderOptions, "scale", "Size", min=0.05, soft_max=1.0)
+    own_samples: switch("samples", "Own Samples", "Choose the number of samples; off: the engine's usual one", 64)
+    scale: from_field(
+        RenderOptions,
+        "scale",
+        "Size",
+        "Share of the photo's resolution",
+        min=0.05,
+        soft_max=1.0,
+        subtype="FACTOR",
+    )
     format: EnumProperty(
         name="Format",
         description="Of the frames' files; each format needs an output folder of its own",
@@ -107,6 +116,10 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         precision=1,
         step=10,
         update=_on_f_number,
+    )
+    blurs_depth: switch("f_number", "Depth of Field", "Blur what is out of focus, as a lens does", 2.8)
+    own_focus: switch(
+        "focus_distance", "Own Focus", "Choose the plane of focus; off: each object is in focus at rest", 1.0
     )
     focus_distance: from_field(
         RenderOptions,

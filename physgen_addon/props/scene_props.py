@@ -148,6 +148,8 @@ class PHYSGEN_PG_simulation(bpy.types.PropertyGroup):
         "quality",
         "Quality",
         "Resolution of the simulation",
+        # A first bake is to be seen at once; the command line's own default is for what is kept.
+        default="preview",
         items=[
             ("preview", "Preview", "Takes seconds: to judge a motion"),
             ("standard", "Standard", "For most scenes on a laptop"),

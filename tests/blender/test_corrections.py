@@ -328,6 +328,8 @@ def test_manual_changes_survive_a_new_reconstruction(world, tmp_path):
 def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
     kept = {name for names in import_physics.OF_BODY for name in names}
     others = {"rna_type", "name", "enabled", "source", "cache", "material", "speed", "pins", "pin_index", "original"}
+    # Ways to show and set the number or the choice that is kept.
+    others |= {"surface", "own_wall", "waits"}
     assert set(PHYSGEN_PG_body.bl_rna.properties.keys()) == kept | others
     kept = {name for names in import_physics.OF_MATERIAL for name in names}
     assert set(PHYSGEN_PG_material.bl_rna.properties.keys()) == kept | {"rna_type", "name", "preset"}

@@ -4,6 +4,7 @@
 import dataclasses
 import inspect
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from physgen import physgen_addon
 from physgen.batch.blender_script import add_script_options
 from physgen.batch.commands.render_commands import render_options
 from physgen.batch.render import build_parser
-from physgen.physgen_addon import interpreter, text
+from physgen.physgen_addon import interpreter, paths, text
 from physgen.physgen_addon.operators import render_ops
 from physgen.physgen_addon.panels.render_panel import RESULTS
 from physgen.physgen_addon.panels.sidebar import is_in
@@ -582,9 +583,7 @@ def test_rendering_reports_why_it_is_impossible(world, bake, tmp_path, monkeypat
     state.simulation.bake = str(tmp_path)
     with pytest.raises(RuntimeError, match="holds no bake"):
         bpy.ops.physgen.render_video()
-    state.simulation.bake, state.rendering.output = str(folder), "//out"
-    with pytest.raises(RuntimeError, match="not saved yet"):
-        bpy.ops.physgen.render_video()
+    state.simulation.bake = str(folder)
     state.rendering.output = str(tmp_path / "out")
     # With the light zip the Python that simulates renders.
     monkeypatch.setitem(interpreter.RENDERING, "no_such_module", "Something")
@@ -597,3 +596,49 @@ def test_the_command_is_of_this_blender():
     command = render_ops.render_command()
     assert command[1:] == [str(render_ops.SCRIPT)] and Path(command[0]).is_file()
     assert render_ops.SCRIPT.is_file()
+
+
+def test_frames_of_a_file_that_is_not_saved_go_where_its_bakes_wait(tmp_path):
+    rendering = bpy.context.scene.physgen.rendering
+    assert rendering.output.startswith("//") and not bpy.data.filepath
+    waiting = render_ops._output_folder(bpy.context.scene)
+    assert waiting.is_relative_to(paths.unsaved_root()) and paths.unsaved_root().is_dir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert render_ops._output_folder(bpy.context.scene) == tmp_path / "physgen_render"
+
+
+def test_a_switch_stands_for_a_number_that_is_not_zero():
+    rendering = bpy.context.scene.physgen.rendering
+    assert not rendering.blurs_depth and rendering.f_number == 0
+    rendering.blurs_depth = True
+    assert rendering.f_number == pytest.approx(2.8)
+    rendering.f_number = 4.0
+    rendering.blurs_depth = True
+    assert rendering.f_number == 4.0, "switching on what is on has changed the number"
+    rendering.blurs_depth = False
+    assert rendering.f_number == 0
+    body = a_body().physgen
+    assert body.surface == "GROUND"
+    body.surface = "OWN"
+    assert body.own_surface
+
+
+def test_popups_are_broken_into_lines_where_there_is_a_window(monkeypatch):
+    message = "a word and another " * 20 + "\n" + "x" * 200
+    assert text.popup(message) == message
+    monkeypatch.setattr(text, "bpy", SimpleNamespace(app=SimpleNamespace(background=False)))
+    lines = text.popup(message).splitlines()
+    assert max(map(len, lines)) <= text.POPUP and "".join(lines).replace(" ", "") == "".join(message.split())
+
+
+def test_a_photo_that_blender_made_an_empty_of_is_a_start(tmp_path):
+    image = bpy.data.images.new("dropped", 32, 24)
+    image.filepath_raw, image.file_format = str(tmp_path / "dropped.png"), "PNG"
+    image.save()
+    assert not bpy.ops.physgen.use_image.poll()
+    empty = bpy.data.objects.new("Empty", None)
+    empty.empty_display_type, empty.data = "IMAGE", bpy.data.images.load(str(tmp_path / "dropped.png"))
+    bpy.context.scene.collection.objects.link(empty)
+    select(empty)
+    assert bpy.ops.physgen.use_image() == {"FINISHED"}
+    assert bpy.context.scene.physgen_photo.path == str(tmp_path / "dropped.png") and empty.hide_get()

@@ -25,6 +25,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = "user_default"
+TOUR_SIZE = "1280x1000"
+"""Of the window of ``tour.py``: a laptop's."""
 FAULTS = ("Traceback (most recent call last)", "Error: Python", "ERROR (bpy.rna)", "EXCEPTION_ACCESS_VIOLATION")
 """What no log may hold: operators and panels report, they do not fall over."""
 
@@ -102,13 +104,15 @@ class Run:
         words["photo"] = str(self.options.photo.resolve()) if self.options.photo else ""
         words["only"] = self.options.only
         task.write_text(json.dumps(words), encoding="utf-8")
-        width, height = self.options.size.split("x")
-        window = ("--window-geometry", "0", "0", width, height)
-        with display(self.options.size) as screen:
-            script = ("--python-exit-code", "1", "-P", str(HERE / "work.py"), "--", str(task))
-            self.start("work", *window, *script, timeout=self.options.timeout, **screen)
-        self.require("work.json")
-        if self.options.only:
+        for name, size in (("tour", TOUR_SIZE), ("work", self.options.size)):
+            if self.options.script not in ("", name):
+                continue
+            window = ("--window-geometry", "0", "0", *size.split("x"))
+            with display(size) as screen:
+                script = ("--python-exit-code", "1", "-P", str(HERE / f"{name}.py"), "--", str(task))
+                self.start(name, *window, *script, timeout=self.options.timeout, **screen)
+            self.require(f"{name}.json")
+        if self.options.only or self.options.script == "tour":
             return
         # Another user, who has never heard of the extension.
         script = ("--python-exit-code", "1", "-P", str(HERE / "reopen.py"), "--", str(task))
@@ -140,8 +144,9 @@ def main() -> int:
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
     parser.add_argument("--photo", type=Path, help="photo to open and find objects in (default: one that is rendered)")
     parser.add_argument(
-        "--only", default="", help="steps of work.py, separated by commas; nothing is opened again then"
+        "--only", default="", help="steps of tour.py and work.py, by commas; nothing is opened again then"
     )
+    parser.add_argument("--script", default="", choices=["", "tour", "work"], help="only this one (default: both)")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds for the work inside Blender")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,14 +77,90 @@ def show_sidebar() -> Generator[float, None, None]:
     yield 0.5
 
 
-def shoot(folder: Path, name: str) -> Generator[float, None, None]:
+def xdotool(*words: object) -> None:
+    """Move the mouse or press keys, as the user of the window."""
+    subprocess.run(["xdotool", *map(str, words)], check=True)
+
+
+def drawn(times: int = 2) -> Generator[float, None, None]:
+    """Wait until Blender has handled what the X server sent, and has drawn that often: minutes where it is busy."""
+    seen: list[int] = []
+    handler = bpy.types.SpaceView3D.draw_handler_add(lambda: seen.append(1), (), "WINDOW", "POST_PIXEL")
+    try:
+        while len(seen) < times:
+            viewport().tag_redraw()
+            yield 0.1
+    finally:
+        bpy.types.SpaceView3D.draw_handler_remove(handler, "WINDOW")
+
+
+def middle() -> tuple[int, int]:
+    """The middle of the viewport, in pixels of the screen from its upper left corner."""
+    area = region(viewport(), "WINDOW")
+    return area.x + area.width // 2, window().y + window().height - (area.y + area.height // 2)
+
+
+def point(x: int, y: int) -> Generator[float, None, None]:
+    """Move the mouse there; Blender learns of it when it handles events."""
+    xdotool("mousemove", x - 3, y, "mousemove", x, y)
+    yield from drawn()
+
+
+def aim() -> None:
+    """Put the mouse into the middle of the viewport, where popups then open."""
+    xdotool("mousemove", *middle())
+
+
+def click(x: int, y: int) -> Generator[float, None, None]:
+    """One left click."""
+    yield from point(x, y)
+    xdotool("click", 1)
+    yield from drawn()
+
+
+def press(key: str) -> Generator[float, None, None]:
+    """One key, such as ``shift+p``."""
+    xdotool("key", key)
+    yield from drawn()
+
+
+def widen(width: int) -> Generator[float, None, None]:
+    """Drag the sidebar's edge until it is ``width`` px wide; nothing without xdotool, as no script can do it."""
+    if shutil.which("xdotool") is None:
+        return
+    for _ in range(3):
+        bar = region(viewport(), "UI")
+        if abs(bar.width - width) <= 1:
+            return
+        x, y = bar.x, window().y + window().height - (bar.y + bar.height // 2)
+        xdotool("mousemove", x - 20, y, "mousemove", x, y)
+        yield from drawn()
+        xdotool("mousedown", 1)
+        yield from drawn(2)
+        for share in (0.5, 1.0):
+            xdotool("mousemove", round(x - share * (width - bar.width)), y)
+            yield from drawn(2)
+        xdotool("mouseup", 1)
+        yield from drawn(2)
+
+
+def shoot(folder: Path, name: str, widths: Sequence[int] = (431, 292)) -> Generator[float, None, None]:
+    """Write ``NAME_WIDTH.png``, the sidebar alone, at each width, and ``NAME.png``, the window at the last."""
+    for width in widths:
+        yield from widen(width)
+        yield from _shoot(folder, name)
+        bar = folder / f"{name}_sidebar.png"
+        if bar.is_file():
+            bar.rename(folder / f"{name}_{width}.png")
+
+
+def _shoot(folder: Path, name: str) -> Generator[float, None, None]:
     """Write ``NAME.png``, the window, and ``NAME_sidebar.png``, the sidebar alone, as they look when all is drawn."""
     folder.mkdir(exist_ok=True)
     # Panels slide to their places over several drawings.
-    for _ in range(6):
-        for area in window().screen.areas:
-            area.tag_redraw()
-        yield 0.3
+    for area in window().screen.areas:
+        area.tag_redraw()
+    yield from drawn(4)
     path = folder / f"{name}.png"
     picture(window(), path)
     bar = region(viewport(), "UI")

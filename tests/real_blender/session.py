@@ -62,5 +62,7 @@ def run(name: str, steps: list[Callable[[], Step]]) -> None:
         return None
 
     bpy.context.preferences.view.show_splash = False
+    # Pictures are of panels; without a graphics card every smoothed line is the processor's work.
+    bpy.context.preferences.system.viewport_aa = "OFF"
     # Persistent: it outlives opening another file.
     bpy.app.timers.register(tick, first_interval=2.0, persistent=True)

@@ -59,7 +59,8 @@ def python_missing():
     try:
         bpy.ops.physgen.check_python()
     except RuntimeError as error:
-        assert "pip install" in str(error), error
+        assert "no Python" in str(error), error
+        assert "pip install" in preferences().check_command, preferences().check_command
     else:
         raise AssertionError("a Python that is not there was found")
     yield from screens.shoot_preferences(SCREENS, "2_preferences_trouble", TASK["addon"])

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender, with the extension as an artist finds it: nothing is opened beforehand, mouse and keys do the work.
+
+Every state of the panel is pictured at each width of the task, in a window of 1,000 px height; the clicks from the
+default cube to a playing bake, and from the sample photo to a still, are counted and timed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from pathlib import Path
+
+import bpy
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import screens
+import session
+
+TASK = session.task()
+OUT, SCREENS = Path(TASK["out"]), Path(TASK["out"]) / "tour"
+
+
+def extension(module: str):
+    """A module of the installed extension."""
+    return importlib.import_module(f"{TASK['addon']}.{module}")
+
+
+def running():
+    """The job that is running, or None."""
+    return extension("physgen_addon.background_jobs").running()
+
+
+def ended(what: str, seconds: float = 300):
+    """Wait until no job runs."""
+    yield from session.until(lambda: running() is None, seconds, what)
+
+
+def home():
+    """Blender's own start-up file, one large viewport, the tab in front."""
+    bpy.ops.wm.read_homefile(use_factory_startup=False)
+    yield 1.0
+    yield from screens.show_sidebar()
+
+
+def first_bake():
+    """Default cube to a playing bake by the pie menu: two clicks, three keys; pictures of the way."""
+    preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
+    preferences.python = TASK["python"]
+    yield from home()
+    yield from screens.shoot(SCREENS, "01_start")
+    x, y = screens.middle()
+    yield from screens.point(x, y)
+    began = time.monotonic()
+    yield from screens.press("shift+p")
+    screens.picture(screens.window(), SCREENS / "02_pie.png")
+    yield from screens.click(x - 130, y)
+    assert bpy.data.objects["Cube"].physgen.enabled, "the pie's left entry did not add the cube"
+    yield from screens.press("shift+p")
+    # The pie opens at the mouse.
+    yield from screens.click(x - 130, y - 110)
+    assert running() is not None, "the pie's upper entry did not bake"
+    until_playing = session.until(lambda: (running() is None) or (running().done or 0) > 1, 120, "the first frame")
+    yield from until_playing
+    first = time.monotonic() - began
+    yield from screens.shoot(SCREENS, "04_baking")
+    yield from ended("the bake")
+    whole = time.monotonic() - began
+    before = bpy.context.scene.frame_current
+    yield from screens.point(x, y)
+    yield from screens.press("space")
+    yield from session.until(lambda: bpy.context.scene.frame_current not in (before, before + 1), 30, "playing")
+    yield from screens.shoot(SCREENS, "05_playing")
+    yield from screens.press("Escape")
+    return {"clicks": 2, "keys": 3, "first_frame_s": round(first, 1), "baked_s": round(whole, 1)}
+
+
+def by_panel():
+    """One object added by the panel: is Bake in sight? Then changed, so that the bake is out of date; freed."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+    yield from screens.shoot(SCREENS, "03_one_object")
+    scene = bpy.context.scene
+    scene.physgen.simulation.quality, scene.physgen.simulation.frame_end = "preview", 12
+    with screens.focus():
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    yield from ended("the bake")
+    yield from screens.shoot(SCREENS, "06_baked")
+    bpy.data.objects["Cube"].physgen.material.density = 321.0
+    yield 1.5
+    yield from screens.shoot(SCREENS, "07_stale")
+
+
+def refused():
+    """What cannot be baked, and a worker that cannot simulate: the popup and the panel."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.mesh.primitive_plane_add(size=1)
+        bpy.ops.object.select_all(action="SELECT")
+        bpy.ops.physgen.add_bodies("INVOKE_DEFAULT")
+    yield from screens.shoot(SCREENS, "08_refused_added")
+    with screens.focus():
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    yield 0.5
+    yield from ended("the refusal")
+    yield from screens.shoot(SCREENS, "09_refused_bake")
+    yield from home()
+    preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
+    preferences.python = "/usr/bin/python3"
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    yield from ended("the failure")
+    yield 0.5
+    yield from screens.shoot(SCREENS, "10_failed")
+    screens.aim()
+    with screens.focus():
+        bpy.ops.physgen.install_python("INVOKE_DEFAULT")
+    yield 0.7
+    screens.picture(screens.window(), SCREENS / "11_install.png")
+    yield from screens.press("Escape")
+    preferences.python = TASK["python"]
+
+
+def menus():
+    """Quick Effects, Object > PhysGen, the pie menu and Properties > Physics, with one object."""
+    yield from home()
+    for number, name in enumerate(("VIEW3D_MT_object_quick_effects", "PHYSGEN_MT_object")):
+        yield from screens.point(*screens.middle())
+        with screens.focus():
+            bpy.ops.wm.call_menu(name=name)
+        yield 0.6
+        screens.picture(screens.window(), SCREENS / f"12_menu_{number + 1}.png")
+        yield from screens.press("Escape")
+    with screens.focus():
+        bpy.ops.physgen.quick_jelly()
+    bpy.ops.screen.back_to_previous()
+    yield 0.5
+    area = next(area for area in screens.window().screen.areas if area.type == "PROPERTIES")
+    area.spaces.active.context = "PHYSICS"
+    yield 1.0
+    screens.picture(screens.window(), SCREENS / "13_physics_tab.png")
+
+
+def sample_meshes():
+    """The sample of meshes, as opened, baking and baked."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.physgen.open_sample(sample="MESHES")
+    yield from screens.shoot(SCREENS, "14_sample_meshes")
+    with screens.focus():
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    yield from session.until(lambda: running() is None or (running().done or 0) > 6, 200, "some frames")
+    yield from screens.shoot(SCREENS, "15_sample_baking")
+    yield from ended("the bake")
+    bpy.context.scene.frame_set(14)
+    yield from screens.shoot(SCREENS, "16_sample_baked")
+
+
+def sample_photo():
+    """The sample photo to a still: opened, reconstructed, baked, rendered."""
+    yield from home()
+    began = time.monotonic()
+    with screens.focus():
+        bpy.ops.physgen.open_sample(sample="PHOTO")
+    yield 1.0
+    yield from screens.shoot(SCREENS, "17_photo_opened")
+    with screens.focus():
+        assert bpy.ops.physgen.reconstruct("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield 2.0
+    yield from screens.shoot(SCREENS, "18_reconstructing")
+    yield from ended("the reconstruction")
+    yield from screens.shoot(SCREENS, "19_reconstructed")
+    with screens.focus():
+        assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from ended("the bake", 400)
+    bpy.context.scene.frame_set(9)
+    yield from screens.shoot(SCREENS, "20_photo_baked")
+    windows = set(bpy.context.window_manager.windows)
+    with screens.focus():
+        assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield 2.0
+    yield from screens.shoot(SCREENS, "21_rendering")
+    yield from ended("the still", 400)
+    took = time.monotonic() - began
+    yield 1.0
+    for shown in set(bpy.context.window_manager.windows) - windows:
+        screens.picture(shown, SCREENS / "22_still.png")
+        with bpy.context.temp_override(window=shown):
+            bpy.ops.wm.window_close()
+    yield 0.5
+    yield from screens.shoot(SCREENS, "23_rendered")
+    return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
+
+
+STEPS = [first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
+session.run("tour", [step for step in STEPS if not TASK["only"] or step.__name__ in TASK["only"].split(",")])
