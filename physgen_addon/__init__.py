@@ -36,6 +36,7 @@ MODULES = (
     "operators.sample_ops",
     "operators.quick_ops",
     "gizmos",
+    "cache_bar",
     "handlers",
     "panels.photo_panel",
     "panels.scene_panel",

@@ -235,6 +235,7 @@ class JobOperator(OperatorMixin):
         # Sidebars show the progress, some of them in image editors.
         redraw("VIEW_3D", "UI")
         redraw("IMAGE_EDITOR", "UI")
+        redraw("DOPESHEET_EDITOR", "WINDOW")
         if result is None:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)

@@ -38,7 +38,7 @@ class BakeState:
     status: ``none``, ``baking``, ``paused`` (incomplete), ``baked``, ``stale`` (of an earlier state of the scene) or
     ``missing`` (files deleted or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the scene.
     trouble: the last error; advice: state and remedy in words. estimate_text: estimated cost of baking; empty if
-    unknown.
+    unknown. frame_start: of the bake that is shown, or would be made. bakes: all that are on the disk, newest first.
     """
 
     status: str = "none"
@@ -48,6 +48,8 @@ class BakeState:
     trouble: str = ""
     advice: str = ""
     estimate_text: str = ""
+    frame_start: int = 1
+    bakes: tuple[bake_record.BakeOnDisk, ...] = ()
 
     @property
     def message(self) -> str:
@@ -192,6 +194,8 @@ def observe(scene: bpy.types.Scene) -> BakeState:
     found = replace(
         found,
         disk_bytes=sum(bake_record.disk_bytes(cache) for cache in caches_of(scene)),
+        frame_start=_first_frame(scene),
+        bakes=tuple(bake for cache in caches_of(scene) for bake in bake_record.bakes_on_disk(cache)),
         estimate_text=simulation.estimate
         if simulation.estimate and simulation.estimate_of == _fingerprint(scene)[0]
         else "",
@@ -202,6 +206,11 @@ def observe(scene: bpy.types.Scene) -> BakeState:
         # Changes without further notice: a killed worker leaves a child process that ends a moment later.
         mark_progress(scene)
     return found
+
+
+def _first_frame(scene: bpy.types.Scene) -> int:
+    shown = None if bake_job(scene) is not None else shown_record(scene)
+    return scene.physgen.simulation.frame_start if shown is None else shown.frame_start
 
 
 def _fingerprint(scene: bpy.types.Scene) -> tuple[str, str]:

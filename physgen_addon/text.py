@@ -112,6 +112,16 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
+def age(seconds: float) -> str:
+    """Return an age such as ``just now``, ``5 min ago``, ``3 h ago``, ``2 days ago``."""
+    if seconds < 60:
+        return "just now"
+    for unit, size, most in (("min", 60, 60), ("h", 3600, 48)):
+        if seconds < most * size:
+            return f"{seconds / size:.0f} {unit} ago"
+    return f"{seconds / 86400:.0f} days ago"
+
+
 def length(metres: float) -> str:
     """Return a length such as ``1.2 mm`` or ``34 cm``; a dash if unknown (below zero)."""
     if not math.isfinite(metres) or metres < 0:

@@ -346,6 +346,32 @@ class PHYSGEN_OT_free_old_bakes(_CacheOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class PHYSGEN_OT_free_one_bake(_CacheOperator, bpy.types.Operator):
+    """Delete this bake from the disk. Undo cannot restore it"""
+
+    bl_idname = "physgen.free_one_bake"
+    bl_label = "Free This Bake"
+
+    folder: bpy.props.StringProperty(description="Folder of the bake", options={"HIDDEN", "SKIP_SAVE"})
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Delete it; the one that is shown leaves the scene first."""
+        scene = context.scene
+        known = [record for cache in bake_state.caches_of(scene) for record in bake_record.records(cache)]
+        record = next((record for record in known if record.folder == self.folder), None)
+        if record is None:
+            raise InputError(f"{self.folder}: is no bake of this scene")
+        if bake_state.shows(scene, record.path):
+            return set(bpy.ops.physgen.free_bake())
+        if used_elsewhere(scene, record.path):
+            raise InputError(f"{record.path}: another scene or file plays it; free it there")
+        freed = delete(record.path)
+        bake_state.observe(scene)
+        self.report({"INFO"}, f"The bake is deleted; {storage(freed)}")
+        return {"FINISHED"}
+
+
 class PHYSGEN_OT_relink_caches(_CacheOperator, bpy.types.Operator):
     """Choose the folder of the moved bakes: the cache folder, one of its scenes, or the bake itself"""
 

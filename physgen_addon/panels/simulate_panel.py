@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
+
 import bpy
 
 from .. import text
 from ..background_jobs import PHYSGEN_OT_cancel_job, running
-from ..bake_state import BakeState, state
+from ..bake_state import BakeState, shows, state
 from ..operators.bake_ops import (
     PHYSGEN_OT_bake,
     PHYSGEN_OT_estimate_bake,
     PHYSGEN_OT_free_bake,
     PHYSGEN_OT_free_old_bakes,
+    PHYSGEN_OT_free_one_bake,
     PHYSGEN_OT_pause_bake,
     PHYSGEN_OT_relink_caches,
 )
@@ -140,6 +144,29 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     row.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free", icon="TRASH")
 
 
+LISTED = 8
+"""Bakes in the list; *Free Old* deletes the others without listing them."""
+
+
+def _draw_bakes(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw every bake of the scene: frames, size, age, whose it is, and a button that frees it."""
+    scene = context.scene
+    found = state(scene).bakes
+    column = layout.column(align=True)
+    for bake in found[:LISTED]:
+        shown = shows(scene, Path(bake.folder))
+        row = column.row(align=True)
+        frames = f"{bake.frames}" if bake.frames_done == bake.frames else f"{bake.frames_done} of {bake.frames}"
+        age = text.age(time.time() - bake.written)
+        row.label(text=f"{frames} frames, {text.storage(bake.size)}, {age}", icon="PLAY" if shown else "FILE_CACHE")
+        row.operator(PHYSGEN_OT_free_one_bake.bl_idname, text="", icon="TRASH", emboss=False).folder = bake.folder
+        others = [Path(name).name for name in bake.files if name != bpy.data.filepath]
+        if others:
+            text.sentences(column, context, f"also of {', '.join(others[:3])}", icon="FILE_BLEND")
+    if len(found) > LISTED:
+        column.label(text=f"and {len(found) - LISTED} more", icon="BLANK1")
+
+
 class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
     """Location of the bakes, and what computes them"""
 
@@ -157,6 +184,7 @@ class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
             text.sentences(column, context, words, icon="INFO")
         column.prop(simulation, "device")
         column.prop(simulation, "seed")
+        _draw_bakes(layout, context)
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_relink_caches.bl_idname, text="Find Lost", icon="FILE_FOLDER")
         row.operator(PHYSGEN_OT_free_old_bakes.bl_idname, text="Free Old", icon="TRASH")

@@ -9,6 +9,7 @@ without bpy, in the job's thread.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import threading
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...sim.atomic import write_json
 from ...sim.cache.bake_check import damage_of
-from ...sim.cache.bake_folder import BakeManifest, load_manifest
+from ...sim.cache.bake_folder import MANIFEST_FILE, BakeManifest, load_manifest
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
 from ...sim.validation import parse, read_json, to_json
@@ -257,10 +258,50 @@ def matching(cache: Path, fingerprint: str) -> BakeRecord | None:
     return max(found, key=lambda record: playable(record.path), default=None)
 
 
+@dataclass(frozen=True, kw_only=True)
+class BakeOnDisk:
+    """A bake of a scene cache as listed in the panel.
+
+    frames_done of frames can be played; size in bytes with all its files; written: seconds since 1970, of its manifest;
+    files: .blend files that showed it when they were saved and still exist.
+    """
+
+    folder: str
+    frames_done: int
+    frames: int
+    size: int
+    written: float
+    files: tuple[str, ...] = ()
+
+
+def bakes_on_disk(cache: Path) -> list[BakeOnDisk]:
+    """Return what lies in the scene cache ``cache``, newest first."""
+    found = []
+    for record in records(cache):
+        manifest = manifest_of(record.path)
+        with contextlib.suppress(OSError):
+            written = (record.path / MANIFEST_FILE).stat().st_mtime
+            if manifest is not None:
+                bake = BakeOnDisk(
+                    folder=record.folder,
+                    frames_done=playable(record.path),
+                    frames=manifest.frames,
+                    size=_bytes_in(record.path),
+                    written=written,
+                    files=tuple(str(path) for path in other_files(record, None)),
+                )
+                found.append(bake)
+    return sorted(found, key=lambda bake: -bake.written)
+
+
 def disk_bytes(cache: Path) -> int:
     """Return the size of all bakes in the scene cache ``cache``."""
+    return _bytes_in(cache / BAKES)
+
+
+def _bytes_in(folder: Path) -> int:
     total = 0
-    for path in (cache / BAKES).rglob("*"):
+    for path in folder.rglob("*"):
         try:
             total += path.stat().st_size if path.is_file() else 0
         except OSError:

@@ -15,8 +15,9 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from mathutils import Matrix
-from physgen.physgen_addon import background_jobs, bake_state, paths
+from physgen.physgen_addon import background_jobs, bake_state, cache_bar, paths
 from physgen.physgen_addon import bake_state as unsaved
+from physgen.physgen_addon.bake_state import BakeState
 from physgen.physgen_addon.operators.bake_ops import Bake
 from physgen.physgen_addon.playback import bake_record, point_caches, show_bake
 from physgen.sim.cache.bake_folder import load_manifest
@@ -283,6 +284,43 @@ def test_freeing_old_bakes_keeps_the_one_that_is_shown(file):
     other = another_bake(folder)
     assert bpy.ops.physgen.free_old_bakes() == {"FINISHED"}
     assert not other.exists() and status() == "baked"
+
+
+def test_each_bake_is_listed_and_freed_by_itself(file):
+    folder = paths.absolute(scene().physgen.simulation.bake)
+    other = another_bake(folder)
+    listed = bake_state.observe(scene()).bakes
+    assert {bake.folder for bake in listed} == {str(folder), str(other)}
+    assert all(bake.frames_done == bake.frames == FRAMES and bake.size > 8 * 12 * FRAMES for bake in listed)
+    assert sum(bake.size for bake in listed) <= bake_state.state(scene()).disk_bytes
+    assert bpy.ops.physgen.free_one_bake(folder=str(other)) == {"FINISHED"}
+    assert not other.exists() and status() == "baked"
+    with pytest.raises(RuntimeError, match="is no bake of this scene"):
+        bpy.ops.physgen.free_one_bake(folder=str(file))
+    assert bpy.ops.physgen.free_one_bake(folder=str(folder)) == {"FINISHED"}
+    assert not folder.exists() and status() == "none" and file.is_dir()
+
+
+def test_the_timeline_shows_which_frames_are_cached(file):
+    (span,) = cache_bar.spans(bake_state.state(scene()))
+    assert span[:2] == (START - 0.5, START + FRAMES - 0.5) and span[2] == cache_bar.COLOURS["baked"]
+    bpy.data.objects["Cube"].physgen.material.density *= 2
+    (span,) = cache_bar.spans(bake_state.observe(scene()))
+    assert span[2] == cache_bar.COLOURS["stale"]
+    half = BakeState("paused", 2, 6, frame_start=10)
+    assert [part[:2] for part in cache_bar.spans(half)] == [(9.5, 11.5), (11.5, 15.5)]
+    assert cache_bar.spans(None) == [] == cache_bar.spans(BakeState("none", 0, 6))
+
+
+def test_a_first_bake_ends_playback_unless_an_animation_goes_on(baked, file):
+    # Of a file whose timeline had Blender's 250 frames.
+    assert scene().frame_end == START + FRAMES - 1
+    assert bpy.ops.physgen.free_bake() == {"FINISHED"}
+    scene().frame_end = 250
+    item = bpy.data.objects.new("moving", None)
+    item.keyframe_insert("location", frame=100)
+    assert bpy.ops.physgen.bake("EXEC_DEFAULT") == {"FINISHED"}
+    assert scene().frame_end == 250
 
 
 def test_two_scenes_of_a_file_keep_to_themselves(file):
