@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.rigid import fit_rigid
-from physgen.sim.diagnose.rigid.observed_poses import as_matrix, perturbed, state_difference
+from physgen.sim.diagnose.rigid.observed_poses import as_matrix, observe_body, perturbed, state_difference
 from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
 from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
@@ -169,6 +169,28 @@ def test_values_are_what_the_effect_takes(name):
     setting = freedom.change(scene, scene.base, z)
     assert effect(name).checked(freedom.values(scene, setting, z))
     assert np.isfinite(scene.numbers([setting])).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_a_pose_is_judged_by_moments_as_by_every_point(count):
+    """Sums over the points of a frame, of which some are not seen, replace the points."""
+    rng = np.random.default_rng(count)
+    rest = rng.normal(0.0, 0.05, (count, 3))
+    points = np.array([0.3, -1.0, 2.0]) + rng.normal(0.0, 0.05, (6, count, 3))
+    points[3, 0], points[4] = np.nan, np.nan
+    times, index = np.arange(6) / 60.0, np.zeros(count, np.int64)
+    trial = Trial(name="a", role="fit", times=times, points=points, pixels=None, object_index=index, rest_points=rest)
+    seen = observe_body(scene_of(sphere(), [trial], sigma=2e-3).capture, trial, 0, np.zeros(3))
+    turns = rng.normal(size=(6, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    places = rng.normal(0.0, 0.3, (6, 3))
+    gap, slope = seen.residuals(places, turns, np.arange(6))
+    gap, slope = gap.reshape(6, -1), slope.reshape(6, -1, 6)
+    chi2, down, info = seen.information(places, turns, np.arange(6))
+    assert chi2 == pytest.approx(np.sum(gap**2, axis=1), rel=1e-9)
+    assert down == pytest.approx(np.einsum("frp,fr->fp", slope, gap), rel=1e-9, abs=1e-6)
+    assert info == pytest.approx(np.einsum("frp,frq->fpq", slope, slope), rel=1e-9, abs=1e-6)
+    assert chi2[4] == 0 and not info[4].any()
 
 
 def test_an_offset_centre_moves_the_centre_of_mass():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,9 +21,14 @@ Array = NDArray[np.float64]
 
 def multiply(p: Array, q: Array) -> Array:
     """Return the rotation by ``q``, then by ``p``."""
-    w, v = p[..., :1], p[..., 1:]
-    a, b = q[..., :1], q[..., 1:]
-    return np.concatenate([w * a - np.sum(v * b, axis=-1, keepdims=True), w * b + a * v + np.cross(v, b)], axis=-1)
+    out = np.empty(np.broadcast_shapes(p.shape, q.shape))
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out[..., 0] = a * w - b * x - c * y - d * z
+    out[..., 1] = a * x + b * w + c * z - d * y
+    out[..., 2] = a * y - b * z + c * w + d * x
+    out[..., 3] = a * z + b * y - c * x + d * w
+    return out
 
 
 def conjugate(q: Array) -> Array:
@@ -46,20 +52,20 @@ def as_rotvec(q: Array) -> Array:
 
 def as_matrix(q: Array) -> Array:
     """Return rotation matrices (..., 3, 3)."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out = np.empty((*q.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return out
 
 
 def skew(v: Array) -> Array:
     """Return cross product matrices (..., 3, 3) of ``v``."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([np.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+    out = np.zeros((*v.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -v[..., 0], -v[..., 1], -v[..., 2]
+    return out
 
 
 def perturbed(states: Array, change: Array) -> Array:
@@ -152,11 +158,87 @@ class ObservedBody:
 
     def information(self, x: Array, q: Array, frames: NDArray[np.int64]) -> tuple[Array, Array, Array]:
         """Return chi² (F,), its descent direction (F, 6) and the information matrix of the pose (F, 6, 6)."""
+        if self.camera is None:
+            return points_information(self.moments.at(frames), x, q)
         gap, slope = self.residuals(x, q, frames)
         size = gap.shape[0]
         gap, slope = gap.reshape(size, -1), slope.reshape(size, -1, 6)
         turned = slope.swapaxes(1, 2)
         return np.sum(gap**2, axis=1), (turned @ gap[..., None])[..., 0], turned @ slope
+
+    @cached_property
+    def moments(self) -> PointMoments:
+        """Return the sums over seen points of every frame; of points only."""
+        there = np.isfinite(self.seen).all(axis=-1)
+        count = there.sum(axis=1).astype(np.float64)
+        share = there / np.maximum(count, 1.0)[:, None]
+        seen = np.where(there[..., None], self.seen, 0.0)
+        middle, center = np.einsum("fk,fki->fi", share, seen), share @ self.places
+        off = np.where(there[..., None], seen - middle[:, None], 0.0)
+        lever = np.where(there[..., None], self.places - center[:, None], 0.0)
+        weight = 1.0 / self.sigma**2
+        return PointMoments(
+            count=weight * count,
+            middle=middle,
+            center=center,
+            square=weight * np.sum(off**2, axis=(1, 2)),
+            both=weight * np.einsum("fki,fkj->fij", lever, off),
+            spread=weight * np.einsum("fki,fkj->fij", lever, lever),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointMoments:
+    """What chi² of a pose needs of F frames' points: weighted by 1/sigma², about their means.
+
+    count: (F,) points seen. middle: (F, 3) m, mean seen. center: (F, 3) m, mean place, body axes. square: (F,) sum of
+    squared distances seen. both, spread: (F, 3, 3) sums of place times seen, and of place times place.
+    """
+
+    count: Array
+    middle: Array
+    center: Array
+    square: Array
+    both: Array
+    spread: Array
+
+    def at(self, frames: NDArray[np.int64] | slice) -> PointMoments:
+        """Return those of ``frames``."""
+        return PointMoments(**{f.name: getattr(self, f.name)[frames] for f in dataclasses.fields(self)})
+
+    @staticmethod
+    def joined(parts: list[PointMoments]) -> PointMoments:
+        """Return those of all frames of ``parts``."""
+        names = [f.name for f in dataclasses.fields(PointMoments)]
+        return PointMoments(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+
+
+def points_information(seen: PointMoments, x: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Return what ``ObservedBody.information`` does, from the moments of its points instead of every single one.
+
+    With the distance d of the means, lever l and rotation R, the sums over points of |g|², g, l × g and of the levers'
+    products are functions of the moments.
+    """
+    turn = as_matrix(q)
+    lever = (turn @ seen.center[..., None])[..., 0]
+    off = seen.middle - x - lever
+    both = turn @ seen.both
+    trace = np.trace(seen.spread, axis1=1, axis2=2)
+    chi2 = seen.count * np.sum(off**2, axis=1) + seen.square + trace - 2 * np.trace(both, axis1=1, axis2=2)
+    slope = np.empty((len(x), 6))
+    slope[:, :3] = seen.count[:, None] * off
+    around = seen.count[:, None] * np.cross(lever, off)
+    around += np.stack([both[:, i, j] - both[:, j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+    slope[:, 3:] = around
+    info = np.zeros((len(x), 6, 6))
+    info[:, [0, 1, 2], [0, 1, 2]] = seen.count[:, None]
+    arm = seen.count[:, None, None] * skew(lever)
+    info[:, :3, 3:], info[:, 3:, :3] = -arm, arm
+    size = seen.count * np.sum(lever**2, axis=1) + trace
+    info[:, 3:, 3:] = -(seen.count[:, None, None] * lever[:, :, None] * lever[:, None, :])
+    info[:, 3:, 3:] -= turn @ seen.spread @ turn.swapaxes(1, 2)
+    info[:, [3, 4, 5], [3, 4, 5]] += size[:, None]
+    return np.maximum(chi2, 0.0), slope, info
 
 
 def observe_body(capture: Capture, trial: Trial, index: int, center: Array) -> ObservedBody:

@@ -8,9 +8,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from .multiple_shooting import Fit, Model, solve
+from .multiple_shooting import Fit, solve
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, CandidateEffect
-from .rigid_search import FOLLOWED_GAIN, FOLLOWED_MISFIT, BodyFits, begin_search, finish, followed, keep, misfit
+from .rigid_search import (
+    BEHIND,
+    BEHIND_SHARE,
+    FOLLOWED_GAIN,
+    FOLLOWED_MISFIT,
+    BodyFits,
+    begin_search,
+    finish,
+    followed,
+    keep,
+    misfit,
+)
+from .shooting_problem import Model
 
 BASES = 3
 """Single effects from which pairs start."""
@@ -65,6 +77,7 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     others = wanted if leaves_structure(bases[0][1]) else hidden
     tried: list[tuple[str, str]] = []
     for name, fit in bases:
+        begun: list[tuple[str, str]] = []
         for other in others:
             same = name == other.name or {name, other.name} in ONE_TRACE
             if same or (name, other.name) in body.fits or (other.name, name) in body.fits:
@@ -73,9 +86,16 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
                 body.work.skip((name, other.name), "tried")
                 continue
             begin_search(body, (CANDIDATE_EFFECTS[name], other), fit)
-            tried.append((name, other.name))
+            begun.append((name, other.name))
+        tried += begun
+        if begun and _explains(body, max(begun, key=lambda key: body.fits[key].evidence)):
+            # Where this pair leaves no structure, another base has nothing to explain better.
+            break
     ranked = sorted(tried, key=lambda key: -body.fits[key].evidence)[:PAIRS_FINISHED]
     for key in ranked:
+        best = max(body.fits[k].evidence for k in tried)
+        if _far_behind(body.fits[key].evidence, best, bases[0][1].evidence):
+            continue
         if body.work.left():
             finish(body, key)
         else:
@@ -83,11 +103,21 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     _refine(body, sorted(ranked, key=lambda key: -body.fits[key].evidence)[:PAIRS_REFINED], bases[0][1].evidence)
 
 
+def _far_behind(evidence: float, best: float, single: float) -> bool:
+    """Return whether a pair of ``evidence`` cannot become the ``best`` one, which gains on the best ``single``."""
+    return evidence < best - max(BEHIND, BEHIND_SHARE * (best - single))
+
+
+def _explains(body: BodyFits, key: tuple[str, str]) -> bool:
+    """Return whether the pair ``key``, fitted to convergence, leaves no structure."""
+    return body.work.left() and not leaves_structure(finish(body, key))
+
+
 def _refine(body: BodyFits, keys: list[tuple[str, str]], single: float) -> None:
     """Refine the pairs ``keys``, best first, with their own Jacobians; follow the best through its own contacts."""
     for number, key in enumerate(keys):
         fit = body.fits[key]
-        if fit.evidence < single + BASE_GAIN:
+        if fit.evidence < single + BASE_GAIN or _far_behind(fit.evidence, body.fits[keys[0]].evidence, single):
             continue
         if not body.work.left():
             body.work.skip(key, "refined")

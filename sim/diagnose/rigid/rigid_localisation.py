@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
-from .multiple_shooting import Fit, Model, Problem, Segment, SegmentedTrial
+from .multiple_shooting import Fit
 from .observed_poses import as_matrix, project
 from .rigid_candidates import BELIEFS, WorldSettings
 from .rigid_prediction import world_points
+from .shooting_problem import Model, Problem, Segment, SegmentedTrial
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture_geometry import mean_known
-from .multiple_shooting import Fit, Model, Problem, SegmentedTrial, solve
+from .multiple_shooting import Fit, solve
 from .observed_poses import as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
+from .shooting_problem import Model, Problem, SegmentedTrial
 from .state_tracking import fit_states
 
 Array = NDArray[np.float64]

@@ -14,19 +14,11 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..work import Work
-from .multiple_shooting import (
-    CONTACT_DEGREES_OF_FREEDOM,
-    Evaluation,
-    Fit,
-    Model,
-    Problem,
-    Segment,
-    SegmentedTrial,
-    solve,
-)
+from .multiple_shooting import Fit, solve
 from .observed_poses import frame_pose, observe_body
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings, tether_numbers
 from .rigid_simulator import RigidWorlds, rigid_body
+from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem, Segment, SegmentedTrial
 from .start_numbers import missing_forces, tether_start
 from .state_tracking import initial_camera, track_states, weight_contacts
 

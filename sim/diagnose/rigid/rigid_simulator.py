@@ -221,18 +221,28 @@ class RigidWorlds:
     threads: int = 0
     work: Work = field(default_factory=Work)
 
-    def run(self, starts: Array, numbers: Array, times: list[Array] | Array) -> Array:
+    def run(
+        self,
+        starts: Array,
+        numbers: Array,
+        times: list[Array] | Array,
+        counts: NDArray[np.int64] | None = None,
+    ) -> Array:
         """Return states (W, M, RECORD) of the centre of volume at ``times`` of every world, in s since its start.
 
-        starts: (W, STATE). numbers: (W, NUMBERS). times: (W, M), or W arrays of up to M, padded with zeros.
+        starts: (W, STATE). numbers: (W, NUMBERS). times: (W, M), or W arrays of up to M, padded with zeros. counts:
+        (W,) how many of (W, M) times count, all without it.
         """
         from . import rigid_kernel  # Taichi is imported late
 
         ensure_started(SolverOptions(threads=self.threads))
-        count = np.array([len(t) for t in times], dtype=np.int32)
-        padded = np.zeros((len(count), max(1, int(count.max(initial=0)))))
-        for row, t in zip(padded, times, strict=True):
-            row[: len(t)] = t
+        if counts is None:
+            count = np.array([len(t) for t in times], dtype=np.int32)
+            padded = np.zeros((len(count), max(1, int(count.max(initial=0)))))
+            for row, t in zip(padded, times, strict=True):
+                row[: len(t)] = t
+        else:
+            count, padded = counts.astype(np.int32), np.ascontiguousarray(times)
         out = np.zeros((len(count), padded.shape[1], RECORD))
         if len(count) and count.max() > 0:
             steps = np.zeros(len(count), dtype=np.int32)

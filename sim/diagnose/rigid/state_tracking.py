@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..capture_geometry import mean_known
-from .multiple_shooting import Model, Problem, Segment, SegmentedTrial, eliminate_states
+from .multiple_shooting import eliminate_states
 from .observed_poses import ObservedBody, as_matrix, frame_pose, perturbed
 from .resting_contact import resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidBody, RigidWorlds
+from .shooting_problem import Model, Problem, Segment, SegmentedTrial
 
 Array = NDArray[np.float64]
 
