@@ -21,6 +21,7 @@ from ..sim.app.requirements import REQUIREMENTS
 from ..sim.app.stage_process import NO_WINDOW, child_environment
 from ..sim.errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError, RenderError
 from ..sim.events import Event, IsCancelled, OnEvent
+from ..sim.memory import ran_out
 from .headless import Stop, events_apart_from_chatter, script_arguments, start_empty, temporary_folder
 from .terminal import Terminal
 
@@ -153,13 +154,15 @@ def run_script(
             done, words = work(options, terminal, lambda: stop() or terminal.reader_gone)
         except PhysGenError as error:
             return _report(error, terminal)
-        except MemoryError:
-            return _report(InputError(f"{stage}: {OUT_OF_MEMORY}"), terminal)
         except OSError as error:
             # Most likely the temporary folder: layers, textures and frames pass through it.
             where = error.filename or Path(tempfile.gettempdir()).parent
             message = f"{where}: {error.strerror or error}; free space, then run again"
             return _report(RenderError(message), terminal)
+        except Exception as error:
+            if not ran_out(error):
+                raise
+            return _report(InputError(f"{stage}: {OUT_OF_MEMORY}"), terminal)
         terminal(done)
         terminal.line(words)
         return 0

@@ -22,6 +22,7 @@ from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import ANYWAY, OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.files import shown
+from ..sim.memory import ran_out
 from ..sim.trust import LIST_FILE, config_folder
 from ..sim.version import VERSION
 from . import stages
@@ -198,7 +199,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             name = "" if error.filename is None else f"{shown(str(error.filename))}: "
             terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
             return InputError.exit_code
-        except MemoryError:
+        except Exception as error:
+            if not ran_out(error):
+                raise
             terminal.error(InputError.__name__, f"{options.command}: {OUT_OF_MEMORY}")
             return InputError.exit_code
 

@@ -22,6 +22,7 @@ from ..sim.atomic import scratch_prefix
 from ..sim.cache.bake_folder import Bake, load_bake
 from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ..sim.memory import RENDERING_RESERVED, available_memory, rendering_bytes, require_memory
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.reasoning.chat_client import ChatRequest
 from ..sim.reconstruct.reconstruct_options import object_names
@@ -95,6 +96,15 @@ def run_render(
     if video is not None:
         require_video_name(Path(video))
     require_photo(scene)
+    camera = scene.model.camera
+    width, height = round(camera.width * options.scale), round(camera.height * options.scale)
+    points = sum(bake.manifest.files.values())
+    require_memory(
+        rendering_bytes(width * height, points),
+        available_memory(RENDERING_RESERVED),
+        what=f"frames of {width}x{height} pixels with {points} vertices and particles",
+        remedy="give a lower --scale",
+    )
     command = own_command("batch.render", str(scene.root.resolve()), "--bake", str(bake.root.resolve()))
     command += ["--out", str(out.resolve()), "--json", "--parent", str(os.getpid()), *render_arguments(options)]
     if frames is not None:

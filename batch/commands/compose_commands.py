@@ -13,6 +13,7 @@ from ...sim.scene.folder import load_scene
 from ...sim.validation import read_json
 from ..terminal import Terminal
 from .diagnosis_commands import parse_names
+from .flags import add_anyway_flag
 
 DEFAULTS = ComposeOptions()
 _LAYOUTS = ("syncdreamer", "zero123++1.1", "zero123++1.2")
@@ -22,6 +23,7 @@ def add_compose(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen compose``."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE2", help="the new scene folder")
+    add_anyway_flag(parser)
     chosen = "from the fixed one to the deformable ones (default: all that touch another, frontmost first)"
     parser.add_argument("--objects", type=parse_names, default=(), metavar="A,B,…", help=chosen)
     method = f"what moves them (default {DEFAULTS.method}; ppps with --no-picture)"

@@ -106,8 +106,8 @@ OBJECT_FLAGS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
 
 
 def add_anyway_flag(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that lets a bake begin for which memory is estimated to be too little (``cli.main`` acts on it)."""
-    parser.add_argument("--anyway", action="store_true", help="bake although memory is estimated to be too little")
+    """Add the flag that lets a stage begin for which memory is estimated to be too little (``cli.main`` acts on it)."""
+    parser.add_argument("--anyway", action="store_true", help="begin although memory is estimated to be too little")
 
 
 def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> None:

@@ -73,6 +73,7 @@ def add_run(parser: argparse.ArgumentParser) -> None:
 def add_reconstruct(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen reconstruct``."""
     parser.add_argument("photo", type=Path, metavar="PHOTO", help="JPEG, PNG, TIFF or WebP")
+    add_anyway_flag(parser)
     add_object_flags(parser)
     add_reconstruction_flags(parser)
     add_reasoning_flags(parser)
@@ -94,6 +95,7 @@ def add_propose(parser: argparse.ArgumentParser) -> None:
 def add_correct(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen correct``."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder reconstructed from a photo")
+    add_anyway_flag(parser)
     add_object_flags(parser, boxes=False)
     add_reconstruction_flags(parser)
     text = (
@@ -130,6 +132,7 @@ def add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the frames")
     parser.add_argument("--frames", metavar="RANGE", help="1-48, 1,5,9 or 1-48x2 (default: all baked frames)")
     parser.add_argument("--video", type=Path, metavar="VIDEO", help="also encode a video: .mp4 or .webm")
+    add_anyway_flag(parser)
     add_render_flags(parser)
 
 

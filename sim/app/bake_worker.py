@@ -22,6 +22,7 @@ from ..atomic import remove_unfinished
 from ..cache.folder_lock import release_all
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
+from ..memory import ran_out
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json
 from .bake_options import BakeOptions, inputs_hash
@@ -157,15 +158,11 @@ def main(arguments: list[str]) -> int:
         return error.exit_code
     except (MemoryError, RuntimeError) as error:
         # Taichi's allocations and NumPy's fail by different names.
-        if isinstance(error, RuntimeError) and not _ran_out(str(error)):
+        if not ran_out(error):
             raise
         emit(_error(InputError(f"bake: {OUT_OF_MEMORY}")))
         return InputError.exit_code
     return 0
-
-
-def _ran_out(text: str) -> bool:
-    return any(words in text.lower() for words in ("out of memory", "bad_alloc", "cannot allocate", "mmap"))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from ..gaussians.compose.penetration import Penetration, penetration_of_meshes
 from ..gaussians.mesh_to_splats import Texture, splats_on_mesh
 from ..gaussians.splat_ply import read_splats, write_splats
 from ..gaussians.splats import Splats, joined, transform_splats
+from ..memory import COMPOSITION_RESERVED, available_memory, composition_bytes, require_memory
 from ..mpm.colliders import Surface
 from ..mpm.geometry.triangles import face_normals
 from ..reconstruct.scene_output import replacing_folder
@@ -261,6 +262,8 @@ def compose(
         if request.picture:
             require_photo(scene)
         found = contact_groups(scene, request.objects, cells=request.options.cells)
+        for group in found:
+            _require_memory(scene, group, request)
         fits = [_compose_group(scene, group, request, guidance, on_event, cancelled) for group in found]
         moved: dict[str, MovedObject] = {}
         for fit in fits:
@@ -269,6 +272,20 @@ def compose(
             raise Cancelled("the composition was cancelled; nothing was written")
         composed = write_composition(scene, partial, moved, composition_record(scene.model, request, fits))
     return Scene(root=out, model=composed.model)
+
+
+def _require_memory(scene: Scene, group: ContactGroup, request: ComposeRequest) -> None:
+    vertices = max(len(body.surface.vertices) for body in group.bodies)
+    splats = request.splats + sum(
+        len(read_splats(scene.file(body.item.splats))) for body in group.bodies if body.item.splats is not None
+    )
+    pixels = request.options.size**2 if request.options.uses_images else 0
+    require_memory(
+        composition_bytes(request.options.cells, splats, vertices, pixels),
+        available_memory(COMPOSITION_RESERVED),
+        what=f"{request.options.cells} cells, {splats} splats and meshes of up to {vertices} vertices",
+        remedy="give fewer --cells or --splats",
+    )
 
 
 def _compose_group(

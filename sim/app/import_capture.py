@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 from ..diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial, load_capture, save_capture
 from ..errors import InputError
 from ..events import OnEvent, ignore
+from ..files import read_text
 from ..importers.recordings import UNITS, RecordedTable, read_recording
 
 Array = NDArray[np.float64]
 Confirm = Callable[[str], bool]
+
+MAX_REST_BYTES = 2**20
+"""Of a table of places on a body."""
 
 FREE_FALL = (7.0, 12.5)
 """Downward acceleration in m/s² that counts as free fall with its errors and drag."""
@@ -301,7 +305,11 @@ def _rest(table: RecordedTable, item: CaptureObject, request: ImportRequest) -> 
             f"{len(table.labels)} points are tracked: give rest, a CSV name,x,y,z of their places on the body"
         )
     places: dict[str, list[float]] = {}
-    for row in request.rest.read_text(encoding="utf-8-sig").splitlines():
+    try:
+        text = read_text(request.rest, MAX_REST_BYTES, what="table of places").removeprefix("\ufeff")
+    except FileNotFoundError:
+        raise InputError(f"{request.rest}: there is no such file; check its name") from None
+    for row in text.splitlines():
         cells = [c.strip() for c in row.split(",")]
         try:
             places[cells[0].lower()] = [float(c) for c in cells[1:4]]

@@ -30,9 +30,10 @@ from trimesh.triangles import closest_point
 from ..constitutive import COHERENT, GRANULAR, DeformableMaterial, RigidMaterial, cohesion_of, model_of
 from ..effects.registry import apply_effects
 from ..errors import InputError
+from ..memory import available_memory
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
-from ..mpm.cost_estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from ..mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, sample_interior
 from ..mpm.solver_options import SolverOptions
 from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import InputError
+from ..memory import available_memory, require_memory
 from ..mpm.colliders import Collider, Surface, Track
-from ..mpm.cost_estimate import SAMPLING_BYTES, available_memory, require_memory
+from ..mpm.cost_estimate import SAMPLING_BYTES
 from ..mpm.geometry.mesh_checks import check_surface
 from ..mpm.solver_options import SolverOptions, centred
 from ..scene.bake_quality import Quality
@@ -89,7 +90,12 @@ def _refuse_absurd(names: Sequence[str], meshes: Sequence[ObjectMesh], quality: 
             f"object {names[small]} ({lengths[small]:.2g} m) asks for, are too fine for object {names[large]} "
             f"({lengths[large]:.2g} m); choose a coarser quality, make one of them a collider, or check their sizes"
         )
-    require_memory(int(count * SAMPLING_BYTES), int(count), available_memory())
+    require_memory(
+        int(count * SAMPLING_BYTES),
+        available_memory(),
+        what=f"{int(count)} particles",
+        remedy="choose a coarser quality, make more objects colliders",
+    )
 
 
 def _place(meshes: Sequence[ObjectMesh], cell: float, quality: Quality, arch: str) -> tuple[SolverOptions, Similarity]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from ..files import read_text
 
 Array = NDArray[np.float64]
 
@@ -62,18 +63,19 @@ def read_recording(path: Path, columns: Mapping[str, str] | None = None) -> list
     Raises InputError with file, row and remedy for anything that is no such table.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; export a shorter stretch")
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a readable text file ({error})") from None
+        text = read_text(path, MAX_BYTES, what="table of motion").removeprefix("\ufeff")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; check its name") from None
     if path.suffix.lower() == ".trk":
         return [_read_tracker(path, text)]
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
         raise InputError(f"{path}: {path.suffix or 'no ending'} is not read; export CSV, or give Tracker's .trk")
     first = text.partition("\n")[0]
     separator = max(",;\t", key=first.count)
-    rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(cell.strip() for cell in row)]
+    try:
+        rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"{path}: not readable as a table ({error}); export it anew as CSV") from None
     if len(rows) > 3 and rows[0][0].strip() == "scorer" and rows[1][0].strip() == "bodyparts":
         return [_read_deeplabcut(path, rows)]
     return _read_table(path, rows, dict(columns or {}))
@@ -183,12 +185,18 @@ def _turns(path: Path, lines: Sequence[Sequence[str]], names: Sequence[str]) -> 
 
     if (q := columns(QUATERNION)) is not None:
         length = np.linalg.norm(q, axis=1)
-        if np.nanmax(np.abs(length - 1)) > 0.05:
-            raise InputError(f"{path}: quaternions of length {length[np.nanargmax(np.abs(length - 1))]:.3g}, not 1")
+        if not np.isfinite(length).all():
+            raise InputError(
+                f"{path}: a part of a quaternion is missing in row {int(np.argmin(np.isfinite(length))) + 2}"
+            )
+        if np.abs(length - 1).max() > 0.05:
+            raise InputError(f"{path}: quaternions of length {length[np.argmax(np.abs(length - 1))]:.3g}, not 1")
         return Rotation.from_quat(np.roll(q / length[:, None], -1, axis=1)).as_matrix()
     if (angles := columns(EULER)) is not None:
         # Degrees where any angle is beyond a full turn in radians.
-        degrees = bool(np.nanmax(np.abs(angles)) > 2 * math.pi + 0.01)
+        if not np.isfinite(angles).all():
+            raise InputError(f"{path}: roll, pitch or yaw is missing in a row; leave that row out")
+        degrees = bool(np.abs(angles).max() > 2 * math.pi + 0.01)
         return Rotation.from_euler("xyz", angles, degrees=degrees).as_matrix()
     if (matrix := columns(MATRIX)) is not None:
         turns = matrix.reshape(-1, 3, 3)

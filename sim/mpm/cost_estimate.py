@@ -6,18 +6,16 @@ Right within a factor of about three: the substep is that of the start, the spee
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ..constitutive import DeformableMaterial
-from ..errors import ANYWAY, InputError
+from ..errors import InputError
+from ..memory import require_memory
 from .bodies import BodyParticles
 from .solver_options import SolverOptions
 
@@ -121,77 +119,12 @@ def refuse_excess(cost: Estimate, particles: int, available: int | None) -> None
             f"particles), more than {MAX_HOURS:g}: lower the velocity or Young's modulus, raise the density, bake "
             "fewer frames, or choose a coarser quality"
         )
-    require_memory(cost.bytes, particles, available)
-
-
-def require_memory(needed: int, particles: int, available: int | None) -> None:
-    """Raise InputError when ``needed`` bytes are more than ``available``; None: not known, so never.
-
-    Nor where the user gave ``--anyway`` (``ANYWAY``).
-    """
-    if available is not None and needed > available and not os.environ.get(ANYWAY):
-        raise InputError(
-            f"this would take about {needed / 2**30:.3g} GiB of memory for {particles} particles, and "
-            f"{available / 2**30:.3g} GiB are available: choose a coarser quality, make more objects colliders, or "
-            "close other programs; --anyway tries it"
-        )
-
-
-def available_memory() -> int | None:
-    """Bytes of main memory that a new process may take without swapping; None where that cannot be found out.
-
-    Linux: MemAvailable, and what the control group and the limit on this process's address space leave. Windows:
-    available physical memory. Elsewhere (macOS): half of all physical memory, since free memory means little there.
-    """
-    try:
-        if sys.platform == "win32":
-            return _windows_memory()
-        if sys.platform.startswith("linux"):
-            return _linux_memory(Path("/proc/meminfo"), Path("/sys/fs/cgroup"))
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    except (OSError, ValueError, AttributeError):
-        return None
-
-
-def _linux_memory(meminfo: Path, group: Path) -> int | None:
-    found = [
-        int(line.split()[1]) * 1024 for line in meminfo.read_text().splitlines() if line.startswith("MemAvailable:")
-    ]
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        if limit != "max":
-            found.append(max(0, int(limit) - int((group / "memory.current").read_text())))
-    except (OSError, ValueError):
-        pass
-    left = _address_space_left()
-    if left is not None:
-        found.append(left)
-    return min(found) if found else None
-
-
-def _address_space_left() -> int | None:
-    """Bytes that ``ulimit -v`` leaves this process, and those that it starts; None without a limit."""
-    import resource
-
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if most == resource.RLIM_INFINITY:
-        return None
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    return max(0, most - used)
-
-
-def _windows_memory() -> int | None:
-    class Status(ctypes.Structure):
-        _fields_ = (
-            ("length", ctypes.c_ulong),
-            ("load", ctypes.c_ulong),
-            *((name, ctypes.c_ulonglong) for name in ("total", "available", "a", "b", "c", "d", "e")),
-        )
-
-    status = Status()
-    status.length = ctypes.sizeof(status)
-    good = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
-    return int(status.available) if good else None
+    require_memory(
+        cost.bytes,
+        available,
+        what=f"{particles} particles",
+        remedy="choose a coarser quality, make more objects colliders",
+    )
 
 
 def _cores() -> int:

@@ -17,6 +17,7 @@ from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from ..errors import InputError
 from ..files import MAX_PICTURE_BYTES, open_file
+from ..memory import DECODED_BYTES, available_memory, require_memory
 
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 ROUNDING_SIGMA = 0.02
@@ -242,6 +243,9 @@ def _decode(path: Path, image: Image.Image, max_size: int) -> Photo:
     if image.format == "JPEG" and image.mode in ("RGB", "L"):
         # JPEG can be decoded at 1/2, 1/4 or 1/8: a 40-megapixel photo costs a fraction, and no sharpness is lost.
         image.draft(None, (max_size, max_size))
+    # After draft: what is decoded, not what is stored.
+    decoded = image.size[0] * image.size[1] * DECODED_BYTES
+    require_memory(decoded, available_memory(), what=f"the photo {path}", remedy="scale it down")
     image.load()
     upright = ImageOps.exif_transpose(_to_rgb(image, profile)) if "exif" in image.info else _to_rgb(image, profile)
     if orientation in (5, 6, 7, 8):

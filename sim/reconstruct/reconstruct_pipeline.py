@@ -17,6 +17,7 @@ from PIL import Image
 from ..atomic import write_json
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..memory import RECONSTRUCTION_RESERVED, available_memory, reconstruction_bytes, require_memory
 from ..scene.environment import prepared as prepared_environment
 from ..scene.environment import write_environment
 from ..scene.equirectangular import Radiance
@@ -182,6 +183,12 @@ def reconstruct_photo(
                 f"photo of {picture.original_size[0]}x{picture.original_size[1]} pixels is processed at "
                 f"{picture.width}x{picture.height}; max_size changes that"
             )
+        require_memory(
+            reconstruction_bytes(_box_pixels(picture, objects), len(objects)),
+            available_memory(RECONSTRUCTION_RESERVED),
+            what=f"{len(objects)} objects in a photo of {picture.width}x{picture.height} pixels",
+            remedy="scale the photo down",
+        )
         objects = [_in_working_pixels(item, picture.scale) for item in objects]
         seen, boxes = segment_objects(picture, objects, options, store, steps)
         steps.begin("physics")
@@ -250,6 +257,15 @@ def reconstruct_photo(
             save_scene(folder, scene)
         steps.finish()
     return Scene(root=out, model=scene)
+
+
+def _box_pixels(picture: Photo, objects: Sequence[ObjectRequest]) -> int:
+    """Return the working pixels in the boxes of all objects; one that has only a mask counts as a quarter photo."""
+    whole, found = picture.width * picture.height, 0.0
+    for item in objects:
+        x0, y0, x1, y1 = item.box or (0, 0, 0, 0)
+        found += min(abs(x1 - x0) * abs(y1 - y0) * picture.scale**2, whole) if item.box else whole / 4
+    return int(found)
 
 
 def _in_working_pixels(item: ObjectRequest, scale: float) -> ObjectRequest:

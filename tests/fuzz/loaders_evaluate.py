@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""The loaders of ``physgen evaluate``: videos, folders of pictures, a bake with its energies, a benchmark's folder."""
+"""The loaders of ``physgen evaluate`` and ``questionnaire``: videos, pictures, energies, a benchmark, answers of people
+and of a model."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, save_manifest
-from physgen.sim.cache.pc2 import Pc2Writer
+from loaders import add, put_bake, put_json, put_video
+from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.errors import InputError
 from physgen.sim.evaluate.against import against
 from physgen.sim.evaluate.bake_physics import bake_physics
 from physgen.sim.evaluate.footage import open_footage
+from physgen.sim.evaluate.model_judge import CRITERIA, read_scores
 from physgen.sim.evaluate.physics_iq_folder import read_benchmark, read_submission
-from physgen.sim.version import VERSION
+from physgen.sim.evaluate.questionnaire import FORMAT, load_case, load_key
+from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire, read_answers
+from physgen.sim.files import read_bytes
 
 RANDOM = np.random.default_rng(0)
 PIXELS = RANDOM.integers(0, 255, (4, 24, 32, 3), dtype=np.uint8)
@@ -24,11 +27,7 @@ GENERATED = "0001_perspective-left_trimmed-ball.mp4"
 
 
 def _video(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    out = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 8, (32, 24))
-    for frame in PIXELS:
-        out.write(frame)
-    out.release()
+    put_video(path, PIXELS, fps=8)
 
 
 def _read_video(folder: Path) -> None:
@@ -48,22 +47,7 @@ def _read_pictures(folder: Path) -> None:
 
 
 def _bake(folder: Path) -> None:
-    with Pc2Writer(folder / "box.pc2", vertex_count=8) as cache:
-        for _ in range(3):
-            cache.append(RANDOM.random((8, 3)))
-    manifest = BakeManifest(
-        inputs_hash="0" * 64,
-        fps=24.0,
-        frame_start=1,
-        frames=3,
-        frames_done=3,
-        state="complete",
-        engine="mpm",
-        version=VERSION,
-        particles=8,
-        objects=(BakedObject(name="box", file="box.pc2", vertices=8),),
-    )
-    save_manifest(folder, manifest)
+    put_bake(folder)
     frames = [{"kinetic_j": 1.0, "elastic_j": 0.5, "potential_j": 2.0, "frame": i} for i in range(3)]
     (folder / "metrics.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
 
@@ -85,10 +69,59 @@ def _read_submission(folder: Path) -> None:
         assert "split-videos" in str(error)
 
 
-EVALUATE: dict[str, tuple[tuple[str, ...], Callable[[Path], object], Callable[[Path], object]]] = {
-    "video to evaluate": (("v.mp4",), lambda f: _video(f / "v.mp4"), _read_video),
-    "pictures to evaluate": (("f/0001.png", "f/0003.png"), _pictures, _read_pictures),
-    "energies of a bake": (("metrics.json", "manifest.json"), _bake, _read_bake),
-    "videos for Physics-IQ": ((GENERATED,), _submission, _read_submission),
+add("video to evaluate", "v.mp4", lambda f: _video(f / "v.mp4"), _read_video)
+add("pictures to evaluate", ("f/0001.png", "f/0003.png"), _pictures, _read_pictures)
+add("energies of a bake", ("metrics.json", "manifest.json"), _bake, _read_bake)
+add("videos for Physics-IQ", GENERATED, _submission, _read_submission)
+
+
+KEY = {
+    "format": FORMAT,
+    "version": 1,
+    "questionnaire": "0123",
+    "criteria": list(CRITERIA),
+    "cases": [{"id": "case_01", "name": "apple", "prompt": "It falls.", "videos": {"aa": "ours", "bb": "other"}}],
 }
-"""By name: files to damage, what writes them into a folder, what reads them there."""
+ANSWERS = {
+    "format": "physgen questionnaire answers",
+    "version": 1,
+    "questionnaire": "0123",
+    "person": "ann",
+    "saved": "2026-01-01T00:00:00Z",
+    "cases": {"case_01": {"order": ["bb", "aa"], "scores": {t: dict.fromkeys(CRITERIA, 3) for t in ("aa", "bb")}}},
+}
+JUDGED = """Video 1: Physical Realism Score: 0.5; Photorealism Score: 0.25; Semantic Consistency Score: 1;
+Video 2: Physical Realism Score: 0; Photorealism Score: .5; Semantic Consistency Score: 0,75;
+"""
+
+
+def _case(folder: Path) -> None:
+    (folder / "photo.jpg").write_bytes(b"")
+    (folder / "a.mp4").write_bytes(b"")
+    (folder / "case.toml").write_text('prompt = "It falls."\nimage = "photo.jpg"\n[videos]\nours = "a.mp4"\n')
+
+
+def _read_judged(folder: Path) -> None:
+    try:
+        text = read_bytes(folder / "a.txt", 2**20).decode("utf-8", "replace")
+    except FileNotFoundError:
+        return
+    for scores in read_scores(text, 2).scores:
+        assert scores is None or all(0 <= value <= 1 for value in scores.values())
+
+
+add("case of a questionnaire", "case.toml", _case, load_case)
+add("key of a questionnaire", "key.json", lambda f: put_json(f / "key.json", KEY), lambda f: load_key(f / "key.json"))
+add(
+    "answers of a questionnaire",
+    "a.json",
+    lambda f: put_json(f / "a.json", ANSWERS),
+    lambda f: read_answers(f / "a.json", KEY),
+)
+add(
+    "answers that are collected",
+    ("a.json", "key.json"),
+    lambda f: (put_json(f / "key.json", KEY), put_json(f / "a.json", ANSWERS)),
+    lambda f: collect_questionnaire([f / "a.json"], key=f / "key.json", out=f / "results"),
+)
+add("answer of a judge", "a.txt", lambda f: (f / "a.txt").write_text(JUDGED), _read_judged)

@@ -32,7 +32,12 @@ from types import FrameType
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import loaders_judges  # noqa: F401 - adds its loaders
+import loaders_bakes  # noqa: F401 - each adds its loaders
+import loaders_captures  # noqa: F401
+import loaders_evaluate  # noqa: F401
+import loaders_jobs  # noqa: F401
+import loaders_pictures  # noqa: F401
+import loaders_scenes  # noqa: F401
 from loaders import LOADERS, Loader
 from mutations import mutated
 from physgen.sim.errors import PhysGenError

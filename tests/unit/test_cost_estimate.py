@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimated cost of a run: the theoretical time step, refusal by hours and by memory, free memory on each system."""
+"""Estimated cost of a run: the theoretical time step, refusal by hours and by memory."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.mpm import cost_estimate as module
 from physgen.sim.mpm.bodies import BodyParticles
 from physgen.sim.mpm.colliders import Surface, Track
-from physgen.sim.mpm.cost_estimate import Estimate, available_memory, estimate, refuse_excess, stable_step
+from physgen.sim.mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
 from physgen.sim.mpm.solver_options import SolverOptions
 
 POINTS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)])
@@ -54,18 +54,3 @@ def test_too_long_or_too_large_is_refused_with_a_way_out():
         refuse_excess(cost(72, 1), 9, None)
     with pytest.raises(InputError, match=r"3 GiB.*2 GiB are available.*coarser quality"):
         refuse_excess(cost(1, 3), 9, 2 * 2**30)
-
-
-def test_available_memory_is_plausible_here():
-    found = available_memory()
-    assert found is None or 2**26 < found < 2**46
-
-
-def test_memory_on_linux_is_the_lesser_of_machine_and_group(tmp_path):
-    (tmp_path / "meminfo").write_text("MemTotal: 16 kB\nMemAvailable:    8000 kB\n")
-    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 8000 * 1024
-    (tmp_path / "memory.max").write_text("max\n")
-    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 8000 * 1024
-    (tmp_path / "memory.max").write_text("5000\n")
-    (tmp_path / "memory.current").write_text("1000\n")
-    assert module._linux_memory(tmp_path / "meminfo", tmp_path) == 4000
