@@ -53,6 +53,8 @@ def provide_modules(packages: Path | None) -> str | None:
         try:
             importlib.import_module(name)
         except ImportError as error:
+            if ran_out(error):
+                raise InputError(f"render: {OUT_OF_MEMORY}") from error
             found = importlib.util.find_spec(name)
             origin = found.origin if found is not None else name
             raise RenderError(

@@ -20,8 +20,8 @@ MIB = 2**20
 RECONSTRUCTION_BASE = 249 * MIB
 RECONSTRUCTION_OBJECT = 17 * MIB
 RECONSTRUCTION_BOX_PIXEL = 1340
-"""Of a pixel in the boxes of all objects: masks, edges, bodies, textures. The rest of the photo, inpainted in pieces, was
-below what the measurements tell apart."""
+"""Of a pixel in the boxes of all objects: masks, edges, bodies, textures. The rest of the photo, inpainted in pieces,
+was below what the measurements tell apart."""
 RECONSTRUCTION_RESERVED = 1300 * MIB
 
 DECODED_BYTES = 20
@@ -34,11 +34,14 @@ def reconstruction_bytes(box_pixels: int, objects: int) -> int:
     return RECONSTRUCTION_BASE + RECONSTRUCTION_OBJECT * objects + RECONSTRUCTION_BOX_PIXEL * box_pixels
 
 
-COMPOSITION_BASE = 330 * MIB
+ENGINE_RESERVED = 1100 * MIB
+"""Of a bake: Taichi begins with a pool of 1 GiB."""
+
+COMPOSITION_BASE = 326 * MIB
 COMPOSITION_CELL = 7000
 """Of a cell of the cube around the deformable object; of a ball, half of them hold particles."""
 COMPOSITION_VERTEX = 7900
-COMPOSITION_SPLAT = 0
+COMPOSITION_SPLAT = 1400
 COMPOSITION_PIXEL = 60
 """Of the compared image, by the rasteriser's own account (``MAX_PIXELS``)."""
 COMPOSITION_RESERVED = 2500 * MIB
@@ -59,7 +62,7 @@ def composition_bytes(cells: int, splats: int, vertices: int, pixels: int) -> in
     )
 
 
-RENDERING_BASE = 423 * MIB
+RENDERING_BASE = 482 * MIB
 RENDERING_PIXEL = 441
 RENDERING_VERTEX = 1250
 RENDERING_RESERVED = 2300 * MIB
@@ -92,6 +95,7 @@ LACK = (
     "failed to map segment",
     "can't start new thread",
     "mmap",
+    "memory allocation",
 )
 """Words by which libraries say that memory ran out: C++, OpenCV, NumPy, the dynamic linker, Python, Taichi."""
 

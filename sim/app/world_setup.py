@@ -30,7 +30,7 @@ from trimesh.triangles import closest_point
 from ..constitutive import COHERENT, GRANULAR, DeformableMaterial, RigidMaterial, cohesion_of, model_of
 from ..effects.registry import apply_effects
 from ..errors import InputError
-from ..memory import available_memory
+from ..memory import ENGINE_RESERVED, available_memory
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
@@ -212,7 +212,7 @@ class PreparedWorld:
     def require_affordable(self) -> None:
         """Raise InputError when the bake would take too long or more memory than there is."""
         on_host = self.arch in ("cpu", "metal")
-        refuse_excess(self.cost, self.particle_count, available_memory() if on_host else None)
+        refuse_excess(self.cost, self.particle_count, available_memory(ENGINE_RESERVED) if on_host else None)
 
     def on(self, arch: str) -> PreparedWorld:
         """The same, with the cost on another architecture."""

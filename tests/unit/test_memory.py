@@ -1,12 +1,25 @@
 # SPDX-License-Identifier: MIT
 """Memory: what there is, on each system; estimates that refuse before a stage begins; what its lack leaves behind."""
 
+import contextlib
+import os
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from physgen.batch.cli import main
 from physgen.sim import memory
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.memory import available_memory, ran_out, require_memory
+from physgen.sim.version import VERSION
+from PIL import Image
+
+from .compose_scenes import a_scene, ball
 
 MIB = 2**20
 
@@ -78,3 +91,120 @@ def test_too_little_is_refused_with_the_numbers_unless_the_user_says_anyway(monk
 )
 def test_the_lack_of_memory_is_known_by_whatever_name(error, lack):
     assert ran_out(error) is lack
+
+
+@contextlib.contextmanager
+def address_space(more):
+    """A limit on this process's addresses, as by ``ulimit -v``, that leaves ``more`` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + more, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def refused(capsys, tmp_path, *arguments):
+    """What a command says that is given too little memory; nothing else may be left of it."""
+    before = sorted(tmp_path.rglob("*"))
+    with address_space(1000 * MIB):
+        assert main([str(argument) for argument in arguments]) == 3
+    assert sorted(tmp_path.rglob("*")) == before
+    return capsys.readouterr().err
+
+
+def test_a_reconstruction_without_the_memory_is_refused_before_it_begins(tmp_path, capsys, ball_scene):
+    Image.fromarray(np.zeros((200, 300, 3), np.uint8)).save(tmp_path / "photo.png")
+    given = ["reconstruct", tmp_path / "photo.png", "--box", "20,30,220,180", "--out", tmp_path / "scene"]
+    assert re.search(
+        r"about 0\.\d+ GiB of memory for 1 objects in a photo of 300x200 pixels, and 0 GiB are available: scale",
+        refused(capsys, tmp_path, *given),
+    )
+
+
+def test_a_photo_too_large_to_decode_is_refused_before_it_is(tmp_path, capsys):
+    Image.new("RGB", (8000, 6000)).save(tmp_path / "photo.png")
+    given = ["reconstruct", tmp_path / "photo.png", "--box", "20,30,220,180", "--out", tmp_path / "scene"]
+    said = refused(capsys, tmp_path, *given)
+    assert "0.894 GiB of memory for the photo" in said and "scale it down" in said
+
+
+def test_a_composition_without_the_memory_is_refused_before_it_begins(tmp_path, capsys):
+    pytest.importorskip("taichi")
+    import physgen.sim.app.compose_scene  # noqa: F401 - libraries are loaded before the limit is there
+
+    root = a_scene(tmp_path / "scene", {"a": ball(0), "b": ball(0.09)}).root
+    given = ["compose", root, "--out", tmp_path / "fitted", "--no-picture", "--cells", "64"]
+    assert re.search(
+        r"about 2\.\d+ GiB of memory for 64 cells, 20000 splats and meshes of up to 162 vertices, and 0 GiB",
+        refused(capsys, tmp_path, *given),
+    )
+
+
+def test_rendering_without_the_memory_is_refused_before_blender_starts(tmp_path, capsys, ball_scene):
+    root = ball_scene().root
+    bake = tmp_path / "bake"
+    bake.mkdir()
+    item = BakedObject(name="ball0", file="ball0.pc2", vertices=642)
+    save_manifest(
+        bake,
+        BakeManifest(
+            inputs_hash="0" * 64,
+            fps=24.0,
+            frame_start=1,
+            frames=3,
+            frames_done=3,
+            state="complete",
+            engine="mpm",
+            version=VERSION,
+            particles=9,
+            objects=(item,),
+        ),
+    )
+    said = refused(capsys, tmp_path, "render", root, "--bake", bake, "--out", tmp_path / "frames", "--scale", "4")
+    assert re.search(r"GiB of memory for frames of 240x160 pixels with 642 vertices and particles, and 0 GiB", said)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("verb", ["bake", "compose", "reconstruct"])
+def test_out_of_memory_is_one_line_and_the_folder_can_be_gone_on_from(tmp_path, ball_scene, verb):
+    """Begun anyway, under a limit that the libraries alone exceed; then again without one."""
+    if verb == "reconstruct":
+        rows, columns = np.mgrid[:72, :96] + 0.5
+        image = np.full((72, 96, 3), (190, 175, 140), np.uint8)
+        image[(columns - 48) ** 2 + (rows - 38) ** 2 < 15**2] = (200, 50, 40)
+        Image.fromarray(image).save(tmp_path / "photo.png")
+        given = ["reconstruct", tmp_path / "photo.png", "--box", "30,18,66,58", "--pitch", "25", "--no-sun"]
+    elif verb == "compose":
+        root = a_scene(tmp_path / "scene", {"a": ball(0), "b": ball(0.09)}).root
+        given = ["compose", root, "--no-picture", "--steps", "1", "--substeps", "2", "--cells", "8"]
+    else:
+        given = ["bake", ball_scene().root, "--frames", "2", "--quality", "preview"]
+    command = [sys.executable, "-m", "physgen.batch.cli", *map(str, given), "--out", str(tmp_path / "out")]
+
+    def run(most, *more):
+        def limit():
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+        environment = {**os.environ, "PHYSGEN_CONFIG": str(tmp_path / "config")}
+        return subprocess.run(
+            [*command, *more],
+            capture_output=True,
+            text=True,
+            env=environment,
+            preexec_fn=limit if most else None,
+            check=False,
+        )
+
+    # What is left for the work itself differs; at one of these it begins, and does not end.
+    for most in (900 * MIB, 1100 * MIB, 1300 * MIB):
+        done = run(most, "--anyway")
+        if done.returncode == 0:
+            break
+        assert done.returncode in (3, 4), done.stderr[-2000:]
+        assert "Traceback" not in done.stderr and done.stderr.count("error: ") == 1
+    left = [path.name for path in tmp_path.rglob(".*")]
+    assert left == [], left
+    done = run(None)
+    assert done.returncode == 0, done.stderr[-2000:]

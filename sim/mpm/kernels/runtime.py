@@ -11,6 +11,7 @@ from typing import Any
 import taichi as ti
 
 from ...errors import InputError
+from ...memory import ran_out
 from ..solver_options import SolverOptions
 
 logger = logging.getLogger(__name__)
@@ -50,6 +51,8 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
     try:
         _start(arguments)
     except RuntimeError as error:
+        if ran_out(error):
+            raise MemoryError(str(error)) from error
         if wanted[0] == "cpu":
             raise InputError(f"solver option cache_folder is {folder!r}: Taichi did not start ({error})") from error
         logger.warning("Taichi could not start on %s (%s); computing on the CPU", wanted[0], error)
