@@ -71,13 +71,18 @@ def footed(
             for extra in THICKEST * np.arange(STEPS + 1) / STEPS:
                 made = thicken.by(extra, low=low)
                 stands = support_of(made, faces)
-                score = SAFE if stands.share >= 1.0 else stands.share
+                score = (1.0 if on_legs else SAFE) if stands.share >= 1.0 else stands.share
                 score -= COST * (stands.volume / plain.volume - 1.0) + worse
                 if score > highest:
                     best, highest = made, score
                 if stands.share >= 1.0:
                     break
     return best, (best != vertices).any(axis=1)
+
+
+def settled(camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]) -> Points:
+    """Return ``vertices`` (V, 3) with the unseen underside settled, and nothing thicker."""
+    return _Thickening(camera, silhouette, vertices, faces).by(0.0, low=True)
 
 
 class _Thickening:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
-from .footing import footed
+from .footing import footed, settled
 from .inflate import Silhouette
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
 from .support import support_of
@@ -177,11 +177,16 @@ def inflated_mesh(
         # One round brings the base onto the ground; the rest is for the one that is taken.
         points = relax(field, points, faces, 1)
         body = _to_world(silhouette, reference, points, faces)
-        steadiness = support_of(body.vertices, body.faces).steadiness
+        if front is None and reference.middle is not None:
+            # Longer feet change little else, so they may be as long as the margin wants them, on the ground as a whole.
+            settled_feet = settled(camera, silhouette, body.vertices, body.faces)
+            steadiness, enough = support_of(settled_feet, body.faces).share, 1.0
+        else:
+            steadiness, enough = support_of(body.vertices, body.faces).steadiness, STABLE
         if best is None or steadiness > best[4]:
             best = (reference, points, faces, lost, steadiness)
         # A relief need not stand by itself, as long as it touches the ground: moving it back only enlarges it.
-        if steadiness >= STABLE or (flat and steadiness > -1.0):
+        if steadiness >= enough or (flat and steadiness > -1.0):
             break
     assert best is not None
     reference, points, faces, lost, _ = best

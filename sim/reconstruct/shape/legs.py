@@ -65,6 +65,12 @@ class Leg:
             found[row, left:right] = True
         return found
 
+    def lowness(self, shape: tuple[int, ...]) -> Points:
+        """Return (h, w) how low its pixels are: 1 at the foot, 0 from ``HIGH`` on and outside of it."""
+        rows = np.arange(shape[0])
+        high = (self.foot[1] - 1.0 - rows) / (HIGH * self.width)
+        return self.region(shape) * np.clip(1.0 - high**2, 0.0, 1.0)[:, None]
+
 
 def outline_size(mask: Mask) -> float:
     """Return the longer side of the bounding box of ``mask`` in pixels."""
@@ -111,7 +117,7 @@ def _leg(mask: Mask, column: int, bottom: int, widest: float) -> Leg | None:
         end = at + int(gaps[0]) if len(gaps) else len(line)
         # A foot that is seen at a slant grows to its width first.
         if len(rows) >= 6 and len(rows) >= FOOT * (right[-1] - left[-1]):
-            if len(rows) < 12 or len(rows) % 8 == 0:
+            if own == 0.0 or len(rows) < 12 or len(rows) % 8 == 0:
                 own = float(np.median(np.subtract(right, left)))
             if own > 2.0 * widest:
                 return None
@@ -148,13 +154,25 @@ SLOPE = 0.15
 LOWEST = 0.03
 """Height of the foremost foot over the outline's lowest point, over its longer side: what stands on legs touches the
 ground with nothing else."""
+HIGH = 1.2
+"""Height of feet over the width of their legs: what may reach farther than the leg that stands on it."""
 COARSE = 90
 """Pixels along the longer side of the grid on which depth is carried from the legs through the body."""
 
 
-def standing_depth(camera: Camera, mask: Mask, distance: Points, left: int, top: int) -> tuple[Points, Mask] | None:
-    """Return the distance away from the camera (h, w), units along the ground, of a body that stands on legs, and the
-    pixels (h, w) of its legs; None unless two or more are visible.
+@dataclass(frozen=True)
+class StandingDepth:
+    """Where a body on legs is. away: (h, w) units along the ground from the camera; low: (h, w) 1 at the feet, fading
+    to 0 above them; radius: half the width of a leg, units; legs: how many are seen."""
+
+    away: Points
+    low: Points
+    radius: float
+    legs: int
+
+
+def standing_depth(camera: Camera, mask: Mask, distance: Points, left: int, top: int) -> StandingDepth | None:
+    """Return where a body that stands on legs is; None unless two or more are visible.
 
     mask, distance: (h, w) on a crop whose first pixel's corner is at the photo's pixel ``left``, ``top``. Legs are as
     far away as their feet; elsewhere the distance is harmonic, without flow through the outline.
@@ -187,7 +205,9 @@ def standing_depth(camera: Camera, mask: Mask, distance: Points, left: int, top:
         pinned |= region
     # Between two legs of different distance side by side there is a slope, not a cliff.
     slope = SLOPE * float(np.median([leg.width for leg in chosen]))
-    return _carried(mask, away, pinned, slope), pinned
+    low = np.max([leg.lowness(mask.shape) for leg in chosen], axis=0)
+    radius = 0.5 * unit * float(np.median([leg.width for leg in chosen]))
+    return StandingDepth(_carried(mask, away, pinned, slope), low, radius, len(chosen))
 
 
 def _carried(mask: Mask, values: Points, pinned: Mask, slope: float) -> Points:

@@ -181,26 +181,35 @@ def reference_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[Refer
         )
 
 
-BOOTS = (1.0, 1.6, 2.4, 3.5, 5.0)
-"""Thickness of legs behind their middle, over that in front, to try until the body stands."""
+FEET = (1.0, 1.3, 1.7, 2.2, 3.0)
+"""Lengths of feet over the width of their legs, to try until the body stands: a person's are 3."""
+PAWS = 1.7
+"""The longest of them on more than two legs: paws and hooves are short."""
 
 
 def standing_surfaces(camera: Camera, silhouette: Silhouette) -> Iterator[ReferenceSurface]:
-    """Yield reference surfaces of a body on legs, each leg as far away as its foot; none if it has no legs."""
+    """Yield reference surfaces of a body on legs, each leg as far away as its foot; none if it has no legs.
+
+    Longer feet begin where the photo shows them and reach as far behind the leg as before it, so that the body stands
+    over their middle; a foot that only went back would carry nothing in front.
+    """
     found = standing_depth(camera, silhouette.mask, silhouette.distance, silhouette.left, silhouette.top)
     if found is None:
         return
-    away, legs = found
     plain = next(reference_surfaces(camera, silhouette))
     height, width = silhouette.mask.shape
     rows, columns = np.mgrid[:height, :width]
     pixels = np.stack([silhouette.left + columns + 0.5, silhouette.top + rows + 0.5], axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels)
-    depth = ((away.ravel() - camera.position[1]) / np.maximum(rays[:, 1], 0.05)).reshape(height, width)
     inflated = np.sqrt(np.maximum(silhouette.square_height, 0.0))
-    low = ndimage.gaussian_filter(legs.astype(np.float64), 2.0)
-    for boot in BOOTS:
-        surface = MeasuredSurface(depth, inflated, silhouette.left, silhouette.top, 1.0 + (boot - 1.0) * low)
+    low = ndimage.gaussian_filter(found.low, 2.0)
+    for length in FEET:
+        if length > PAWS and found.legs > 2:
+            break
+        away = found.away + (length - 1.0) * found.radius - camera.position[1]
+        depth = (away.ravel() / np.maximum(rays[:, 1], 0.05)).reshape(height, width)
+        longer = 1.0 + (length - 1.0) * low
+        surface = MeasuredSurface(depth, inflated * longer, silhouette.left, silhouette.top, longer)
         yield replace(plain, middle=surface, back=1.0)
 
 
