@@ -190,9 +190,15 @@ def _rehearse(
     on_event: OnEvent,
     cancelled: IsCancelled,
 ) -> DefaultMotion:
-    """Return ``motion`` with the speed and the clip that coarse bakes in ``folder`` suggest."""
+    """Return ``motion`` with the speed and the clip that coarse bakes in ``folder`` suggest.
+
+    What falls over in one only hops straight up in the next, and stays where it is if it falls over even so.
+    """
+    from ..sim.app.default_motion import default_motion
     from ..sim.app.rehearsal import MOST_REHEARSALS, rehearsal_options, rehearsed
 
+    calm: set[str] = set()
+    still: set[str] = set()
     for number in range(MOST_REHEARSALS):
         out = folder / str(number)
         try:
@@ -202,9 +208,17 @@ def _rehearse(
             on_event({"event": "notice", "stage": "motion", "message": message})
             return motion
         found = rehearsed(scene, load_bake(out), motion, frames=frames, slow=slow)
-        if not found.leaving or number == MOST_REHEARSALS - 1:
+        fallen = {move.name for move in motion.moves} & set(found.toppled)
+        if fallen:
+            still |= fallen & calm
+            calm |= fallen
+            motion = default_motion(scene, fps=options.fps, frames=frames, slow=slow, calm=calm, still=still)
+            if not motion.moves:
+                return motion
+        elif not found.leaving or number == MOST_REHEARSALS - 1:
             return found.motion
-        motion = found.tamed(scene)
+        else:
+            motion = found.tamed(scene)
     return motion
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,14 +152,20 @@ class DefaultMotion:
 
 
 def default_motion(
-    scene: Scene, *, fps: float = 24.0, frames: int | None = None, slow: float | None = None
+    scene: Scene,
+    *,
+    fps: float = 24.0,
+    frames: int | None = None,
+    slow: float | None = None,
+    calm: Collection[str] = (),
+    still: Collection[str] = (),
 ) -> DefaultMotion:
     """Return a motion for the objects of ``scene``, which are taken to be at rest: a hop each, as they have room.
 
     The peak follows from size, matter and the room above; the whole path stays in the picture and clear of other
     objects, and ends on ground that looks like that where the object stands. fps: of the clip; frames, slow: its
     length and how many times slower than real it is; None chooses them so that all of the action is shown, in two to
-    three seconds.
+    three seconds. calm: names of objects that only hop straight up, low; still: of those that are left at rest.
 
     >>> import physgen
     >>> physgen.default_motion(physgen.load_scene("scene")).sentence  # doctest: +SKIP
@@ -167,7 +173,7 @@ def default_motion(
 
     Raises InputError for a mesh or clean plate that cannot be read.
     """
-    moves = _moves(scene)
+    moves = _moves(scene, calm, still)
     action = max((_end(_thing_of(scene, move.name), move) for move in moves), default=0.0)
     return fitted(scene, moves, dict.fromkeys(SLOW, action), fps=fps, frames=frames, slow=slow)
 
@@ -198,17 +204,17 @@ def fitted(
     return DefaultMotion(moves=moves, frames=frames, fps=fps, slow=slow, action_s=action, sentence=sentence)
 
 
-def _moves(scene: Scene) -> tuple[Move, ...]:
+def _moves(scene: Scene, calm: Collection[str], still: Collection[str]) -> tuple[Move, ...]:
     model = scene.model
     gravity = float(np.linalg.norm(model.gravity))
     # A hop comes down where gravity points into the ground; elsewhere nothing simple is right.
     if model.ground is None or gravity < 0.5 or float(np.dot(model.gravity, model.ground.unit_normal)) > -0.9 * gravity:
         return ()
-    stage = _Stage(scene, gravity)
+    stage = _Stage(scene, gravity, calm)
     chosen: list[Move] = []
     for _ in range(MOST_MOVES):
         begin = 0.0 if not chosen else chosen[-1].start_s + 0.7 * chosen[-1].flight_s
-        done = [move.name for move in chosen]
+        done = [move.name for move in chosen] + list(still)
         found = [stage.best(thing, begin, chosen) for thing in stage.things if thing.item.name not in done]
         rated = [pair for pair in found if pair is not None]
         if not rated:
@@ -220,8 +226,8 @@ def _moves(scene: Scene) -> tuple[Move, ...]:
 class _Stage:
     """The objects of a scene, its camera, and the ground as the photo shows it."""
 
-    def __init__(self, scene: Scene, gravity: float) -> None:
-        self.scene, self.gravity = scene, gravity
+    def __init__(self, scene: Scene, gravity: float, calm: Collection[str]) -> None:
+        self.scene, self.gravity, self.calm = scene, gravity, calm
         self.camera, self.ground = scene.model.camera, scene.model.ground_plane
         self.up = self.ground.unit_normal
         ahead = np.asarray(self.camera.world_from_camera, dtype=np.float64)[:3, 2]
@@ -246,6 +252,8 @@ class _Stage:
         hops = [[self._tries(thing, share, begin) for share in LOWER]]
         pushes = [[self._pushes(thing, share, begin) for share in LOWER]]
         ways = [*pushes, *hops] if self._slides_better(thing) else [*hops, *pushes]
+        if thing.item.name in self.calm:
+            ways = hops
         if not before:
             # Something that fills the picture may leave it by a little, alone, at last; lower peaks only show less.
             ways.append([self._tries(thing, share, begin) for share in LOWER[::-1]])
@@ -259,6 +267,8 @@ class _Stage:
         return None
 
     def _steady(self, thing: Thing) -> bool:
+        if thing.item.name in self.calm:
+            return False
         return thing.round or min(thing.tips(way, self.up) for way in self.ways) >= STEADY
 
     def _slides_better(self, thing: Thing) -> bool:

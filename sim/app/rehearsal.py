@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a coarse bake tells of a motion before the real one: when it is over, and what leaves the picture.
+"""What a coarse bake tells of a motion before the real one: when it is over, what leaves the picture, what falls over.
 
 A ballistic estimate knows a motion up to the first contact. The engine knows the rest, and a coarse run costs seconds.
 """
@@ -16,9 +16,11 @@ from ..cache.bake_folder import Bake
 from ..cache.pc2 import Pc2Reader
 from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
+from ..scene.scene_object import SceneObject
 from .bake_options import BakeOptions
 from .clip_check import STEP_PX, Clip, leaving, seen_tracks
 from .default_motion import LONGEST_S, SLOW, DefaultMotion, fitted
+from .free_space import thing_at_rest
 
 RATE = 60.0
 """Samples a second of the scene."""
@@ -29,17 +31,21 @@ LONGER, AT_LEAST_S, AT_MOST_S = 2.0, 0.6, LONGEST_S / 2.0
 TAMED = 0.75
 """Share of the speed that is left to a motion of which something leaves the picture: little over half as far."""
 
-MOST_REHEARSALS = 3
+TOPPLED = math.radians(40.0)
+"""Turn from rest at which a thing that does not roll counts as fallen over: it shows sides that the photo does not."""
+
+MOST_REHEARSALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rehearsed:
     """motion: with the clip that ends when nothing is seen to move any more. leaving: the warning about each object
-    that leaves the picture within that clip.
+    that leaves the picture within that clip. toppled: names of the objects that fall over in it.
     """
 
     motion: DefaultMotion
     leaving: tuple[str, ...]
+    toppled: tuple[str, ...] = ()
 
     def tamed(self, scene: Scene) -> DefaultMotion:
         """Return the motion with less speed, of which a rehearsal is to be made again."""
@@ -83,4 +89,29 @@ def rehearsed(
     names = [item.name for item in bake.manifest.objects]
     seen = Clip(first=1, fps=rate)
     gone = [leaving(name, track[:shown], camera, seen) for name, track in zip(names, tracks, strict=True)]
-    return Rehearsed(motion=clip, leaving=tuple(text for text in gone if text))
+    lying = [
+        item.name
+        for item, cache in zip(scene.model.objects, caches, strict=True)
+        if not _rolls(scene, item) and _turn(cache, shown) > TOPPLED
+    ]
+    return Rehearsed(motion=clip, leaving=tuple(text for text in gone if text), toppled=tuple(lying))
+
+
+def _rolls(scene: Scene, item: SceneObject) -> bool:
+    """Whether turning is its way of moving, or it has no shape to turn."""
+    return item.material.law in ("sand", "snow", "fluid") or thing_at_rest(scene, item, scene.model.ground_plane).round
+
+
+def _turn(cache: Pc2Reader, count: int) -> float:
+    """Largest angle in radians, among the first ``count`` samples of ``cache``, of the rotation that fits best from the
+    first one (Kabsch 1976)."""
+    rest = cache.sample(0).astype(np.float64)
+    rest -= rest.mean(axis=0)
+    most = 0.0
+    for number in range(1, count):
+        now = cache.sample(number).astype(np.float64)
+        first, _, second = np.linalg.svd(rest.T @ (now - now.mean(axis=0)))
+        sign = np.sign(np.linalg.det(first @ second))
+        turn = first @ np.diag([1.0, 1.0, sign]) @ second
+        most = max(most, math.acos(float(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
+    return most

@@ -344,3 +344,20 @@ def test_a_slow_bake_holds_the_same_motion_at_more_moments(ball_scene, tmp_path)
     heights = np.array([slow.vertices("ball0", n)[:, 2].mean() for n in range(1, 11)])
     times = np.arange(10) / 72.0
     assert np.abs(heights - heights[0] - times + 0.5 * 9.81 * times**2).max() < 5e-4
+
+
+def test_what_falls_over_in_a_rehearsal_hops_calmly_and_else_stays(table, tmp_path):
+    import physgen
+
+    scene = table([(0, 0, 0, 0.05, 0.05, 0.14)], ["wood"])
+    motion = default_motion(scene)
+    tripped = dataclasses.replace(motion.moves[0], velocity=(1.2, 0.0, 0.0), spin=(0.0, 9.0, 0.0))
+    motion = dataclasses.replace(motion, moves=(tripped,))
+    bake = physgen.bake(motion.applied(scene), out=tmp_path / "0", options=rehearsal_options(motion, BakeOptions()))
+    assert rehearsed(scene, bake, motion).toppled == ("box0",)
+    (calm,) = default_motion(scene, calm=["box0"]).moves
+    assert not calm.slides and calm.aside == (0.0, 0.0, 0.0) and calm.spin == (0.0, 0.0, 0.0)
+    motion = dataclasses.replace(motion, moves=(calm,))
+    bake = physgen.bake(motion.applied(scene), out=tmp_path / "1", options=rehearsal_options(motion, BakeOptions()))
+    assert rehearsed(scene, bake, motion).toppled == ()
+    assert default_motion(scene, still=["box0"]).moves == ()
