@@ -10,6 +10,7 @@ from physgen.sim.composite.inpaint import FillOptions
 from physgen.sim.reconstruct.background.background_inpainting import blend, fill_background, leftover_shadow
 from physgen.sim.reconstruct.background.inpainting_methods import (
     METHODS,
+    VIEW_PIXELS,
     InpaintingTask,
     choose_method,
     match_grain,
@@ -18,6 +19,7 @@ from physgen.sim.reconstruct.background.inpainting_methods import (
 )
 from physgen.sim.reconstruct.background.surface_edges import edges_behind
 from physgen.sim.reconstruct.background.surface_inpainting import clamp_to_surroundings, logarithms
+from physgen.sim.reconstruct.background.top_view import top_views, visible_in_photo
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 
 WIDTH, HEIGHT = 200, 150
@@ -194,3 +196,15 @@ def test_every_way_fills_and_leaves_the_rest(way):
     filled, again = METHODS[way](task), METHODS[way](task)
     assert (filled[hole] > 20.0).all()
     assert (filled == again).all()
+
+
+def test_a_floor_of_which_little_shows_is_still_filled_from_above():
+    # A trial hole lies among objects; the view from above reaches far beside the photo, so little of it is known.
+    hole = disc(100, 85, 26)
+    closed = ~disc(100, 85, 31) & ~hole
+    task = InpaintingTask(checks(), hole, closed, camera(), FillOptions())
+    ((view, _),) = top_views(camera(), hole, VIEW_PIXELS)
+    share = visible_in_photo(view, closed | hole).mean()
+    assert 0.02 < share < 0.06
+    filled, rows = METHODS["as ground"](task), METHODS["by rows"](task)
+    assert not np.array_equal(filled[hole], rows[hole])

@@ -73,7 +73,9 @@ def _local(values: NDArray[np.float32], where: Mask, blur: float) -> NDArray[np.
 VIEW_PIXELS = 1_300_000
 """Largest size of one view; larger ones are coarser than the photo."""
 MIN_KNOWN = 0.06
-"""Least visible share of a view to inpaint the rest from."""
+"""Least visible share of the photo's part to inpaint the rest from."""
+MIN_KNOWN_GROUND = 0.02
+"""The same of a top view, much of which lies beside the photo: a trial hole between objects leaves 0.06 of it."""
 MARGIN = 0.8
 """Margin of the photo around a hole, over the size of the hole."""
 CONTRAST = 45.0
@@ -124,7 +126,7 @@ def as_ground(task: InpaintingTask) -> Picture:
         shown = visible_in_photo(view, np.zeros_like(left))
         known = visible_in_photo(view, task.closed | left)
         hole = shown & ~visible_in_photo(view, left & ~task.closed) & ~known
-        if known.mean() < MIN_KNOWN or not hole.any():
+        if known.mean() < MIN_KNOWN_GROUND or not hole.any():
             continue
         filled = fill_surface(to_top_view(result, view), hole, ~known & ~hole, task.options)
         rows, columns = box(part, 0)
