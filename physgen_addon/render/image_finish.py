@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.composite import blur, film_grain
-from ...sim.composite.compositing import ObjectLayer
+from ...sim.composite.compositing import ObjectLayer, rolled_off
 from ...sim.composite.pull_push import spread_values
 from ...sim.composite.srgb import Linear
+from ...sim.scene.equirectangular import LUMINANCE
 from ...sim.scene.model import Camera, SceneModel
 from ...sim.smoothstep import smoothstep
 from .clean_plate import CleanPlate
@@ -28,6 +30,10 @@ MOVED_PX = (0.25, 1.5)
 LEAST_CHANGE = 0.02
 """Share of a pixel from other sources than the photo that is too small for grain: it is never quite 0 far from objects.
 """
+BRIGHTEST, UNBOUNDED = 0.99, 1e3
+"""Share of an object's pixels that are darker than what its light may come up to; luminance that is no bound."""
+GAP = 0.025
+"""Distance of an object's vertices on the image over its width, at most."""
 REACH_PX = 64
 """Maximum distance around objects that blur can carry their colours."""
 
@@ -45,17 +51,21 @@ class ImageFinish:
             model = film_grain.estimate_noise(plate.photo)
             self._grain = film_grain.Grain(model, self._size, options.seed)
             self._grainy = [film_grain.noise_share(model, plate.photo, mask) for mask in plate.object_masks]
+        self._brightest = [_brightest(plate.photo[mask]) for mask in plate.object_masks]
         self._sigmas = _outline_sigmas(plate) if options.match_sharpness else []
 
     def objects(self, layer: ObjectLayer, camera: Camera, now: Vertices) -> ObjectLayer:
         """Return ``layer`` as the photo's lens would image it, seen by ``camera`` with vertices ``now`` (V, 3)."""
-        if not self._sigmas and self._options.f_number is None:
-            return layer
         moved = self._moved(camera, now)
         window = _around(layer.alpha)
         if window is None or not any(weight.any() for weight in moved):
             return layer
         part = ObjectLayer(texture=layer.texture[window], alpha=layer.alpha[window], light=layer.light[window])
+        most = self._map(camera, now, [np.full(len(v), b) for v, b in zip(now, self._brightest, strict=True)])[window]
+        # Between its vertices those of another object behind it show through.
+        wide = max(3, round(GAP * self._size[0])) | 1
+        most = cv2.dilate(np.ascontiguousarray(most), np.ones((wide, wide), np.uint8))
+        part = rolled_off(part, np.where(most < UNBOUNDED, most, np.float32(np.inf)))
         if self._sigmas:
             larger = self._map(camera, now, self._magnification(camera, now))[window]
             sigma = self._map(camera, now, [np.full(len(v), s) for v, s in zip(now, self._sigmas, strict=True)])[window]
@@ -64,9 +74,9 @@ class ImageFinish:
         if self._options.f_number is not None:
             radius = self._map(camera, now, self._added_blur(camera, now, self._options.f_number))[window]
             part = blur.defocused(part, radius * np.float32(self._size[0] / camera.width))
-        texture, alpha = layer.texture.copy(), layer.alpha.copy()
-        texture[window], alpha[window] = part.texture, part.alpha
-        return ObjectLayer(texture=texture, alpha=alpha, light=layer.light)
+        texture, alpha, light = layer.texture.copy(), layer.alpha.copy(), layer.light.copy()
+        texture[window], alpha[window], light[window] = part.texture, part.alpha, part.light
+        return ObjectLayer(texture=texture, alpha=alpha, light=light)
 
     def finish(
         self, beauty: Linear, layer: ObjectLayer, camera: Camera, now: Vertices, at_rest: NDArray[np.float32]
@@ -128,6 +138,12 @@ class ImageFinish:
     def _pixels(self, camera: Camera, positions: NDArray[np.floating]) -> NDArray[np.float64]:
         scale = np.array([self._size[0] / camera.width, self._size[1] / camera.height])
         return np.asarray(camera.project(positions)[:, :2] * scale)
+
+
+def _brightest(colours: Linear) -> float:
+    """Return the luminance of nearly the brightest of the photo's ``colours`` (N, 3) of an object; ``UNBOUNDED`` for
+    one that the photo does not show."""
+    return float(np.quantile(colours @ LUMINANCE, BRIGHTEST)) if len(colours) else UNBOUNDED
 
 
 def _outline_sigmas(plate: CleanPlate) -> list[float]:

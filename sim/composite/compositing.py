@@ -122,6 +122,22 @@ def light_ratio(premultiplied: Linear, alpha: NDArray[np.float32]) -> Linear:
     return np.asarray(np.clip(near + (own - near) * weight, 0.0, MAX_RATIO), dtype=np.float32)
 
 
+def rolled_off(layer: ObjectLayer, brightest: NDArray[np.float32]) -> ObjectLayer:
+    """Return ``layer`` with its gains of light bounded: what turns to a lamp becomes no brighter than ``brightest``.
+
+    brightest: (H, W) luminance of the brightest that the photo shows of the object there; infinite where it is not
+    known. How much brighter than the rest of the light a lamp is cannot be read off sides that are not lit by it. Half
+    of the way to the bound gains are as rendered; from there they approach it exponentially, as film does. Light of at
+    most 1, as at rest, stays as it is.
+    """
+    colour = layer.texture / np.maximum(layer.alpha[..., None], 1e-6)
+    own = np.maximum(colour @ np.asarray(LUMINANCE, dtype=np.float32), 1e-4)
+    half = 0.5 * np.clip(brightest / own - 1.0, 1e-3, 2.0 * MAX_RATIO)[..., None]
+    gain = layer.light - 1.0
+    light = np.where(gain > half, 1.0 + half - half * np.expm1(-np.maximum(gain - half, 0.0) / half), layer.light)
+    return replace(layer, light=light.astype(np.float32))
+
+
 def continued_light(ratio: Linear, alpha: NDArray[np.float32]) -> Linear:
     """Return the light ``ratio`` (H, W, 3) with that of its surroundings where the lit surface, of coverage ``alpha``
     (H, W), does not reach: grains fly about beyond the shell that stands for them. Unchanged where there is no surface.

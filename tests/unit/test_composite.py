@@ -202,3 +202,16 @@ def test_without_a_telling_shadow_it_stays_as_rendered():
     assert (deep <= compositing.DEPTHS[1] * compositing.TINTS[1]).all() and (deep > 0).all()
     none = compositing.shadow_exponents(photo, background, np.ones_like(rendered), shaded=shaded, known=known)
     assert np.isfinite(none).all() and none.max() <= compositing.DEPTHS[1] * compositing.TINTS[1]
+
+
+def test_what_turns_to_a_lamp_is_no_brighter_than_the_brightest_of_the_photo():
+    own = np.array([0.2, 0.5, 0.9, 0.5], np.float32)
+    light = np.stack([np.full(3, value, np.float32) for value in (6.0, 1.05, 1.4, 0.6)])[None]
+    texture = np.repeat(own[None, :, None], 3, axis=2)
+    layer = compositing.ObjectLayer(texture=texture, alpha=np.ones((1, 4), np.float32), light=light)
+    bound = np.full((1, 4), 0.8, np.float32)
+    lit = compositing.rolled_off(layer, bound).light * texture
+    # Far above the bound it comes up to it, little gain and darkening stay, and what was brighter gains nothing.
+    assert lit[0, :, 0] == pytest.approx([0.2 * (2.5 + 1.5 * -np.expm1(-3.5 / 1.5)), 0.525, 0.9, 0.3], abs=0.001)
+    assert lit[0, 0, 0] < 0.8
+    assert (compositing.rolled_off(layer, np.full((1, 4), np.inf, np.float32)).light == light).all()
