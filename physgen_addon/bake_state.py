@@ -18,6 +18,7 @@ from . import background_jobs, paths
 from .playback import bake_record, show_bake
 from .playback.bake_record import BakeRecord
 from .props.body_props import bodies
+from .scene_io.export_meshes import mesh_trouble
 from .scene_io.motion_fingerprint import fingerprint
 
 BAKE_OPERATOR = "physgen.bake"
@@ -39,6 +40,7 @@ class BakeState:
     ``missing`` (files deleted or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the scene.
     trouble: the last error; advice: state and remedy in words. estimate_text: estimated cost of baking; empty if
     unknown. frame_start: of the bake that is shown, or would be made. bakes: all that are on the disk, newest first.
+    unfit: names of the objects whose meshes cannot be simulated.
     """
 
     status: str = "none"
@@ -50,6 +52,7 @@ class BakeState:
     estimate_text: str = ""
     frame_start: int = 1
     bakes: tuple[bake_record.BakeOnDisk, ...] = ()
+    unfit: frozenset[str] = frozenset()
 
     @property
     def message(self) -> str:
@@ -109,6 +112,7 @@ def forget() -> None:
     _dirty.clear()
     _fingerprints.clear()
     _troubles.clear()
+    _unfit_of.clear()
 
 
 def set_trouble(scene: bpy.types.Scene, message: str) -> None:
@@ -195,6 +199,7 @@ def observe(scene: bpy.types.Scene) -> BakeState:
         found,
         disk_bytes=sum(bake_record.disk_bytes(cache) for cache in caches_of(scene)),
         frame_start=_first_frame(scene),
+        unfit=_unfit(scene),
         bakes=tuple(bake for cache in caches_of(scene) for bake in bake_record.bakes_on_disk(cache)),
         estimate_text=simulation.estimate
         if simulation.estimate and simulation.estimate_of == _fingerprint(scene)[0]
@@ -206,6 +211,25 @@ def observe(scene: bpy.types.Scene) -> BakeState:
         # Changes without further notice: a killed worker leaves a child process that ends a moment later.
         mark_progress(scene)
     return found
+
+
+MOST_VERTICES = 50_000
+"""Of a mesh that is looked at after every change; a larger one is checked when it is added, and when it is baked."""
+_unfit_of: dict[int, tuple[str, frozenset[str]]] = {}
+"""Fingerprint, and the names found for it, by session_uid."""
+
+
+def _unfit(scene: bpy.types.Scene) -> frozenset[str]:
+    current = _fingerprint(scene)[0]
+    known = _unfit_of.get(scene.session_uid)
+    if known is None or known[0] != current:
+        found = (item for item in bodies(scene) if item.physgen.role == "dynamic" and _is_unfit(item))
+        known = _unfit_of[scene.session_uid] = current, frozenset(item.name for item in found)
+    return known[1]
+
+
+def _is_unfit(item: bpy.types.Object) -> bool:
+    return item.mode == "OBJECT" and len(item.data.vertices) <= MOST_VERTICES and bool(mesh_trouble(item))
 
 
 def _first_frame(scene: bpy.types.Scene) -> int:

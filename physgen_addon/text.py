@@ -31,7 +31,8 @@ def popup(message: str) -> str:
     if bpy.app.background:
         return message
     lines = (textwrap.wrap(line, POPUP, break_on_hyphens=False) for line in message.splitlines())
-    return "\n".join(part for wrapped in lines for part in wrapped)
+    # The status bar shows it in one line and drops the breaks.
+    return " \n".join(part for wrapped in lines for part in wrapped)
 
 
 Execute = Callable[[Any, bpy.types.Context], set[str]]

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty
+from numpy.typing import NDArray
 
 from ...sim.app.propose import best_proposals
 from ...sim.app.stage_process import run_stage
@@ -15,12 +18,14 @@ from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.reconstruct.reconstruct_options import Proposal
 from ..background_jobs import JobOperator, Work
-from ..context import redraw
+from ..context import TAB, redraw, show_beside
 from ..interpreter import cli_command, find_python
+from ..paths import require_folder
 from ..photo.photo_image import PhotoTool, on_screen, place_under, shows_photo
 from ..photo.photo_maths import box_overlap, simplified
 from ..photo.photo_request import photo_file, scene_folder
 from ..props.preferences import python
+from ..text import report_errors
 from .mask_horizon_ops import chosen_box
 from .photo_ops import add_box
 
@@ -90,6 +95,99 @@ class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
         added = add_found(scene, found, every=self.every)
         redraw("IMAGE_EDITOR")
         return f"{len(found)} objects found, {added} boxes added; {Path(str(final['out'])).name} has a numbered picture"
+
+
+DIM = 0.2
+"""Share of the background's brightness in the picture of the cut-outs."""
+OUTLINES = ((1.0, 0.55, 0.1), (0.2, 0.8, 1.0), (0.6, 1.0, 0.3), (1.0, 0.3, 0.8))
+"""Of the objects, in turn."""
+MOST_PX = 1600
+"""Longest side of that picture."""
+
+
+def cutouts_picture(root: Path) -> bpy.types.Image:
+    """Return a new image of the photo of the scene folder ``root``: its objects bright and outlined, the rest dark.
+
+    Raises InputError where the folder has no photo or no masks.
+    """
+    masks = sorted((root / "masks").glob("*.png"))
+    if not masks or not (root / "photo.png").is_file():
+        raise InputError(f"{root}: has no photo with masks; reconstruct it again")
+    photo = _pixels(root / "photo.png")
+    step = -(-max(photo.shape[:2]) // MOST_PX)
+    shown = photo[::step, ::step].copy()
+    inside = np.zeros(shown.shape[:2], dtype=bool)
+    edges = []
+    for path in masks:
+        mask = _pixels(path)[..., 0] > 0.5
+        if mask.shape != photo.shape[:2]:
+            raise InputError(f"{path}: is of another size than photo.png; reconstruct the scene again")
+        mask = mask[::step, ::step]
+        inside |= mask
+        edges.append(mask & ~_shrunk(mask, 2))
+    shown[~inside, :3] *= DIM
+    for edge, colour in zip(edges, itertools.cycle(OUTLINES), strict=False):
+        shown[edge, :3] = colour
+    shown[..., 3] = 1.0
+    height, width = shown.shape[:2]
+    image = bpy.data.images.new(f"Cut-outs of {root.name}", width, height)
+    image.pixels.foreach_set(np.ascontiguousarray(shown, dtype=np.float32).ravel())
+    return image
+
+
+def _shrunk(mask: NDArray[np.bool_], times: int) -> NDArray[np.bool_]:
+    """Return ``mask`` without its outermost ``times`` pixels."""
+    for _ in range(times):
+        wide = np.pad(mask, 1)
+        mask = mask & wide[2:, 1:-1] & wide[:-2, 1:-1] & wide[1:-1, 2:] & wide[1:-1, :-2]
+    return mask
+
+
+def _pixels(path: Path) -> NDArray[np.float32]:
+    """Return the values of a picture as stored, 0 to 1, (H, W, 4), first row at the bottom."""
+    try:
+        image = bpy.data.images.load(str(path))
+    except RuntimeError as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+    try:
+        width, height = image.size
+        values = np.empty(width * height * 4, dtype=np.float32)
+        image.pixels.foreach_get(values)
+    finally:
+        bpy.data.images.remove(image)
+    return values.reshape(height, width, 4)
+
+
+class PHYSGEN_OT_show_cutouts(bpy.types.Operator):
+    """Show what was cut out of the photo as objects, bright in an image editor: what is dark stays in the background"""
+
+    bl_idname = "physgen.show_cutouts"
+    bl_label = "Show Cut-outs"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled after a reconstruction."""
+        if not context.scene.physgen.folder:
+            cls.poll_message_set("Reconstruct a photo first")
+            return False
+        return True
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Make the picture and show it beside the viewport."""
+        image = cutouts_picture(require_folder(context.scene.physgen.folder, "Scene Folder"))
+        for old in [other for other in bpy.data.images if other.get(CUTOUTS)]:
+            bpy.data.images.remove(old)
+        image[CUTOUTS] = True
+        show_beside(context, image, TAB)
+        self.report(
+            {"INFO"}, "What is dark stays in the background; to change it, Correct > Draw Strokes or Paint Mask"
+        )
+        return {"FINISHED"}
+
+
+CUTOUTS = "physgen_cutouts"
+"""Custom property of the picture, so that a new one replaces it."""
 
 
 class PHYSGEN_OT_draw_strokes(PhotoTool, bpy.types.Operator):

@@ -10,7 +10,7 @@ import bpy
 from mathutils import Vector
 
 from ...sim.constitutive import COHERENT, SHAPED, cohesion_of
-from .. import text
+from .. import bake_state, text
 from ..operators.body_ops import (
     PHYSGEN_OT_add_bodies,
     PHYSGEN_OT_add_pin,
@@ -69,11 +69,16 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         """Draw role, name, material and visibility."""
         body = item.physgen
         row = layout.row(align=True)
-        row.prop(item, "name", text="", emboss=False, icon=ROLE_ICONS[body.role])
+        # What cannot be baked as it is; the panel says why after pressing Bake, and did when it was added.
+        row.alert = item.name in bake_state.state(context.scene).unfit
+        row.prop(item, "name", text="", emboss=False, icon="ERROR" if row.alert else ROLE_ICONS[body.role])
         row = row.row()
         row.alignment = "RIGHT"
         words = "Collider" if body.role == "collider" else material_props.preset_title(body.material.preset_name)
-        row.label(text=words + ("*" if body.role == "dynamic" and is_modified(body.material) else ""))
+        # A narrow list has no room for the bracket.
+        row.label(
+            text=words.partition(" (")[0] + ("*" if body.role == "dynamic" and is_modified(body.material) else "")
+        )
         row.prop(item, "hide_viewport", text="", emboss=False)
 
     def filter_items(self, context: bpy.types.Context, data: Any, prop: str) -> tuple[list[int], list[int]]:
@@ -179,11 +184,7 @@ def draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material
     row.operator(PHYSGEN_OT_save_preset.bl_idname, text="", icon="FILE_TICK")
     if name in own.good:
         row.operator(PHYSGEN_OT_delete_preset.bl_idname, text="", icon="TRASH").name = name
-    if modified:
-        text.sentences(
-            layout, context, f"{material_props.preset_title(name)}, with modified values.", icon="GREASEPENCIL"
-        )
-    elif name != material_props.CUSTOM and material_props.find_preset(name) is None:
+    if not modified and name != material_props.CUSTOM and material_props.find_preset(name) is None:
         words = f"There is no preset {name} on this computer. The object keeps its values."
         text.sentences(layout, context, words, icon="INFO")
     for broken in own.broken:

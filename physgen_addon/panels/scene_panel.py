@@ -10,6 +10,7 @@ import bpy
 from .. import text
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
+from ..operators.photo_object_ops import PHYSGEN_OT_show_cutouts
 from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, image_here
 from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
@@ -90,7 +91,9 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row.operator("view3d.view_camera", text="Look Through Camera", icon="VIEW_CAMERA")
     if state.photo_root is not None:
         row.prop(state.photo_root, "hide_viewport", text="")
-    layout.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import Another", icon="IMPORT")
+    row = layout.row(align=True)
+    row.operator(PHYSGEN_OT_show_cutouts.bl_idname, icon="MOD_MASK")
+    row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import Another", icon="IMPORT")
 
 
 class PHYSGEN_PT_correct(Sidebar, bpy.types.Panel):

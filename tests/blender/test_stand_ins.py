@@ -154,3 +154,95 @@ def test_a_collider_keeps_its_modifiers_and_its_animation():
     item.keyframe_insert("location", frame=1)
     assert bpy.ops.physgen.add_colliders() == {"FINISHED"}
     assert bodies(bpy.context.scene) == [item] and not item.hide_viewport
+
+
+def grown_by_nodes(**where):
+    """A cube that Geometry Nodes stretch to twice its height."""
+    item = a_cube(**where)
+    group = bpy.data.node_groups.new("Stretch", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    given, out = (group.nodes.new(f"NodeGroup{way}") for way in ("Input", "Output"))
+    stretch = group.nodes.new("GeometryNodeTransform")
+    stretch.inputs["Scale"].default_value = (1, 1, 2)
+    group.links.new(given.outputs[0], stretch.inputs["Geometry"])
+    group.links.new(stretch.outputs[0], out.inputs[0])
+    item.modifiers.new("Nodes", "NODES").node_group = group
+    return item
+
+
+def posed(location=(0, 0, 0)):
+    """A cube that the bone of an armature has turned by half a right angle."""
+    item = a_cube(location=location)
+    bpy.ops.object.armature_add(location=location)
+    armature = bpy.context.object
+    item.vertex_groups.new(name="Bone").add(range(8), 1.0, "REPLACE")
+    item.modifiers.new("Armature", "ARMATURE").object = armature
+    bone = armature.pose.bones["Bone"]
+    bone.rotation_mode, bone.rotation_euler = "XYZ", (0, math.pi / 4, 0)
+    return item
+
+
+def thrown(location=(0, 0, 0)):
+    """A cube that keyframes move sideways, 0.25 m a frame, until physics takes over at frame 5."""
+    item = a_cube(location=location)
+    for frame, x in ((1, 0.0), (25, 6.0)):
+        item.location = (location[0] + x, *location[1:])
+        item.keyframe_insert("location", frame=frame)
+    for curve in item.animation_data.action.layers[0].strips[0].channelbag(item.animation_data.action_slot).fcurves:
+        for point in curve.keyframe_points:
+            point.interpolation = "LINEAR"
+    return item
+
+
+def test_stand_ins_are_baked_and_play(tmp_path):
+    """All kinds in one bake of a real worker: rest shape in the first frame, gravity's fall, the hand-over."""
+    scene = bpy.context.scene
+    scene.render.fps, scene.frame_end = 24, 12
+    simulation = scene.physgen.simulation
+    simulation.quality, simulation.frame_start, simulation.frame_end = "preview", 1, 9
+    simulation.cache = str(tmp_path / "cache")
+    makers = [a_text, a_curve, arrayed, keyed, grown_by_nodes, posed]
+    rest = {}
+    for number, make in enumerate(makers):
+        item = make()
+        item.location = (0, 6.0 * number, 5)
+        if make is posed:
+            item.modifiers["Armature"].object.location = item.location
+        bpy.context.view_layer.update()
+        rest[item.name] = (item, shown_bounds(item))
+    flier = thrown(location=(0, -8, 5))
+    scene.frame_set(1)
+    add(*(item for item, _ in rest.values()))
+    scene.frame_set(5)
+    add(flier)
+    assert len(bodies(scene)) == len(makers) + 1 and all(body.physgen.original for body in bodies(scene))
+    assert bpy.ops.physgen.bake("EXEC_DEFAULT") == {"FINISHED"}
+    for body in bodies(scene):
+        if body.physgen.original == flier:
+            continue
+        _, (low, high) = rest[body.physgen.original.name]
+        scene.frame_set(1)
+        assert np.allclose(shown_bounds(body), (low, high), atol=1e-4), body.name
+        scene.frame_set(9)
+        fallen = 0.5 * 9.81 * (8 / 24) ** 2
+        assert np.allclose(shown_bounds(body)[0][2], low[2] - fallen, atol=0.05 * fallen), body.name
+        assert body.physgen.original.hide_viewport
+    (body,) = (body for body in bodies(scene) if body.physgen.original == flier)
+    for frame, x in ((5, 1.0), (9, 2.0)):
+        scene.frame_set(frame)
+        low, high = shown_bounds(body)
+        assert math.isclose((low[0] + high[0]) / 2, x, abs_tol=0.02), (frame, low, high)
+        assert flier.hide_viewport and not body.hide_viewport
+    fallen = 0.5 * 9.81 * (4 / 24) ** 2
+    assert math.isclose((low[2] + high[2]) / 2, 5 - fallen, abs_tol=0.05 * fallen)
+    scene.frame_set(4)
+    assert body.hide_viewport and not flier.hide_viewport
+
+
+def add(*items):
+    """Let them take part as rigid bodies, as an artist does who has selected them."""
+    for item in bpy.context.view_layer.objects:
+        item.select_set(item in items)
+    bpy.context.view_layer.objects.active = items[0]
+    assert bpy.ops.physgen.quick_rigid() == {"FINISHED"}

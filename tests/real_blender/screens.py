@@ -124,48 +124,69 @@ def press(key: str) -> Generator[float, None, None]:
     yield from drawn()
 
 
-def widen(width: int) -> Generator[float, None, None]:
-    """Drag the sidebar's edge until it is ``width`` px wide; nothing without xdotool, as no script can do it."""
+def widen(area: bpy.types.Area, width: int) -> Generator[float, None, None]:
+    """Drag the edge of the sidebar of ``area`` until it is ``width`` px wide; nothing without xdotool."""
     if shutil.which("xdotool") is None:
         return
     for _ in range(3):
-        bar = region(viewport(), "UI")
+        bar = region(area, "UI")
         if abs(bar.width - width) <= 1:
             return
         x, y = bar.x, window().y + window().height - (bar.y + bar.height // 2)
         xdotool("mousemove", x - 20, y, "mousemove", x, y)
         yield from drawn()
         xdotool("mousedown", 1)
-        yield from drawn(2)
+        yield from drawn()
         for share in (0.5, 1.0):
             xdotool("mousemove", round(x - share * (width - bar.width)), y)
-            yield from drawn(2)
+            yield from drawn()
         xdotool("mouseup", 1)
-        yield from drawn(2)
+        yield from drawn()
 
 
-def shoot(folder: Path, name: str, widths: Sequence[int] = (431, 292)) -> Generator[float, None, None]:
-    """Write ``NAME_WIDTH.png``, the sidebar alone, at each width, and ``NAME.png``, the window at the last."""
-    for width in widths:
-        yield from widen(width)
-        yield from _shoot(folder, name)
-        bar = folder / f"{name}_sidebar.png"
-        if bar.is_file():
-            bar.rename(folder / f"{name}_{width}.png")
+def arrange(widths: Sequence[int]) -> Generator[float, None, None]:
+    """Make the window viewports alone, one a width of the sidebar, each on the tab, and let new files look like that.
+
+    The last is the largest. Nothing is arranged without xdotool, as only the mouse can change a sidebar's width.
+    """
+    for area in [area for area in window().screen.areas if area.type != "VIEW_3D"]:
+        with bpy.context.temp_override(window=window(), area=area):
+            bpy.ops.screen.area_close()
+        yield 0.2
+    for width in widths[:-1]:
+        area = viewport()
+        with bpy.context.temp_override(window=window(), area=area, region=region(area, "WINDOW")):
+            bpy.ops.screen.area_split(direction="VERTICAL", factor=(width + 130) / area.width)
+        yield 0.2
+    shown = sorted((area for area in window().screen.areas if area.type == "VIEW_3D"), key=lambda area: area.x)
+    for area in shown:
+        area.spaces.active.show_region_ui = True
+        # Pictures are of panels; without a graphics card all else is the processor's work.
+        area.spaces.active.overlay.show_floor = area.spaces.active.overlay.show_ortho_grid = False
+    yield from drawn()
+    for area, width in zip(shown, widths, strict=True):
+        region(area, "UI").active_panel_category = TAB
+        yield from widen(area, width)
+    bpy.ops.wm.save_homefile()
+    yield 0.5
 
 
-def _shoot(folder: Path, name: str) -> Generator[float, None, None]:
-    """Write ``NAME.png``, the window, and ``NAME_sidebar.png``, the sidebar alone, as they look when all is drawn."""
+def shoot(folder: Path, name: str) -> Generator[float, None, None]:
+    """Write ``NAME.png``, the window, and ``NAME_WIDTH.png``, each sidebar alone, as they look when all is drawn."""
     folder.mkdir(exist_ok=True)
     # Panels slide to their places over several drawings.
-    for area in window().screen.areas:
-        area.tag_redraw()
-    yield from drawn(4)
+    for _ in range(3):
+        for area in window().screen.areas:
+            area.tag_redraw()
+        yield 0.2
+    yield from drawn()
     path = folder / f"{name}.png"
     picture(window(), path)
-    bar = region(viewport(), "UI")
-    if bar.width > 1:
-        crop(path, folder / f"{name}_sidebar.png", (bar.x, bar.y, bar.width, bar.height))
+    for area in window().screen.areas:
+        if area.type == "VIEW_3D":
+            bar = region(area, "UI")
+            if bar.width > 1:
+                crop(path, folder / f"{name}_{bar.width}.png", (bar.x, bar.y, bar.width, bar.height))
 
 
 def shoot_preferences(folder: Path, name: str, addon: str) -> Generator[float, None, None]:

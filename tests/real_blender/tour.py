@@ -37,17 +37,26 @@ def ended(what: str, seconds: float = 300):
     yield from session.until(lambda: running() is None, seconds, what)
 
 
+WIDTHS = (431, 292)
+"""Of the sidebar, in pixels: dragged wide, and as it opens."""
+
+
+def arranged():
+    """Two viewports with sidebars of the two widths, in this file and in new ones."""
+    preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
+    preferences.python = TASK["python"]
+    yield from screens.arrange(WIDTHS)
+
+
 def home():
-    """Blender's own start-up file, one large viewport, the tab in front."""
-    bpy.ops.wm.read_homefile(use_factory_startup=False)
-    yield 1.0
-    yield from screens.show_sidebar()
+    """A new file."""
+    bpy.ops.wm.read_homefile()
+    yield 0.5
+    yield from screens.drawn()
 
 
 def first_bake():
     """Default cube to a playing bake by the pie menu: two clicks, three keys; pictures of the way."""
-    preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
-    preferences.python = TASK["python"]
     yield from home()
     yield from screens.shoot(SCREENS, "01_start")
     x, y = screens.middle()
@@ -101,10 +110,15 @@ def refused():
         bpy.ops.object.select_all(action="SELECT")
         bpy.ops.physgen.add_bodies("INVOKE_DEFAULT")
     yield from screens.shoot(SCREENS, "08_refused_added")
-    with screens.focus():
-        bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield 0.5
-    yield from ended("the refusal")
+    try:
+        with screens.focus():
+            bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    except RuntimeError as error:
+        # Scripts get as an exception what pops up for artists, whose turn is next.
+        assert "is flat" in str(error), error
+    else:
+        raise AssertionError("a flat object was baked")
+    yield from screens.drawn()
     yield from screens.shoot(SCREENS, "09_refused_bake")
     yield from home()
     preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
@@ -136,12 +150,16 @@ def menus():
         yield from screens.press("Escape")
     with screens.focus():
         bpy.ops.physgen.quick_jelly()
-    bpy.ops.screen.back_to_previous()
-    yield 0.5
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    yield 1.0
+    with screens.focus():
+        bpy.ops.physgen.quick_jelly()
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
     area = next(area for area in screens.window().screen.areas if area.type == "PROPERTIES")
     area.spaces.active.context = "PHYSICS"
-    yield 1.0
-    screens.picture(screens.window(), SCREENS / "13_physics_tab.png")
+    yield from ended("the bake")
+    yield from screens.drawn(4)
+    screens.picture(screens.window(), SCREENS / "13_physics_tab_and_timeline.png")
 
 
 def sample_meshes():
@@ -195,5 +213,10 @@ def sample_photo():
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
 
 
-STEPS = [first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
-session.run("tour", [step for step in STEPS if not TASK["only"] or step.__name__ in TASK["only"].split(",")])
+def wanted(step) -> bool:
+    """Whether the task asks for it; the window is arranged in any case."""
+    return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
+
+
+STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
+session.run("tour", [step for step in STEPS if wanted(step)])
