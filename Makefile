@@ -65,10 +65,12 @@ docs: setup
 benchmark: setup
 	$(BIN)/python -m physgen.benchmarks $(NAMES) $(if $(QUICK),--quick)
 
-extension: setup
-	@$(BIN)/python setup/extension.py $(if $(ZIPS),--zips $(ZIPS))
+# Any Python with pip, no environment: it builds a zip and runs nothing of it.
+extension:
+	@test -n "$(PYTHON)" || exit 1
+	@"$(PYTHON)" setup/extension.py $(if $(ZIPS),--zips $(ZIPS))
 
-test-blender-app: extension
+test-blender-app: setup extension
 	$(BIN)/python tests/real_blender/run.py --blender "$(BLENDER)" --python "$(abspath $(BIN)/python)"
 
 clean:

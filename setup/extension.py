@@ -90,8 +90,11 @@ LINES = {
 NAMES = ("any", *(f"{platform}-{line}" for line in LINES for platform in PLATFORMS))
 
 
-def build(name: str, out: Path, wheels: Path) -> Path:
-    """Build the zip ``name`` into ``out``. Raises subprocess.CalledProcessError where wheels cannot be had."""
+def build(name: str, out: Path, wheels: Path | None) -> Path:
+    """Build the zip ``name`` into ``out``. Raises subprocess.CalledProcessError where wheels cannot be had.
+
+    wheels: where downloads are kept; None builds ``any`` without a wheel, by the standard library alone.
+    """
     manifest = read_manifest(ROOT)
     target, fields = None, {}
     if name != "any":
@@ -101,7 +104,9 @@ def build(name: str, out: Path, wheels: Path) -> Path:
         fields = {"platforms": [place], "blender_version_min": line.since}
         if line.before:
             fields["blender_version_max"] = line.before
-    files = all_wheels(ROOT, target, wheels) if target else pure_wheels(ROOT, wheels)
+    files: list[Path] = []
+    if wheels is not None:
+        files = all_wheels(ROOT, target, wheels) if target else pure_wheels(ROOT, wheels)
     suffix = "" if name == "any" else f"-{name}"
     path = out / f"{manifest['id']}-{manifest['version']}{suffix}.zip"
     write_zip(ROOT, path, fields, files)
@@ -275,7 +280,11 @@ def main() -> int:
     parser.add_argument("--zips", nargs="*", choices=["all", *NAMES], metavar="NAME", help=f"all, {', '.join(NAMES)}")
     parser.add_argument("--out", type=Path, default=ROOT / "dist")
     parser.add_argument("--wheels", type=Path, default=ROOT / "build" / "wheels", help="where downloads are kept")
+    alone = "build `any` without trimesh, which reads mesh files: neither pip nor a network is needed"
+    parser.add_argument("--no-wheels", action="store_true", help=alone)
     options = parser.parse_args()
+    if options.no_wheels:
+        options.zips, options.wheels = ["any"], None
     names = NAMES if options.zips and "all" in options.zips else options.zips or default_zips()
     for name in names:
         try:

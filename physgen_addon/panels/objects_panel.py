@@ -70,8 +70,8 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         body = item.physgen
         row = layout.row(align=True)
         # What cannot be baked as it is; the panel says why after pressing Bake, and did when it was added.
-        row.alert = item.name in bake_state.state(context.scene).unfit
-        row.prop(item, "name", text="", emboss=False, icon="ERROR" if row.alert else ROLE_ICONS[body.role])
+        is_unfit = item.name in bake_state.state(context.scene).unfit
+        row.prop(item, "name", text="", emboss=False, icon="ERROR" if is_unfit else ROLE_ICONS[body.role])
         row = row.row()
         row.alignment = "RIGHT"
         words = "Collider" if body.role == "collider" else material_props.preset_title(body.material.preset_name)

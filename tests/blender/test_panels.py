@@ -16,8 +16,9 @@ from physgen import physgen_addon
 from physgen.batch.blender_script import add_script_options
 from physgen.batch.commands.render_commands import render_options
 from physgen.batch.render import build_parser
-from physgen.physgen_addon import interpreter, paths, text
+from physgen.physgen_addon import bake_state, interpreter, paths, text
 from physgen.physgen_addon.operators import render_ops
+from physgen.physgen_addon.operators.photo_object_ops import cutouts_picture
 from physgen.physgen_addon.panels.render_panel import RESULTS
 from physgen.physgen_addon.panels.sidebar import is_in
 from physgen.physgen_addon.props import material_props
@@ -26,6 +27,7 @@ from physgen.physgen_addon.props.material_props import LAW_FIELDS, get_material,
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS, effect_values
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.sim.effects.registry import effect
+from physgen.sim.errors import InputError
 from physgen.sim.scene.material import LAWS
 
 
@@ -642,3 +644,42 @@ def test_a_photo_that_blender_made_an_empty_of_is_a_start(tmp_path):
     select(empty)
     assert bpy.ops.physgen.use_image() == {"FINISHED"}
     assert bpy.context.scene.physgen_photo.path == str(tmp_path / "dropped.png") and empty.hide_get()
+
+
+def a_picture(path, values):
+    image = bpy.data.images.new(path.stem, values.shape[1], values.shape[0])
+    image.pixels.foreach_set(np.ascontiguousarray(values, dtype=np.float32).ravel())
+    image.filepath_raw, image.file_format = str(path), "PNG"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save()
+    bpy.data.images.remove(image)
+
+
+def test_the_picture_of_the_cut_outs_darkens_what_stays_in_the_background(tmp_path):
+    photo, mask = np.full((24, 32, 4), 0.8), np.zeros((24, 32, 4))
+    photo[..., 3] = mask[..., 3] = mask[8:16, 10:20] = 1.0
+    with pytest.raises(InputError, match="no photo with masks"):
+        cutouts_picture(tmp_path)
+    a_picture(tmp_path / "photo.png", photo)
+    a_picture(tmp_path / "masks" / "book.png", mask)
+    image = cutouts_picture(tmp_path)
+    shown = np.array(image.pixels[:]).reshape(24, 32, 4)[..., :3]
+    assert shown[12, 15] == pytest.approx(0.8, abs=0.01) and shown[2, 2] == pytest.approx(0.16, abs=0.01)
+    assert shown[8, 15] == pytest.approx((1.0, 0.55, 0.1), abs=0.01)
+    a_picture(tmp_path / "masks" / "cup.png", mask[:12])
+    with pytest.raises(InputError, match=r"cup\.png: is of another size"):
+        cutouts_picture(tmp_path)
+
+
+def test_what_cannot_be_baked_is_marked_in_the_list_until_it_is_mended():
+    cube = a_body("Cube")
+    plane = a_cube("Plane")
+    plane.data.transform(((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 0), (0, 0, 0, 1)))
+    select(plane)
+    bpy.ops.physgen.add_bodies()
+    assert bake_state.observe(bpy.context.scene).unfit == {"Plane"}
+    plane.physgen.role = "collider"
+    assert bake_state.observe(bpy.context.scene).unfit == set()
+    plane.physgen.role = "dynamic"
+    plane.data = cube.data
+    assert bake_state.observe(bpy.context.scene).unfit == set()

@@ -3,6 +3,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 import tomllib
 import zipfile
 from pathlib import Path, PurePosixPath
@@ -191,3 +193,15 @@ def test_every_zip_is_for_a_python_and_a_numpy_that_its_blender_has(extension):
     old, new = extension.requirements(ROOT, "3.11"), extension.requirements(ROOT, "3.13")
     assert "numpy>=1.26,<2" in old and "numpy>=1.26" in new, "markers are those of Blender's Python"
     assert "numpy" in extension.SHIPPED and extension._plain("Charset_Normalizer") in extension.SHIPPED
+
+
+def test_the_zip_without_wheels_needs_the_standard_library_alone(tmp_path):
+    # -I: no environment, no packages beside the script; -S: none of the interpreter's own.
+    command = [sys.executable, "-I", "-S", str(ROOT / "setup" / "extension.py"), "--no-wheels", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    (path,) = tmp_path.glob("*.zip")
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    assert "blender_manifest.toml" in names and "physgen_addon/__init__.py" in names
+    assert not any(name.endswith(".whl") for name in names)
