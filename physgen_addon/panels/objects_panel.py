@@ -75,6 +75,8 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         row = row.row()
         row.alignment = "RIGHT"
         words = "Collider" if body.role == "collider" else material_props.preset_title(body.material.preset_name)
+        if words == material_props.preset_title(material_props.CUSTOM) and body.source:
+            words = "Recognised"
         # A narrow list has no room for the bracket.
         row.label(
             text=words.partition(" (")[0] + ("*" if body.role == "dynamic" and is_modified(body.material) else "")
@@ -351,7 +353,6 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
             text.sentences(layout, context, "A collider follows its keyframes. Animate it as any object.")
             return
         body = item.physgen
-        text.sentences(layout, context, f"{item.name} at the start:")
         column = settings(layout, context)
         column.prop(body, "velocity")
         column.prop(body, "speed")

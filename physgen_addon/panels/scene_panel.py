@@ -7,7 +7,9 @@ from pathlib import Path
 
 import bpy
 
-from .. import text
+from .. import bake_state, text
+from ..background_jobs import PHYSGEN_OT_cancel_job
+from ..operators.bake_ops import PHYSGEN_OT_pause_bake
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
 from ..operators.photo_object_ops import PHYSGEN_OT_show_cutouts
@@ -16,7 +18,7 @@ from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
-from .sidebar import SCENE, Sidebar
+from .sidebar import SCENE, Sidebar, draw_progress
 
 
 class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
@@ -29,6 +31,12 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw starting points; later the scene's folder."""
         layout, state = self.layout, context.scene.physgen
+        job = bake_state.bake_job(context.scene)
+        if job is not None:
+            # In sight however long the panels below are; Simulate has the same with words.
+            row = draw_progress(layout, job)
+            row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
+            row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
         if state.folder:
             _draw_folder(layout, context, state)
             return
@@ -77,6 +85,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     folder = Path(bpy.path.abspath(state.folder))
     row = layout.row(align=True)
     row.prop(state, "folder", text="")
+    row.operator(PHYSGEN_OT_import_scene.bl_idname, text="", icon="IMPORT")
     there = folder.is_dir()
     # On macOS a folder may be a program, which opening starts.
     if there and folder.suffix.lower() != ".app":
@@ -86,14 +95,11 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
         text.sentences(
             layout, context, "This folder is not there: choose where it is now, or import it again.", icon="ERROR"
         )
-    text.sentences(layout, context, f"{text.count(len(bodies(context.scene)), 'object')} in the simulation.")
     row = layout.row(align=True)
-    row.operator("view3d.view_camera", text="Look Through Camera", icon="VIEW_CAMERA")
+    row.operator("view3d.view_camera", text="Camera", icon="VIEW_CAMERA")
+    row.operator(PHYSGEN_OT_show_cutouts.bl_idname, text="Cut-outs", icon="MOD_MASK")
     if state.photo_root is not None:
         row.prop(state.photo_root, "hide_viewport", text="")
-    row = layout.row(align=True)
-    row.operator(PHYSGEN_OT_show_cutouts.bl_idname, icon="MOD_MASK")
-    row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import Another", icon="IMPORT")
 
 
 class PHYSGEN_PT_correct(Sidebar, bpy.types.Panel):
