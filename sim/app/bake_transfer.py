@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cache.bake_check import require_intact
 from ..cache.bake_folder import MESH_SPACE, WORLD_SPACE, Bake, BakedObject, save_manifest
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import InputError
@@ -34,8 +35,9 @@ def transfer_bake(
     names: name in ``photo`` → name in ``baked_scene``; objects left out stay where the photo shows them.
 
     Raises InputError when ``baked_scene`` has changed since the bake, an object is missing from it, or an object's
-    vertices differ from the photo's scene.
+    vertices differ from the photo's scene, or files of ``bake`` are not what was written.
     """
+    require_intact(bake)
     manifest = bake.manifest
     if manifest.geometry_hash and manifest.geometry_hash != baked_scene.geometry_hash():
         raise InputError(f"{bake.root}: was baked from other meshes or positions; bake the scene again")
@@ -49,7 +51,8 @@ def transfer_bake(
             raise InputError(f"{bake.root}: has no cache of object {name!r}; bake the scene again")
         cache = None if name is None else (Pc2Reader(bake.root / files[name].file), files[name], bodies[name])
         placed.append(_transfer_object(photo, item, cache, manifest.frames_done, out, on_event))
-    result = dataclasses.replace(manifest, objects=tuple(placed), geometry_hash=photo.geometry_hash())
+    # The checksums are of the samples before they were moved.
+    result = dataclasses.replace(manifest, objects=tuple(placed), checksums=(), geometry_hash=photo.geometry_hash())
     save_manifest(out, result)
     return Bake(root=out, manifest=result)
 

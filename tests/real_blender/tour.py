@@ -203,6 +203,8 @@ def sample_photo():
     yield from screens.shoot(SCREENS, "21_rendering")
     yield from ended("the still", 400)
     took = time.monotonic() - began
+    result = bpy.context.scene.physgen.rendering.result
+    assert result.endswith("0009.png") and Path(result).is_file(), f"no still: {result!r}"
     yield 1.0
     for shown in set(bpy.context.window_manager.windows) - windows:
         screens.picture(shown, SCREENS / "22_still.png")
@@ -213,10 +215,30 @@ def sample_photo():
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
 
 
+def documented():
+    """The pictures of docs/images, in Blender's own layout: both samples, and the one of meshes baked."""
+    for sample in ("PHOTO", "MESHES"):
+        bpy.ops.wm.read_homefile(use_factory_startup=True)
+        yield 0.5
+        screens.viewport().spaces.active.show_region_ui = True
+        yield from screens.drawn()
+        screens.region(screens.viewport(), "UI").active_panel_category = screens.TAB
+        yield from screens.drawn()
+        with screens.focus():
+            bpy.ops.physgen.open_sample(sample=sample)
+        yield 1.0
+        yield from screens.shoot(SCREENS, f"docs_{sample.lower()}")
+    with screens.focus():
+        bpy.ops.physgen.bake("INVOKE_DEFAULT")
+    yield from ended("the bake", 500)
+    bpy.context.scene.frame_set(16)
+    yield from screens.shoot(SCREENS, "docs_baked")
+
+
 def wanted(step) -> bool:
     """Whether the task asks for it; the window is arranged in any case."""
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
-STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
+STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, documented]
 session.run("tour", [step for step in STEPS if wanted(step)])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.app.bake_transfer import transfer_bake
+from physgen.sim.cache.bake_check import require_intact
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
@@ -49,6 +50,8 @@ def made(tmp_path):
     with Pc2Writer(bake / "Mug.pc2", vertex_count=8) as writer:
         for index in range(3):
             writer.append(own.vertices + np.array([0, 0, 0.1 * index]))
+        # As every bake has them.
+        sums = writer.checksum("Mug.pc2", ended=True)
     manifest = BakeManifest(
         inputs_hash="0",
         fps=30.0,
@@ -60,6 +63,7 @@ def made(tmp_path):
         version="0",
         particles=1,
         geometry_hash=scene.geometry_hash(),
+        checksums=(sums,),
         objects=(BakedObject(name="Mug", file="Mug.pc2", vertices=8, space="mesh"),),
     )
     save_manifest(bake, manifest)
@@ -71,6 +75,9 @@ def test_transferred_bake_is_in_world_metres_under_scene_names(made, tmp_path):
     events = []
     transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"}, on_event=events.append)
     manifest = load_manifest(tmp_path / "out")
+    # What a render checks first.
+    require_intact(load_bake(bake))
+    require_intact(load_bake(tmp_path / "out"))
     assert manifest.geometry_hash == photo.geometry_hash() and manifest.fps == 30 and manifest.frames_done == 3
     assert [(item.name, item.space) for item in manifest.objects] == [("cup", "world"), ("spoon", "world")]
     rest = [load_object_mesh(photo, item).vertices for item in photo.model.objects]
@@ -120,3 +127,12 @@ def test_particles_come_along(made, tmp_path):
     centre = np.asarray(scene.model.objects[0].world_from_mesh)[:3, 3]
     expected = points + centre + np.array([0, 0, 0.2])
     np.testing.assert_allclose(Pc2Reader(tmp_path / "out" / cup.points_file).sample(2), expected, atol=1e-6)
+
+
+def test_a_damaged_bake_is_not_transferred(made, tmp_path):
+    photo, scene, bake = made
+    content = bytearray((bake / "Mug.pc2").read_bytes())
+    content[-1] ^= 1
+    (bake / "Mug.pc2").write_bytes(content)
+    with pytest.raises(InputError, match=r"Mug\.pc2: frames 3 are not what was baked"):
+        transfer_bake(photo, scene, load_bake(bake), out=tmp_path / "out", names={"cup": "Mug"})
