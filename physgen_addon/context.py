@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 from typing import Any
 
 import bpy
@@ -93,6 +94,20 @@ def show_whole(context: bpy.types.Context, scene: bpy.types.Scene, *, colours: s
         with context.temp_override(window=context.window, area=area, region=region):
             if bpy.ops.view3d.view_center_camera.poll():
                 bpy.ops.view3d.view_center_camera()
+                if context.preferences.system.use_region_overlap:
+                    _leave_sidebar_free(space.region_3d, region, area)
+
+
+def _leave_sidebar_free(view: bpy.types.RegionView3D, region: bpy.types.Region, area: bpy.types.Area) -> None:
+    """Shrink and shift the camera's frame, which fills ``region``, to where no sidebar covers it."""
+    sidebar = next((other.width for other in area.regions if other.type == "UI" and other.width > 1), 0)
+    if not 0 < sidebar < region.width / 2:
+        return
+    free = (region.width - sidebar) / region.width
+    # As in Blender's BKE_screen_view3d_zoom_to_fac and BKE_camera_params_from_view3d.
+    size = (math.sqrt(2) + view.view_camera_zoom / 50) ** 2 / 4 * free
+    view.view_camera_zoom = (math.sqrt(4 * size) - math.sqrt(2)) * 50
+    view.view_camera_offset[0] += (1 - free) / (4 * size)
 
 
 def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
