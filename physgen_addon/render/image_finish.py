@@ -64,7 +64,7 @@ class ImageFinish:
         most = self._map(camera, now, [np.full(len(v), b) for v, b in zip(now, self._brightest, strict=True)])[window]
         # Between its vertices those of another object behind it show through.
         wide = max(3, round(GAP * self._size[0])) | 1
-        most = cv2.dilate(np.ascontiguousarray(most), np.ones((wide, wide), np.uint8))
+        most = np.asarray(cv2.dilate(np.ascontiguousarray(most), np.ones((wide, wide), np.uint8)), dtype=np.float32)
         part = rolled_off(part, np.where(most < UNBOUNDED, most, np.float32(np.inf)))
         if self._sigmas:
             larger = self._map(camera, now, self._magnification(camera, now))[window]

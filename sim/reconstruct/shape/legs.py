@@ -205,7 +205,7 @@ def standing_depth(camera: Camera, mask: Mask, distance: Points, left: int, top:
         pinned |= region
     # Between two legs of different distance side by side there is a slope, not a cliff.
     slope = SLOPE * float(np.median([leg.width for leg in chosen]))
-    low = np.max([leg.lowness(mask.shape) for leg in chosen], axis=0)
+    low = np.asarray(np.max([leg.lowness(mask.shape) for leg in chosen], axis=0), dtype=np.float64)
     radius = 0.5 * unit * float(np.median([leg.width for leg in chosen]))
     return StandingDepth(_carried(mask, away, pinned, slope), low, radius, len(chosen))
 
