@@ -23,9 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from trimesh.remesh import subdivide_to_size
-from trimesh.triangles import closest_point
 
 from ..constitutive import COHERENT, GRANULAR, DeformableMaterial, RigidMaterial, cohesion_of, model_of
 from ..effects.registry import apply_effects
@@ -45,6 +42,7 @@ from ..scene.model import Contact, Ground, Keys, Material, Motion, SceneModel, S
 from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
+from .matter_maps import factors_of, nearest_on_surface
 from .world_separation import separate
 from .world_setup_checks import require_above_ground, resolve, surface_warnings, vertices_at
 
@@ -72,12 +70,8 @@ def keep_shell(sample: InteriorSample, mesh: ObjectMesh, thickness: float, spaci
         raise InputError(
             f"shell_thickness is {thickness:g} m: give {spacing:.2g} m (the particle spacing) or more, or bake finer"
         )
-    points, faces, owners = subdivide_to_size(
-        mesh.vertices, mesh.faces, max_edge=max(spacing, 1e-9), max_iter=24, return_index=True
-    )
-    nearest = cKDTree(points[faces].mean(axis=1)).query(sample.positions)[1]
-    triangles = mesh.vertices[mesh.faces[owners[nearest]]]
-    distance = np.linalg.norm(closest_point(triangles, sample.positions) - sample.positions, axis=1)
+    nearest = nearest_on_surface(mesh, sample.positions, spacing)[1]
+    distance = np.linalg.norm(nearest - sample.positions, axis=1)
     keep = distance <= thickness
     if int(keep.sum()) < MIN_PARTICLES:
         raise InputError(f"shell_thickness is {thickness:g} m: that leaves {int(keep.sum())} particles; give more")
@@ -250,7 +244,7 @@ def prepare_world(
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
     granular = _granular(scene)
     bodies = tuple(
-        _body(item, meshes[i], spacing, cell, options.seed, scattered=item.name in granular)
+        _body(folder, item, meshes[i], spacing, cell, options.seed, scattered=item.name in granular)
         for i, item in ((i, scene.objects[i]) for i in moving)
     )
     colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
@@ -301,7 +295,7 @@ def _granular(scene: SceneModel) -> set[str]:
 
 
 def _body(
-    item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int, *, scattered: bool
+    folder: Scene, item: SceneObject, mesh: ObjectMesh, spacing: float, cell: float, seed: int, *, scattered: bool
 ) -> BodyParticles:
     if item.material.law == "rigid" and (item.pins or item.goal_stiffness > 0):
         raise InputError(
@@ -321,6 +315,10 @@ def _body(
             sample = keep_shell(sample, mesh, thickness, spacing)
     except InputError as error:
         raise InputError(f"object {item.name}: {error}") from None
+    stiffness, density = (
+        None if factors is None else factors_of(folder, item, mesh, factors, sample.positions, spacing)
+        for factors in (item.stiffness_map, item.density_map)
+    )
     return BodyParticles(
         name=item.name,
         positions=sample.positions,
@@ -339,6 +337,14 @@ def _body(
         pin_motion=_track(item.pin_motion),
         goal_stiffness=item.goal_stiffness,
         goal_damping=item.goal_damping,
+        parameter_tracks={
+            track.field: Track(
+                times=np.array([key.time_s for key in track.keys]), values=np.array([key.value for key in track.keys])
+            )
+            for track in item.material_tracks
+        },
+        stiffness_scale=stiffness,
+        density_scale=density,
     )
 
 

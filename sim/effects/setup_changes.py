@@ -7,9 +7,12 @@ import dataclasses
 from collections.abc import Callable
 from types import MappingProxyType
 
+import numpy as np
+
 from ..constitutive import COHERENT, GRANULAR, SHAPED, DeformableMaterial, RigidMaterial, models
 from ..errors import InputError
 from ..mpm.bodies import BodyForces, BodyParticles
+from ..mpm.colliders import Track
 from ..mpm.solver_options import Ground
 from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact
 from ..mpm.world_setup import WorldSetup
@@ -77,11 +80,14 @@ def change_materials(
     """Return ``setup`` with ``change`` made to the materials of one of ``cohesions`` of the bodies at ``targets``."""
 
     def changed(body: BodyParticles) -> BodyParticles:
-        material = body.material
+        material, tracks = body.material, dict(body.parameter_tracks)
         if isinstance(material, DeformableMaterial) and material.cohesion in cohesions:
+            for name, track in body.parameter_tracks.items():
+                values = [getattr(change(body.material_at(float(time))), name) for time in track.times]
+                tracks[name] = Track(times=track.times, values=np.array(values))
             material = change(material)
         rest = tuple(change(m) if m.cohesion in cohesions else m for m in body.materials)
-        return dataclasses.replace(body, material=material, materials=rest)
+        return dataclasses.replace(body, material=material, materials=rest, parameter_tracks=tracks)
 
     return change_bodies(setup, targets, changed)
 

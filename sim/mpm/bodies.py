@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +115,11 @@ class BodyParticles:
     """(time s, index), times rising from 0 or more: from that time on all particles are of that material, with the mass
     and volume they have. Not of rigid bodies."""
 
+    parameter_tracks: Mapping[str, Track] = field(default_factory=dict)
+    """Parameters of ``material`` over time by name, fields that its law reads, values (K,) in their units: at each time
+    all of that material has the values of then, whatever it was made with. Not the density: mass stays. Particles of
+    ``materials``, by index or from a time on, keep theirs. Not of rigid bodies."""
+
     density_scale: NDArray[np.float64] | None = None
     """Factor (N,) on the density of each particle, above 0; None: 1."""
 
@@ -196,10 +203,10 @@ class BodyParticles:
         )
         object.__setattr__(self, "contact_radii", radii)
         self._check_fields(len(positions))
-        for field in ("velocity", "spin"):
-            vector = getattr(self, field)
+        for name in ("velocity", "spin"):
+            vector = getattr(self, name)
             self._require(
-                len(vector) == 3 and all(math.isfinite(c) for c in vector), field, vector, "give three finite numbers"
+                len(vector) == 3 and all(math.isfinite(c) for c in vector), name, vector, "give three finite numbers"
             )
         self._require(
             math.isfinite(self.start_time) and self.start_time >= 0,
@@ -210,34 +217,36 @@ class BodyParticles:
 
     def _check_fields(self, count: int) -> None:
         """Check the fields with a value per particle or per time."""
-        for field in ("density_scale", "stiffness_scale"):
-            scale = getattr(self, field)
+        for name in ("density_scale", "stiffness_scale"):
+            scale = getattr(self, name)
             if scale is not None:
                 scale = np.ascontiguousarray(scale, dtype=np.float64)
                 good = scale.shape == (count,) and bool(np.isfinite(scale).all() and (scale > 0).all())
-                self._require(good, field, scale.shape, f"give {count} finite numbers above 0")
-                object.__setattr__(self, field, scale)
+                self._require(good, name, scale.shape, f"give {count} finite numbers above 0")
+                object.__setattr__(self, name, scale)
         if self.material_index is not None:
             index = np.ascontiguousarray(self.material_index, dtype=np.int32)
             good = index.shape == (count,) and bool((index >= 0).all() and (index <= len(self.materials)).all())
             self._require(good, "material_index", index.shape, f"give {count} numbers from 0 to {len(self.materials)}")
             object.__setattr__(self, "material_index", index)
         self._check_material_track()
+        self._check_parameter_tracks()
         if self.pins is not None:
             pins = np.ascontiguousarray(self.pins, dtype=np.bool_)
             self._require(pins.shape == (count,), "pins", pins.shape, f"give {count}, one a particle")
             object.__setattr__(self, "pins", pins)
-        for field in ("acceleration", "velocity_keys", "pin_motion"):
-            track = getattr(self, field)
+        for name in ("acceleration", "velocity_keys", "pin_motion"):
+            track = getattr(self, name)
             if track is not None:
-                self._require(track.values.shape[1:] == (3,), field, track.values.shape, "give values (K, 3)")
-        for field, high in (("goal_stiffness", 1e6), ("goal_damping", 1.0)):
-            value = getattr(self, field)
-            self._require(math.isfinite(value) and 0 <= value <= high, field, value, f"give 0 to {high:g}")
+                self._require(track.values.shape[1:] == (3,), name, track.values.shape, "give values (K, 3)")
+        for name, high in (("goal_stiffness", 1e6), ("goal_damping", 1.0)):
+            value = getattr(self, name)
+            self._require(math.isfinite(value) and 0 <= value <= high, name, value, f"give 0 to {high:g}")
         self._require(self.name != GROUND_NAME, "name", self.name, "choose another, this one is the ground's")
         if self.rigid:
             self._require(self.surface is not None, "surface", None, "give the mesh of a rigid body")
-            held = self.pins is not None or self.goal_stiffness > 0 or bool(self.materials or self.material_track)
+            held = self.pins is not None or self.goal_stiffness > 0
+            held = held or bool(self.materials or self.material_track or self.parameter_tracks)
             self._require(not held, "pins, goals and materials", "given", "leave them out of a rigid body")
 
     def _check_material_track(self) -> None:
@@ -253,6 +262,33 @@ class BodyParticles:
         self._require(
             known, "material_track", self.material_track, f"give indices of materials, 0 to {len(self.materials)}"
         )
+
+    def _check_parameter_tracks(self) -> None:
+        if self.rigid or not self.parameter_tracks:
+            return
+        assert not isinstance(self.material, RigidMaterial)
+        known = [name for name in self.material.reads if name != "fibre_axis"]
+        for name, track in self.parameter_tracks.items():
+            self._require(name in known, "parameter_tracks", name, f"give some of {', '.join(known)}")
+            self._require(track.values.ndim == 1, f"parameter_tracks[{name!r}]", track.values.shape, "give values (K,)")
+        try:
+            _ = self.materials_over_time
+        except InputError as error:
+            raise InputError(f"body {self.name!r}: parameter_tracks: {error}") from None
+
+    def material_at(self, time: float) -> DeformableMaterial:
+        """``material``, of a body that deforms, as its tracks have it at ``time`` in s."""
+        assert not isinstance(self.material, RigidMaterial)
+        if not self.parameter_tracks:
+            return self.material
+        values = {name: float(track.at(time)) for name, track in self.parameter_tracks.items()}
+        return dataclasses.replace(self.material, **values)
+
+    @property
+    def materials_over_time(self) -> tuple[DeformableMaterial, ...]:
+        """All that a body that deforms is made of at any keyframe: ``material`` at each, and ``materials``."""
+        times = sorted({float(t) for track in self.parameter_tracks.values() for t in track.times}) or [0.0]
+        return (*(self.material_at(time) for time in times), *self.materials)
 
     @property
     def rigid(self) -> bool:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..constitutive import DeformableMaterial
 from ..errors import InputError
 from ..memory import require_memory
 from .bodies import BodyParticles
@@ -97,9 +96,8 @@ def stable_step(bodies: Sequence[BodyParticles], cell: float, options: SolverOpt
     """
     wave = speed = 0.0
     for body in bodies:
-        for material in (body.material, *body.materials):
-            if isinstance(material, DeformableMaterial):
-                wave = max(wave, body.bounding_speed(material, 1.0 / cell))
+        if not body.rigid:
+            wave = max(wave, *(body.bounding_speed(material, 1.0 / cell) for material in body.materials_over_time))
         keys = 0.0 if body.velocity_keys is None else float(np.linalg.norm(body.velocity_keys.values, axis=1).max())
         speed = max(speed, keys, float(np.linalg.norm(body.initial_velocities, axis=1).max()))
     step = min([options.max_step, *(body.spring_step for body in bodies)])

@@ -110,14 +110,14 @@ class Engine:
         self._several = several
         self.count = 0
         self.retries = 0
-        self._table = _upload_new(numbers.table)
-        self._world_integers = _upload_new(numbers.world_integers)
-        self._world_numbers = _upload_new(numbers.worlds)
-        self._field_integers = _upload_new(numbers.field_integers)
+        self._table = upload_new(numbers.table)
+        self._world_integers = upload_new(numbers.world_integers)
+        self._world_numbers = upload_new(numbers.worlds)
+        self._field_integers = upload_new(numbers.field_integers)
         self._field_world = numbers.field_integers[:, layout.WORLD].copy()
-        self._fields = _upload_new(numbers.fields)
-        self._touches = _upload_new(numbers.touches)
-        self._pairs = _upload_new(numbers.pairs)
+        self._fields = upload_new(numbers.fields)
+        self._touches = upload_new(numbers.touches)
+        self._pairs = upload_new(numbers.pairs)
         self._means = ti.ndarray(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
         self._control = ti.ndarray(ti.f64, self.world_count * layout.CONTROL_ROW)
         control = np.zeros((self.world_count, layout.CONTROL_ROW))
@@ -204,6 +204,16 @@ class Engine:
         self._world_numbers.from_numpy(np.ascontiguousarray(worlds, dtype=np.float32).ravel())
         if self.field_count:
             self._fields.from_numpy(np.ascontiguousarray(fields, dtype=np.float32).ravel())
+
+    def set_materials(self, table: NDArray[np.float32]) -> None:
+        """Set the rows of the materials for the next segment of time."""
+        self._table.from_numpy(np.ascontiguousarray(table, dtype=np.float32).ravel())
+
+    def set_moduli(self, first: int, shares: ti.Ndarray, shear: float, bulk: float) -> None:
+        """Set 2 mu V0 and lambda V0 of the particles from number ``first`` on to ``shares`` of these two numbers, see
+        ``sorting.set_moduli``."""
+        here, end = self._particles[0], first + shares.shape[0]
+        sorting.set_moduli(self.count, first, end, shear, bulk, shares, here["ids"], here["constants"])
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
@@ -544,7 +554,7 @@ def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArr
     return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), _block_keys(np.int64(field), block)
 
 
-def _upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
+def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
     """A new array on the device with the numbers of ``values``, flat; at least one long."""
     kind = ti.i32 if values.dtype == np.int32 else ti.f32
     array = ti.ndarray(kind, max(1, values.size))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive import ROW, DeformableMaterial, ElasticMaterial, RigidMaterial
+from ..constitutive import ROW, DeformableMaterial, ElasticMaterial
 from ..scene.units import Similarity
 from .bodies import BodyParticles
 from .kernels import layout
@@ -90,10 +90,16 @@ def world_slots(setups: Sequence[WorldSetup], cells: Sequence[Similarity]) -> tu
     return tuple(result)
 
 
-def materials_of(body: BodyParticles) -> tuple[DeformableMaterial, ...]:
-    """All materials of a body that deforms, in the order of ``material_index``."""
-    assert not isinstance(body.material, RigidMaterial)
-    return (body.material, *body.materials)
+def materials_of(body: BodyParticles, time: float = 0.0) -> tuple[DeformableMaterial, ...]:
+    """All materials of a body that deforms at ``time`` in s, in the order of ``material_index``."""
+    return (body.material_at(time), *body.materials)
+
+
+def material_table(all_places: Sequence[WorldSlot], times: Sequence[float]) -> NDArray[np.float32]:
+    """Rows of the kernels' table of materials, each world's at its time of ``times`` in s."""
+    bodies = [(place.setup.bodies[i], times[place.world]) for place in all_places for i in place.soft]
+    rows = [m.row for body, time in bodies for m in materials_of(body, time)] or [(0.0,) * ROW]
+    return np.asarray(rows, dtype=np.float32)
 
 
 def first_material(place: WorldSlot, body: int) -> int:
@@ -106,7 +112,7 @@ def laws_of(setup: WorldSetup) -> int:
     """Bits of the constitutive models in a world; those of the simplest kernel where all bodies are rigid."""
     soft = [body for body in setup.bodies if not body.rigid]
     return (
-        functools.reduce(operator.or_, (m.laws for body in soft for m in materials_of(body)), 0)
+        functools.reduce(operator.or_, (m.laws for body in soft for m in body.materials_over_time), 0)
         or 1 << ElasticMaterial.number
     )
 
@@ -115,7 +121,6 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
     """Pack all that is constant over the run; rows of worlds and fields are those at time 0."""
     bodies = [place.setup.bodies[i] for place in all_places for i in place.soft]
     laws = functools.reduce(operator.or_, (laws_of(place.setup) for place in all_places))
-    table = [m.row for body in bodies for m in materials_of(body)] or [(0.0,) * ROW]
     touches: list[tuple[float, ...]] = []
     pairs: list[tuple[float, ...]] = []
     world_integers = np.zeros((len(all_places), layout.WORLD_INTEGERS), dtype=np.int32)
@@ -142,7 +147,7 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
                 pairs.append(contact_row(setup.contact(body.name, setup.bodies[j].name), place.cells))
     return PackedWorlds(
         laws=laws,
-        table=np.asarray(table, dtype=np.float32),
+        table=material_table(all_places, [0.0] * len(all_places)),
         world_integers=world_integers,
         worlds=np.stack([world_row(place, 0.0, 0.0) for place in all_places]),
         field_integers=field_integers,
@@ -259,6 +264,14 @@ def particles(
         anchors=anchors,
     )
     return added, wave_speed
+
+
+def modulus_shares(body: BodyParticles, choice: NDArray[np.int32], cells: Similarity) -> NDArray[np.float32]:
+    """What 2 mu V0 and lambda V0 of each particle (N,) are over its material's numbers in Pa; -1 for those that are not
+    of the body's own ``material``, whose tracks they do not follow."""
+    factor = np.ones(body.count) if body.stiffness_scale is None else body.stiffness_scale
+    shares = cells.modulus(1.0) * body.volumes * cells.scale**3 * factor
+    return np.where(choice == 0, shares, -1.0).astype(np.float32)
 
 
 def stiffness(body: BodyParticles, choice: NDArray[np.int32], cells: Similarity) -> tuple[Array, float]:

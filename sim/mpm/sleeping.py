@@ -282,6 +282,7 @@ def _wants_sleep(body: BodyParticles) -> bool:
     """Whether ``body`` is marked as asleep, starts at rest, and is moved by nothing but gravity and contact."""
     still = not any(body.velocity) and not any(body.spin) and body.start_time == 0.0
     driven = body.acceleration is not None or body.velocity_keys is not None or bool(body.material_track)
+    driven = driven or bool(body.parameter_tracks)
     driven = driven or body.pins is not None or body.goal_stiffness > 0
     return body.asleep and still and not driven and _quiet(body.forces)
 

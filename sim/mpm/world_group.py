@@ -7,15 +7,17 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
+from ..constitutive import DeformableMaterial
 from ..errors import Cancelled, InputError, SimulationError
 from ..events import IsCancelled, never
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import packing
-from .colliders import SAME_TIME
+from .colliders import SAME_TIME, Track
 from .diagnostics import FittedGradients
-from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, upload_new
 from .kernels import layout, runtime
 from .kernels.time_stepping import RIGID_LOST
 from .rigid.rigid_bodies import RigidBodies, RigidPose
@@ -33,6 +35,10 @@ RIGID_PREFIX = "solids."
 
 ROUNDING = 1e-12
 """Rounding error of sums of times, s."""
+
+PARAMETER_STEP, PARAMETER_PIECES = 1.0 / 240.0, 32
+"""A parameter on its way between two keyframes is constant for this many seconds at most, and for this part of the way;
+it has the value of the middle."""
 
 LEAST_WATCH = 1e-4
 """Seconds that pass at least between two looks at what may touch a sleeper."""
@@ -82,6 +88,8 @@ class WorldGroup:
         self._host: State | None = None
         self._poses: dict[tuple[int, str], RigidPose] = {}
         self._fits: dict[int, FittedGradients] = {}
+        self._followed: dict[int, DeformableMaterial] = {}
+        self._shares: dict[int, ti.Ndarray] = {}
         self._reach_times(np.full(len(self), -math.inf))
 
     def _new_rigid_bodies(self) -> RigidBodies:
@@ -149,6 +157,7 @@ class WorldGroup:
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
+            self._follow_parameters(stops)
             if self._rigid_bodies.count:
                 moving = np.flatnonzero(stops > self._times)
                 self._rigid_bodies.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
@@ -179,12 +188,38 @@ class WorldGroup:
         single = []
         for body in setup.bodies:
             tracks += [body.acceleration, body.pin_motion, body.velocity_keys]
+            tracks += list(body.parameter_tracks.values())
             single += [body.start_time, *(time for time, _ in body.material_track)]
+            single += [_parameter_stop(track, now) for track in body.parameter_tracks.values()]
         for collider in setup.colliders:
             tracks += [collider.translations, collider.rotations, collider.vertices]
         knots = [t for t in single if now + SAME_TIME < t < end - SAME_TIME]
         knots += [t for track in tracks if track is not None for t in track.knots(now + SAME_TIME, end - SAME_TIME)]
         return min([end, *knots])
+
+    def _follow_parameters(self, stops: Array) -> None:
+        """Give bodies with tracks of parameters what those have in the middle of the segments up to ``stops`` (W,)."""
+        middle = 0.5 * (self._times + stops)
+        changed = False
+        for place in self._places:
+            first = int(self._first_body[place.world])
+            for i in place.soft:
+                body, number = place.setup.bodies[i], first + i
+                if not body.parameter_tracks or not self._started[number]:
+                    continue
+                material = body.material_at(float(middle[place.world]))
+                if self._followed.get(number) == material:
+                    continue
+                if number not in self._shares:
+                    choice = self._material_choice(place, i, float(self._times[place.world]) + SAME_TIME)
+                    self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
+                offset = int(self._offsets[number])
+                self._engine.set_moduli(offset, self._shares[number], material.shear_number, material.bulk_number)
+                self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
+                self._followed[number] = material
+                changed = True
+        if changed:
+            self._engine.set_materials(packing.material_table(self._places, list(middle)))
 
     def _wake_touched(self) -> Array:
         """Wake the bodies that moving ones have come to touch; for each world (W,) the time until which none else is.
@@ -296,6 +331,8 @@ class WorldGroup:
         """Switch the body's particles to another material from now on; their history variables are reset."""
         choice = self._material_choice(place, body_index, now)
         number = int(self._first_body[place.world]) + body_index
+        self._shares.pop(number, None)
+        self._followed.pop(number, None)
         state = self._engine.state()
         mine = self._rows_of(state, number)
         order = np.asarray(state["ids"])[mine] - self._offsets[number]
@@ -484,9 +521,18 @@ class WorldGroup:
             self._rigid_bodies.restore(rigid_bodies)
         self._engine = self._new_engine()
         self._engine.restore(checkpoint)
+        self._followed, self._shares = {}, {}
         self._between = False
         self._host = None
         self._poses = {}
+
+
+def _parameter_stop(track: Track, now: float) -> float:
+    """The time until which a parameter on ``track`` may be taken as constant from ``now`` on; inf if it is."""
+    i = int(np.searchsorted(track.times, now + SAME_TIME, side="right"))
+    if i == 0 or i == len(track.times) or track.values[i] == track.values[i - 1]:
+        return math.inf
+    return now + max(min(PARAMETER_STEP, float(track.times[i] - track.times[i - 1]) / PARAMETER_PIECES), 2 * SAME_TIME)
 
 
 def _checked_motion(

@@ -186,7 +186,7 @@ class WorldView:
         choice = self.group.material_choice(self.index, index)
         volumes = body.volumes if body.stiffness_scale is None else body.volumes * body.stiffness_scale
         gradients, memories = self.elastic_gradients(index), self.memories(index)
-        parts = [(m, choice == i) for i, m in enumerate(materials_of(body))]
+        parts = [(m, choice == i) for i, m in enumerate(materials_of(body, self.time))]
         parts = [(m, mine) for m, mine in parts if mine.any()]
         stored = sum(m.elastic_energy(volumes[mine], gradients[mine], memories[mine]) for m, mine in parts)
         relaxing = [(m, mine) for m, mine in parts if m.relaxing_share > 0]

@@ -80,7 +80,7 @@ class Scene:
             for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
                 del fields[irrelevant]
             fields["material"].pop("preset")
-            for later in ("asleep", "held"):
+            for later in ("asleep", "held", "material_tracks", "stiffness_map", "density_map"):
                 if not fields[later]:
                     # Older scenes have no such field either.
                     del fields[later]
@@ -92,6 +92,9 @@ class Scene:
                 fields["splats"] = file_hash(self.file(item.splats))
             if item.motion is not None and item.motion.vertices_file is not None:
                 fields["motion"]["vertices_file"] = file_hash(self.file(item.motion.vertices_file))
+            for kind, factors in (("stiffness_map", item.stiffness_map), ("density_map", item.density_map)):
+                if factors is not None and factors.file is not None:
+                    fields[kind]["file"] = file_hash(self.file(factors.file)) + Path(factors.file).suffix.lower()
             objects.append(fields)
         ground: dict[str, Any] | None = None
         if scene.ground is not None:
@@ -252,6 +255,8 @@ def referenced_files(scene: SceneModel) -> list[str]:
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None
         names += [name for name in (item.mesh, item.mask, item.shadow, track, item.splats) if name is not None]
+        factors = [factors.file for factors in (item.stiffness_map, item.density_map) if factors is not None]
+        names += [name for name in factors if name is not None]
     names += [name for name in (scene.light.environment, scene.depth) if name is not None]
     return names
 

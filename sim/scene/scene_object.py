@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import finite, quantity, require, require_quantities, require_range
+from ..constitutive import RIGID, model_of
+from ..validation import finite, quantity, range_of, require, require_quantities, require_range
 from .material import Material
 
 Vector = tuple[float, float, float]
@@ -33,7 +34,70 @@ Keys = tuple[Key, ...]
 """Keyframes, linear in between, constant before the first and after the last; empty: no track."""
 
 
-def require_rising(field_name: str, keys: Keys) -> None:
+@dataclass(frozen=True, kw_only=True)
+class NumberKey:
+    """One keyframe of a single number: ``value`` at ``time_s`` seconds after frame 1."""
+
+    time_s: float
+    value: float
+
+    def __post_init__(self) -> None:
+        require(finite(self.time_s), "time_s", self.time_s, "give finite seconds")
+        require(finite(self.value), "value", self.value, "give a finite number")
+
+
+STEADY = ("density", "rigid_restitution")
+"""Numbers of a material that have no track: matter keeps its mass."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialTrack:
+    """A number of the object's material over time, in place of the material's own.
+
+    field: a number of ``Material`` that its law reads, but for the density.
+    keys: at least one, in the range of that field, linear in between.
+    """
+
+    field: str
+    keys: tuple[NumberKey, ...]
+
+    def __post_init__(self) -> None:
+        known = [f.name for f in fields(Material) if "range" in f.metadata and f.name not in STEADY]
+        require(self.field in known, "material_tracks.field", self.field, f"choose one of {', '.join(known)}")
+        where = f"material_tracks.{self.field}"
+        require(len(self.keys) > 0, where, self.keys, "give at least one keyframe")
+        require_rising(where, self.keys)
+        low, high = range_of(Material, self.field)
+        for key in self.keys:
+            require_range(where, key.value, low, high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FactorMap:
+    """A factor on a property of an object's matter that varies from place to place, from weights on its surface.
+
+    Matter has the weight w, 0 to 1, of the nearest point of the surface; the factor is at_zero^(1-w) at_one^w, so that
+    a weight of 0.5 between 0.1 and 10 means 1.
+
+    attribute: name of the vertices' attribute in the mesh file that holds the weights: of a PLY file a property, of a
+        GLB file an attribute that begins with ``_``.
+    file: in place of it a file in the scene folder: an ``.npz`` with ``weights`` (V,), the vertices in the order of the
+        mesh file, or a PNG or JPEG picture laid on by the mesh's texture coordinates (red channel, black 0, white 1).
+    at_zero, at_one: factors of weight 0 and 1, 0.001 to 1000.
+    """
+
+    attribute: str | None = None
+    file: str | None = None
+    at_zero: float = quantity(1.0, 1e-3, 1e3)
+    at_one: float = quantity(1.0, 1e-3, 1e3)
+
+    def __post_init__(self) -> None:
+        require_quantities(self, "factor map: ")
+        one = (self.attribute is None) != (self.file is None)
+        require(one, "factor map: attribute, file", (self.attribute, self.file), "give one of the two")
+
+
+def require_rising(field_name: str, keys: Keys | tuple[NumberKey, ...]) -> None:
     """Raise InputError unless the times of ``keys`` rise."""
     for before, after in itertools.pairwise(keys):
         require(
@@ -173,6 +237,9 @@ class SceneObject:
         displacement in m).
     goal_stiffness: spring of all particles to their rest positions, force over mass and distance in 1/s², 0 (none) to
         1e6; goal_damping: share of critical damping, 0 to 1.
+    material_tracks: numbers of the material over time, each named once.
+    stiffness_map: factor on Young's modulus (fluids: bulk modulus and viscosity) from place to place; not of rigid
+        objects. density_map: on the density.
     """
 
     name: str
@@ -204,6 +271,9 @@ class SceneObject:
     pin_motion: Keys = ()
     goal_stiffness: float = quantity(0.0, 0.0, 1e6, "1/s²")
     goal_damping: float = quantity(0.0, 0.0, 1.0)
+    material_tracks: tuple[MaterialTrack, ...] = ()
+    stiffness_map: FactorMap | None = None
+    density_map: FactorMap | None = None
 
     def __post_init__(self) -> None:
         allowed = (
@@ -253,9 +323,23 @@ class SceneObject:
         require(held or not self.pin_motion, f"{where}: pin_motion", "given", "give pins or goal_stiffness as well")
         if self.role == "dynamic":
             require(self.motion is None, f"{where}: motion", "given", "only an object of role 'collider' has one")
+            self._check_matter(where)
             return
-        for name in ("start_time", "acceleration", "velocity_keys", "pins", "goal_stiffness"):
+        matter = ("material_tracks", "stiffness_map", "density_map")
+        for name in ("start_time", "acceleration", "velocity_keys", "pins", "goal_stiffness", *matter):
             require(not getattr(self, name), f"{where}: {name}", "given", "only an object of role 'dynamic' has one")
+
+
+    def _check_matter(self, where: str) -> None:
+        law = self.material.law
+        read = () if law == RIGID else model_of(law).reads
+        named = [track.field for track in self.material_tracks]
+        for name in named:
+            reads = ", ".join(n for n in read if n != "fibre_axis") or "none"
+            require(name in read, f"{where}: material_tracks", name, f"the law {law!r} reads {reads}: choose one")
+            require(named.count(name) == 1, f"{where}: material_tracks", name, "give every field one track")
+        soft = law != RIGID or self.stiffness_map is None
+        require(soft, f"{where}: stiffness_map", "given", "leave it out of a rigid object, or choose another law")
 
 
 def _invertible(matrix: NDArray[np.float64]) -> bool:

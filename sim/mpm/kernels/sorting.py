@@ -222,6 +222,27 @@ def permute(count: ti.i32, targets: Integers, old: ParticleState, new: ParticleS
 
 
 @kernel
+def set_moduli(
+    count: ti.i32,
+    first: ti.i32,
+    end: ti.i32,
+    shear: ti.f32,
+    bulk: ti.f32,
+    shares: Scalars,
+    ids: Integers,
+    constants: Vectors4,
+):
+    """Set 2 mu V0 and lambda V0 of the particles numbered ``first`` to ``end`` - 1 to their shares, V0 and a factor, of
+    ``shear`` and ``bulk``; those whose share is below 0 keep theirs."""
+    for p in range(count):
+        if first <= ids[p] < end:
+            share = shares[ids[p] - first]
+            if share >= 0.0:
+                constants[p][1] = share * shear
+                constants[p][2] = share * bulk
+
+
+@kernel
 def permute_numbers(count: ti.i32, targets: Integers, old: Scalars, new: Scalars):
     """Move one number a particle to its new index."""
     for p in range(count):
