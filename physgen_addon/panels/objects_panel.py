@@ -169,6 +169,12 @@ class PHYSGEN_PT_material(_Part, bpy.types.Panel):
                     column.prop(material, name)
                 continue
             _number(column, material, name, UNITS[name](getattr(material, name)) if name in UNITS else "")
+        body = context.active_object.physgen
+        for kind in ("stiffness", "density") if material.law != "rigid" else ("density",):
+            group = f"{kind}_group"
+            column.prop_search(body, group, context.active_object, "vertex_groups")
+            if getattr(body, group):
+                column.prop(body, f"{kind}_factor")
         if any(is_body(o) and o != context.active_object for o in context.selected_objects):
             column.operator(PHYSGEN_OT_copy_material.bl_idname, icon="COPYDOWN")
 

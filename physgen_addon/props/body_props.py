@@ -13,7 +13,7 @@ from bpy.props import (
 )
 from mathutils import Vector
 
-from ...sim.scene.model import Ground, SceneObject
+from ...sim.scene.model import FactorMap, Ground, SceneObject
 from ..playback import splats
 from .generated_properties import from_field, switch
 from .material_props import PHYSGEN_PG_material
@@ -131,6 +131,32 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         soft_max=0.1,
     )
     own_wall: switch("shell_thickness", "Own Wall", "Choose its thickness; off: the thinnest that is resolved", 0.01)
+    stiffness_group: StringProperty(
+        name="Stiffness Weights",
+        description="Vertex group (or attribute) whose weights change the stiffness from place to place",
+    )
+    stiffness_factor: from_field(
+        FactorMap,
+        "at_one",
+        "Stiffness at 1",
+        "Factor on the stiffness where the weight is 1; none where it is 0, geometric in between",
+        default=0.1,
+        soft_min=0.01,
+        soft_max=100.0,
+    )
+    density_group: StringProperty(
+        name="Density Weights",
+        description="Vertex group (or attribute) whose weights change the density from place to place",
+    )
+    density_factor: from_field(
+        FactorMap,
+        "at_one",
+        "Density at 1",
+        "Factor on the density where the weight is 1; none where it is 0, geometric in between",
+        default=2.0,
+        soft_min=0.1,
+        soft_max=10.0,
+    )
     sandy: BoolProperty(name="Turns to Sand", description="Turn the object into sand")
     sandy_frame: IntProperty(name="From Frame", description="First frame as sand", default=1, min=0, soft_max=250)
 

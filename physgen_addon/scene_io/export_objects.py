@@ -7,10 +7,11 @@ from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
-from ...sim.constitutive import FLUID, RIGID, cohesion_of
+from ...sim.constitutive import FLUID, RIGID, cohesion_of, model_of
 from ...sim.errors import InputError
-from ...sim.scene.model import Effect, Material
+from ...sim.scene.model import Effect, Material, MaterialTrack, NumberKey
 from ..props.material_props import get_material
 from ..text import decimal
 from .export_animation import Clock, channels, scaled, why_it_moves
@@ -92,10 +93,81 @@ def require_simulable(item: bpy.types.Object) -> None:
         )
 
 
+MATERIAL = "physgen.material."
+"""Beginning of the path of a material's numbers in animation curves."""
+
+
+def animated_numbers(item: bpy.types.Object) -> list[str]:
+    """Return the numbers of the material of ``item`` that are animated and that its law reads, but the density."""
+    law = item.physgen.material.law
+    read = () if law == RIGID else model_of(law).reads
+    found = {path.removeprefix(MATERIAL) for path, _ in channels(item) if path.startswith(MATERIAL)}
+    return [name for name in read if name in found and name != "fibre_axis"]
+
+
+class MaterialTracks:
+    """Animated numbers of an object's material, read frame by frame."""
+
+    def __init__(self, item: bpy.types.Object, clock: Clock) -> None:
+        self.names = animated_numbers(item) if item.physgen.role == "dynamic" else []
+        self.moves = bool(self.names)
+        self._item, self._clock = item, clock
+        self._values: list[list[float]] = []
+
+    def read(self, graph: bpy.types.Depsgraph) -> None:
+        """Read the evaluated frame ``graph``."""
+        material = self._item.evaluated_get(graph).physgen.material
+        self._values.append([decimal(getattr(material, name)) for name in self.names])
+
+    def tracks(self) -> tuple[MaterialTrack, ...]:
+        """Return a keyframe at every frame, without those inside stretches that are constant."""
+        found = []
+        for name, values in zip(self.names, zip(*self._values, strict=True), strict=True):
+            kept = [
+                i for i, v in enumerate(values) if i in (0, len(values) - 1) or not values[i - 1] == v == values[i + 1]
+            ]
+            times = [self._clock.seconds(self._clock.start + i) for i in kept]
+            keys = tuple(NumberKey(time_s=t, value=values[i]) for t, i in zip(times, kept, strict=True))
+            found.append(MaterialTrack(field=name, keys=keys))
+        return tuple(found)
+
+
+PAINTED = (("stiffness_map", "stiffness_group", "stiffness_factor"), ("density_map", "density_group", "density_factor"))
+"""Maps of a scene's object, and the properties that name the weights and the factor where these are 1."""
+
+
+def painted_weights(item: bpy.types.Object, name: str) -> NDArray[np.float32]:
+    """Return the weights (V,), 0 to 1, of the vertex group or attribute ``name`` of the mesh of ``item``.
+
+    Vertices outside of the group have 0. Raises InputError if there is neither, or for weights out of range.
+    """
+    mesh, group = item.data, item.vertex_groups.get(name)
+    weights = np.zeros(len(mesh.vertices), dtype=np.float32)
+    attribute = mesh.attributes.get(name)
+    if group is not None:
+        number = group.index
+        for vertex in mesh.vertices:
+            for part in vertex.groups:
+                if part.group == number:
+                    weights[vertex.index] = part.weight
+    elif attribute is not None and attribute.domain == "POINT" and attribute.data_type == "FLOAT":
+        attribute.data.foreach_get("value", weights)
+    else:
+        known = ", ".join(group.name for group in item.vertex_groups) or "none"
+        raise InputError(
+            f"object {item.name!r}: has no vertex group or attribute of numbers {name!r} of its vertices (groups: "
+            f"{known}): paint one of that name, or clear it under Material"
+        )
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and (weights <= 1).all()):
+        raise InputError(f"object {item.name!r}: {name!r} holds numbers outside 0 to 1: normalise it")
+    return weights
+
+
 def require_still_settings(owner: bpy.types.ID, where: str) -> None:
-    """Raise InputError if a PhysGen setting on ``owner`` is animated: the simulation uses one value."""
+    """Raise InputError if a PhysGen setting on ``owner`` is animated but for a material's numbers."""
+    moving = {MATERIAL + name for name in animated_numbers(owner)} if isinstance(owner, bpy.types.Object) else set()
     for path, _ in sorted(channels(owner)):
-        if path.startswith("physgen"):
+        if path.startswith("physgen") and path not in moving:
             raise InputError(
                 f"{where}: {path} is animated, but the simulation takes one value of it: clear its keyframes or driver"
             )

@@ -9,19 +9,23 @@ matrix at the first frame, in metres. Photo and light are not exported: the Blen
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.atomic import replacing
+from ...sim.constitutive import RIGID
 from ...sim.errors import InputError
 from ...sim.gaussians.splat_ply import write_splats
 from ...sim.scene.folder import SCENE_FILE, Scene, parse_scene, referenced_files, save_scene
-from ...sim.scene.model import Ground, SceneModel, SceneObject
+from ...sim.scene.model import FactorMap, Ground, SceneModel, SceneObject
 from ...sim.validation import read_json
 from ..playback import splats
 from ..props.body_props import bodies
+from ..text import decimal
 from . import export_world
 from .export_animation import (
     clock,
@@ -36,6 +40,9 @@ from .export_animation import (
 from .export_meshes import Triangles, closed, read_triangles, require_sound, write_mesh
 from .export_objects import (
     OWN,
+    PAINTED,
+    MaterialTracks,
+    painted_weights,
     physics,
     require_evaluated,
     require_placed,
@@ -104,7 +111,10 @@ class _Export:
             for item in self._items
             if item.physgen.role == "dynamic" and len(item.physgen.pins)
         }
-        tracks: list[export_world.GravityTrack | Collider | PinBoxes] = [gravity, *colliders.values(), *pins.values()]
+        matter = {item.name: MaterialTracks(item, times) for item in self._items if item.physgen.role == "dynamic"}
+        tracks: list[export_world.GravityTrack | Collider | PinBoxes | MaterialTracks] = [
+            *(gravity, *colliders.values(), *pins.values(), *matter.values())
+        ]
         for track in tracks:
             if not track.moves:
                 track.read(graph)
@@ -116,7 +126,7 @@ class _Export:
             if item.name in colliders:
                 objects.append(self._collider(colliders[item.name]))
             else:
-                objects.append(self._dynamic(item, pins.get(item.name), ground, graph))
+                objects.append(self._dynamic(item, pins.get(item.name), matter[item.name], ground, graph))
         effects = export_world.effects(scene, self._names)
         for item in self._items:
             effects += sand(item, self._names[item.name], times)
@@ -132,7 +142,12 @@ class _Export:
         )
 
     def _dynamic(
-        self, item: bpy.types.Object, pins: PinBoxes | None, ground: Ground | None, graph: bpy.types.Depsgraph
+        self,
+        item: bpy.types.Object,
+        pins: PinBoxes | None,
+        matter: MaterialTracks,
+        ground: Ground | None,
+        graph: bpy.types.Depsgraph,
     ) -> SceneObject:
         file, mesh = self._base_mesh(item)
         matrix = placed(item.evaluated_get(graph).matrix_world, self._unit)
@@ -140,6 +155,12 @@ class _Export:
         world = _to_world(mesh, matrix)
         if ground is not None:
             _require_above(item, world, ground)
+        fields = physics(item, self._unit, self._clock) | self._painted(item)
+        tracks = matter.tracks()
+        if tracks:
+            # The present frame's numbers are not those of the first.
+            first = {track.field: track.keys[0].value for track in tracks}
+            fields |= {"material_tracks": tracks, "material": replace(fields["material"], **first)}
         return SceneObject(
             name=self._names[item.name],
             mesh=file,
@@ -148,8 +169,20 @@ class _Export:
             splats=self._splats(item),
             pins=() if pins is None else pins.boxes(),
             pin_motion=() if pins is None else pins.motion(),
-            **physics(item, self._unit, self._clock),
+            **fields,
         )
+
+    def _painted(self, item: bpy.types.Object) -> dict[str, FactorMap]:
+        """Write the weights of ``item`` and return its maps by field."""
+        found = {}
+        for field, group, factor in PAINTED:
+            name = getattr(item.physgen, group)
+            if name and not (field == "stiffness_map" and item.physgen.material.law == RIGID):
+                file = f"meshes/{self._names[item.name]} {field.partition('_')[0]}.npz"
+                with replacing(self._root / file) as partial, partial.open("wb") as stream:
+                    np.savez(stream, weights=painted_weights(item, name))
+                found[field] = FactorMap(file=file, at_one=decimal(getattr(item.physgen, factor)))
+        return found
 
     def _base_mesh(self, item: bpy.types.Object) -> tuple[str, Triangles]:
         """Return the mesh of ``item`` and its file, shared by objects with the same mesh."""

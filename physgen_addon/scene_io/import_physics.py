@@ -113,6 +113,12 @@ def fill_body(
     for field, what in (("acceleration", "an acceleration"), ("velocity_keys", "velocities")):
         if getattr(source, field):
             notes.append(f"{source.name} has {what} over time in the folder; here it has none")
+    if source.material_tracks:
+        changing = ", ".join(track.field for track in source.material_tracks)
+        notes.append(f"{source.name} has {changing} over time in the folder; here they stay")
+    for field, what in (("stiffness_map", "a stiffness"), ("density_map", "a density")):
+        if getattr(source, field) is not None:
+            notes.append(f"{source.name} has {what} that differs from place to place in the folder; here it is one")
     if source.motion is not None and source.motion.vertices_file is not None:
         notes.append(f"{source.name} deforms by {source.motion.vertices_file} in the folder; here it stands still")
     elif source.motion is not None:
@@ -234,6 +240,8 @@ _SURFACE = ("friction", "static_friction", "restitution")
 OF_BODY = (
     ("role",),
     ("fill", "shell_thickness"),
+    ("stiffness_group", "stiffness_factor"),
+    ("density_group", "density_factor"),
     ("sandy", "sandy_frame"),
     ("own_surface", "contact_mode", *_SURFACE),
     ("velocity",),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any
 
 import bpy
@@ -32,7 +33,15 @@ from .export_animation import (
     metres_per_unit,
 )
 from .export_meshes import read_corners, read_points
-from .export_objects import foreign_modifiers, is_smoothing, physics, sand
+from .export_objects import (
+    PAINTED,
+    animated_numbers,
+    foreign_modifiers,
+    is_smoothing,
+    painted_weights,
+    physics,
+    sand,
+)
 from .export_world import effects
 
 UNSEEN = {
@@ -114,7 +123,13 @@ class _Digest:
         """Add one body with everything that moves it."""
         scene = self._scene
         self._add(item.name)
-        self._add_checked(lambda: _plain(physics(item, self._unit, clock(scene))), lambda: sand(item, "", clock(scene)))
+        self._add_checked(lambda: _plain(item, physics(item, self._unit, clock(scene))))
+        self._add_checked(lambda: sand(item, "", clock(scene)))
+        for field, group, factor in PAINTED if item.physgen.role == "dynamic" else ():
+            name = getattr(item.physgen, group)
+            if name:
+                self._add(field, getattr(item.physgen, factor))
+                self._add_checked(partial(_weights_hash, item, name))
         self._seen.discard((item.as_pointer(), True))
         dynamic = item.physgen.role == "dynamic"
         self._object(item, shape=True, as_seen=not dynamic)
@@ -289,8 +304,13 @@ class _Digest:
             self._add(None if value is None else value.name)
 
 
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """Return ``fields`` without the name of the material preset."""
+def _plain(item: bpy.types.Object, fields: dict[str, Any]) -> dict[str, Any]:
+    """Return ``fields`` without the name of the material preset and the numbers of it that are animated."""
     if "material" not in fields:
         return fields
-    return {**fields, "material": {name: n for name, n in vars(fields["material"]).items() if name != "preset"}}
+    left = {"preset", *animated_numbers(item)}
+    return {**fields, "material": {name: n for name, n in vars(fields["material"]).items() if name not in left}}
+
+
+def _weights_hash(item: bpy.types.Object, name: str) -> str:
+    return hashlib.sha256(painted_weights(item, name).tobytes()).hexdigest()

@@ -329,7 +329,6 @@ class SceneObject:
         for name in ("start_time", "acceleration", "velocity_keys", "pins", "goal_stiffness", *matter):
             require(not getattr(self, name), f"{where}: {name}", "given", "only an object of role 'dynamic' has one")
 
-
     def _check_matter(self, where: str) -> None:
         law = self.material.law
         read = () if law == RIGID else model_of(law).reads

@@ -12,6 +12,7 @@ import physgen
 from mathutils import Matrix
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
 from physgen.physgen_addon.scene_io.export_scene import export_scene
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.meshes import load_object_mesh
@@ -207,3 +208,37 @@ def test_linked_objects_need_an_override(scene, tmp_path):
     refused(scene, tmp_path, "'brick'", "library override")
     item.override_create(remap_local_usages=True)
     exported(scene, tmp_path)
+
+
+def test_painted_weights_and_animated_numbers_reach_the_engine(scene, tmp_path):
+    """A vertex group above the middle weighs three times as much; stiffness falls by keyframes, and the frame that is
+    shown changes neither export nor fingerprint. What cannot be is refused by name."""
+    scene.physgen.simulation.frame_start, scene.physgen.simulation.frame_end = 1, 9
+    item = add()
+    body = item.physgen
+    group = item.vertex_groups.new(name="top")
+    group.add([v.index for v in item.data.vertices if v.co.z > 0], 1.0, "REPLACE")
+    body.density_group, body.density_factor = "top", 3.0
+    for frame, value in ((1, 4e5), (9, 1e5)):
+        body.material.youngs_modulus = value
+        item.keyframe_insert("physgen.material.youngs_modulus", frame=frame)
+    scene.frame_set(5)
+    before = fingerprint(scene)
+    folder, objects = exported(scene, tmp_path)
+    cube = objects["Cube"]
+    assert cube.density_map.at_one == 3.0 and cube.density_map.at_zero == 1.0 and cube.stiffness_map is None
+    (track,) = cube.material_tracks
+    assert (track.field, track.keys[0].value, track.keys[-1].value) == ("youngs_modulus", 4e5, 1e5)
+    assert cube.material.youngs_modulus == 4e5 and track.keys[-1].time_s == pytest.approx(8 / 24)
+    ready = prepared(folder).setup.bodies[0]
+    assert ready.center_of_mass[2] > 1.05 and ready.density_scale.max() == pytest.approx(3.0, rel=0.02)
+    assert ready.material_at(1.0).youngs_modulus == 1e5
+    scene.frame_set(9)
+    assert fingerprint(scene) == before
+    group.add([0], 0.5, "REPLACE")
+    assert fingerprint(scene) != before
+    body.density_group = "gone"
+    refused(scene, tmp_path / "other", "'Cube'", "'gone'", "top")
+    body.density_group = ""
+    item.keyframe_insert("physgen.material.density", frame=1)
+    refused(scene, tmp_path / "other", "'Cube'", "physgen.material.density", "animated")
