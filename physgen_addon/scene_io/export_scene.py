@@ -112,9 +112,8 @@ class _Export:
             if item.physgen.role == "dynamic" and len(item.physgen.pins)
         }
         matter = {item.name: MaterialTracks(item, times) for item in self._items if item.physgen.role == "dynamic"}
-        tracks: list[export_world.GravityTrack | Collider | PinBoxes | MaterialTracks] = [
-            *(gravity, *colliders.values(), *pins.values(), *matter.values())
-        ]
+        tracks: list[export_world.GravityTrack | Collider | PinBoxes | MaterialTracks] = [gravity]
+        tracks += [*colliders.values(), *pins.values(), *matter.values()]
         for track in tracks:
             if not track.moves:
                 track.read(graph)

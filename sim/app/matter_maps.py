@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -71,14 +73,14 @@ def _at_vertices(folder: Scene, item: SceneObject, factors: FactorMap, count: in
         path = folder.file(item.mesh)
         where = f"{path}: attribute {factors.attribute!r}"
         mesh = read_mesh(path)
-        found = dict(mesh.vertex_attributes)
+        attributes: dict[str, Any] = dict(mesh.vertex_attributes)
         raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
         if raw is not None and getattr(raw, "dtype", None) is not None and raw.dtype.names:
-            found |= {name: raw[name] for name in raw.dtype.names if name not in ("x", "y", "z")}
-        if factors.attribute not in found:
-            known = ", ".join(sorted(found)) or "none"
+            attributes |= {name: raw[name] for name in raw.dtype.names if name not in ("x", "y", "z")}
+        if factors.attribute not in attributes:
+            known = ", ".join(sorted(attributes)) or "none"
             raise InputError(f"object {item.name}: {where} is missing; the vertices have {known}: name one of them")
-        values = found[factors.attribute]
+        values = attributes[factors.attribute]
     values = np.asarray(values, dtype=np.float64)
     values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
     if values.shape != (count,):

@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -281,7 +282,7 @@ class BodyParticles:
         assert not isinstance(self.material, RigidMaterial)
         if not self.parameter_tracks:
             return self.material
-        values = {name: float(track.at(time)) for name, track in self.parameter_tracks.items()}
+        values: dict[str, Any] = {name: float(track.at(time)) for name, track in self.parameter_tracks.items()}
         return dataclasses.replace(self.material, **values)
 
     @property

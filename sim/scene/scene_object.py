@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -97,7 +98,7 @@ class FactorMap:
         require(one, "factor map: attribute, file", (self.attribute, self.file), "give one of the two")
 
 
-def require_rising(field_name: str, keys: Keys | tuple[NumberKey, ...]) -> None:
+def require_rising(field_name: str, keys: Sequence[Key | NumberKey]) -> None:
     """Raise InputError unless the times of ``keys`` rise."""
     for before, after in itertools.pairwise(keys):
         require(
