@@ -125,6 +125,15 @@ def test_a_sliding_cube_stops_after_v2_over_2_mu_g():
     assert np.abs(found[1, 7:13]).max() < 0.01
 
 
+@pytest.mark.parametrize("corners", [8, 16, 24, 32, 48])
+def test_a_sliding_cylinder_stops_there_however_finely_its_rim_is_drawn(corners):
+    scene = scene_of(item(trimesh.creation.cylinder(radius=0.025, height=0.05, sections=corners)), friction=0.2)
+    path = run(scene, state((0, 0, 0.025), velocity=(1.0, 0, 0)), [0.1, 0.2, 0.4, 0.7])
+    assert path[-1, 0] == pytest.approx(1.0 / (2 * 0.2 * 9.81), rel=0.01)
+    # Six points carry it: on the first six of the rim it would tip by 0.6 to 10 degrees.
+    assert np.abs(path[:, 4:7]).max() < np.radians(0.05) / 2
+
+
 def test_a_sliding_ball_ends_up_rolling_at_five_sevenths():
     found = run(scene_of(sphere()), state((0, 0, RADIUS), (1, 0, 0)), [0.6], friction=0.4)
     assert found[0, 7] == pytest.approx(5 / 7, rel=0.01)

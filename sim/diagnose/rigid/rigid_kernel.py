@@ -15,6 +15,7 @@ mass of the body.
 from typing import NamedTuple
 
 import taichi as ti
+import taichi.math as tm
 
 from ...mpm.kernels.kernel_bundles import kernel
 from ...mpm.rigid.rigid_math import dmat3, dvec3, dvec4, matrix_of, turned
@@ -27,6 +28,8 @@ ITERATIONS = 512
 """Loop iterations per world: Taichi's CPU backend gives a thread at least this many."""
 
 MOST_CONTACTS = 6
+"""Points that carry a body at once. Where more lie below the plane, those that reach farthest in as many directions are
+taken: a rim of 32 corners stands on a hexagon of its own size, and not on the arc that comes first."""
 SWEEPS = 8
 CALM_STEP, CALM_SPEED, CALM_FORCE = 1e-3, 0.02, 40.0
 """Step in s of a calm contact, and its limits: normal speed in m/s and force per mass in m/s²."""
@@ -198,7 +201,31 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                         sums = ti.Matrix.zero(ti.f64, MOST_CONTACTS, 3)
                         eases = ti.Vector.zero(ti.f64, MOST_CONTACTS)
                         calm = True
+                        below, chosen = 0, 0
+                        picks = ti.Vector([-1] * MOST_CONTACTS, ti.i32)
+                        for i in range(body.corners if body.corners > MOST_CONTACTS else 0):
+                            reach = r @ dvec3(body.points[i, 0], body.points[i, 1], body.points[i, 2])
+                            below += (x + reach - arm - body.radius * n - foot).dot(n) - sunk < 0
+                        if below > MOST_CONTACTS:
+                            chosen = 1
+                            side = n.cross(dvec3(1.0, 0.0, 0.0))
+                            if ti.abs(n[0]) > 0.8:
+                                side = n.cross(dvec3(0.0, 1.0, 0.0))
+                            side = side.normalized()
+                            for k in range(MOST_CONTACTS):
+                                angle = 2.0 * tm.pi * k / MOST_CONTACTS
+                                way = ti.cos(angle) * side + ti.sin(angle) * n.cross(side)
+                                farthest = ti.cast(-1e30, ti.f64)
+                                for i in range(body.corners):
+                                    reach = r @ dvec3(body.points[i, 0], body.points[i, 1], body.points[i, 2])
+                                    depth = (x + reach - arm - body.radius * n - foot).dot(n) - sunk
+                                    if depth < 0 and reach.dot(way) > farthest:
+                                        farthest = reach.dot(way)
+                                        picks[k] = i
                         for i in range(body.corners):
+                            carries = 1 - chosen
+                            for k in ti.static(range(MOST_CONTACTS)):
+                                carries |= picks[k] == i
                             lever = (
                                 r @ dvec3(body.points[i, 0], body.points[i, 1], body.points[i, 2])
                                 - arm
@@ -209,7 +236,7 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                             un = u.dot(n)
                             if depth >= 0 and depth < 4 * CALM_STEP * ti.max(-un, 0.0):
                                 calm = False
-                            if depth < 0 and found < MOST_CONTACTS:
+                            if depth < 0 and carries > 0 and found < MOST_CONTACTS:
                                 # At the turning point of a bounce the speed is small too, but not the spring force.
                                 if ti.abs(un) > CALM_SPEED or runs.p[w, SPRING] * depth < -CALM_FORCE:
                                     calm = False

@@ -22,6 +22,10 @@ LEAST_PIECE = 6
 JUMP_SHARE, PUSH_SHARE, JUMP_SIGMAS = 0.3, 0.6, 7.0
 """Change of velocity that is an impact: as a share of the largest speed, on a surface (where an outline that turns
 wobbles), and in standard deviations."""
+CRUDE = 5.0
+"""Residual of a piece over that of its parts from which it hides a push."""
+STILL = 0.05
+"""Share of the greatest speed below which a body lies still before or after its motion."""
 DOWN_COSINE = 0.8
 """Cosine to the picture's downward axis of an acceleration that may be gravity: phones are held upright."""
 FLIGHT_SHARE = (0.55, 1.7)
@@ -90,7 +94,9 @@ def _parabola(times: Array, places: Array) -> tuple[Array, float]:
 
 
 def _piece(times: Array, places: Array, first: int, last: int) -> _Piece:
-    part = slice(first, last + 1)
+    """Return the piece; its acceleration is that of its motion, less the rest before and after."""
+    begins, ends = _moving_part(times[first : last + 1], places[first : last + 1])
+    part = slice(first + begins, first + ends + 1)
     t = times[part]
     fit, miss = _parabola(t, places[part])
     middle = t.mean()
@@ -103,19 +109,33 @@ def _piece(times: Array, places: Array, first: int, last: int) -> _Piece:
     )  # fmt: skip
 
 
+def _moving_part(times: Array, places: Array) -> tuple[int, int]:
+    """Return the first and last sample of the motion, where a body lies still before or afterwards."""
+    width = max(2, len(times) // 40)
+    speed = np.linalg.norm(places[width:] - places[:-width], axis=1) / (times[width:] - times[:-width])
+    moves = np.flatnonzero(speed > STILL * float(np.percentile(speed, 97))) if len(speed) else np.array([], np.int64)
+    if len(moves) < LEAST_PIECE:
+        return 0, len(times) - 1
+    return int(moves[0]), int(moves[-1]) + width
+
+
 def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
     """Return the samples of impacts: where the straight lines before and after disagree in velocity."""
     count = len(times)
     width = int(np.clip(count // 24, 4, 9))
-    change = np.zeros(count)
+    steps = np.zeros((count, 2))
     sigma = noise_px(places)
     for k in range(width, count - width):
         before, after = slice(k - width, k + 1), slice(k, k + width + 1)
         a = np.polyfit(times[before] - times[k], places[before], 2 if width > 5 else 1)
         b = np.polyfit(times[after] - times[k], places[after], 2 if width > 5 else 1)
-        change[k] = float(np.linalg.norm(b[-2] - a[-2]))
-    steps = np.linalg.norm(places[width:] - places[:-width], axis=1) / np.maximum(times[width:] - times[:-width], 1e-9)
-    usual = float(np.percentile(steps, 97)) if len(steps) else 0.0
+        steps[k] = b[-2] - a[-2]
+    if width <= 5 and count > 2 * width:
+        # Straight lines through a curved path disagree by its steady acceleration everywhere.
+        steps[width : count - width] -= np.median(steps[width : count - width], axis=0)
+    change = np.linalg.norm(steps, axis=1)
+    paces = np.linalg.norm(places[width:] - places[:-width], axis=1) / np.maximum(times[width:] - times[:-width], 1e-9)
+    usual = float(np.percentile(paces, 97)) if len(paces) else 0.0
     span = float(np.median(np.diff(times))) * width
     blur = (4.0 if width > 5 else 1.8) * sigma / max(span, 1e-9) / np.sqrt(width)
     limit = max(share * usual, JUMP_SIGMAS * blur)
@@ -159,9 +179,13 @@ def understand_motion(
     if flights and _longest(pieces, places) in flights:
         return _flight(times, places, pieces, flights, impacts, scale, diameter_px, clearance, where)
     pieces = _pieces(times, places, jumps(times, places, PUSH_SHARE))
+    finer = _pieces(times, places, impacts)
     if not pieces:
         raise InputError(f"{where}: the body is followed for {len(times)} frames, too few between its impacts")
     best = _longest(pieces, places)
+    if finer and best.miss > CRUDE * max(_longest(finer, places).miss, noise_px(places)):
+        # A push that is weak beside the fastest motion is one all the same if nothing smooth fits across it.
+        best = _longest(finer, places)
     if _runs_down(best, scale, places) and not from_above:
         return _slope(times, places, best, scale, clearance)
     return _surface(times, places, best, scale, clearance, elevation)
@@ -222,7 +246,9 @@ def _flight(
     total = np.sum([p.acceleration * (p.last - p.first) ** 2 for p in flights], axis=0)
     down = total / np.linalg.norm(total)
     strengths = np.array([float(p.acceleration @ down) for p in flights])
-    weights = np.array([float(p.last - p.first) ** 2 for p in flights])
+    # Drag grows with the square of the speed: long and slow flights tell gravity.
+    speeds = np.array([float(np.mean([p.begin @ p.begin, p.end @ p.end])) for p in flights])
+    weights = np.array([float(p.last - p.first) ** 2 for p in flights]) / np.maximum(speeds, 1e-9)
     pull = float(np.average(strengths, weights=weights))
     notes = [f"a flight: things fall with {pull / scale:.3g} m/s² by the body's size"]
     by_flight, spread = pull / GRAVITY, float(np.hypot(0.02, SIZE_PX / diameter_px))

@@ -31,6 +31,9 @@ LIKE_AROUND, LEAST_SHARE = 22.0, 0.03
 """Grey levels within which a value counts as that of the surroundings, and least share of them that it must have."""
 LIKE_RARE = 12.0
 """Distance in grey levels (BGR) to any pixel of the surroundings, however rare, within which a value counts, too."""
+PLAIN_SHARE, PLAIN_SPREAD = 0.55, 7.0
+"""A hole lies in a plain surface if this share of what is around it follows one smooth course of colours, within three
+times its scatter, and that is at most so many grey levels."""
 WIDE = 2.5
 """Area of a hull over its contents from which it is no compact body."""
 LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
@@ -170,7 +173,8 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
     """Return background and noise with what covers ``holes`` for long taken away.
 
     levels: (5, H, W, 3) percentiles over time. A value counts if its colour occurs around the hole, the median first;
-    where none does, the body was there all the time, and the hole is filled from its rim.
+    where none does, the body was there all the time, and the hole is filled from its rim. In a plain surface, a table or
+    a wall, the colour that it would have there decides, so that a body is told from what has nearly its colours.
     """
     out, noise = median.copy(), noise.copy()
     empty = np.zeros_like(holes)
@@ -182,6 +186,10 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
         inside = labels[rows, columns] == k
         around = median[rows, columns][holes[rows, columns] == 0].astype(np.float32)
         if len(around) < 20 or inside.sum() < 9:
+            continue
+        plain = _plain_surface(median, holes, (x, y, w, h))
+        if plain is not None:
+            _bare_plain(out, noise, levels, labels == k, plain)
             continue
         around = around[:: max(1, len(around) // 1500)]
         rules = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 12, 1.0)
@@ -218,6 +226,70 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
     if empty.any():
         out = np.asarray(cv2.inpaint(out, empty, 5, cv2.INPAINT_TELEA), np.uint8)
     return out, np.where(noise > 0, noise, float(np.median(noise)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PlainSurface:
+    """Colours that vary smoothly. colours: (H, W, 3) of the whole picture's part ``at``. tolerance: grey levels.
+    rare: (N, 3) what stands around and does not follow."""
+
+    at: tuple[slice, slice]
+    colours: NDArray[np.float32]
+    tolerance: float
+    rare: NDArray[np.float32]
+
+
+def _plain_surface(median: Picture, holes: Picture, box: tuple[int, int, int, int]) -> _PlainSurface | None:
+    """Return the smooth surface around the hole in ``box`` (x, y, w, h), extended into it; None if there is none."""
+    x, y, w, h = box
+    pad = int(np.clip(0.6 * max(w, h), 16, 160))
+    at = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
+    near = cv2.dilate(holes[at], np.ones((2 * (max(w, h) // 24) + 3,) * 2, np.uint8))
+    part = cv2.GaussianBlur(median[at], (3, 3), 0).astype(np.float32)
+    rows, columns = np.mgrid[0 : part.shape[0], 0 : part.shape[1]].astype(np.float32)
+    v, u = rows / part.shape[0] - 0.5, columns / part.shape[1] - 0.5
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    free = np.flatnonzero(near.ravel() == 0)
+    if len(free) < 60:
+        return None
+    free = free[:: max(1, len(free) // 4000)]
+    a, b = terms.reshape(-1, 6)[free].astype(np.float64), part.reshape(-1, 3)[free].astype(np.float64)
+    weights, off = np.ones(len(a)), np.zeros(len(a))
+    fit = np.zeros((6, 3))
+    for _ in range(12):
+        fit = np.linalg.lstsq(a * weights[:, None], b * weights[:, None], rcond=None)[0]
+        off = np.abs(b - a @ fit).max(axis=1)
+        weights = 1.0 / np.maximum(1.0, off / max(float(np.median(off)), 0.5))
+    spread = max(1.48 * float(np.median(off)), 1.0)
+    follows = off < 3 * spread
+    if spread > PLAIN_SPREAD or follows.mean() < PLAIN_SHARE:
+        return None
+    rare = part.reshape(-1, 3)[free][off > 6 * spread]
+    return _PlainSurface(
+        at=at, colours=(terms @ fit).clip(0, 255).astype(np.float32), tolerance=3 * spread, rare=rare[:1500]
+    )
+
+
+def _bare_plain(
+    out: Picture, noise: Array, levels: NDArray[np.uint8], hole: NDArray[np.bool_], plain: _PlainSurface
+) -> None:
+    """Fill ``hole`` (H, W) of ``out`` and ``noise``: by what was seen there of the surface, or of rare things around."""
+    inside = hole[plain.at]
+    wanted = plain.colours[inside]
+    seen = levels[:, plain.at[0], plain.at[1]][:, inside][[2, 1, 3, 0, 4]].astype(np.float32)
+    off = np.abs(seen - wanted).max(axis=-1)
+    order = np.where(off[0] < plain.tolerance, 0, off.argmin(axis=0))
+    chosen = seen[order, np.arange(len(wanted))]
+    strange = off[order, np.arange(len(wanted))] >= plain.tolerance
+    chosen[strange] = wanted[strange]
+    if strange.any() and len(plain.rare) >= 20:
+        apart = cKDTree(plain.rare).query(seen[:, strange])[0]
+        rare = np.where(apart[0] < LIKE_RARE, 0, apart.argmin(axis=0))
+        known = apart[rare, np.arange(len(rare))] < LIKE_RARE
+        places = np.flatnonzero(strange)[known]
+        chosen[places] = seen[rare[known], places]
+    out[plain.at][inside] = chosen.round().astype(np.uint8)
+    noise[plain.at][inside] = plain.tolerance / 3
 
 
 def find_moving_regions(
