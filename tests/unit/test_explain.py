@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from physgen.batch.cli import main
 from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.motion_view import understand_motion
+from physgen.sim.diagnose.track.moving_regions import find_moving_regions
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
-from physgen.sim.diagnose.track.region_track import true_times
+from physgen.sim.diagnose.track.region_track import true_times, with_missing_frames
 from physgen.sim.errors import InputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "video_to_cause.py"
@@ -71,6 +72,58 @@ def test_a_repeated_frame_is_left_out_and_the_rest_spread_evenly():
     times, fresh, said = true_times(list(np.arange(14) / 30), change, 30.0, None)
     assert fresh.sum() == 11 and "repeat" in said and "frames per second" in said
     assert np.ptp(np.diff(times[fresh])) < 1e-9 and times[-1] == pytest.approx(13 / 30)
+
+
+def test_frames_that_a_camera_has_dropped_are_put_in_and_an_impact_is_none():
+    x = np.delete(10.0 * np.arange(40), 20) + np.random.default_rng(0).normal(0, 0.1, 39)
+    times, missing = with_missing_frames(np.arange(39) / 30, np.stack([x, 0 * x], axis=1))
+    assert missing == 1
+    assert times[20] - times[19] == pytest.approx(2 / 30) and times[-1] == pytest.approx(39 / 30)
+    struck = np.r_[10.0 * np.arange(20), 190 + 20.0 * np.arange(1, 20)]
+    assert with_missing_frames(np.arange(39) / 30, np.stack([struck, 0 * struck], axis=1))[1] == 0
+
+
+def test_a_throw_at_thirty_frames_a_second_is_one_flight():
+    t = np.arange(24) / 30
+    places = np.stack([100 + 1200 * t, 700 - 2900 * t + 0.5 * 7800 * t**2], axis=1)
+    places += np.random.default_rng(1).normal(0, 0.8, places.shape)
+    view = understand_motion(t, places, diameter_px=53, diameter=0.066, clearance=0.033, elevation=np.pi / 2, where="v")
+    assert (view.kind, view.first, view.last) == ("flight", 0, 23)
+
+
+def test_a_body_that_rests_and_is_struck_slides_on_a_level_surface():
+    t = np.arange(270) / 240
+    moving = np.maximum(t - 190 / 240, 0)
+    way = np.where(moving > 0, 600 * moving - 0.5 * 900 * moving**2, 0)
+    places = np.stack([150 + way, 90 + 0.2 * way], axis=1) + np.random.default_rng(1).normal(0, 0.03, (270, 2))
+    view = understand_motion(t, places, diameter_px=17, diameter=0.03, clearance=0.005, elevation=1.0, where="v")
+    assert view.kind == "surface" and 185 < view.first < 205 and view.last == 269
+    # Where it stays for long, only a little of that is kept.
+    times = np.arange(900) / 240
+    still = np.concatenate([places, places[-1] + np.random.default_rng(2).normal(0, 0.03, (630, 2))])
+    view = understand_motion(times, still, diameter_px=17, diameter=0.03, clearance=0.005, elevation=1.0, where="v")
+    assert 185 < view.first < 205 and 265 < view.last < 320
+
+
+def test_a_slow_ball_that_covers_its_place_all_the_time_is_seen_whole_on_a_plain_table(tmp_path):
+    rng = np.random.default_rng(5)
+    rows, columns = np.mgrid[0:240, 0:320]
+    table = np.stack([150 + 0.1 * columns, 150 + 0.1 * columns, 155 + 0.08 * rows], axis=-1)
+    writer = cv2.VideoWriter(str(tmp_path / "slow.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (320, 240))
+    centres = [np.array([120 + 1.4 * k, 120 + 0.3 * k]) for k in range(40)]
+    for centre in centres:
+        frame = np.clip(table + rng.normal(0, 2, table.shape), 0, 255).astype(np.uint8)
+        middle = tuple(int(v) for v in np.round(centre * 16))
+        cv2.circle(frame, middle, 40 * 16, (60, 190, 190), -1, cv2.LINE_AA, 4)
+        writer.write(frame)
+    writer.release()
+    found = find_moving_regions(tmp_path / "slow.avi")
+    # In 29 of its 40 frames it covers the middle of its way: the median shows it there.
+    away = np.abs(found.background.astype(float) - table)[20:-20, 20:-20].max(axis=-1)
+    assert away.max() < 25 and away.mean() < 4
+    for centre, regions in zip(centres, found.regions, strict=True):
+        assert regions[0].area == pytest.approx(np.pi * 40**2, rel=0.05)
+        assert np.linalg.norm(regions[0].middle - 0.5 - centre) < 1.5
 
 
 @settings(max_examples=25, deadline=None)

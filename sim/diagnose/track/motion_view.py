@@ -22,7 +22,7 @@ LEAST_PIECE = 6
 JUMP_SHARE, PUSH_SHARE, JUMP_SIGMAS = 0.3, 0.6, 7.0
 """Change of velocity that is an impact: as a share of the largest speed, on a surface (where an outline that turns
 wobbles), and in standard deviations."""
-CRUDE = 5.0
+CRUDE = 7.0
 """Residual of a piece over that of its parts from which it hides a push."""
 STILL = 0.05
 """Share of the greatest speed below which a body lies still before or after its motion."""
@@ -69,10 +69,12 @@ class MotionView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Piece:
-    """Samples ``first`` to ``last`` with one acceleration (px/s²); begin, end: velocities px/s."""
+    """Samples ``first`` to ``last`` with one acceleration (px/s²); begin, end: velocities px/s. stops: the sample after
+    which it lies still; ``last`` if it does not."""
 
     first: int
     last: int
+    stops: int
     acceleration: Array
     begin: Array
     end: Array
@@ -105,7 +107,8 @@ def _piece(times: Array, places: Array, first: int, last: int) -> _Piece:
         return np.asarray(2 * fit[0] * (at - middle) + fit[1])
 
     return _Piece(
-        first=first, last=last, acceleration=2 * fit[0], begin=speed(t[0]), end=speed(t[-1]), miss=miss
+        first=first, last=last, stops=first + ends, acceleration=2 * fit[0],
+        begin=speed(t[0]), end=speed(t[-1]), miss=miss,
     )  # fmt: skip
 
 
@@ -148,6 +151,18 @@ def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
     return sorted(found)
 
 
+def wobble_px(times: Array, places: Array) -> float:
+    """Return the residual of a coordinate about a smooth path: the outline of a body that turns swings about its
+    centre, which third differences do not see."""
+    begins, ends = _moving_part(times, places)
+    part = slice(begins, ends + 1)
+    if ends - begins < 3 * LEAST_PIECE:
+        return 0.0
+    t = (times[part] - times[part].mean()) / max(float(np.ptp(times[part])), 1e-9)
+    left = places[part] - np.vander(t, 4) @ np.polyfit(t, places[part], 3)
+    return float(np.sqrt(np.mean(left**2) * len(left) / (len(left) - 4)))
+
+
 def noise_px(places: Array) -> float:
     """Return the noise of a coordinate from third differences, which smooth motion hardly has."""
     third = np.abs(np.diff(places, 3, axis=0)).ravel()
@@ -182,10 +197,10 @@ def understand_motion(
     finer = _pieces(times, places, impacts)
     if not pieces:
         raise InputError(f"{where}: the body is followed for {len(times)} frames, too few between its impacts")
-    best = _longest(pieces, places)
-    if finer and best.miss > CRUDE * max(_longest(finer, places).miss, noise_px(places)):
+    best = _most_curved(times, pieces)
+    if finer and best.miss > CRUDE * max(_most_curved(times, finer).miss, noise_px(places)):
         # A push that is weak beside the fastest motion is one all the same if nothing smooth fits across it.
-        best = _longest(finer, places)
+        best = _most_curved(times, finer)
     if _runs_down(best, scale, places) and not from_above:
         return _slope(times, places, best, scale, clearance)
     return _surface(times, places, best, scale, clearance, elevation)
@@ -200,6 +215,14 @@ def _pieces(times: Array, places: Array, impacts: list[int]) -> list[_Piece]:
 
 def _longest(pieces: list[_Piece], places: Array) -> _Piece:
     return max(pieces, key=lambda p: float(np.linalg.norm(places[p.last] - places[p.first])))
+
+
+def _most_curved(times: Array, pieces: list[_Piece]) -> _Piece:
+    """Return the piece that shows most of what slows or speeds it up: the way that its acceleration takes it."""
+    return max(
+        pieces,
+        key=lambda p: float(np.linalg.norm(p.acceleration)) * float(times[p.stops] - times[p.first]) ** 2,
+    )
 
 
 def _flies(piece: _Piece, scale: float) -> bool:
@@ -329,7 +352,8 @@ def _slope(times: Array, places: Array, piece: _Piece, scale: float, clearance: 
 def _surface(
     times: Array, places: Array, piece: _Piece, scale: float, clearance: float, elevation: float
 ) -> MotionView:
-    first, last = _moving_from(times, places, piece), piece.last
+    first = _moving_from(times, places, piece)
+    last = min(piece.last, piece.stops + max(2, round(REST_SHARE * (piece.stops - first))))
     matrix = np.array([[1.0, 0.0, 0.0], [0.0, -np.sin(elevation), -np.cos(elevation)]]) * scale
     origin = places[first]
     off = (places[first : last + 1] - origin) / scale
@@ -345,7 +369,7 @@ def _surface(
 def _moving_from(times: Array, places: Array, piece: _Piece) -> int:
     """Return the sample from which the body of ``piece`` is left alone: after the last push, at its greatest
     acceleration along the way; on a slope, after it has begun to move."""
-    part: NDArray[np.int64] = np.arange(piece.first, piece.last + 1)
+    part: NDArray[np.int64] = np.arange(piece.first, piece.stops + 1)
     width = max(3, len(part) // 16)
     if len(part) < 3 * width:
         return piece.first
@@ -353,6 +377,14 @@ def _moving_from(times: Array, places: Array, piece: _Piece) -> int:
         times[part[width:]] - times[part[:-width]]
     )
     top = float(np.percentile(speed, 97))
+    wide = max(width, len(part) // 8)
+    if speed[-1] <= 0.8 * top and wide > width:
+        # It slows down: the outline of a body that turns wobbles, and a mean over a longer time tells its speed.
+        width = wide
+        speed = np.linalg.norm(places[part[width:]] - places[part[:-width]], axis=1) / (
+            times[part[width:]] - times[part[:-width]]
+        )
+        top = float(np.percentile(speed, 97))
     if speed[-1] > 0.8 * top:  # it gains speed: from where a tenth of it is reached
         first = int(np.argmax(speed > 0.1 * top))
     else:

@@ -173,8 +173,8 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
     """Return background and noise with what covers ``holes`` for long taken away.
 
     levels: (5, H, W, 3) percentiles over time. A value counts if its colour occurs around the hole, the median first;
-    where none does, the body was there all the time, and the hole is filled from its rim. In a plain surface, a table or
-    a wall, the colour that it would have there decides, so that a body is told from what has nearly its colours.
+    where none does, the body was there all the time, and the hole is filled from its rim. In a plain surface, a table
+    or a wall, the colour that it would have there decides, so that a body is told from what has nearly its colours.
     """
     out, noise = median.copy(), noise.copy()
     empty = np.zeros_like(holes)
@@ -249,20 +249,24 @@ def _plain_surface(median: Picture, holes: Picture, box: tuple[int, int, int, in
     rows, columns = np.mgrid[0 : part.shape[0], 0 : part.shape[1]].astype(np.float32)
     v, u = rows / part.shape[0] - 0.5, columns / part.shape[1] - 0.5
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    free = np.flatnonzero(near.ravel() == 0)
-    if len(free) < 60:
-        return None
-    free = free[:: max(1, len(free) // 4000)]
-    a, b = terms.reshape(-1, 6)[free].astype(np.float64), part.reshape(-1, 3)[free].astype(np.float64)
-    weights, off = np.ones(len(a)), np.zeros(len(a))
-    fit = np.zeros((6, 3))
-    for _ in range(12):
-        fit = np.linalg.lstsq(a * weights[:, None], b * weights[:, None], rcond=None)[0]
-        off = np.abs(b - a @ fit).max(axis=1)
-        weights = 1.0 / np.maximum(1.0, off / max(float(np.median(off)), 0.5))
-    spread = max(1.48 * float(np.median(off)), 1.0)
-    follows = off < 3 * spread
-    if spread > PLAIN_SPREAD or follows.mean() < PLAIN_SHARE:
+    around = np.flatnonzero(near.ravel() == 0)
+    # Beside a large hole most of what is left may be something else: then the median within it counts, too.
+    for free in (around, np.arange(near.size)):
+        if len(free) < 60:
+            continue
+        free = free[:: max(1, len(free) // 4000)]
+        a, b = terms.reshape(-1, 6)[free].astype(np.float64), part.reshape(-1, 3)[free].astype(np.float64)
+        weights, off = np.ones(len(a)), np.zeros(len(a))
+        fit = np.zeros((6, 3))
+        for step in range(16):
+            fit = np.linalg.lstsq(a * weights[:, None], b * weights[:, None], rcond=None)[0]
+            off = np.abs(b - a @ fit).max(axis=1)
+            usual = max(float(np.median(off)), 0.5)
+            weights = 1.0 / np.maximum(1.0, off / usual) * (1.0 if step < 8 else off < 6 * usual)
+        spread = max(1.48 * float(np.median(off)), 1.0)
+        if spread <= PLAIN_SPREAD and (off < 3 * spread).mean() >= PLAIN_SHARE:
+            break
+    else:
         return None
     rare = part.reshape(-1, 3)[free][off > 6 * spread]
     return _PlainSurface(
@@ -273,7 +277,7 @@ def _plain_surface(median: Picture, holes: Picture, box: tuple[int, int, int, in
 def _bare_plain(
     out: Picture, noise: Array, levels: NDArray[np.uint8], hole: NDArray[np.bool_], plain: _PlainSurface
 ) -> None:
-    """Fill ``hole`` (H, W) of ``out`` and ``noise``: by what was seen there of the surface, or of rare things around."""
+    """Fill ``hole`` (H, W) of ``out`` and ``noise`` by what was seen there of the surface, or of rare things around."""
     inside = hole[plain.at]
     wanted = plain.colours[inside]
     seen = levels[:, plain.at[0], plain.at[1]][:, inside][[2, 1, 3, 0, 4]].astype(np.float32)

@@ -14,10 +14,10 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, CaptureObject, Ground, Trial
 from ..capture_checks import check_capture
 from .body_request import BodyRequest
-from .motion_view import MotionView, noise_px, stopped_at, understand_motion
+from .motion_view import MotionView, noise_px, stopped_at, understand_motion, wobble_px
 from .moving_regions import MovingRegions, Region, find_moving_regions
 from .pose_estimation import Array
-from .region_track import link_regions, true_times
+from .region_track import link_regions, true_times, with_missing_frames
 from .track_input import VideoTrial
 from .track_videos import Video
 
@@ -29,6 +29,9 @@ ELEVATIONS = tuple(math.radians(a) for a in (0, 15, 25, 35, 45, 55, 65, 75, 90))
 """Angles of the camera above the ground that are tried against outlines."""
 CLEAR, FROM_ABOVE = 0.1, math.radians(55)
 """Relative difference of an outline from the body's, and elevation, at which a body is surely seen from above."""
+CENTRE_PX = 0.2
+"""Standard deviation of a centre in px that no scatter shows: an edge is known to about half a pixel, and its contrast
+changes along the way."""
 MISSHAPEN = 0.35
 """Relative difference between an outline and the body's from which a warning is given."""
 
@@ -96,6 +99,9 @@ def follow_plain_body(
         raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
     clock = times[[r.frame for r in regions]]
     places = np.array([r.middle for r in regions]) / found.scale
+    clock, missing = with_missing_frames(clock, places)
+    if missing:
+        warnings.append(f"{missing} frames are missing in the file: the body jumps ahead and goes on as before")
     length_px, length, elevation, misfit = apparent_size(regions, body, item, found.scale)
     if misfit > MISSHAPEN:
         warnings.append(
@@ -119,7 +125,11 @@ def follow_plain_body(
     if len(kept) < LEAST_FRAMES:
         raise InputError(f"{path}: only {len(kept)} frames of free motion; film at a higher frame rate")
     points = view.points[kept - view.first]
-    trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_px(places[view.first : view.last + 1]))
+    part = slice(view.first, view.last + 1)
+    noise_of_centre = noise_px(places[part])
+    if body.kind in ("box", "mesh") and view.kind == "surface":
+        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], places[part]))
+    trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre)
     capture = check_capture(
         Capture(
             gravity=(0.0, 0.0, -9.81),
@@ -171,7 +181,7 @@ def _trial(
         object_index=np.zeros(len(rest), dtype=np.int64),
         rest_points=rest,
     )
-    return trial, max(noise, 0.1) / view.scale
+    return trial, float(np.hypot(noise, CENTRE_PX)) / view.scale
 
 
 def apparent_size(

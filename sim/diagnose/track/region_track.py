@@ -22,6 +22,9 @@ LEAST_FRAMES = 8
 """Frames of the shortest path."""
 COLOUR_STEP, SIZE_STEP = 40.0, 0.45
 """Change of colour in grey levels, and of the logarithm of the area, that cost as much as a step of one size."""
+AHEAD, ALIKE, ROUND_OFF = 5, 0.3, 0.25
+"""Steps on each side that a jump ahead is compared with, largest difference of its neighbours from them, and of the
+jump from a whole number of steps."""
 TWIN = 0.12
 """A frame counts as a repetition if it differs from the one before by less than this share of the usual change."""
 
@@ -177,3 +180,26 @@ def true_times(
         times[fresh] = spread
         said += f"; the others were recorded at {(fresh.sum() - 1) / max(times[-1], 1e-9):.3g} frames per second"
     return times, fresh, said
+
+
+def with_missing_frames(times: Array, places: Array) -> tuple[Array, int]:
+    """Return times (T,) s with the time of frames that a camera has dropped put in, and how many those are.
+
+    A body that jumps ahead by a whole number of its steps, and goes on as before, was not seen in between: an impact
+    would have changed its velocity. places: (T, 2) px.
+    """
+    steps = np.diff(places, axis=0)
+    spans = np.diff(times)
+    pace = np.linalg.norm(steps, axis=1) / np.maximum(spans, 1e-12)
+    added = np.zeros(len(pace))
+    for k in range(1, len(pace) - 1):
+        near = np.r_[pace[max(0, k - AHEAD) : k], pace[k + 1 : k + 1 + AHEAD]]
+        usual = float(np.median(near))
+        if usual * spans[k] < 2.0 or np.abs(near - usual).max() > ALIKE * usual:
+            continue
+        jump = pace[k] / usual
+        whole = round(jump)
+        if 2 <= whole <= 4 and abs(jump - whole) < ROUND_OFF:
+            added[k] = (whole - 1) * spans[k]
+    count = int(np.count_nonzero(added))
+    return times + np.r_[0.0, np.cumsum(added)], count
