@@ -185,12 +185,24 @@ _split_off: list[int] = []
 """The image editor that ``show_beside`` has split off, by its address, which is compared and never followed."""
 
 
-def close_beside() -> None:
-    """Close the image editor that ``show_beside`` has opened, if it is still one; the viewport takes its place."""
+def close_beside(scene: bpy.types.Scene) -> None:
+    """Close the image editor that ``show_beside`` has opened, if it is still one; the viewport takes its place.
+
+    The photo of ``scene`` is fitted to the viewport once that has its new size.
+    """
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.as_pointer() in _split_off and area.type == "IMAGE_EDITOR" and len(window.screen.areas) > 1:
                 with bpy.context.temp_override(window=window, area=area):
                     bpy.ops.screen.area_close()
+                bpy.app.timers.register(functools.partial(_fit_again, scene.session_uid), first_interval=0.2)
                 break
     _split_off.clear()
+
+
+def _fit_again(uid: int) -> None:
+    # A timer has no window of its own.
+    for window in bpy.context.window_manager.windows:
+        if window.scene.session_uid == uid:
+            with bpy.context.temp_override(window=window):
+                show_photo(bpy.context, window.scene)

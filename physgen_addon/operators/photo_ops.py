@@ -372,7 +372,7 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         root, photo = Path(str(final["scene"])), photo_file(scene.physgen_photo)
         changed = find_edits(scene, photo)
         sentence = show_scene(scene, root)
-        close_beside()
+        close_beside(scene)
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)
