@@ -9,10 +9,10 @@ every extra parameter. Whether the best one explains them at all follows from it
 with the log evidence L_c in nats relative to the nominal model, a threshold d that only effects pay (chance gains of
 the search), a temperature T > 1 because trials of one recording share model errors, the misfit m_c of the fit, and
 a(m), the probability that the right candidate leaves a misfit of m (logistic in ln m). An effect that does not predict
-held-out trials better has no gain, whatever its evidence; where one predicts them down to the noise, unknown yields to
-it, whatever its misfit. ``none`` is never said while the nominal model's held-out error is many times noise and grain
-(the simulator's own uncertainty): what it would get goes to ``unknown``. The constants were set on captures of known
-cause made by other simulators (docs/diagnosis.md).
+held-out trials better has no gain, whatever its evidence, but where bounces make them chaotic, and is never sure there;
+where one predicts them down to the noise, unknown yields to it, whatever its misfit. ``none`` is never said while the
+nominal model's held-out error is many times noise and grain (the simulator's own uncertainty): what it would get goes
+to ``unknown``. The constants were set on captures of known cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ class ComparisonSettings:
         leave open cost no evidence.
     unseen_fee: nats that an effect pays more where it predicts held-out trials no better, and the nominal model's error
         there is within noise and grain, so that they cannot judge; else it has no gain at all.
+    unshown: largest probability of an effect that predicts held-out trials no better; where their error grows, it is
+        divided by the same factor, and ``unknown`` gets the rest.
     second_fee: nats that a second effect pays, beside its prior; with unseen_fee where the pair predicts held-out
         trials no better than its better single effect.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
@@ -58,6 +60,7 @@ class ComparisonSettings:
     prior_none: float = 0.3
     containing: float = 0.2
     unseen_fee: float = 100.0
+    unshown: float = 0.9
     second_fee: float = 20.0
     predicted: tuple[float, float] = (0.9, 0.98)
     many: float = 3.0
@@ -102,7 +105,9 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
     candidates = [nominal_or_refitted(fits), *worth]
     grain = math.hypot(fits.floor_rms_m, fits.grain_rms_m)
     weights = _weights(candidates, weighing, grain)
-    adequate = [_adequacy(c.misfit, candidates[0].misfit, weighing) for c in candidates]
+    adequate = [
+        _adequacy(c.misfit, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates
+    ]
     if _far_off(fits, weighing):
         adequate[0] = 0.0
     shares = [w * a for w, a in zip(weights, adequate, strict=True)]
@@ -249,6 +254,14 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
         # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.
         gain = min(gain, max(gain - weighing.unseen_fee, 0.0) if nominal.heldout_rms_m < grain else 0.0)
     return gain - weighing.fee
+
+
+def _shown(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings) -> float:
+    """Return the most that ``fit`` may claim after its prediction of held-out trials: less where their error grows."""
+    before, after = nominal.heldout_rms_m, fit.heldout_rms_m
+    if not fit.effects or after < weighing.predicts * before or not math.isfinite(before):
+        return 1.0
+    return weighing.unshown * min(1.0, before / after) if math.isfinite(after) and after > 0 else 0.0
 
 
 def _adequacy(misfit: float, nominal: float, weighing: ComparisonSettings) -> float:

@@ -130,6 +130,22 @@ def test_chaotic_held_out_motion_does_not_veto_a_large_gain():
     assert verdict(adhesion, 0.0) == UNKNOWN and verdict(little, 0.0237) in (NONE, UNKNOWN)
 
 
+@given(st.floats(0.0, 1e5), st.floats(1.0, 4.0), st.floats(0.3, 12.0), st.floats(1e-3, 1.0))
+def test_what_predicts_worse_than_nothing_is_never_sure(evidence, growth, nominal_misfit, grain):
+    """An adhesion was named with p = 1.00 where its held-out error was half again the nominal model's."""
+    nominal = fit(misfit=nominal_misfit, rms=0.0055)
+    adhesion = fit("adhesion", evidence=evidence, misfit=0.8, rms=0.0055 * growth)
+    found = compare_models(
+        Found(nominal=nominal, refitted=nominal, candidates=(adhesion,), grain_rms_m=grain), ComparisonSettings()
+    )
+    assert found.probabilities["adhesion"] <= 0.9 / growth + 1e-9
+    surely = compare_models(
+        Found(nominal=nominal, refitted=nominal, candidates=(dataclasses.replace(adhesion, heldout_rms_m=0.004),)),
+        ComparisonSettings(),
+    )
+    assert surely.probabilities["adhesion"] > 0.95 or evidence < 60
+
+
 @given(
     st.lists(
         st.tuples(
