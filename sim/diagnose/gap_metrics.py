@@ -101,7 +101,8 @@ def carried_residual(capture: Capture, nominal: Mapping[str, Array]) -> float:
 
     nominal: (T, K, 3) m by trial. A baseline without any physics.
     """
-    shown = [len(t.times) * np.diff(t.times).mean() for t in capture.predict_trials]
+    # A single frame has no rate.
+    shown = [len(t.times) * np.diff(t.times).mean() for t in capture.predict_trials if len(t.times) > 1]
     lead = float(np.median(shown)) if shown else SHOWN_S
     squares = []
     for trial in capture.fit_trials:
@@ -114,7 +115,8 @@ def carried_residual(capture: Capture, nominal: Mapping[str, Array]) -> float:
         last = np.where(known, tail, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         off = np.square(residual[first:] - last).sum(axis=-1)
         squares.append(off[np.isfinite(off)] * metres_per_unit(capture, trial, nominal[trial.name]) ** 2)
-    return float(np.sqrt(np.concatenate(squares).mean())) if squares else math.nan
+    known_squares = np.concatenate(squares) if squares else np.empty(0)
+    return float(np.sqrt(known_squares.mean())) if len(known_squares) else math.nan
 
 
 def negative_controls(

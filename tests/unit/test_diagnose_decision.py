@@ -22,7 +22,7 @@ from physgen.sim.diagnose.diagnosis import (
     TrialArrays,
     Verdict,
 )
-from physgen.sim.diagnose.gap_metrics import localise
+from physgen.sim.diagnose.gap_metrics import carried_residual, localise
 from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
 from physgen.sim.diagnose.report.wording import verdict_summary
 from physgen.sim.diagnose.suggested_experiments import next_experiment
@@ -327,3 +327,15 @@ def test_a_diagnosis_is_written_and_read(tmp_path):
         files.read_diagnosis(tmp_path)
     with pytest.raises(InputError, match="no such file"):
         files.read_diagnosis(tmp_path / "nowhere")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_trial_that_nothing_is_seen_of_later_has_no_carried_residual_and_warns_of_nothing():
+    seen = a_trial(frames=40)
+    assert seen.points is not None
+    nominal = {seen.name: seen.points + 0.002}
+    assert carried_residual(a_capture(seen), nominal) == pytest.approx(0.0, abs=1e-9)
+    lost = seen.points.copy()
+    lost[12:] = np.nan
+    gone = dataclasses.replace(seen, points=lost)
+    assert math.isnan(carried_residual(a_capture(gone), nominal))
