@@ -1,4 +1,4 @@
-# make demo | test | test-all | test-explore | fuzz | lock | audit | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
+# make demo | test | test-all | test-explore | coverage | fuzz | lock | audit | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
 # PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
 # BEST=1 renders the demo as the documentation shows it, WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
@@ -17,9 +17,10 @@ BLENDER ?= blender
 N ?= 100000
 SEED ?= 0
 # Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest $(SPREAD)
 
-.PHONY: setup demo test test-all test-explore fuzz lint lock audit docs benchmark extension test-blender-app clean
+.PHONY: setup demo test test-all test-explore coverage fuzz lint lock audit docs benchmark extension test-blender-app clean
 
 setup:
 	@test -n "$(PYTHON)" || exit 1
@@ -38,6 +39,16 @@ test-all: setup
 # Examples that no run has drawn before, for the tests that draw any. Failing ones are kept in .hypothesis/.
 test-explore: setup
 	HYPOTHESIS_PROFILE=explore $(PYTEST) -m "hypothesis and not slow" $(TESTS)
+
+# Line coverage of `make test`, with the processes that tests start: totals, a line a file, pages in build/coverage/html.
+coverage: setup
+	rm -rf build/coverage
+	mkdir -p build/coverage
+	$(BIN)/python -m coverage run -m pytest $(SPREAD) -m "$(MARKS)" $(TESTS) || touch build/coverage/failed
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage html --quiet -d build/coverage/html
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
+	@test ! -e build/coverage/failed
 
 # What `make setup` installs, anew: the newest versions that pyproject.toml allows, with their hashes; look at the diff.
 lock: setup

@@ -19,7 +19,8 @@ CANCELLED = 130
 def _is_own_process() -> bool:
     """Return whether this process is the ``physgen`` command, not a program that uses its modules."""
     started = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return (started is not None and started.name.endswith(".batch.cli")) or PurePath(sys.argv[0]).stem == "physgen"
+    module = "" if started is None else started.name
+    return module.endswith((".batch.cli", "physgen.__main__")) or PurePath(sys.argv[0]).stem == "physgen"
 
 
 def heed() -> None:

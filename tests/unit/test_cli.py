@@ -21,7 +21,7 @@ from physgen.sim.scene.folder import load_scene
 
 def in_a_process(*arguments):
     """Run the command in a process of its own; exit code, events and standard error."""
-    command = [sys.executable, "-m", "physgen.batch.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "physgen", *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     events = [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
     return result.returncode, events, result.stderr

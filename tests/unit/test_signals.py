@@ -27,8 +27,16 @@ def stage(*arguments):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("module", ["physgen.sim.errors", "numpy", "physgen.batch.terminal"])
-def test_while_its_modules_are_imported_the_code_is_the_same(number, module):
+@pytest.mark.parametrize(
+    ("started", "module"),
+    [
+        ("physgen.batch.cli", "physgen.sim.errors"),
+        ("physgen.batch.cli", "numpy"),
+        ("physgen.batch.cli", "physgen.batch.terminal"),
+        ("physgen.__main__", "numpy"),
+    ],
+)
+def test_while_its_modules_are_imported_the_code_is_the_same(number, started, module):
     code = textwrap.dedent(f"""
         import os, runpy, sys
         seen = []
@@ -38,7 +46,7 @@ def test_while_its_modules_are_imported_the_code_is_the_same(number, module):
                 os.kill(os.getpid(), {int(number)})
         sys.addaudithook(hook)
         sys.argv = ["physgen", "doctor"]
-        runpy.run_module("physgen.batch.cli", run_name="__main__", alter_sys=True)
+        runpy.run_module({started!r}, run_name="__main__", alter_sys=True)
     """)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
