@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import settings
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest
 from physgen.sim.reconstruct.background import background_inpainting
 from physgen.sim.reconstruct.background.inpainting_methods import MethodChoice
 from physgen.sim.scene.folder import Scene, save_scene
@@ -82,6 +83,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the files, but not the tests of a file, which may share what a fixture made."""
     rank = {name: index for index, name in enumerate(LONGEST)}
     items.sort(key=lambda item: (item.path.name not in ONE_THREAD, rank.get(item.path.name, len(rank))))
+
+
+def complete_manifest(*objects: BakedObject, frames: int = 3, **changes) -> BakeManifest:
+    """The manifest of a complete bake of ``objects``, from frame 1, 24 a second; ``changes`` are other fields."""
+    whole = {"frames": frames, "frames_done": frames, "state": "complete", "objects": objects}
+    rest = {"inputs_hash": "0" * 64, "fps": 24.0, "frame_start": 1, "engine": "test", "version": "0", "particles": 1}
+    return BakeManifest(**{**whole, **rest, **changes})
 
 
 LOOKING_AWAY = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))

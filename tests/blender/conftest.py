@@ -17,12 +17,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.model import Camera, Ground, Light, SceneModel, SceneObject
 from PIL import Image
+
+from ..conftest import complete_manifest
 
 if importlib.util.find_spec("bpy") is None:
     collect_ignore_glob = ["test_*.py"]
@@ -235,19 +237,8 @@ def bake(world, tmp_path):
         with Pc2Writer(folder / "ball.pc2", vertex_count=len(rest)) as writer:
             for shift in shifts:
                 writer.append(rest + np.asarray(shift))
-        manifest = BakeManifest(
-            inputs_hash="0",
-            fps=24.0,
-            frame_start=1,
-            frames=len(shifts),
-            frames_done=len(shifts),
-            state="complete",
-            engine="test",
-            version="0",
-            particles=1,
-            objects=(BakedObject(name="ball", file="ball.pc2", vertices=len(rest)),),
-        )
-        save_manifest(folder, manifest)
+        item = BakedObject(name="ball", file="ball.pc2", vertices=len(rest))
+        save_manifest(folder, complete_manifest(item, frames=len(shifts)))
         return folder
 
     return write

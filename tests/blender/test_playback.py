@@ -16,8 +16,10 @@ from physgen.physgen_addon import (
 from physgen.physgen_addon.playback import bake_record, particles, point_caches, show_bake
 from physgen.physgen_addon.playback.bake_record import BakeRecord, Look
 from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
+
+from ..conftest import complete_manifest
 
 FRAMES, START = 4, 10
 STEP = np.array([0.3, 0.0, 0.0])
@@ -72,21 +74,7 @@ def a_bake(tmp_path):
             points_file="Cube.points.pc2" if flows else None,
             points=len(lattice()) if flows else 0,
         )
-        save_manifest(
-            folder,
-            BakeManifest(
-                inputs_hash="0",
-                fps=24.0,
-                frame_start=1,
-                frames=frames,
-                frames_done=frames,
-                state="complete",
-                engine="test",
-                version="0",
-                particles=1,
-                objects=(baked,),
-            ),
-        )
+        save_manifest(folder, complete_manifest(baked, frames=frames))
         looks = (look or Look(name="Cube"),)
         record = BakeRecord(folder=str(folder), fingerprints=(fingerprint(scene),), frame_start=START, looks=looks)
         bake_record.write_record(record)

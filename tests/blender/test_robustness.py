@@ -26,10 +26,12 @@ from physgen.physgen_addon.scene_io.export_animation import export_names
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.physgen_addon.scene_io.export_world import effects as exported_effects
 from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.effects.registry import effects as all_effects
 from physgen.sim.errors import InputError
+
+from ..conftest import complete_manifest
 
 FRAMES, START, PARTICLES = 3, 10, 20
 posix = pytest.mark.skipif(os.name == "nt", reason="scripts of the shell")
@@ -82,9 +84,7 @@ def folder(tmp_path):
     baked = BakedObject(
         name="Cube", file="Cube.pc2", vertices=8, space="mesh", points_file="Cube.points.pc2", points=PARTICLES
     )
-    common = {"inputs_hash": "0", "fps": 24.0, "frame_start": 1, "engine": "test", "version": "0", "particles": 1}
-    manifest = BakeManifest(frames=FRAMES, frames_done=FRAMES, state="complete", objects=(baked,), **common)
-    save_manifest(folder, manifest)
+    save_manifest(folder, complete_manifest(baked, frames=FRAMES))
     looks = (Look(name="Cube", shape=bake_record.GRAINS, from_frame=START),)
     record = BakeRecord(folder=str(folder), fingerprints=(fingerprint(scene()),), frame_start=START, looks=looks)
     bake_record.write_record(record)

@@ -11,13 +11,15 @@ from physgen.physgen_addon.playback.bake_record import BakeRecord
 from physgen.physgen_addon.playback.point_caches import open_bake
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.physgen_addon.render.renderer import Renderer
-from physgen.sim.cache.bake_folder import Bake, BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import Bake, BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.cache.torn_skins import read_torn_skin, write_torn_skin
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.skinning import bind, deform
 from physgen.sim.tearing.blocks import make_blocks, opening_times, regrouped
 from physgen.sim.tearing.torn_skin import tear
+
+from ..conftest import complete_manifest
 
 FRAMES = 6
 
@@ -61,18 +63,7 @@ def torn_bake(ball_scene, tmp_path):
         torn=len(motion.skin.parents),
         torn_from=motion.skin.first,
     )
-    manifest = BakeManifest(
-        inputs_hash="",
-        fps=24.0,
-        frame_start=1,
-        frames=FRAMES,
-        frames_done=FRAMES,
-        state="complete",
-        engine="",
-        version="",
-        particles=len(matter),
-        objects=(item,),
-    )
+    manifest = complete_manifest(item, frames=FRAMES, particles=len(matter))
     save_manifest(root, manifest)
     return scene, Bake(root=root, manifest=manifest), mesh
 

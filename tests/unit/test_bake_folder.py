@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import (
     BakedObject,
-    BakeManifest,
     disk_usage,
     free_bake,
     load_bake,
@@ -23,25 +22,17 @@ from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 
+from ..conftest import complete_manifest
+
 SAND = BakedObject(name="sand", file="sand.pc2", vertices=4, space="mesh", points_file="sand.points.pc2", points=9)
 
 
 def a_bake(folder, **changes):
     """A folder as a cancelled bake leaves it."""
     folder.mkdir(parents=True, exist_ok=True)
-    fields = {
-        "inputs_hash": "0" * 64,
-        "fps": 24.0,
-        "frame_start": 1,
-        "frames": 3,
-        "frames_done": 1,
-        "state": "cancelled",
-        "engine": "mls-mpm/cpu",
-        "version": "0",
-        "particles": 9,
-        "objects": (SAND, BakedObject(name="cup", file="cup.pc2", vertices=2)),
-    }
-    manifest = BakeManifest(**{**fields, **changes})
+    cancelled = {"frames_done": 1, "state": "cancelled", "engine": "mls-mpm/cpu", "particles": 9}
+    cup = BakedObject(name="cup", file="cup.pc2", vertices=2)
+    manifest = complete_manifest(SAND, cup, **{**cancelled, **changes})
     for name, count in manifest.files.items():
         with Pc2Writer(folder / name, vertex_count=count) as writer:
             writer.append(np.zeros((count, 3)))

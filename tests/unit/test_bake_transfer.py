@@ -8,12 +8,14 @@ import pytest
 import trimesh
 from physgen.sim.app.bake_transfer import transfer_bake
 from physgen.sim.cache.bake_check import require_intact
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Camera, SceneModel, SceneObject
+
+from ..conftest import complete_manifest
 
 LOOK = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -2.0), (0.0, -1.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0))
 CAMERA = Camera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, world_from_camera=LOOK)
@@ -52,21 +54,9 @@ def made(tmp_path):
             writer.append(own.vertices + np.array([0, 0, 0.1 * index]))
         # As every bake has them.
         sums = writer.checksum("Mug.pc2", ended=True)
-    manifest = BakeManifest(
-        inputs_hash="0",
-        fps=30.0,
-        frame_start=1,
-        frames=3,
-        frames_done=3,
-        state="complete",
-        engine="test",
-        version="0",
-        particles=1,
-        geometry_hash=scene.geometry_hash(),
-        checksums=(sums,),
-        objects=(BakedObject(name="Mug", file="Mug.pc2", vertices=8, space="mesh"),),
-    )
-    save_manifest(bake, manifest)
+    mug = BakedObject(name="Mug", file="Mug.pc2", vertices=8, space="mesh")
+    given = {"geometry_hash": scene.geometry_hash(), "checksums": (sums,)}
+    save_manifest(bake, complete_manifest(mug, fps=30.0, **given))
     return photo, scene, bake
 
 

@@ -25,7 +25,6 @@ from physgen.sim.cache.bake_check import check_bake, damage_of, require_intact
 from physgen.sim.cache.bake_folder import (
     CHECKPOINT_FILE,
     BakedObject,
-    BakeManifest,
     load_bake,
     load_manifest,
     save_manifest,
@@ -36,6 +35,8 @@ from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct.scene_output import replacing_folder
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.scene_sums import SUMS_FILE, changed_files, check_scene
+
+from ..conftest import complete_manifest
 
 
 @settings(max_examples=30)
@@ -93,20 +94,8 @@ def a_bake(folder, frames=5, **changes):
         for _ in range(frames):
             cache.append(np.random.default_rng(frames).random((8, 3)))
         checksums = (cache.checksum("box.pc2", ended=True),)
-    manifest = BakeManifest(
-        inputs_hash="0" * 64,
-        fps=24.0,
-        frame_start=1,
-        frames=frames,
-        frames_done=frames,
-        state="complete",
-        engine="mpm",
-        version="0",
-        particles=1,
-        objects=(BakedObject(name="box", file="box.pc2", vertices=8),),
-        checksums=checksums,
-    )
-    save_manifest(folder, dataclasses.replace(manifest, **changes))
+    box = BakedObject(name="box", file="box.pc2", vertices=8)
+    save_manifest(folder, complete_manifest(box, frames=frames, **{"checksums": checksums, **changes}))
     return load_bake(folder)
 
 

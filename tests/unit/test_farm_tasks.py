@@ -31,10 +31,12 @@ from physgen.batch.farm.task_execution import (
     save_record,
     up_to_date_record,
 )
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.events import ignore, never
 from physgen.sim.version import VERSION
+
+from ..conftest import complete_manifest
 
 
 def variant(name, source="scene", **changes):
@@ -77,10 +79,7 @@ def test_a_task_is_done_once_and_again_when_something_changed(ball_scene, tmp_pa
 def test_a_bakes_particles_are_among_what_it_made(tmp_path):
     task = Task(id="bake", stage="bake", argv=("bake",), produces=("b/bake/manifest.json", "b/bake/heap.pc2"))
     heap = BakedObject(name="heap", file="heap.pc2", vertices=3, points_file="heap.points.pc2", points=5)
-    manifest = BakeManifest(
-        inputs_hash="", fps=24.0, frame_start=1, frames=1, frames_done=1, state="complete", engine="mpm",
-        version=VERSION, particles=5, objects=(heap,),
-    )  # fmt: skip
+    manifest = complete_manifest(heap, frames=1)
     folder = tmp_path / "b" / "bake"
     folder.mkdir(parents=True)
     save_manifest(folder, manifest)

@@ -9,10 +9,12 @@ import trimesh
 from physgen.batch.cli import main
 from physgen.sim.app.pack_bake import PACKED_FILE, pack_bake, unpack_bake
 from physgen.sim.cache.bake_check import check_bake
-from physgen.sim.cache.bake_folder import Bake, BakedObject, BakeManifest, load_bake, save_manifest
+from physgen.sim.cache.bake_folder import Bake, BakedObject, load_bake, save_manifest
 from physgen.sim.cache.packed_cache import PackedCache
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.errors import InputError
+
+from ..conftest import complete_manifest
 
 BALL = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
 FRAMES = 48
@@ -36,19 +38,7 @@ def baked(tmp_path):
             writer.append(wobble(sample))
         checksum = writer.checksum("ball.pc2", ended=True)
     item = BakedObject(name="ball", file="ball.pc2", vertices=len(BALL.vertices))
-    manifest = BakeManifest(
-        inputs_hash="",
-        fps=24.0,
-        frame_start=1,
-        frames=FRAMES,
-        frames_done=FRAMES,
-        state="complete",
-        engine="",
-        version="",
-        particles=1,
-        objects=(item,),
-        checksums=(checksum,),
-    )
+    manifest = complete_manifest(item, frames=FRAMES, checksums=(checksum,))
     (root / "metrics.json").write_text("{}")
     save_manifest(root, manifest)
     return Bake(root=root, manifest=manifest)

@@ -16,10 +16,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from physgen.sim.cache import folder_lock as folder_lock_module
-from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_manifest, save_manifest
+from physgen.sim.cache.bake_folder import BakedObject, load_manifest, save_manifest
 from physgen.sim.cache.folder_lock import LOCK_FILE, folder_lock, is_held, is_locked
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
+
+from ..conftest import complete_manifest
 
 samples_of_points = hnp.arrays(
     np.float32, st.tuples(st.integers(1, 5), st.integers(1, 9), st.just(3)), elements=st.floats(-1e3, 1e3, width=32)
@@ -82,19 +84,8 @@ def test_garbage_is_no_cache(tmp_path, content, signed):
 
 
 def a_manifest(**changes):
-    fields = {
-        "inputs_hash": "0" * 64,
-        "fps": 24.0,
-        "frame_start": 1,
-        "frames": 3,
-        "frames_done": 3,
-        "state": "complete",
-        "engine": "test",
-        "version": "0",
-        "particles": 8,
-        "objects": (BakedObject(name="cup", file="cup.pc2", vertices=4),),
-    }
-    return BakeManifest(**{**fields, **changes})
+    cup = BakedObject(name="cup", file="cup.pc2", vertices=4)
+    return complete_manifest(cup, **{"particles": 8, **changes})
 
 
 def test_a_manifest_comes_back(tmp_path):
