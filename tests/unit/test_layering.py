@@ -101,10 +101,10 @@ def test_rendering_and_opening_a_scene_never_pay_for_taichi():
 
 
 def test_a_command_starts_without_what_only_another_needs():
-    """Every bake, render and task of a farm starts one; each of these takes half a second."""
+    """Every bake, render and task of a farm starts one; each of these takes a quarter of a second or more."""
     code = "import sys, physgen.batch.cli; print(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"taichi", "bpy", "trimesh", "skimage", "scipy.signal", "scipy.stats"} & set(result.stdout.split())
+    assert not {"taichi", "bpy", "trimesh", "skimage", "scipy"} & set(result.stdout.split())
 
 
 def test_one_version():

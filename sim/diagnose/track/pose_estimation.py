@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..capture import Camera
 
@@ -117,6 +116,9 @@ def _ransac(camera: Camera, rest: Array, pixels: Array, guess: Pose, tolerance: 
 def _refined(
     camera: Camera, rest: Array, pixels: Array, guess: Pose, tolerance: float, largest: float
 ) -> Located | None:
+    # Imported late: every command imports the options of tracking, and through them this file.
+    from scipy.spatial.transform import Rotation
+
     pose = guess
     residual = _residual(camera, rest, pixels, pose)
     for _ in range(30):

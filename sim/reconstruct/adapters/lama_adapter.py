@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ...errors import InputError
 from .onnx_session import open_session
@@ -53,6 +52,9 @@ def filled_hole_by_hole(pixels: Pixels, hole: Mask, least: int, fill: Callable[[
 
 def without_content(pixels: Pixels, hole: Mask) -> Pixels:
     """Return ``pixels`` with the nearest colours outside in ``hole``, whose content resizing would smear."""
+    # Imported late: every command that chooses models imports this file.
+    from scipy import ndimage
+
     if hole.all():
         return pixels
     near = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
