@@ -27,7 +27,6 @@ from ..sim.trust import LIST_FILE, config_folder
 from ..sim.version import VERSION
 from . import stages
 from .commands import (
-    check_command,
     compose_commands,
     diagnosis_commands,
     doctor,
@@ -86,7 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
         command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
     )
     sound = "whether the files of a bake, scene or frames folder are what was written"
-    check_command.add_check(command("check", check_command.run_check, sound))
+    scene_commands.add_check(command("check", scene_commands.run_check, sound))
     previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
     scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
     photo_commands.add_render(

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.batch.commands.check_command import check_folder
+from physgen.batch.commands.scene_commands import check_folder
 from physgen.physgen_addon.frames.frame_files import write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex
 from physgen.physgen_addon.playback import bake_record
