@@ -3,12 +3,12 @@
 
     import physgen
 
-    objects = [physgen.ObjectRequest(name="cup", box=(215, 960, 475, 1190), preset="metal", velocity=(0, 0, 1.5))]
-    scene = physgen.reconstruct("photo.jpg", objects, out="work/scene")
-    bake = physgen.bake(scene, out="work/bake", options=physgen.BakeOptions(frames=48))
+    objects = [physgen.ObjectRequest(name="cup", box=(70, 12, 488, 392), preset="jelly", velocity=(0, 0, 0.6))]
+    scene = physgen.reconstruct("presets/demo/coffee.jpg", objects, out="work/scene", on_event=print)
+    bake = physgen.bake(scene, out="work/bake", options=physgen.BakeOptions(frames=48), on_event=print)
     frames = physgen.render(scene, bake, out="work/frames", video="video.mp4")
 
-    capture = physgen.track(scene, ["recording.mp4"], out="work/capture")
+    capture = physgen.track(scene, ["recording.mp4"], out="work/capture")  # your own video of what the photo shows
     diagnosis = physgen.diagnose(capture, out="work/diagnosis")
     print(diagnosis.verdict.effect, diagnosis.summary)
 
