@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From an outline to a body: its shape, silhouette, volume, mesh and colours."""
 
+import functools
 import math
 
 import cv2
@@ -49,6 +50,19 @@ def made(mask, notices=None, pitch_deg=25.0, seen=None, pixels=None, vertices=30
     return build_body(view(pitch_deg), mask, wanted, options, said.append, seen=seen, pixels=pixels)
 
 
+@functools.cache
+def body_alone(primitive):
+    """Outline, body and notices of a primitive, or of a blob for None, of which nothing else is said; not to change."""
+    mask, notices = blob(3) if primitive is None else outline(primitive), []
+    return mask, made(mask, notices), notices
+
+
+@functools.cache
+def cup_body():
+    """Not to change."""
+    return made(cup()[0], vertices=7000)
+
+
 def checked(body):
     """The mesh, after what holds for every body."""
     mesh = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False)
@@ -68,9 +82,7 @@ def checked(body):
 
 @pytest.mark.parametrize(("primitive", "shape"), [(BOX, "box"), (CAN, "cylinder"), (BALL, "sphere")])
 def test_a_clear_outline_becomes_its_primitive(primitive, shape):
-    mask = outline(primitive)
-    notices = []
-    body = made(mask, notices)
+    _, body, notices = body_alone(primitive)
     mesh = checked(body)
     assert body.shape == shape
     assert body.fit > 0.985
@@ -97,8 +109,7 @@ def test_a_camera_three_degrees_off_keeps_shape_silhouette_and_proportions(primi
 
 
 def test_a_cup_keeps_its_handle_and_its_volume():
-    mask, _ = cup()
-    body = made(mask, vertices=7000)
+    body = cup_body()
     mesh = checked(body)
     assert body.shape == "cylinder"
     assert body.fit > 0.97
@@ -195,8 +206,7 @@ def test_a_body_hidden_below_is_fitted_to_what_is_seen():
 
 def test_visible_faces_show_their_pixels_and_others_pixels_of_the_object():
     for primitive in (BOX, CAN, BALL, None):
-        mask = blob(3) if primitive is None else outline(primitive)
-        body = made(mask)
+        mask, body, _ = body_alone(primitive)
         a, b, c = (body.mesh.vertices[body.mesh.faces[:, i]] for i in range(3))
         normal, towards = np.cross(b - a, c - a), view().position - a
         cosine = (normal * towards).sum(axis=1) / np.linalg.norm(normal, axis=1) / np.linalg.norm(towards, axis=1)
@@ -226,7 +236,7 @@ def test_empty_outlines_are_refused():
 
 
 def test_equal_inputs_give_equal_bodies():
-    first, second = made(cup()[0]), made(cup()[0])
+    first, second = cup_body(), made(cup()[0], vertices=7000)
     assert np.array_equal(first.mesh.vertices, second.mesh.vertices)
     assert np.array_equal(first.mesh.colours, second.mesh.colours)
 
