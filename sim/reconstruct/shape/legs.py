@@ -69,7 +69,8 @@ class Leg:
         """Return (h, w) how low its pixels are: 1 at the foot, 0 from ``HIGH`` on and outside of it."""
         rows = np.arange(shape[0])
         high = (self.foot[1] - 1.0 - rows) / (HIGH * self.width)
-        return np.asarray(np.where(self.region(shape), np.clip(1.0 - high**2, 0.0, 1.0)[:, None], 0.0), dtype=np.float64)
+        low = np.clip(1.0 - high**2, 0.0, 1.0)[:, None]
+        return np.asarray(np.where(self.region(shape), low, 0.0), dtype=np.float64)
 
 
 def outline_size(mask: Mask) -> float:
