@@ -14,7 +14,7 @@ import bpy
 from ..sim.cache.bake_folder import MANIFEST_FILE, load_manifest
 from ..sim.cache.folder_lock import LOCK_FILE, is_locked
 from ..sim.errors import InputError
-from . import background_jobs, paths
+from . import background_jobs, blend_trust, paths
 from .playback import bake_record, show_bake
 from .playback.bake_record import BakeRecord
 from .props.body_props import bodies
@@ -28,6 +28,7 @@ MESSAGES = {
     "paused": "Incomplete. Resume continues it",
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
     "missing": "The bake was moved. Find its folder, or bake again",
+    "asks": "This file came with a bake outside its folder, which is left alone until you agree (see Scene)",
     "damaged": "Files of the bake are gone or damaged. Bake again, which computes that part anew, or find a good copy",
 }
 
@@ -278,7 +279,8 @@ def _look(scene: bpy.types.Scene) -> BakeState:
         return BakeState("baking", job.done or 0, job.total or frames, advice=words)
     if manifest is None or shown is None:
         status = "missing" if simulation.bake else "none"
-        return BakeState(status, 0, frames, trouble=obstacle or _unreadable(scene), advice=MESSAGES[status])
+        advice = MESSAGES["asks" if blend_trust.is_pending(simulation.bake) else status]
+        return BakeState(status, 0, frames, trouble=obstacle or _unreadable(scene), advice=advice)
     done = bake_record.playable(shown.path)
     damage = bake_record.damage(shown.path, manifest, wait=bpy.app.background)
     troubles = show_bake.misfits(scene, shown)

@@ -11,10 +11,9 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from . import bake_state, paths
+from . import bake_state, blend_trust, paths
 from . import bake_state as unsaved
 from .context import redraw
-from .photo import photo_trust
 from .playback import point_caches
 from .playback.bake_record import BAKES
 from .props.body_props import bodies
@@ -154,10 +153,11 @@ def _on_history(*_: Any) -> None:
 
 @persistent
 def _on_load(*_: Any) -> None:
+    # First, so that nothing is looked at before it is known what the file may ask for.
+    blend_trust.note_loaded()
     bake_state.forget()
     _settings.clear()
     paths.new_unsaved_key()
-    photo_trust.note_loaded()
     unsaved.forget_unsaved()
     for scene in bpy.data.scenes:
         _find_by_modifiers(scene)
@@ -198,7 +198,7 @@ def _after_save(path: str = "", *_: Any) -> None:
     if path:
         restore_folders(path)
         unsaved.after_first_save(path)
-        photo_trust.note_saved()
+        blend_trust.note_saved()
         bake_state.mark_dirty()
 
 

@@ -15,6 +15,7 @@ import bpy
 from ..sim.cache.bake_folder import load_manifest
 from ..sim.errors import InputError
 from ..sim.scene.object_names import DEVICES
+from . import blend_trust
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 """Options of a property whose path may begin with ``//``."""
@@ -39,9 +40,13 @@ def user_folder(name: str, *, create: bool = False) -> Path:
 
 
 def require_folder(path: str, what: str) -> Path:
-    """Return ``path`` as an absolute path (``//`` is the .blend's folder); InputError if empty."""
+    """Return ``path`` as an absolute path (``//`` is the .blend's folder).
+
+    InputError if empty, or if it came with somebody else's file and the user has not agreed to it.
+    """
     if not path.strip():
         raise InputError(f"{what} is empty: choose a folder")
+    blend_trust.require(path)
     return Path(bpy.path.abspath(path.strip())).resolve()
 
 
@@ -49,6 +54,7 @@ def require_file(path: str, what: str) -> Path:
     """Return ``path`` as an absolute path (``//`` is the .blend's folder); InputError if it is no file."""
     if not path.strip():
         raise InputError(f"{what} is empty: choose a file")
+    blend_trust.require(path)
     file = absolute(path.strip())
     if not file.is_file():
         raise InputError(f"{what}: {file} is no file; choose another")
@@ -196,6 +202,7 @@ def absolute(path: str) -> Path:
 
 
 def shown_bake(scene: bpy.types.Scene) -> Path | None:
-    """Return the folder of the bake that ``scene`` shows, existing or not; None without one."""
+    """Return the folder of the bake that ``scene`` shows, existing or not; None without one, and for one that waits for
+    the user's word."""
     path = scene.physgen.simulation.bake
-    return absolute(path) if path else None
+    return absolute(path) if path and not blend_trust.is_pending(path) else None

@@ -18,6 +18,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .errors import InputError
+from .files import read_bytes
+
 if TYPE_CHECKING:
     from jinja2 import Environment
 
@@ -113,6 +116,29 @@ def page_head(title: str, style: str, *, script: str | None = None) -> Markup:
         element("title", title),
         element("style", Markup(style)),
     )
+
+
+_HARMLESS = re.compile(
+    rb"\s*<!DOCTYPE html>\s*<html lang=\"en\">\s*<head><meta charset=\"utf-8\" />"
+    rb"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src &#x27;none&#x27;; "
+    rb"style-src &#x27;sha256-[A-Za-z0-9+/=]{44}&#x27;; img-src data:; base-uri &#x27;none&#x27;; "
+    rb"form-action &#x27;none&#x27;\" />"
+)
+"""How a page of ``page_head`` without a script begins. Nothing precedes the policy, so a browser holds all that follows
+to it, whoever wrote that."""
+MOST_PAGE_BYTES = 2**28
+
+
+def require_harmless(page: Path) -> None:
+    """Raise InputError unless the file ``page`` is one that runs nothing, loads nothing and leads nowhere by itself,
+    so that a browser may show it even if it came from somebody else."""
+    try:
+        content = read_bytes(page, MOST_PAGE_BYTES, what="page")
+    except FileNotFoundError:
+        raise InputError(f"{page}: there is no such page; run the command again that makes it") from None
+    head = _HARMLESS.match(content)
+    if head is None or b"http-equiv" in content[head.end() :].lower():
+        raise InputError(f"{page}: is not as PhysGen writes it and may run scripts, so it is not opened; make it anew")
 
 
 def _allowed(text: str) -> str:

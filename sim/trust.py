@@ -28,7 +28,7 @@ from .errors import InputError
 
 T = TypeVar("T")
 
-RUNS, READS = "runs", "reads"
+RUNS, READS, WRITES = "runs", "reads", "writes"
 
 VARIABLE = "PHYSGEN_CONFIG"
 LIST_FILE = "trusted.json"
@@ -42,8 +42,8 @@ MOST_ENTRIES = 2000
 class Claim:
     """One thing that a file asks for beyond its folder.
 
-    kind: ``RUNS`` or ``READS``. where: its field. text: what would be run or read. code: hash of the program that it
-    names, as far as it is known; a changed program is another claim.
+    kind: ``RUNS``, ``READS`` or ``WRITES``. where: its field. text: what would be run, read, or written and deleted.
+    code: hash of the program that it names, as far as it is known; a changed program is another claim.
     """
 
     kind: str

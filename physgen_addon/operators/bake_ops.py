@@ -12,7 +12,7 @@ from ...sim.cache.bake_folder import free_bake, load_manifest
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
-from .. import background_jobs, bake_state, paths
+from .. import background_jobs, bake_state, blend_trust, paths
 from .. import bake_state as unsaved
 from ..background_jobs import Job, JobOperator, Work
 from ..compat import OperatorMixin
@@ -305,6 +305,7 @@ class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
         scene = context.scene
         folder = paths.absolute(scene.physgen.simulation.bake)
         try:
+            blend_trust.require(scene.physgen.simulation.bake)
             kept = used_elsewhere(scene, folder)
             show_bake.hide(scene)
             freed = 0 if kept or bake_record.manifest_of(folder) is None else delete(folder)

@@ -15,6 +15,7 @@ from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
 from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.html import require_harmless
 from ...sim.scene.folder import Scene, load_scene
 from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
@@ -188,8 +189,7 @@ class PHYSGEN_OT_open_report(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Open report.html."""
         page = report_folder(context.scene.physgen_diagnose) / PAGE_FILE
-        if not page.is_file():
-            raise InputError(f"{page}: there is no such page; run the diagnosis again")
+        require_harmless(page)
         webbrowser.open(page.as_uri())
         return {"FINISHED"}
 

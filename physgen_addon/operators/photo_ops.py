@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import BoolProperty, StringProperty
 
 from ...sim.app.stage_process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.html import require_harmless
 from ...sim.scene.folder import load_scene
+from .. import bake_state, blend_trust
 from ..background_jobs import JobOperator, Work
 from ..context import TAB, active, close_beside, show_beside
 from ..interpreter import cli_command, find_python, photo_check
-from ..photo import photo_trust
 from ..photo.photo_image import (
     SUFFIXES,
     PhotoTool,
@@ -303,27 +304,30 @@ def unregister_box_drawing() -> None:
 
 
 class PHYSGEN_OT_trust_file(bpy.types.Operator):
-    """Agree to what this file would have read outside its folder, and reconstruct"""
+    """Agree to what this file names outside its folder: each path is shown first"""
 
     bl_idname = "physgen.trust_file"
     bl_label = "This File Asks for Others"
 
+    go_on: BoolProperty(name="Reconstruct Then", default=True, options={"HIDDEN", "SKIP_SAVE"})
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show every line."""
         manager = context.window_manager
-        title = "Somebody set these files. Read them?"
+        title = "Somebody set these paths. Use them?"
         return manager.invoke_props_dialog(self, width=560, title=title, confirm_text="Trust This File")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the lines."""
-        for claim in photo_trust.pending(context.scene):
+        for claim in blend_trust.pending(context.scene):
             self.layout.label(text=claim.line(), icon="FILE")
         self.layout.label(text="Choose Cancel if you do not know who made this file.")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Agree; where there is a window, go on."""
-        photo_trust.agree(context.scene)
-        if not bpy.app.background:
+        """Agree; where Reconstruct asked, go on with it."""
+        blend_trust.agree(context.scene)
+        bake_state.mark_dirty()
+        if self.go_on and not bpy.app.background:
             bpy.ops.physgen.reconstruct("INVOKE_DEFAULT")
         return {"FINISHED"}
 
@@ -349,14 +353,14 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask first, where the file came with settings that read outside its folder."""
-        if photo_trust.pending(context.scene) and not bpy.app.background:
+        if blend_trust.pending(context.scene) and not bpy.app.background:
             bpy.ops.physgen.trust_file("INVOKE_DEFAULT")
             return {"CANCELLED"}
         return super().invoke(context, event)
 
     def request(self, context: bpy.types.Context) -> Work:
         """Return the reconstruction as a child process, which reads the masks from files."""
-        photo_trust.require_agreed(context.scene)
+        blend_trust.require_agreed(context.scene)
         state = context.scene.physgen_photo
         given, out, preferred = arguments(state), scene_folder(state), python(context)
         write_masks(dict(mask_files(state, out).values()))
@@ -403,5 +407,6 @@ class PHYSGEN_OT_open_photo_report(bpy.types.Operator):
         page = report_page(context.scene.physgen_photo)
         if page is None:
             raise InputError("there is no report of this photo; switch Write Report on and reconstruct")
+        require_harmless(page)
         webbrowser.open(page.as_uri())
         return {"FINISHED"}

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import bpy
 
-from .. import text
+from .. import blend_trust, text
 from ..operators.diagnose_ops import (
     PHYSGEN_OT_add_effect,
     PHYSGEN_OT_clear_capture,
@@ -112,8 +113,10 @@ class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
             row = layout.row()
             row.scale_y = 1.4
             row.operator(PHYSGEN_OT_explain_video.bl_idname, icon="VIEWZOOM")
-        if video.comparison:
-            layout.operator("wm.path_open", text="Play Comparison", icon="PLAY").filepath = video.comparison
+        path = Path(bpy.path.abspath(video.comparison))
+        # A .blend from elsewhere may set any path here, and the operating system opens it: a program would run.
+        if video.comparison and not blend_trust.is_pending(video.comparison) and path.suffix == ".mp4":
+            layout.operator("wm.path_open", text="Play Comparison", icon="PLAY").filepath = str(path)
 
 
 class PHYSGEN_PT_diagnose_show(_Part, bpy.types.Panel):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import text
+from .. import blend_trust, text
 from ..background_jobs import running
 from ..interpreter import missing_modules
 from ..operators.render_ops import (
@@ -71,7 +71,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
 
 
 def _draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup) -> None:
-    if not rendering.result:
+    if not rendering.result or blend_trust.is_pending(rendering.result):
         return
     path = Path(bpy.path.abspath(rendering.result))
     # A .blend from elsewhere may set any path here, and Open passes it to the operating system.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import bake_state, text
+from .. import bake_state, blend_trust, text
 from ..background_jobs import PHYSGEN_OT_cancel_job
 from ..operators.bake_ops import PHYSGEN_OT_pause_bake
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
@@ -18,7 +18,7 @@ from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
-from .sidebar import SCENE, Sidebar, draw_progress
+from .sidebar import SCENE, Sidebar, draw_progress, draw_trust
 
 
 class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
@@ -37,6 +37,7 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
             row = draw_progress(layout, job)
             row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
             row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+        draw_trust(layout, context)
         if state.folder:
             _draw_folder(layout, context, state)
             return
@@ -86,7 +87,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row = layout.row(align=True)
     row.prop(state, "folder", text="")
     row.operator(PHYSGEN_OT_import_scene.bl_idname, text="", icon="IMPORT")
-    there = folder.is_dir()
+    there = not blend_trust.is_pending(state.folder) and folder.is_dir()
     # On macOS a folder may be a program, which opening starts.
     if there and folder.suffix.lower() != ".app":
         row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)

@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from .. import bake_state, text
+from .. import bake_state, blend_trust, text
 from ..background_jobs import Job, PHYSGEN_OT_cancel_job, progress_text, running
 from ..context import TAB
 from ..gizmos import SHOW_ARROWS
@@ -74,6 +74,16 @@ def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message
         row.operator("physgen.install_python", text="Install…", icon="IMPORT")
         button = row.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
         button.module = PHYSGEN_AP_preferences.bl_idname
+
+
+def draw_trust(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw what somebody else's file asks for, and the way to agree to it; nothing where nothing waits."""
+    waiting = len(blend_trust.pending(context.scene))
+    if waiting:
+        box = layout.box()
+        words = f"This file names {text.count(waiting, 'path')} outside its folder, left alone until you agree."
+        text.sentences(box, context, words, icon="ERROR")
+        box.operator("physgen.trust_file", text="Look and Agree…", icon="CHECKMARK").go_on = False
 
 
 def active_body(context: bpy.types.Context) -> Any:

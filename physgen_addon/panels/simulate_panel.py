@@ -22,7 +22,7 @@ from ..operators.bake_ops import (
 )
 from ..operators.world_ops import PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only
 from ..props.body_props import bodies
-from .sidebar import SIMULATE, Sidebar, draw_preview, draw_progress, draw_trouble, is_baking, settings
+from .sidebar import SIMULATE, Sidebar, draw_preview, draw_progress, draw_trouble, draw_trust, is_baking, settings
 
 
 class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
@@ -117,6 +117,7 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
             draw_trouble(layout, context, found.trouble, icon="ERROR")
         text.sentences(layout, context, advice)
         return
+    draw_trust(layout, context)
     box = layout.box()
     if found.trouble:
         draw_trouble(box, context, found.trouble, icon="ERROR")

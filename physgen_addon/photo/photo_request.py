@@ -14,6 +14,7 @@ from ...sim.scene.folder import SCENE_FILE
 from ...sim.scene.model import Camera
 from ...sim.scene.object_names import valid_names
 from ...sim.validation import read_json
+from .. import blend_trust
 from ..paths import folder_beside, require_folder
 from . import photo_maths
 from .photo_consent import OFFLINE, is_allowed
@@ -147,6 +148,7 @@ def _asking(state: bpy.types.PropertyGroup, online: bool) -> list[str]:
 
 
 def _file(path: str, what: str) -> Path:
+    blend_trust.require(path)
     found = Path(bpy.path.abspath(path.strip())).resolve()
     if not found.is_file():
         raise InputError(f"{what}: there is no file {found}; choose where it is now, or clear the field")

@@ -18,6 +18,7 @@ from ...sim.scene.folder import Scene, inside, load_scene, save_scene
 from ...sim.scene.model import Ground, SceneModel, SceneObject
 from ...sim.scene.object_names import valid_names
 from ...sim.scene.textured_mesh import read_textured_mesh, write_moved_mesh
+from ..paths import require_folder
 from ..props.body_props import is_body
 from . import export_world
 from .export_animation import depsgraph, matrix_rows, metres_per_unit, placed
@@ -67,7 +68,7 @@ def photo_scene(scene: bpy.types.Scene) -> Scene | None:
     if not scene.physgen.folder:
         return None
     try:
-        found = load_scene(Path(bpy.path.abspath(scene.physgen.folder)))
+        found = load_scene(require_folder(scene.physgen.folder, "Scene"))
     except InputError:
         return None
     return found if found.model.photo is not None else None

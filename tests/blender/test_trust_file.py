@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A .blend from somebody else reads nothing outside its folder before the user agreed; one's own needs no word."""
+"""A .blend from somebody else reads, writes and deletes nothing outside its folder before the user agreed; one's own
+needs no word."""
+
+import json
 
 import numpy as np
 import pytest
@@ -7,9 +10,12 @@ from PIL import Image
 
 bpy = pytest.importorskip("bpy")
 import physgen
+from physgen.physgen_addon import bake_state, blend_trust, paths
 from physgen.physgen_addon.operators.photo_ops import add_box, set_photo
-from physgen.physgen_addon.photo import photo_trust
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
+from physgen.sim.errors import InputError
 from physgen.sim.trust import NotTrusted
+from physgen.sim.version import VERSION
 
 
 @pytest.fixture(autouse=True)
@@ -30,38 +36,46 @@ def blend(tmp_path):
     set_photo(bpy.context.scene, secret)
     box = add_box(bpy.context.scene, (10, 10, 50, 50), "ball")
     box.mesh = str(secret.parent / "private.obj")
+    return saved(tmp_path)
+
+
+def saved(tmp_path):
     path = tmp_path / "downloaded" / "toy.blend"
-    path.parent.mkdir()
+    path.parent.mkdir(exist_ok=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     return path
 
 
+def wheres(scene):
+    return [claim.where for claim in blend_trust.pending(scene)]
+
+
 def test_ones_own_file_needs_no_word(blend):
-    assert photo_trust.pending(bpy.context.scene) == []
+    assert blend_trust.pending(bpy.context.scene) == []
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert photo_trust.pending(bpy.context.scene) == []
+    assert blend_trust.pending(bpy.context.scene) == []
 
 
 def test_somebody_elses_reads_nothing_outside_its_folder_before_the_word(blend, tmp_path, monkeypatch):
     monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     scene = bpy.context.scene
-    lines = [claim.line() for claim in photo_trust.pending(scene)]
-    assert [line.split(" = ")[0] for line in lines] == ["reads photo", "reads ball: mesh"]
-    with pytest.raises(RuntimeError, match=r"you have not agreed to them: reads photo = .*private\.png"):
+    lines = [claim.line() for claim in blend_trust.pending(scene)]
+    assert sorted(line.split(" = ")[0] for line in lines) == ["reads Photo", "reads ball: Mesh"]
+    with pytest.raises(RuntimeError, match=r"you have not agreed to them: reads .*private\.(png|obj)"):
         bpy.ops.physgen.reconstruct()
     with pytest.raises(NotTrusted):
-        photo_trust.require_agreed(scene)
+        blend_trust.require_agreed(scene)
     # Saving it is no word, choosing a file is one for that file.
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     scene = bpy.context.scene
-    assert len(photo_trust.pending(scene)) == 2
+    assert len(blend_trust.pending(scene)) == 2
     scene.physgen_photo.boxes[0].mesh = str(tmp_path / "my own.obj")
-    assert [claim.where for claim in photo_trust.pending(scene)] == ["photo"]
+    assert wheres(scene) == ["Photo"]
     # The question's yes.
     assert bpy.ops.physgen.trust_file() == {"FINISHED"}
-    photo_trust.require_agreed(scene)
+    blend_trust.require_agreed(scene)
 
 
 def test_a_yes_is_remembered_until_the_file_asks_for_something_else(blend, tmp_path, monkeypatch):
@@ -69,10 +83,117 @@ def test_a_yes_is_remembered_until_the_file_asks_for_something_else(blend, tmp_p
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     bpy.ops.physgen.trust_file()
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert photo_trust.pending(bpy.context.scene) == []
+    assert blend_trust.pending(bpy.context.scene) == []
     monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "maker"))
     bpy.context.scene.physgen_photo.depth = str(tmp_path / "elsewhere" / "more.exr")
     bpy.ops.wm.save_mainfile()
     monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert "depth" in [claim.where for claim in photo_trust.pending(bpy.context.scene)]
+    assert "Depth Map" in wheres(bpy.context.scene)
+
+
+def path_properties(group):
+    """Identifiers of all properties in ``group`` that name a file or folder."""
+    found = set()
+    for prop in group.bl_rna.properties:
+        if prop.identifier == "rna_type":
+            continue
+        if prop.type == "STRING" and prop.subtype in blend_trust.PATHS:
+            found.add(prop.identifier)
+        elif prop.type == "POINTER" and issubclass(type(getattr(group, prop.identifier)), bpy.types.PropertyGroup):
+            found |= path_properties(getattr(group, prop.identifier))
+    return found
+
+
+def test_every_property_with_a_path_waits_for_the_word(tmp_path, monkeypatch):
+    """Not a list that somebody has to remember: what has a path's subtype is found, and refused where it is used."""
+    scene = bpy.context.scene
+    outside = tmp_path / "elsewhere"
+    outside.mkdir()
+    named = {
+        "physgen": ("folder",),
+        "physgen.simulation": ("cache", "bake"),
+        "physgen.rendering": ("output", "result"),
+        "physgen_photo": ("path", "depth", "output"),
+        "physgen_diagnose": ("capture", "report", "scene_folder", "before", "after"),
+    }
+    for owner, names in named.items():
+        for name in names:
+            group = scene.path_resolve(owner)
+            assert group.bl_rna.properties[name].subtype in blend_trust.PATHS, (owner, name)
+            setattr(group, name, str(outside / name))
+    scene.physgen_diagnose.video.file = str(outside / "v.mp4")
+    scene.physgen_diagnose.video.mesh = str(outside / "v.obj")
+    known = {identifier for owner in blend_trust.GROUPS for identifier in path_properties(getattr(scene, owner))}
+    covered = {name for names in named.values() for name in names} | {"file", "mesh", "comparison"}
+    assert known <= covered, known - covered
+    # Bodies name no files at all.
+    bpy.ops.mesh.primitive_cube_add()
+    assert not path_properties(bpy.context.object.physgen)
+    path = saved(tmp_path)
+    monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    scene = bpy.context.scene
+    assert len(blend_trust.pending(scene)) == sum(map(len, named.values())) + 2
+    for text in (scene.physgen.folder, scene.physgen.rendering.output, scene.physgen_diagnose.capture):
+        with pytest.raises(NotTrusted, match="came with paths outside its folder"):
+            paths.require_folder(text, "Folder")
+    with pytest.raises(NotTrusted):
+        paths.require_file(scene.physgen_diagnose.video.file, "Video")
+    with pytest.raises(NotTrusted):
+        paths.scene_cache(scene)
+    assert paths.shown_bake(scene) is None and bake_state.caches_of(scene) == []
+
+
+def a_bake(folder):
+    folder.mkdir(parents=True)
+    item = BakedObject(name="ball", file="ball.pc2", vertices=8)
+    values = {"inputs_hash": "0" * 64, "fps": 24.0, "frame_start": 1, "frames": 3, "frames_done": 3}
+    manifest = BakeManifest(**values, state="complete", engine="mpm", version=VERSION, particles=8, objects=(item,))
+    (folder / "ball.pc2").write_bytes(b"precious")
+    save_manifest(folder, manifest)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_free_in_somebody_elses_file_deletes_nothing_of_ours(tmp_path, monkeypatch):
+    """Both the cache and the bake are the file's to name, so that being inside its cache proves nothing."""
+    scene = bpy.context.scene
+    victim = tmp_path / "home" / "project" / scene.name / "bakes" / "mine"
+    before = a_bake(victim)
+    (victim.parent / "mine.json").write_text(json.dumps({"format": "physgen-blender-bake/1", "fingerprints": ["x"]}))
+    scene.physgen.simulation.cache = str(tmp_path / "home" / "project")
+    scene.physgen.simulation.bake = str(victim)
+    scene.physgen.rendering.output = str(tmp_path / "home" / "project")
+    bpy.ops.mesh.primitive_cube_add()
+    path = saved(tmp_path)
+    monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
+    untouched = sorted((tmp_path / "home").rglob("*"))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    scene = bpy.context.scene
+    with pytest.raises(RuntimeError, match="have not agreed"):
+        bpy.ops.physgen.free_bake()
+    bpy.ops.physgen.free_old_bakes()
+    with pytest.raises(RuntimeError, match="no bake of this scene"):
+        bpy.ops.physgen.free_one_bake(folder=str(victim))
+    bpy.ops.wm.save_mainfile()
+    assert {item.name: item.read_bytes() for item in victim.iterdir()} == before
+    assert sorted((tmp_path / "home").rglob("*")) == untouched
+    assert "until you agree" in bake_state.observe(scene).advice or not bake_state.concerns(scene)
+    # With the user's word it is what it says.
+    bpy.ops.physgen.trust_file()
+    assert paths.shown_bake(scene) == victim and paths.scene_cache(scene) == victim.parents[1]
+    assert bpy.ops.physgen.free_bake() == {"FINISHED"} and not (victim / "ball.pc2").exists()
+
+
+def test_a_link_that_leads_out_of_the_folder_counts_as_outside(tmp_path, monkeypatch):
+    scene = bpy.context.scene
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "downloaded").mkdir()
+    (tmp_path / "downloaded" / "cache").symlink_to(tmp_path / "secret")
+    scene.physgen.simulation.cache = "//cache"
+    path = saved(tmp_path)
+    monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    with pytest.raises(InputError, match="outside its folder"):
+        paths.scene_cache(bpy.context.scene)
+    assert [claim.text for claim in blend_trust.pending(bpy.context.scene)] == [str(tmp_path / "secret")]

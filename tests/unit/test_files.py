@@ -15,6 +15,7 @@ from physgen.sim.cache.bake_folder import disk_usage, load_bake
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import InputError
 from physgen.sim.files import open_file, read_bytes, read_text, read_toml
+from physgen.sim.html import page_head, require_harmless
 from physgen.sim.npz import read_npy, read_npz
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import read_mesh
@@ -279,3 +280,36 @@ def test_a_gltf_reads_no_buffer_outside_its_folder(tmp_path):
         with pytest.raises(InputError):
             read_mesh(folder / "a.gltf")
     assert stat.S_ISREG((tmp_path / buffer).stat().st_mode)
+
+
+@pytest.mark.parametrize(
+    ("page", "good"),
+    [
+        ('<!DOCTYPE html>\n<html lang="en">{head}\n<body><p>a</p><script>alert(1)</script></body></html>', True),
+        ('<script>alert(1)</script><!DOCTYPE html>\n<html lang="en">{head}<body></body></html>', False),
+        ('<!DOCTYPE html>\n<html lang="en" onload="alert(1)">{head}<body></body></html>', False),
+        ('<!DOCTYPE html>\n<html lang="en">{runs}<body></body></html>', False),
+        ("<!DOCTYPE html>\n<html lang=\"en\">{head}<META HTTP-EQUIV=refresh content='0;url=//evil'></html>", False),
+        ("<html><body>a</body></html>", False),
+        ("", False),
+    ],
+)
+def test_only_a_page_that_the_browser_holds_to_our_policy_is_opened(tmp_path, page, good):
+    """A browser runs no script after the policy; a page with one before it, or that leads elsewhere, is not shown."""
+    text = page.format(head=page_head("t", "p{}"), runs=page_head("t", "p{}", script="alert(1)"))
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    if good:
+        require_harmless(tmp_path / "report.html")
+        return
+    with pytest.raises(InputError, match="may run scripts, so it is not opened"):
+        require_harmless(tmp_path / "report.html")
+
+
+def test_every_page_that_is_written_forbids_scripts_or_names_its_own():
+    """Templates take their head from ``page_head``, which has the policy, or bring a policy themselves."""
+    root = Path(__file__).resolve().parents[2]
+    templates = [path for part in ("sim", "batch", "blind_check") for path in (root / part).rglob("*.html")]
+    assert len(templates) >= 5
+    for path in templates:
+        text = path.read_text(encoding="utf-8")
+        assert "{{ head }}" in text or "default-src 'none'" in text or "<head" not in text, path

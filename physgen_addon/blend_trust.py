@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a .blend file from somebody else names outside its own folder is left alone until the user agreed.
+
+Properties that hold a path are found by their subtype, so that none is forgotten. Values that were set in this session
+are the user's word, and so are files that they saved. Of a file that is opened, every path that leads out of its folder
+waits for the answer, unless its content is in the user's list (``sim/trust``): all that read, write or delete by such a
+path ask ``require`` first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..sim.trust import READS, WRITES, Claim, NotTrusted, remember, trusted_keys
+
+_came: set[Claim] = set()
+"""Claims of the open file that nobody has agreed to; stored in no file."""
+
+
+GROUPS = ("physgen", "physgen_photo", "physgen_diagnose", "physgen_compose")
+"""Our properties of a scene."""
+
+PATHS = ("FILE_PATH", "DIR_PATH")
+WRITTEN = ("output", "cache", "bake", "report", "scene_folder", "after")
+"""Properties whose files or folders are written, or deleted; the others are read."""
+
+
+def _paths(scene: bpy.types.Scene) -> Iterator[tuple[str, str, str]]:
+    """Yield kind, name and text of every property of ``scene`` that names a file or folder."""
+    for name in GROUPS:
+        yield from _paths_in(getattr(scene, name), "")
+
+
+def _paths_in(group: bpy.types.PropertyGroup, where: str) -> Iterator[tuple[str, str, str]]:
+    for prop in group.bl_rna.properties:
+        if prop.identifier == "rna_type":
+            continue
+        if prop.type == "STRING" and prop.subtype in PATHS:
+            kind = WRITES if prop.identifier in WRITTEN else READS
+            yield kind, f"{where}{prop.name}", getattr(group, prop.identifier)
+        elif prop.type == "POINTER" and isinstance(getattr(group, prop.identifier), bpy.types.PropertyGroup):
+            yield from _paths_in(getattr(group, prop.identifier), where)
+        elif prop.type == "COLLECTION":
+            for item in getattr(group, prop.identifier):
+                if isinstance(item, bpy.types.PropertyGroup):
+                    yield from _paths_in(item, f"{item.name}: " if item.name else where)
+
+
+def _outside(text: str) -> str | None:
+    """Return where ``text`` leads, if that is not the folder of the open file; None if it is.
+
+    Nothing outside is touched to find out: on Windows a look at another computer's folder tells it who looks.
+    """
+    path = Path(os.path.normpath(bpy.path.abspath(text.strip())))
+    if not bpy.data.filepath:
+        return str(path)
+    home = Path(bpy.data.filepath).parent
+    if path.is_relative_to(home) or path.is_relative_to(home.resolve()):
+        # A link may lead out.
+        found = path.resolve()
+        return None if found.is_relative_to(home.resolve()) else str(found)
+    return str(path)
+
+
+def _claims(scene: bpy.types.Scene) -> list[Claim]:
+    """Return all that the settings of ``scene`` name outside the folder of the file."""
+    named = ((kind, where, _outside(text)) for kind, where, text in _paths(scene) if text.strip())
+    return [Claim(kind, where, path) for kind, where, path in named if path is not None]
+
+
+def _key(claims: list[Claim]) -> str:
+    return hashlib.sha256("\n".join(claim.line() for claim in sorted(claims)).encode()).hexdigest()
+
+
+def note_loaded() -> None:
+    """Remember what the file that was just opened asks for; called after every load, before anything else is."""
+    _came.clear()
+    if not bpy.data.filepath:
+        return
+    keys = trusted_keys()
+    for scene in bpy.data.scenes:
+        claims = _claims(scene)
+        if claims and _key(claims) not in keys:
+            _came.update(claims)
+
+
+def note_saved() -> None:
+    """Count the file that was just saved as the user's own, where nothing in it waits for an answer."""
+    for scene in bpy.data.scenes:
+        claims = _claims(scene)
+        if claims and not _came.intersection(claims):
+            remember(_key(claims), Path(bpy.data.filepath))
+
+
+def pending(scene: bpy.types.Scene) -> list[Claim]:
+    """Return what ``scene`` names that came with the file, and that the user has not agreed to."""
+    return [claim for claim in _claims(scene) if claim in _came] if _came else []
+
+
+def agree(scene: bpy.types.Scene) -> None:
+    """Take the user's word for all that ``pending`` names, now and the next time."""
+    claims = _claims(scene)
+    _came.difference_update(claims)
+    if bpy.data.filepath:
+        remember(_key(claims), Path(bpy.data.filepath))
+
+
+def is_pending(text: str) -> bool:
+    """Return whether the path ``text`` of a property waits for the user's word."""
+    return bool(_came) and bool(text.strip()) and _outside(text) in {claim.text for claim in _came}
+
+
+def require(text: str) -> None:
+    """Raise NotTrusted if the path ``text`` of a property waits for the user's word."""
+    if is_pending(text):
+        found = _outside(text)
+        _refuse([claim for claim in sorted(_came) if claim.text == found])
+
+
+def require_agreed(scene: bpy.types.Scene) -> None:
+    """Raise NotTrusted if anything is pending."""
+    claims = pending(scene)
+    if claims:
+        _refuse(claims)
+
+
+def _refuse(claims: list[Claim]) -> None:
+    lines = "; ".join(claim.line() for claim in claims)
+    raise NotTrusted(
+        f"this file came with paths outside its folder, and you have not agreed to them: {lines}; press Look and Agree "
+        "in the Scene panel, or choose the files anew",
+        claims,
+    )
