@@ -16,6 +16,9 @@ from ...sim.events import IsCancelled
 from ..terminal import Terminal
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ...sim.diagnose.capture import Capture
     from ...sim.diagnose.diagnosis import Verdict
 
 _UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -129,6 +132,8 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     only = "candidate effects, such as air_drag,wind (default: all that can act on the objects)"
     parser.add_argument("--effects", type=parse_names, metavar="NAMES", help=only)
     parser.add_argument("--no-confirm", action="store_true", help="skip the verification run in the particle engine")
+    export = "also write what was found as a model for MuJoCo (found.xml) or a layer of USD Physics (found.usda)"
+    parser.add_argument("--export", nargs="+", choices=("mjcf", "usd"), default=[], help=export)
 
 
 def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
@@ -140,15 +145,30 @@ def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     settings = DiagnoseOptions(
         budget_s=options.budget, work=options.work, effects=options.effects, confirm=not options.no_confirm
     )
-    found = diagnose(
-        load_capture(options.capture), out=options.out, options=settings, on_event=terminal, cancelled=cancelled
-    )
+    capture = load_capture(options.capture)
+    found = diagnose(capture, out=options.out, options=settings, on_event=terminal, cancelled=cancelled)
     terminal(_verdict_event(options.out, found.verdict) | {"seconds": found.seconds})
-    lines = [found.summary]
+    lines = [found.summary, *_export(capture, options.out, options.export)]
     if found.next_experiment:
         lines.append(f"next: {found.next_experiment}")
     terminal.line("\n".join([*lines, f"report: {options.out / 'report.html'}"]))
     return 0
+
+
+def _export(capture: Capture, folder: Path, kinds: Sequence[str]) -> list[str]:
+    """Write what the diagnosis in ``folder`` found for other simulators; return lines about it."""
+    from ...sim.app.add_effect import found_effects
+    from ...sim.app.export_patch import FORMATS, patch_text
+    from ...sim.atomic import write_bytes
+    from ...sim.diagnose.diagnosis import REPORT_FILE
+    from ...sim.validation import read_json
+
+    lines: list[str] = []
+    for kind in kinds:
+        text, notes = patch_text(capture, found_effects(read_json(folder / REPORT_FILE)), kind)
+        write_bytes(folder / FORMATS[kind], text.encode())
+        lines += [f"{kind}: {folder / FORMATS[kind]}", *notes]
+    return lines
 
 
 def _verdict_event(out: Path, verdict: Verdict) -> dict[str, Any]:
