@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from physgen.benchmarks.common import benchmark_parser, print_result
@@ -38,17 +39,15 @@ def cubes(count: int, seed: int = 0) -> list[np.ndarray]:
     return [corner + rng.random((each, 3)) * side for corner in low]
 
 
-def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, object]:
-    """Measure in this process; return the figures."""
+def world_of(particles: int, *, arch: str, threads: int, cache_folder: Path | None) -> Any:
+    """The world of this benchmark, with about so many particles, before its first substep."""
     from physgen.sim.constitutive import ElasticMaterial
     from physgen.sim.mpm.bodies import BodyParticles
     from physgen.sim.mpm.solver_options import Ground, SolverOptions
     from physgen.sim.mpm.world import World
     from physgen.sim.scene.units import Similarity
 
-    options = SolverOptions(
-        grid=GRID, arch=arguments.arch, threads=arguments.threads, max_step=1e-4, cache_folder=cache_folder
-    )
+    options = SolverOptions(grid=GRID, arch=arch, threads=threads, max_step=1e-4, cache_folder=cache_folder)
     material = ElasticMaterial(density=1000.0, youngs_modulus=5e5, poisson_ratio=0.2)
     bodies = [
         BodyParticles(
@@ -58,16 +57,21 @@ def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, o
             material=material,
             velocity=(0.0, 0.0, -1.0),
         )
-        for i, points in enumerate(cubes(arguments.particles))
+        for i, points in enumerate(cubes(particles))
     ]
-    count = sum(body.count for body in bodies)
-    start = time.perf_counter()
-    world = World(
+    return World(
         bodies=bodies,
         ground=Ground(point=(0.0, 0.0, GROUND), friction=0.5),
         similarity=Similarity(scale=1.0),
         options=options,
     )
+
+
+def run(arguments: argparse.Namespace, cache_folder: Path | None) -> dict[str, object]:
+    """Measure in this process; return the figures."""
+    start = time.perf_counter()
+    world = world_of(arguments.particles, arch=arguments.arch, threads=arguments.threads, cache_folder=cache_folder)
+    count = sum(body.count for body in world.bodies)
     world.advance(2e-4)
     compile_s = time.perf_counter() - start
     speeds, cpu, wall = [], 0.0, 0.0

@@ -46,13 +46,13 @@ def setups(count: int, particles: int) -> list[Any]:
     return result
 
 
-def run(worlds: int, particles: int, duration: float, threads: int) -> dict[str, object]:
+def run(worlds: int, particles: int, duration: float, threads: int, arch: str = "cpu") -> dict[str, object]:
     """Measure both ways, after a run that compiles the kernels; return the figures."""
     from physgen.sim.mpm.solver_options import SolverOptions
     from physgen.sim.mpm.world import Worlds
     from physgen.sim.scene.units import Similarity
 
-    options = SolverOptions(grid=64, threads=threads)
+    options = SolverOptions(grid=64, arch=arch, threads=threads)
     similarity = Similarity(scale=1.0, origin=(-1.0, -1.0, -1.0))
     all_setups = setups(worlds, particles)
     Worlds(all_setups[:2], similarity=similarity, options=options).advance(2e-3)
@@ -98,10 +98,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--particles", type=int, default=3000, help="particles in each (default: %(default)s)")
     parser.add_argument("--duration", type=float, default=0.04, help="seconds simulated (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads, 0 for all (default: %(default)s)")
+    parser.add_argument("--arch", default="cpu", help="cpu, cuda or vulkan (default: %(default)s)")
     options = parser.parse_args(arguments)
     if options.worlds < 2 or options.particles < 64:
         parser.error("give at least 2 worlds of 64 particles")
-    result = run(options.worlds, options.particles, options.duration, options.threads)
+    result = run(options.worlds, options.particles, options.duration, options.threads, options.arch)
     print_result(result, as_json=options.json)
     return 0 if result["same_bytes"] else 1
 

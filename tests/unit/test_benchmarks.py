@@ -15,6 +15,7 @@ FAST = (
     "diagnosis",
     "farm",
     "farm_dask",
+    "gpu",
     "main_thread",
     "materials",
     "mpm",

@@ -6,6 +6,7 @@ Tolerances in this folder are requirements (see docs/physics.md), not fits to wh
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +24,8 @@ from physgen.sim.scene.units import Similarity
 
 GRID = 64
 CELL = 2.0 / GRID  # metres, with the similarity below
+ARCH = os.environ.get("PHYSGEN_TEST_ARCH", "cpu")
+"""Where the engine computes; ``benchmarks/gpu.sh`` sets it."""
 
 BoxFactory = Callable[..., BodyParticles]
 Block = Callable[..., BodyParticles]
@@ -31,7 +34,7 @@ GiveMotion = Callable[[World, np.ndarray, np.ndarray], None]
 
 @pytest.fixture
 def options() -> SolverOptions:
-    return SolverOptions(grid=GRID)
+    return SolverOptions(grid=GRID, arch=ARCH)
 
 
 @pytest.fixture
@@ -161,7 +164,7 @@ def rigid_bodies() -> Callable[..., RigidBodies]:
     """A factory of rigid bodies: worlds of 32 cells a metre around the origin."""
 
     def make(*setups: WorldSetup) -> RigidBodies:
-        runtime.ensure_started(SolverOptions(grid=GRID))
+        runtime.ensure_started(SolverOptions(grid=GRID, arch=ARCH))
         return RigidBodies(setups, [1.0 / CELL] * len(setups), [(-1.0, -1.0, -1.0)] * len(setups))
 
     return make
