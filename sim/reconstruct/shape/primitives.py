@@ -88,13 +88,23 @@ def hull_polygon(pixels: Points) -> Points:
 
 def distance_to_convex(points: Points, polygon: Points) -> NDArray[np.float64]:
     """Return the signed distance (n,) of ``points`` (n, 2) to a convex ``polygon`` (m, 2), positive inside."""
-    # One row an edge, one array a component: the fits spend most of their time here.
-    (start_x, start_y), (edge_x, edge_y) = polygon.T[..., None], (np.roll(polygon, -1, axis=0) - polygon).T[..., None]
+    # One row an edge, one array a component, in place: the fits spend most of their time here.
+    ends = np.concatenate((polygon[1:], polygon[:1]))
+    (start_x, start_y), (edge_x, edge_y) = polygon.T[..., None], (ends - polygon).T[..., None]
     squared = np.maximum(edge_x**2 + edge_y**2, 1e-12)
     offset_x, offset_y = points[:, 0] - start_x, points[:, 1] - start_y
-    along = np.clip((offset_x * edge_x + offset_y * edge_y) / squared, 0.0, 1.0)
-    distance = np.sqrt(((offset_x - along * edge_x) ** 2 + (offset_y - along * edge_y) ** 2).min(axis=0))
-    cross = edge_x * offset_y - edge_y * offset_x
+    along = offset_x * edge_x
+    along += offset_y * edge_y
+    along /= squared
+    np.clip(along, 0.0, 1.0, out=along)
+    cross = edge_x * offset_y
+    cross -= edge_y * offset_x
+    offset_x -= along * edge_x
+    offset_y -= along * edge_y
+    offset_x *= offset_x
+    offset_y *= offset_y
+    offset_x += offset_y
+    distance = np.sqrt(offset_x.min(axis=0))
     inside = (cross.min(axis=0) >= 0) | (cross.max(axis=0) <= 0)
     return np.where(inside, distance, -distance)
 
