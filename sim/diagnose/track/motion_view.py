@@ -185,7 +185,7 @@ def understand_motion(
     diameter_px, diameter: a length of the body in px and m. clearance: m, of its centre above what it stands on.
     elevation: rad, of the camera above a level surface; half a turn's quarter looks straight down. from_above: the
     body's outline shows its upper side, so that no slope is seen from its side.
-    Raises InputError where nothing moves freely for long enough.
+    Raises InputError where nothing moves freely for long enough, and for what gains speed on a level surface.
     """
     scale = diameter_px / diameter
     impacts = jumps(times, places)
@@ -201,7 +201,12 @@ def understand_motion(
     if finer and best.miss > CRUDE * max(_most_curved(times, finer).miss, noise_px(places)):
         # A push that is weak beside the fastest motion is one all the same if nothing smooth fits across it.
         best = _most_curved(times, finer)
-    if _runs_down(best, scale, places) and not from_above:
+    if _runs_down(best, scale, places):
+        if from_above:
+            raise InputError(
+                f"{where}: the body gains speed, and its outline is one from above: film a slope from its side; "
+                "a disc that rolls on its rim cannot be simulated"
+            )
         return _slope(times, places, best, scale, clearance)
     return _surface(times, places, best, scale, clearance, elevation)
 
