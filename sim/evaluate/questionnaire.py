@@ -21,6 +21,7 @@ from typing import Any
 from PIL import Image
 
 from ..atomic import replacing_tree, write_bytes, write_json
+from ..cache.folder_lock import lock_beside
 from ..composite.srgb import read_rgb
 from ..diagnose.track.track_videos import Video
 from ..errors import Cancelled, InputError
@@ -188,7 +189,7 @@ def make_questionnaire(
     if out.is_dir() and any(out.iterdir()) and not (out / KEY_FILE).is_file():
         raise InputError(f"{shown(out)}: holds something other than a questionnaire; choose an empty or new folder")
     progress = StageProgress(on_event, "questionnaire", len(read))
-    with replacing_tree(out) as folder:
+    with lock_beside(out), replacing_tree(out) as folder:
         pages = folder / PAGES
         (pages / "media").mkdir(parents=True)
         described: list[dict[str, Any]] = []

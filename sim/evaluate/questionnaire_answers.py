@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_bytes, write_json
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..files import shown
 from ..html import element, join, page_head, page_style
@@ -253,7 +254,7 @@ def collect_questionnaire(
         ],
         "notes": notes,
     }
-    with replacing_tree(out) as folder:
+    with lock_beside(out), replacing_tree(out) as folder:
         write_json(folder / RESULT_FILE, found)
         write_bytes(folder / TABLE_FILE, _csv(sheets, cases))
         write_bytes(folder / PAGE_FILE, result_page(found).encode())

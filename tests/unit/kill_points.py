@@ -28,13 +28,20 @@ import numpy as np
 from physgen import batch  # noqa: F401
 from physgen.sim import atomic
 from physgen.sim.app import rest_check  # noqa: F401 - before the fork
+from physgen.sim.app.pack_bake import pack_bake, unpack_bake
 from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
 from physgen.sim.app.reconstruct_record import STAMP_FILE, read_stamp, require_request
 from physgen.sim.app.scene_variant import make_variant
 from physgen.sim.app.set_light import LightRequest, set_light
+from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, save_manifest
 from physgen.sim.cache.folder_lock import LOCK_FILE, remove_dead_lock
+from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.version import VERSION
 from PIL import Image
 
 cv2.setNumThreads(0)
@@ -141,8 +148,61 @@ def do_bake(folder):
     bake(load_scene(folder / "scene"), out=folder / "bake", options=BakeOptions(frames=3, quality="preview"))
 
 
+def do_compose(folder):
+    """What a composition writes, over an earlier one; what it computes changes nothing on the disk."""
+    from physgen.sim.app.compose_scene import MovedObject, composition_folder, write_composition
+
+    scene = load_scene(folder / "scene")
+    mesh = load_object_mesh(scene, scene.objects[0])
+    moved = MovedObject(vertices=mesh.vertices + 0.01, faces=np.asarray(mesh.faces))
+    with composition_folder(scene.root, folder / "fitted") as partial:
+        write_composition(scene, partial, {scene.objects[0].name: moved}, {"format": "physgen-compose/1", "pairs": []})
+
+
+def a_packable_bake(folder):
+    """Two samples of a cube; what is in them does not matter."""
+    (folder / "whole").mkdir()
+    points = np.random.default_rng(0).random((2, 8, 3))
+    with Pc2Writer(folder / "whole" / "cube.pc2", vertex_count=8, start_frame=1) as cache:
+        for sample in points:
+            cache.append(sample)
+    item = BakedObject(name="cube", file="cube.pc2", vertices=8)
+    numbers = {"inputs_hash": "0" * 64, "fps": 24.0, "frame_start": 1, "frames": 2, "frames_done": 2, "particles": 8}
+    manifest = BakeManifest(**numbers, state="complete", engine="mpm", version=VERSION, objects=(item,))
+    save_manifest(folder / "whole", manifest)
+
+
+def do_pack(folder):
+    """Packed, and unpacked again."""
+    pack_bake(load_bake(folder / "whole"), out=folder / "packed")
+    unpack_bake(folder / "packed", out=folder / "unpacked")
+
+
+KEY = {"format": "physgen questionnaire", "version": 1, "questionnaire": "0", "criteria": list(CRITERIA)}
+CASE = {"id": "case_01", "name": "a", "prompt": "It falls.", "videos": {"aa": "ours", "bb": "other"}}
+
+
+def answers(folder, score):
+    scores = {token: dict.fromkeys(CRITERIA, score) for token in ("aa", "bb")}
+    sheet = {"format": "physgen questionnaire answers", "version": 1, "questionnaire": "0", "person": "ann"}
+    sheet |= {"saved": "2026-01-01T00:00:00Z", "cases": {"case_01": {"order": ["bb", "aa"], "scores": scores}}}
+    (folder / "answers.json").write_text(json.dumps(sheet))
+    (folder / "key.json").write_text(json.dumps({**KEY, "cases": [CASE]}))
+
+
+def do_collect(folder):
+    """Results of a questionnaire over earlier ones."""
+    collect_questionnaire([folder / "answers.json"], key=folder / "key.json", out=folder / "results")
+
+
+OUTPUTS = {"compose": ("fitted",), "pack": ("packed", "unpacked"), "collect": ("results",)}
+"""Folders that a scenario makes: each as it was before, or as the whole run makes it."""
+
 SCENARIOS = {
     "bake": do_bake,
+    "compose": do_compose,
+    "pack": do_pack,
+    "collect": do_collect,
     "correct": do_correct,
     "journal": do_correct_with_a_journal,
     "reconstruct": do_reconstruct,
@@ -163,6 +223,13 @@ def leftovers(folder):
     return [str(path.relative_to(folder)) for path in folder.rglob(".*")]
 
 
+def contents(folder):
+    """What is in ``folder``; None where it is not there."""
+    if not folder.is_dir():
+        return None
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def caches(folder):
     return {path.name: path.read_bytes() for path in (folder / "bake").glob("*.pc2")}
 
@@ -171,12 +238,15 @@ def check(name, folder, whole, reference):
     """Return what is wrong after a kill and the next command's recovery."""
     atomic.recover(folder / "config" / "trusted.json")
     atomic.recover_scratch(folder / "scratch")
-    for part in ("scene", "windy", "bake"):
+    for part in ("scene", "windy", "bake", *OUTPUTS.get(name, ())):
         atomic.recover(folder / part)
         remove_dead_lock(folder / f".{part}{LOCK_FILE}")
         remove_dead_lock(folder / part / LOCK_FILE)
     if state(folder) not in whole:
         return "neither the earlier scene nor the new one"
+    for part in OUTPUTS.get(name, ()):
+        if contents(folder / part) not in (contents(folder.parent / "start" / part), contents(reference / part)):
+            return f"{part} is neither what it was nor what it becomes"
     if name == "bake":
         # The next run goes on from what is there, to the same bytes.
         if forked(lambda: do_bake(folder)) != 0:
@@ -206,6 +276,16 @@ def main(name, folder, points):
     action, start = SCENARIOS[name], folder / "start"
     start.mkdir()
     assert forked(lambda: edited(start)) == 0
+    if name == "compose":
+        # Over an earlier composition, which is exchanged.
+        assert forked(lambda: do_compose(start)) == 0
+        (start / "fitted" / "earlier").touch()
+    elif name == "pack":
+        a_packable_bake(start)
+    elif name == "collect":
+        answers(start, 2)
+        do_collect(start)
+        answers(start, 4)
     (start / "scratch").mkdir()
 
     def attempt(number, fatal):
@@ -233,7 +313,7 @@ def main(name, folder, points):
     assert code == 0
     # The copies differ in nothing but their place.
     whole = [state(start), state(done)]
-    assert whole[0] != whole[1] or name in ("variant", "bake")
+    assert whole[0] != whole[1] or name in ("variant", "bake", *OUTPUTS)
     wrong = [] if check(name, done, [whole[1]], done) is None else ["the whole run left something"]
     first, last, step = points
     tried = 0

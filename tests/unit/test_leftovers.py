@@ -51,6 +51,13 @@ def test_a_bake_killed_before_some_calls_goes_on_to_the_same_bytes(tmp_path):
     assert found["wrong"] == [] and found["points"] >= 3
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("scenario", "least"), [("compose", 20), ("pack", 20), ("collect", 10)])
+def test_what_others_write_is_whole_or_not_there_at_whichever_call_they_are_killed(tmp_path, scenario, least):
+    found = kill_points(scenario, tmp_path, "1:1000:1" if scenario != "compose" else "2:1000:3")
+    assert found["wrong"] == [] and found["calls"] >= least and found["points"] >= least // 3
+
+
 @pytest.fixture
 def dead():
     """The mark of a process that has ended."""
