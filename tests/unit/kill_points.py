@@ -44,6 +44,10 @@ from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.version import VERSION
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+from compose_scenes import a_scene, ball
+
 cv2.setNumThreads(0)
 QUICK = ReconstructOptions(mesh_vertices=500, pitch_deg=25.0, patch_radius=2, sun=False, max_size=96)
 REQUESTS = [ObjectRequest(box=(30, 18, 66, 58), name="ball", shape="inflated")]
@@ -148,13 +152,13 @@ def do_bake(folder):
     bake(load_scene(folder / "scene"), out=folder / "bake", options=BakeOptions(frames=3, quality="preview"))
 
 
-def do_compose(folder):
+def do_compose(folder, by=0.01):
     """What a composition writes, over an earlier one; what it computes changes nothing on the disk."""
     from physgen.sim.app.compose_scene import MovedObject, composition_folder, write_composition
 
-    scene = load_scene(folder / "scene")
+    scene = load_scene(folder / "pair")
     mesh = load_object_mesh(scene, scene.objects[0])
-    moved = MovedObject(vertices=mesh.vertices + 0.01, faces=np.asarray(mesh.faces))
+    moved = MovedObject(vertices=mesh.vertices + by, faces=np.asarray(mesh.faces))
     with composition_folder(scene.root, folder / "fitted") as partial:
         write_composition(scene, partial, {scene.objects[0].name: moved}, {"format": "physgen-compose/1", "pairs": []})
 
@@ -278,8 +282,8 @@ def main(name, folder, points):
     assert forked(lambda: edited(start)) == 0
     if name == "compose":
         # Over an earlier composition, which is exchanged.
-        assert forked(lambda: do_compose(start)) == 0
-        (start / "fitted" / "earlier").touch()
+        a_scene(start / "pair", {"a": ball(0), "b": ball(0.09)})
+        assert forked(lambda: do_compose(start, by=0.02)) == 0
     elif name == "pack":
         a_packable_bake(start)
     elif name == "collect":

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Killed at any moment, a command loses nothing, and the next one clears away what it left, and nothing else."""
 
+import ctypes
+import errno
 import json
 import subprocess
 import sys
@@ -184,3 +186,39 @@ def test_a_replaced_folder_is_whole_at_every_moment(tmp_path, monkeypatch):
     with pytest.raises(InputError), atomic.replacing_tree(out):
         raise InputError("no")
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM, None])
+def test_where_the_system_has_no_exchange_the_earlier_folder_is_moved_aside(tmp_path, monkeypatch, number):
+    """Old kernels, NFS, FAT and Windows: the call is refused, or is not there at all."""
+
+    class Library:
+        if number is not None:
+
+            def renameat2(self, *given):
+                ctypes.set_errno(number)
+                return -1
+
+    monkeypatch.setattr(atomic.ctypes, "CDLL", lambda *given, **options: Library())
+    out = tmp_path / "scene"
+    out.mkdir()
+    (out / "old").touch()
+    with atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert [path.name for path in out.iterdir()] == ["new"]
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_an_exchange_that_fails_for_another_reason_leaves_the_earlier_folder(tmp_path, monkeypatch):
+    class Library:
+        def renameat2(self, *given):
+            ctypes.set_errno(errno.EIO)
+            return -1
+
+    monkeypatch.setattr(atomic.ctypes, "CDLL", lambda *given, **options: Library())
+    out = tmp_path / "scene"
+    out.mkdir()
+    (out / "old").touch()
+    with pytest.raises(OSError, match="Input/output error"), atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert [path.name for path in out.iterdir()] == ["old"] and len(list(tmp_path.iterdir())) == 1
