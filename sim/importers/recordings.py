@@ -242,9 +242,12 @@ def _read_tracker(path: Path, text: str) -> RecordedTable:
         for entry in item.findall("property"):
             if entry.get("name") == name and entry.text:
                 try:
-                    return float(entry.text)
+                    value = float(entry.text)
                 except ValueError:
                     break
+                if math.isfinite(value):
+                    return value
+                raise InputError(f"{path}: {name} is {value} in {item.get('class')}; track it again")
         if default is None:
             raise InputError(f"{path}: {name} is missing in {item.get('class')}")
         return default
@@ -266,7 +269,7 @@ def _read_tracker(path: Path, text: str) -> RecordedTable:
         name = next((e.text for e in item.findall("property") if e.get("name") == "name" and e.text), "mass")
         own = tracks.setdefault(name, {})
         for entry in item.findall("property[@name='framedata']/property"):
-            index = re.fullmatch(r"\[(\d+)\]", entry.get("name") or "")
+            index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name") or "")
             data = entry.find("object")
             if index is not None and data is not None:
                 own[int(index[1])] = (number(data, "x"), number(data, "y"))

@@ -170,9 +170,12 @@ def load_scene(root: str | Path) -> Scene:
     lie outside the folder.
     """
     root = Path(root)
-    if not root.exists():
-        # A run that replaced it may have been killed between two steps.
-        recover(root)
+    try:
+        if not root.exists():
+            # A run that replaced it may have been killed between two steps.
+            recover(root)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{shown(root)}: no folder can be called that ({error.__class__.__name__})") from None
     path = root / SCENE_FILE
     data = read_json(path, folder=root)
     folder = Scene(root=root, model=parse_scene(data, str(path)))
