@@ -197,7 +197,7 @@ module.bake(load_scene(Path({str(folder.root)!r})), out={str(tmp_path / "parts")
     assert bake(load_scene(folder.root), out=tmp_path / "parts", options=options).manifest.state == "complete"
     assert caches(tmp_path / "parts") == caches(tmp_path / "whole")
     left = sorted(p.relative_to(tmp_path / "parts").as_posix() for p in (tmp_path / "parts").rglob("*") if p.is_file())
-    assert left == ["ball0.pc2", "ball0.points.pc2", "manifest.json", "metrics.json"]
+    assert left == ["ball0.pc2", "ball0.points.pc2", "manifest.json", "metrics.json", "times.json"]
 
 
 @pytest.mark.long
