@@ -2,7 +2,8 @@
 """A command that is asked to stop while its modules are still imported ends with the same code as later.
 
 Importing NumPy and the rest takes a second, on a busy machine many. Nothing is written before ``cli.main`` takes
-the signals over (``terminal.stop_signals``), so ending at once loses nothing. Imported first, and light.
+the signals over (``terminal.stop_signals``), so ending at once loses nothing. Imported first, and light; what has
+to be set before NumPy is imported is set here, too.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import os
 import signal
 import sys
 from pathlib import PurePath
+
+from ..sim.app.launch import ONE_BLAS_THREAD
 
 CANCELLED = 130
 """Exit code of ``Cancelled`` in sim/errors.py."""
@@ -31,3 +34,4 @@ def heed() -> None:
 
 if _is_own_process():
     heed()
+    os.environ.setdefault(*ONE_BLAS_THREAD)

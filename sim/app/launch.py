@@ -23,6 +23,8 @@ from pathlib import Path
 PACKAGE = "physgen"
 PACKAGES_VARIABLE = "PHYSGEN_PACKAGES"
 OLDEST = (3, 11)
+ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
+"""Matrices here are small: more threads wait on each other, and sums would depend on how many cores there are."""
 ORPHAN_GRACE_S = 20.0
 """Time for an orphaned process to clean up."""
 
@@ -38,6 +40,7 @@ def main(arguments: "list[str]") -> None:
     here = Path(__file__).absolute().parent
     hiding = (here, here.parents[1] / "batch")
     sys.path[:] = [entry for entry in sys.path if Path(entry).absolute() not in hiding]
+    os.environ.setdefault(*ONE_BLAS_THREAD)
     while arguments and arguments[0].startswith("--"):
         option, value = arguments[:2]
         arguments = arguments[2:]
