@@ -30,8 +30,8 @@ def popup(message: str) -> str:
     """
     if bpy.app.background:
         return message
-    lines = (textwrap.wrap(line, POPUP, break_on_hyphens=False) for line in message.splitlines())
-    # The status bar shows it in one line and drops the breaks.
+    lines = (textwrap.wrap(line, POPUP - 1, break_on_hyphens=False) for line in message.splitlines())
+    # The status bar shows it in one line and drops the breaks, so that each line ends with a blank.
     return " \n".join(part for wrapped in lines for part in wrapped)
 
 

@@ -77,19 +77,15 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     others = wanted if leaves_structure(bases[0][1]) else hidden
     tried: list[tuple[str, str]] = []
     for name, fit in bases:
-        begun: list[tuple[str, str]] = []
-        for other in others:
-            same = name == other.name or {name, other.name} in ONE_TRACE
-            if same or (name, other.name) in body.fits or (other.name, name) in body.fits:
-                continue
-            if not body.work.left():
-                body.work.skip((name, other.name), "tried")
-                continue
-            begin_search(body, (CANDIDATE_EFFECTS[name], other), fit)
-            begun.append((name, other.name))
+        begun = _begin(body, [(name, other.name) for other in others], fit)
         tried += begun
-        if begun and _explains(body, max(begun, key=lambda key: body.fits[key].evidence)):
-            # Where this pair leaves no structure, another base has nothing to explain better.
+        likeliest = max(begun, key=lambda key: body.fits[key].evidence, default=None)
+        if likeliest is not None and _explains(body, likeliest):
+            # Another base has nothing to explain better; but what no recording tells apart has to be weighed.
+            known = {candidate.name for candidate in wanted}
+            for twin in _twins(likeliest):
+                if twin[1] in known and (twin[0],) in body.fits:
+                    tried += _begin(body, [twin], body.fits[(twin[0],)])
             break
     ranked = sorted(tried, key=lambda key: -body.fits[key].evidence)[:PAIRS_FINISHED]
     for key in ranked:
@@ -101,6 +97,32 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
         else:
             body.work.skip(key, "fitted to convergence")
     _refine(body, sorted(ranked, key=lambda key: -body.fits[key].evidence)[:PAIRS_REFINED], bases[0][1].evidence)
+
+
+def _begin(body: BodyFits, keys: list[tuple[str, str]], fit: Fit) -> list[tuple[str, str]]:
+    """Begin the search of those pairs ``keys`` that are new, from ``fit`` of their first effect, and return them."""
+    begun = []
+    for name, other in keys:
+        same = name == other or {name, other} in ONE_TRACE
+        if same or (name, other) in body.fits or (other, name) in body.fits:
+            continue
+        if not body.work.left():
+            body.work.skip((name, other), "tried")
+            continue
+        begin_search(body, (CANDIDATE_EFFECTS[name], CANDIDATE_EFFECTS[other]), fit)
+        begun.append((name, other))
+    return begun
+
+
+def _twins(key: tuple[str, str]) -> list[tuple[str, str]]:
+    """Return the pairs that have, in place of one effect of ``key``, its twin in ``ONE_TRACE``; the other one first."""
+    return [
+        (stays, twin)
+        for stays, leaves in (key, key[::-1])
+        for alike in ONE_TRACE
+        if leaves in alike
+        for twin in alike - {leaves, stays}
+    ]
 
 
 def _far_behind(evidence: float, best: float, single: float) -> bool:
