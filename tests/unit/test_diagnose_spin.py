@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
 from physgen.sim.diagnose.rigid import fit_rigid
-from physgen.sim.diagnose.rigid.observed_poses import observe_body
+from physgen.sim.diagnose.rigid.observed_poses import LEFT, observe_body
+from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, fit_candidates
+from physgen.sim.diagnose.work import Work
 from scipy.integrate import solve_ivp
 
 RADIUS, DENSITY, DRAG, LIFT, SIGMA = 0.02, 80.6, 0.125, 0.0056, 0.002
@@ -99,3 +101,61 @@ def test_noise_follows_what_is_left_between_the_stated_and_the_largest(residual,
     assert SIGMA <= sharp.sigma <= duller.sigma <= seen.sigma
     assert seen.sharpened(0.5 * SIGMA).sigma == pytest.approx(SIGMA)
     assert seen.hides_spin and not dataclasses.replace(seen, places=seen.places + 0.01).hides_spin
+
+
+def wandering_throw(seed, drag, *, slow=0.003, white=4e-4):
+    """One throw of a ball, believed heavy, in a picture plane: white noise and a slow error of ``slow`` of its path."""
+    rng, times = np.random.default_rng(seed), np.arange(0, 0.5, 1 / 120)
+
+    def rate(_, y):
+        return [*y[3:], *(np.array([0, 0, -9.81]) - drag * np.linalg.norm(y[3:]) * y[3:])]
+
+    start = [0, 0, 1.5, rng.uniform(2, 4), 0, rng.uniform(0, 2)]
+    way = solve_ivp(rate, (0, 0.5), start, t_eval=times, rtol=1e-9, atol=1e-10).y[:3].T
+    memory = np.exp(-0.5 * ((times[:, None] - times) / (np.ptp(times) / 4)) ** 2) + 1e-8 * np.eye(len(times))
+    off = slow * np.linalg.norm(np.ptp(way, axis=0)) * np.linalg.cholesky(memory) @ rng.normal(size=way.shape)
+    off += white * rng.normal(size=way.shape)
+    off[:, 1] = 0
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    belief = ObjectBelief(name="ball", mesh="ball.obj", density_kg_m3=700.0, stiffness="hard")
+    item = CaptureObject(belief=belief, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    trial = Trial(
+        name="take",
+        role="fit",
+        times=times,
+        points=(way + off)[:, None],
+        pixels=None,
+        object_index=np.zeros(1, dtype=np.int64),
+        rest_points=np.zeros((1, 3)),
+    )
+    ground = Ground(point=(0.0, 0.0, -5.0), friction=0.5, restitution=0.5)
+    return Capture(
+        gravity=(0.0, 0.0, -9.81), ground=ground, objects=(item,), noise_sigma=white, camera=None, trials=(trial,)
+    )
+
+
+@pytest.mark.parametrize(("seed", "drag"), [(4, 0.07), (0, 0.0)])
+def test_a_slow_error_hides_no_drag_and_its_floor_is_what_scatters(seed, drag):
+    fits = fit_candidates(
+        wandering_throw(seed, drag), DiagnoseOptions(effects=("air_drag", "buoyancy", "magnus")), Work()
+    )
+    verdict = compare_models(fits, ComparisonSettings()).verdict
+    if drag:
+        assert verdict.effects == ("air_drag",) and verdict.probability > 0.8
+    else:
+        assert verdict.effect == "none"
+    # A slow error of 4 mm with a memory of 0.125 s moves the 0.34 s that follow by about that times two.
+    assert 0.004 < fits.floor_rms_m < 0.013
+
+
+@given(st.floats(1e-4, 0.05), st.integers(0, 99))
+def test_noise_is_added_where_something_was_measured_and_moves_speeds_little(slow, seed):
+    capture = wandering_throw(0, 0.0)
+    seen = observe_body(capture, capture.trials[0], 0, np.zeros(3))
+    seen = dataclasses.replace(seen, sigma=float(np.hypot(seen.white, slow * np.sqrt(LEFT * len(seen.times) / 4))))
+    assert seen.slow == pytest.approx(slow) and seen.bare.slow == 0
+    off = seen.disturbed(np.random.default_rng(seed)).seen - seen.seen
+    assert (off[:, :, 1] == 0).all() and seen.measured.tolist() == [True, False, True]
+    steps = np.diff(off[:, 0, [0, 2]], axis=0)
+    # Independent noise of ``sigma`` would make steps of 1.4 times that.
+    assert float(np.sqrt(np.mean(steps**2))) < 2 * seen.white + 0.3 * slow

@@ -92,6 +92,10 @@ SLOW_ERROR = 0.006
 TOGETHER = 4.0
 """Frames, or fractions of a trial, with common errors where they are correlated."""
 
+LEFT = 0.22
+"""Share of the variance of a slow error with the memory of a quarter of a flight that a fitted state, an offset and a
+speed, leaves as a residual: the rest moves the state, and with it what is predicted."""
+
 CENTRED = 1e-3
 """Distance in m from the body's centre up to which a point counts as the centre."""
 
@@ -122,14 +126,49 @@ class ObservedBody:
         """Return whether only the body's centre is tracked, so that its spin shows in nothing but its path."""
         return self.camera is None and len(self.places) == 1 and float(np.abs(self.places).max()) < CENTRED
 
+    @cached_property
+    def measured(self) -> NDArray[np.bool_]:
+        """Return (D,) along which axes anything was measured: of a video of one view not the depth."""
+        there = self.seen[np.isfinite(self.seen).all(axis=(1, 2))]
+        return np.ptp(there, axis=(0, 1)) > 0 if len(there) else np.zeros(self.seen.shape[2], dtype=bool)
+
+    @property
+    def _shared(self) -> float:
+        """Return how many frames have one slow error in common: those of a quarter of the trial."""
+        return max(1.0, float(np.isfinite(self.seen).all(axis=(1, 2)).sum()) / TOGETHER)
+
+    @property
+    def slow(self) -> float:
+        """Return the standard deviation in m of the slow error that leaves what ``sigma`` holds; single points only."""
+        left = max(self.sigma**2 - self.white**2, 0.0) / self._shared
+        return float(np.sqrt(left / LEFT)) if self.hides_spin else 0.0
+
+    @property
+    def bare(self) -> ObservedBody:
+        """Return the same without a slow error."""
+        return dataclasses.replace(self, sigma=self.white)
+
     def sharpened(self, residual: float) -> ObservedBody:
         """Return the same with the noise that a residual RMS of a coordinate, in m, implies; never more than now.
 
         What exceeds the white noise is slow: it is common to the frames of a quarter of the trial.
         """
-        count = max(1.0, float(np.isfinite(self.seen).all(axis=(1, 2)).sum()))
-        slow = max(residual**2 - self.white**2, 0.0) * max(1.0, count / TOGETHER)
+        slow = max(residual**2 - self.white**2, 0.0) * self._shared
         return dataclasses.replace(self, sigma=min(self.sigma, float(np.hypot(self.white, np.sqrt(slow)))))
+
+    def disturbed(self, rng: np.random.Generator) -> ObservedBody:
+        """Return the same with noise added once more: white, and slow with the memory of a quarter of the trial.
+
+        ``sigma`` counts a slow error as independent noise with the same information about a mean. Taken for noise
+        of single frames it would move speeds from a few frames by many times what an error that hardly changes within
+        them does.
+        """
+        noise = self.white * rng.normal(size=self.seen.shape)
+        if self.slow > 0:
+            off = (self.times[:, None] - self.times) / max(float(np.ptp(self.times)) / TOGETHER, 1e-9)
+            root = np.linalg.cholesky(np.exp(-0.5 * off**2) + 1e-8 * np.eye(len(off)))
+            noise += self.slow * np.einsum("fg,gkd->fkd", root, rng.normal(size=self.seen.shape))
+        return dataclasses.replace(self, seen=self.seen + noise * self.measured)
 
     @property
     def poses_alone(self) -> bool:

@@ -107,6 +107,8 @@ def noise_spread(fit: Fit) -> float:
     """Return the RMS distance in m by which noise in the first frames moves the prediction of fit trials."""
     short, states = _shortened(fit)
     states = fit_states(short, fit.model, fit.z, states, 3)
+    if all(t.observations.hides_spin for t in short.trials):
+        return _refitted_spread(fit, short, states)
     look = short.evaluate(fit.model, fit.z, states, fixed=True)
     rng, squares = np.random.default_rng(0), []
     for trial, part, state in zip(short.trials, look.linear, states, strict=True):
@@ -122,6 +124,33 @@ def noise_spread(fit: Fit) -> float:
             other = world_points(trial, extrapolate(fit, fit.z, perturbed(state[-1], draw), clock))
             squares.append(np.sum((other - middle) ** 2, axis=-1).ravel())
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+
+
+def _refitted_spread(fit: Fit, short: Problem, states: list[Array]) -> float:
+    """Return what ``noise_spread`` does for single points, part of whose noise is slow: a fit to added noise."""
+    rng, squares = np.random.default_rng(0), []
+    ways: list[list[Array | None]] = []
+    for number in range(NOISE_DRAWS + 1):
+        # The first draw has no noise.
+        seen = [t.observations.disturbed(rng) if number else t.observations for t in short.trials]
+        own = [dataclasses.replace(t, observations=o) for t, o in zip(short.trials, seen, strict=True)]
+        found = fit_states(dataclasses.replace(short, trials=own), fit.model, fit.z, states, 3)
+        ways.append([_later(fit, trial, state[-1]) for trial, state in zip(short.trials, found, strict=True)])
+    for other in ways[1:]:
+        squares += [
+            np.sum((b - a) ** 2, axis=-1).ravel()
+            for a, b in zip(ways[0], other, strict=True)
+            if a is not None and b is not None
+        ]
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+
+
+def _later(fit: Fit, trial: SegmentedTrial, state: Array) -> Array | None:
+    """Return the points (M, K, 3) of a fit trial predicted after its first frames; None where nothing follows."""
+    times = trial.observations.times[shown_frames(fit, trial) :]
+    if trial.observations.trial.role != "fit" or not len(times):
+        return None
+    return world_points(trial, extrapolate(fit, fit.z, state, times - trial.observations.times[trial.nodes[-1]]))
 
 
 def simulate_points(fit: Fit) -> Points:
@@ -270,7 +299,9 @@ def noise_floor(fit: Fit) -> float:
     Pixels are compared with the fitted path, which has almost no noise.
     """
     trials = [t for t in fit.problem.trials if t.observations.trial.role == "fit"]
-    own = [0.0 if t.observations.camera is not None else 3 * t.observations.white**2 for t in trials]
+    seen = [t.observations for t in trials]
+    axes = [float(o.measured.sum()) if o.hides_spin else 3.0 for o in seen]
+    own = [0.0 if o.camera is not None else a * (o.white**2 + o.slow**2) for o, a in zip(seen, axes, strict=True)]
     return float(np.sqrt(np.mean(own) + noise_spread(fit) ** 2))
 
 

@@ -7,6 +7,7 @@ defects at contacts."""
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..work import Work
 from .multiple_shooting import Fit, solve
-from .observed_poses import frame_pose, observe_body
+from .observed_poses import ObservedBody, frame_pose, observe_body
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings, tether_numbers
 from .rigid_simulator import RigidWorlds, rigid_body
 from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem, Segment, SegmentedTrial
@@ -410,34 +411,50 @@ SHARPENED = 0.8
 
 
 def _residual(fit: Fit) -> float:
-    """Return the RMS residual in m of a coordinate of single points, for as many as no state fits."""
+    """Return the RMS residual in m of a coordinate of single points, for as many as no state fits.
+
+    Axes along which nothing was measured, such as a video's depth, have no residual and do not count.
+    """
     chi2, count = 0.0, 0
     for segment in fit.evaluation.segments:
         observations = fit.problem.trials[segment.trial].observations
         chi2 += float(segment.chi2.sum()) * observations.sigma**2
-        count += 3 * int(np.isfinite(observations.seen[segment.frames]).all(axis=2).sum()) - 9
+        frames = int(np.isfinite(observations.seen[segment.frames]).all(axis=2).sum())
+        count += int(observations.measured.sum()) * (frames - 3)
     return float(np.sqrt(chi2 / max(count, 1)))
+
+
+def _seen_as(body: BodyFits, change: Callable[[ObservedBody], ObservedBody]) -> dict[int, Problem]:
+    """Return the problems behind the fits of ``body``, by their identity, with ``change`` made to every observation."""
+    problems: dict[int, Problem] = {}
+    for problem in (body.problem, *(f.problem for f in body.fits.values())):
+        if id(problem) not in problems:
+            own = [dataclasses.replace(t, observations=change(t.observations)) for t in problem.trials]
+            problems[id(problem)] = dataclasses.replace(problem, trials=own)
+    return problems
 
 
 def sharpen(body: BodyFits) -> bool:
     """Replace the largest slow error of single points by the one that the closest fit leaves, and fit everything again.
 
-    Returns whether that made a difference.
+    How much a candidate leaves is told by a fit to the stated noise: within the largest slow error a missing force
+    costs nothing, so that no candidate would move to where it is. Returns whether that made a difference.
     """
     if not body.problem.scene.unscaled:
         return False
-    residual = min(_residual(fit) for fit in body.fits.values())
-    trials = [t.observations.sharpened(residual) for t in body.problem.trials]
-    if all(o.sigma > SHARPENED * t.observations.sigma for o, t in zip(trials, body.problem.trials, strict=True)):
-        return False
-    problems: dict[int, Problem] = {}
-    for fit in body.fits.values():
-        if id(fit.problem) not in problems:
-            own = [dataclasses.replace(t, observations=o) for t, o in zip(fit.problem.trials, trials, strict=True)]
-            problems[id(fit.problem)] = dataclasses.replace(fit.problem, trials=own)
-    sharp = {
-        key: solve(problems[id(fit.problem)], fit.model, fit.z, fit.states, rounds=ROUNDS)
-        for key, fit in body.fits.items()
+    bare = _seen_as(body, lambda o: o.bare)
+    close = {
+        key: solve(bare[id(fit.problem)], fit.model, fit.z, fit.states, rounds=ROUNDS) for key, fit in body.fits.items()
     }
-    body.problem, body.fits, body.flown, body.begun = problems[id(body.problem)], sharp, {}, {}
+    residual = min(_residual(fit) for fit in (*body.fits.values(), *close.values()))
+    sharp = _seen_as(body, lambda o: o.sharpened(residual))
+    pairs = zip(sharp[id(body.problem)].trials, body.problem.trials, strict=True)
+    if all(new.observations.sigma > SHARPENED * old.observations.sigma for new, old in pairs):
+        return False
+    fits = {}
+    for key, fit in body.fits.items():
+        starts = (fit, close[key])
+        again = [solve(sharp[id(fit.problem)], fit.model, f.z, f.states, rounds=ROUNDS) for f in starts]
+        fits[key] = max(again, key=lambda f: f.evidence)
+    body.problem, body.fits, body.flown, body.begun = sharp[id(body.problem)], fits, {}, {}
     return True
