@@ -376,19 +376,13 @@ class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
         cleared.operator(PHYSGEN_OT_clear_motion.bl_idname, text="", icon="LOOP_BACK")
 
 
-class PHYSGEN_PT_start(Sidebar, bpy.types.Panel):
+class PHYSGEN_PT_start(_Part, bpy.types.Panel):
     """When the active object begins to move"""
 
     bl_parent_id = "PHYSGEN_PT_motion"
     bl_label = "Start"
     bl_order = 0
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Shown if the active object is dynamic."""
-        item = active_body(context)
-        return item is not None and item.physgen.role == "dynamic"
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the frame and sleep."""
@@ -400,19 +394,13 @@ class PHYSGEN_PT_start(Sidebar, bpy.types.Panel):
             column.prop(body, "held")
 
 
-class PHYSGEN_PT_pins(Sidebar, bpy.types.Panel):
+class PHYSGEN_PT_pins(_Part, bpy.types.Panel):
     """Pins of the active object"""
 
     bl_parent_id = "PHYSGEN_PT_motion"
     bl_label = "Hold"
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Shown if the active object is dynamic."""
-        item = active_body(context)
-        return item is not None and item.physgen.role == "dynamic"
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw pins and shape stiffness."""
