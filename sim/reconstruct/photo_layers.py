@@ -10,7 +10,7 @@ picture would be a little worse.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -23,11 +23,13 @@ from ..scene.model import Camera
 from .adapters.adapter_registry import adapter_content
 from .background.background_inpainting import blend, fill_background
 from .background.unboxed_things import UnboxedThings, unboxed_things
+from .lighting.ground_gloss import GroundGloss, estimate_gloss
 from .lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes, threshold_shadows
 from .reconstruct_options import ReconstructOptions
 from .segmentation.amodal_completion import complete_colours, complete_outline
 from .segmentation.box_segmentation import Box, segment
 from .segmentation.occlusion_order import Order, occlusion_order
+from .shape.body_texture import TexturedSurface
 from .stage_cache import Notice, StageCache, Steps
 
 Mask = NDArray[np.bool_]
@@ -48,7 +50,8 @@ class Layers:
 
     seen: visible pixels of each object; full: its whole mask. shadows, holes: of each object, without other objects.
     colours: the photo with the hidden part of each object painted in its own colours. front_to_back: indices.
-    uncovered: by index, the picture after each removal that revealed something.
+    uncovered: by index, the picture after each removal that revealed something. unboxed: things without a box, or
+    None.
     """
 
     seen: tuple[Mask, ...]
@@ -59,6 +62,7 @@ class Layers:
     background: Pixels
     front_to_back: tuple[int, ...]
     uncovered: Mapping[int, Pixels]
+    unboxed: Mask | None = None
 
 
 def separate_layers(
@@ -113,7 +117,62 @@ def separate_layers(
         background=made["picture"],
         front_to_back=order,
         uncovered=uncovered,
+        unboxed=unboxed.whole,
     )
+
+
+def separate_gloss(
+    layers: Layers,
+    pixels: Pixels,
+    surfaces: Sequence[TexturedSurface],
+    view: Camera,
+    options: ReconstructOptions,
+    *,
+    inpainter: Inpainter | None,
+    store: StageCache,
+    steps: Steps,
+) -> tuple[Layers, GroundGloss]:
+    """Return ``layers`` whose background is free of mirror images in the ground, and its gloss.
+
+    surfaces: of the objects' bodies, in the unit of ``view``. Other arguments as of ``separate_layers``. Where nothing
+    is mirrored, ``layers`` are returned as they are.
+    """
+    unboxed = np.zeros_like(layers.seen[0]) if layers.unboxed is None else layers.unboxed
+    objects = np.logical_or.reduce(list(layers.seen))
+    steps.begin("gloss")
+    made = store.run(
+        "gloss",
+        {"pixels": pixels, "covered": objects | unboxed, "view": view, "bodies": [vars(s) for s in surfaces]},
+        lambda notice: _gloss(pixels, objects | unboxed, view, surfaces, notice),
+    )
+    reflectivity, roughness, correlation, by_chance = (float(v) for v in made["numbers"])
+    images = tuple(np.asarray(image, dtype=bool) for image in made["images"])
+    gloss = GroundGloss(reflectivity, roughness, correlation, by_chance, images, made["bare"])
+    if reflectivity == 0.0:
+        return layers, gloss
+    union = np.logical_or.reduce(layers.holes)
+    fill = _filler(pixels, view, options, inpainter, unboxed)
+    filled = store.run(
+        "background",
+        {**_fill_inputs(gloss.pixels, view, options), "hole": union, "objects": objects, "barred": unboxed},
+        partial(_filled, fill, gloss.pixels, union, objects),
+    )
+    holes = tuple(hole | image for hole, image in zip(layers.holes, images, strict=True))
+    return replace(layers, holes=holes, background=filled["picture"]), gloss
+
+
+def _gloss(
+    pixels: Pixels, covered: Mask, view: Camera, surfaces: Sequence[TexturedSurface], notice: Notice
+) -> dict[str, NDArray[np.generic]]:
+    found = estimate_gloss(pixels, covered, view, surfaces)
+    if found.reflectivity > 0.0:
+        notice(
+            f"the ground mirrors the objects: reflectivity {found.reflectivity:.2g}, roughness {found.roughness:.2g} "
+            f"(correlation {found.correlation:.2f}, beside them {found.by_chance:.2f}); set ground.reflectivity if this"
+            " is wrong"
+        )
+    numbers = [found.reflectivity, found.roughness, found.correlation, found.by_chance]
+    return {"numbers": np.array(numbers), "images": np.stack(found.images), "bare": found.pixels}
 
 
 Fill = Callable[[Pixels, Mask, Mask, Notice], Pixels]

@@ -30,9 +30,10 @@ from .appearance.appearance_estimate import ObjectAppearance, estimate_appearanc
 from .camera import ground_camera as cameras
 from .camera.camera_estimate import CameraEstimate, estimate_camera, metres_per_unit
 from .camera.depth_map import DepthMap, read_depth
+from .lighting.ground_gloss import GroundGloss
 from .lighting.light_estimate import ENVIRONMENT_FILE, LitScene, estimate_light
 from .photo import Photo, load_photo
-from .photo_layers import Layers, separate_layers
+from .photo_layers import Layers, separate_gloss, separate_layers
 from .reasoning.answer_parser import Answers, read_answer
 from .reasoning.chat_client import ChatRequest
 from .reasoning.material_decision import (
@@ -70,6 +71,7 @@ class SceneEstimate:
     metres: float
     light: Light
     looks: Sequence[ObjectAppearance]
+    gloss: GroundGloss
 
 
 def write_scene(
@@ -123,7 +125,11 @@ def write_scene(
             )
             for i, name in enumerate(names)
         ),
-        ground=Ground(friction=friction),
+        ground=Ground(
+            friction=friction,
+            reflectivity=found.gloss.reflectivity,
+            reflection_roughness=found.gloss.roughness,
+        ),
         light=found.light,
     )
 
@@ -173,7 +179,7 @@ def reconstruct_photo(
     objects = [replace(item, name=name) for item, name in zip(objects, names, strict=True)]
     for item in objects:
         load_preset(item.preset or DEFAULT_PRESET)
-    steps = Steps(8 + 4 * len(objects) + options.report, on_event, cancelled)
+    steps = Steps(9 + 4 * len(objects) + options.report, on_event, cancelled)
     with replacing_folder(out) as folder:
         store = StageCache(folder / STAGES_FOLDER, out / STAGES_FOLDER, steps.notice)
         steps.begin("photo")
@@ -202,6 +208,8 @@ def reconstruct_photo(
         steps.begin("camera")
         depth = _depth(picture, options, steps)
         estimate = estimate_camera(picture, seen, options, depth, steps.notice)
+        named = options.inpainter
+        inpainter = None if named is None else resolve("inpainter", trusted_spec(named), cancelled)
         layers = separate_layers(
             picture.pixels,
             seen,
@@ -210,13 +218,21 @@ def reconstruct_photo(
             estimate.camera,
             options,
             depth=None if depth is None else 1.0 / depth.nearness,
-            inpainter=None
-            if options.inpainter is None
-            else resolve("inpainter", trusted_spec(options.inpainter), cancelled),
+            inpainter=inpainter,
             store=store,
             steps=steps,
         )
         bodies = make_bodies(layers, estimate.camera, objects, options, store, steps, depth=depth)
+        layers, gloss = separate_gloss(
+            layers,
+            picture.pixels,
+            [body.surface for body in bodies],
+            estimate.camera,
+            options,
+            inpainter=inpainter,
+            store=store,
+            steps=steps,
+        )
         physics = tuple(decided_by_shape(item, body.shape) for item, body in zip(physics, bodies, strict=True))
         for name, decided in zip(names, physics, strict=True):
             steps.notice(describe_decision(name, decided))
@@ -233,6 +249,7 @@ def reconstruct_photo(
             metres=_metres(bodies, physics, estimate, options, steps),
             light=light,
             looks=looks,
+            gloss=gloss,
         )
         scene = write_scene(folder, found, objects, physics, _friction(answers, options))
         if at_rest is not None:

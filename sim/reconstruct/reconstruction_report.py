@@ -215,7 +215,12 @@ def _light(folder: Scene) -> Section:
         if radiance is not None:
             shown = report_pictures.tone_mapped(np.asarray(radiance), 480)
             figures.append(_figure(shown, "The environment, all around; twice its mean is white.", 480))
-    return Section(title="Light", text=f"{describe_sun(light).capitalize()}.", figures=figures)
+    ground = folder.model.ground
+    facts = []
+    if ground is not None and ground.reflectivity > 0.0:
+        text = f"{ground.reflectivity:.2g}, roughness {ground.reflection_roughness:.2g}"
+        facts = [("The ground mirrors", text, "share at normal incidence, by the objects' mirror images")]
+    return Section(title="Light", text=f"{describe_sun(light).capitalize()}.", figures=figures, facts=facts)
 
 
 def _physics(folder: Scene) -> Section:

@@ -50,12 +50,21 @@ def check_overrides(names: Sequence[str], overrides: Sequence[str]) -> None:
 
 
 def without_physics(scene: SceneModel, friction: float) -> SceneModel:
-    """Return ``scene`` with default physics: default materials at rest on a ground of ``friction``. Effects stay."""
+    """Return ``scene`` with default physics: default materials at rest on a ground of ``friction``. Effects and
+    the ground's gloss, which is seen only, stay.
+    """
     shapes = [{name: getattr(item, name) for name in SHAPE_FIELDS} for item in scene.objects]
     return dataclasses.replace(
         scene,
         objects=tuple(SceneObject(**shape) for shape in shapes),
-        ground=scene.ground and Ground(point=scene.ground.point, normal=scene.ground.normal, friction=friction),
+        ground=scene.ground
+        and Ground(
+            point=scene.ground.point,
+            normal=scene.ground.normal,
+            friction=friction,
+            reflectivity=scene.ground.reflectivity,
+            reflection_roughness=scene.ground.reflection_roughness,
+        ),
         gravity=SceneModel.gravity,
         gravity_track=(),
         contacts=(),
