@@ -44,6 +44,8 @@ LEVEL = 0.5
 LEAST_CORRELATION, MARGIN, FACTOR = 0.25, 0.15, 2.0
 """Correlation that a mirror image needs, by how much it exceeds the controls', and how many times these it is. Chosen
 with one glossy table in sight (0.56 against 0.19)."""
+LEAST, MOST_OFF = 0.005, 0.7
+"""Least reflectivity of a ground that mirrors; share over that of the view's angle alone below which none is taken."""
 FEWEST = 150
 """Fewest pixels of an image that are compared."""
 MOST_DEVIATING = 3.0
@@ -107,8 +109,9 @@ def estimate_gloss(
     by_chance = max(0.0, *(fit.correlation for fit in controls))
     enough = max(LEAST_CORRELATION, by_chance + MARGIN, FACTOR * by_chance)
     grazing = comparison.grazing
-    reflectivity = (found.share - grazing) / max(1.0 - grazing, 1e-6)
-    if found.correlation < enough or reflectivity <= 0.0:
+    # A view taken for flatter than it is leaves less than Fresnel's share at that angle; far less is something else.
+    reflectivity = max((found.share - grazing) / max(1.0 - grazing, 1e-6), LEAST)
+    if found.correlation < enough or found.share < MOST_OFF * grazing:
         return GroundGloss(0.0, none.roughness, found.correlation, by_chance, none.images, pixels)
     gloss = Ground(reflectivity=min(reflectivity, 1.0), reflection_roughness=found.roughness)
     images, bare = _without(pixels, covered, camera, gloss, [_mirror_image(camera, s, 1.0) for s in surfaces])
