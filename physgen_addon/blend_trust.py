@@ -19,7 +19,7 @@ import bpy
 from ..sim.trust import READS, WRITES, Claim, NotTrusted, remember, trusted_keys
 
 _came: set[Claim] = set()
-"""Claims of the open file that nobody has agreed to; stored in no file."""
+"""Claims of the open file that the user has not agreed to; never saved."""
 
 
 GROUPS = ("physgen", "physgen_photo", "physgen_diagnose", "physgen_compose")

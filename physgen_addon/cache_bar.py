@@ -27,7 +27,7 @@ Span = tuple[float, float, tuple[float, float, float, float]]
 def spans(found: BakeState | None) -> list[Span]:
     """Return what is drawn, as first and last frame and colour: half a frame on either side belongs to a frame.
 
-    found: the last observed state; None for a scene that nobody has looked at.
+    found: the last observed state; None if the scene has not been observed yet.
     """
     if found is None or found.status not in COLOURS or found.frames < 1:
         return []

@@ -174,7 +174,7 @@ def ground_layer(
 
 
 FEWEST_SHADED = 100
-"""Pixels of a photo's shadow from which its colour is told."""
+"""Fewest pixels of a photo's shadow from which its colour is estimated."""
 FAINT = 0.05
 """Darkening, as a natural logarithm of luminance, below which a photo's shadow tells no colour."""
 DEPTHS, TINTS = (0.6, 1.5), (0.3, 3.0)

@@ -437,7 +437,7 @@ def _seen_as(body: BodyFits, change: Callable[[ObservedBody], ObservedBody]) -> 
 def sharpen(body: BodyFits) -> bool:
     """Replace the largest slow error of single points by the one that the closest fit leaves, and fit everything again.
 
-    How much a candidate leaves is told by a fit to the stated noise: within the largest slow error a missing force
+    The residual of a candidate is that of a fit to the stated noise: within the largest slow error a missing force
     costs nothing, so that no candidate would move to where it is. Returns whether that made a difference.
     """
     if not body.problem.scene.unscaled:

@@ -174,7 +174,7 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
 
     levels: (5, H, W, 3) percentiles over time. A value counts if its colour occurs around the hole, the median first;
     where none does, the body was there all the time, and the hole is filled from its rim. In a plain surface, a table
-    or a wall, the colour that it would have there decides, so that a body is told from what has nearly its colours.
+    or a wall, the colour expected there decides, so that a body is kept apart from surfaces of similar colour.
     """
     out, noise = median.copy(), noise.copy()
     empty = np.zeros_like(holes)
