@@ -238,7 +238,7 @@ def command_here(command, on_event, cancelled, **_):
 
 @pytest.mark.long
 def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, monkeypatch):
-    """A mask and a horizon as told; then another back, which cuts out and fills in nothing, but looks for a new mirror image."""
+    """A mask and a horizon as told; then another back: nothing is cut out again, its mirror image is looked for."""
     scene, box = bpy.context.scene, photo.boxes[0]
     mask = truth(world)
     mask[:, : extent(mask)[0] + 6] = False
