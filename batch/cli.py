@@ -183,8 +183,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ[ANYWAY] = "1"
     with stop_signals(lambda: end_at_last(terminal)) as stopped:
         try:
+            # Before this command has a temporary folder of its own: the others' are beside it.
+            recover(options, terminal)
             with atomic.own_scratch():
-                recover(options, terminal)
                 return run(options, terminal, lambda: stopped() or terminal.reader_gone)
         except PhysGenError as error:
             terminal.error(type(error).__name__, str(error))

@@ -16,6 +16,7 @@ FAST = (
     "farm",
     "farm_dask",
     "gpu",
+    "kills",
     "main_thread",
     "materials",
     "mpm",

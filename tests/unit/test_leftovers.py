@@ -89,7 +89,9 @@ def test_a_mark_is_of_one_process_only(dead, living):
     assert not own_mark().is_dead and parse_mark("1-2") is None
 
 
-def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(tmp_path, dead, living, ball_scene, capsys):
+def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(
+    tmp_path, dead, living, ball_scene, capsys, monkeypatch
+):
     root = ball_scene().root
     other = Mark(dead.pid, dead.started, "00000000")
     gone = [
@@ -115,6 +117,8 @@ def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(tmp_
     outside.mkdir()
     (outside / "precious").write_text("mine")
     (root / f".link.partial-{dead}").symlink_to(outside)
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     assert main(["estimate", str(root), "--frames", "2"]) == 0
     said = capsys.readouterr().out
     assert not any(path.exists() for path in gone) and all(path.exists() for path in kept)
@@ -141,6 +145,16 @@ def test_temporary_folders_of_dead_processes_are_removed(tmp_path, dead, living)
     (tmp_path / f"physgen-{dead}-x4" / f"physgen-{living}-x").mkdir()
     assert len(atomic.recover_scratch(tmp_path)) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+
+
+def test_a_command_removes_those_among_the_systems_temporary_files(tmp_path, dead, monkeypatch, capsys):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left = tmp_path / f"physgen-{dead}-x1"
+    (left / "deep").mkdir(parents=True)
+    (tmp_path / "letter").touch()
+    assert main(["effects", "wind"]) == 0
+    assert f"{left}: removed, left by a run that was killed" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["letter"]
 
 
 def test_all_temporary_files_of_a_command_and_its_children_lie_in_one_folder(tmp_path, monkeypatch):
