@@ -140,6 +140,11 @@ def number(value: float, unit: str) -> str:
     return f"{value:.3g}" if unit in ("", "1") else f"{value:.3g} {unit}"
 
 
+def percent(share: float) -> str:
+    """Return three digits of ``share`` in per cent, or a dash if not finite."""
+    return number(100 * share, "%")
+
+
 def volume(cubic_metres: float) -> str:
     """Return a volume such as ``2.4 cm³`` or ``0.13 m³``."""
     for unit, size in (("m³", 1.0), ("dm³", 1e-3), ("cm³", 1e-6)):

@@ -205,7 +205,7 @@ def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
     if effect.has_closed:
         split = column.split(factor=0.45)
         split.label(text="Closes")
-        split.label(text=f"{100 * effect.closed:.3g} % of the gap")
+        split.label(text=f"{text.percent(effect.closed)} of the gap")
 
 
 def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
@@ -227,7 +227,7 @@ def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any
     if not state.resolvable:
         text.sentences(box, context, "Too close to the noise floor to quantify the closure.")
     elif state.closed > -1:
-        box.label(text=f"{100 * state.closed:.3g} % of the gap is closed")
+        box.label(text=f"{text.percent(state.closed)} of the gap is closed")
     if state.numerics_m > 0:
         box.label(text=f"{text.length(state.numerics_m)} of it is the simulator's own error")
 

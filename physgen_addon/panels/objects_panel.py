@@ -307,8 +307,8 @@ def _draw_result(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> 
         column.scale_y = 0.8
         column.label(text=pair.name)
         column.label(
-            text=f"{text.volume(pair.volume_before)} ({100 * pair.share_before:.3g} %) → "
-            f"{text.volume(pair.volume_after)} ({100 * pair.share_after:.3g} %)",
+            text=f"{text.volume(pair.volume_before)} ({text.percent(pair.share_before)}) → "
+            f"{text.volume(pair.volume_after)} ({text.percent(pair.share_after)})",
             icon="BLANK1",
         )
         deepest = f"{text.length(pair.deepest_before)} → {text.length(pair.deepest_after)}"

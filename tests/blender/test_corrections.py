@@ -47,6 +47,8 @@ from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.meshes import load_object_mesh
 
+from .checked_layout import CheckedLayout, Context
+
 SIZE = (160, 120)
 """Pixels of the photo, the world's own; small, because it is reconstructed twice."""
 
@@ -338,64 +340,12 @@ def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
 # -- panels -----------------------------------------------------------------------------------------------------------
 
 
-class Settings:
-    """Takes what a panel sets of an operator, and asks Blender whether it has such a property."""
-
-    def __init__(self, kind):
-        object.__setattr__(self, "_kind", kind)
-
-    def __setattr__(self, name, value):
-        assert name in self._kind.properties, name
-
-
-class Layout:
-    """Takes what a panel draws, and asks Blender whether there are such properties and operators."""
-
-    def __init__(self, words=None):
-        self.words = [] if words is None else words
-
-    def _part(self, *args, **kwargs):
-        return Layout(self.words)
-
-    row = column = box = grid_flow = split = _part
-
-    def panel(self, name, default_closed=False):
-        assert default_closed
-        return Layout(self.words), Layout(self.words)
-
-    def label(self, text="", icon="NONE"):
-        self.words.append(text)
-
-    def prop(self, data, name, text="", icon="NONE", emboss=True):
-        assert name in data.bl_rna.properties, name
-        self.words.append(name)
-
-    def operator(self, name, text="", icon="NONE"):
-        group, _, operator = name.partition(".")
-        kind = getattr(getattr(bpy.ops, group), operator).get_rna_type()
-        assert icon in bpy.types.UILayout.bl_rna.functions["operator"].parameters["icon"].enum_items
-        self.words.append(text or kind.name)
-        return Settings(kind)
-
-    def template_list(self, kind, name, data, items, active, index, rows=5):
-        assert hasattr(bpy.types, kind) and items in data.bl_rna.properties and index in active.bl_rna.properties
-
-    def template_ID(self, data, name, open=""):
-        assert data.bl_rna.properties[name].type == "POINTER"
-        self.words.append(name)
-
-
 def shown(area="VIEW_3D"):
-    context = SimpleNamespace(
-        scene=bpy.context.scene,
-        # In background mode Blender's own scale is 0.
-        preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0), view=SimpleNamespace(ui_scale=1.0)),
-        region=None,
-        space_data=SimpleNamespace(type=area, image=bpy.context.scene.physgen_photo.image),
-    )
-    layout = Layout()
-    draw_photo(layout, context)
-    return layout.words
+    """What the photo's panel draws: texts, and names of what it sets."""
+    layout = CheckedLayout()
+    space = SimpleNamespace(type=area, image=bpy.context.scene.physgen_photo.image)
+    draw_photo(layout, Context(space_data=space))
+    return layout.words + layout.names
 
 
 def test_the_panel_shows_what_can_be_told(photo, world):

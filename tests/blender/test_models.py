@@ -4,7 +4,6 @@
 import gzip
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +12,8 @@ import physgen
 from physgen.physgen_addon.panels.photo_panel import draw_cutouts
 from physgen.sim.reconstruct.models import model_folder
 from physgen.sim.reconstruct.models.known_models import ISNET
+
+from .checked_layout import CheckedLayout, Context
 
 ARCHIVE = os.environ.get("PHYSGEN_TEST_ISNET", "")
 
@@ -25,26 +26,10 @@ def addon(fresh_blender, tmp_path, monkeypatch):
     physgen.unregister()
 
 
-class Layout:
-    """Keeps which operators and properties were drawn."""
-
-    def __init__(self):
-        self.drawn = []
-
-    def row(self, **_):
-        return self
-
-    def operator(self, name, **_):
-        self.drawn.append(name)
-
-    def prop(self, _, name, **__):
-        self.drawn.append(name)
-
-
 def drawn():
-    layout = Layout()
-    draw_cutouts(layout, SimpleNamespace(), bpy.context.scene.physgen_photo)
-    return layout.drawn
+    layout = CheckedLayout()
+    draw_cutouts(layout, Context(), bpy.context.scene.physgen_photo)
+    return layout.names
 
 
 def test_nothing_happens_without_agreement(tmp_path):

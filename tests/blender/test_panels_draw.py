@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every panel, list, menu and popup draws in every state, and names nothing that Blender does not have."""
+
+import math
+import threading
+from pathlib import Path
+
+import bpy
+import physgen
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from physgen import physgen_addon
+from physgen.physgen_addon import background_jobs, bake_state
+from physgen.physgen_addon.panels import simulate_panel
+from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS
+
+from . import checked_layout
+
+COFFEE = Path(physgen.__file__).parent / "presets" / "demo" / "coffee.jpg"
+
+
+@pytest.fixture(autouse=True)
+def addon(fresh_blender):
+    physgen.register()
+    yield
+    physgen.unregister()
+
+
+def kinds(base):
+    """Registered classes of the add-on that derive from ``base``."""
+    modules = physgen_addon._modules()
+    return [kind for module in modules for kind in physgen_addon.registered_classes(module) if issubclass(kind, base)]
+
+
+def draw_all(part=""):
+    """Names and words of all panels and menus now, or of those with ``part`` in their name, by class."""
+    shown = {}
+    for kind in kinds(bpy.types.Panel) + kinds(bpy.types.Menu):
+        layout = checked_layout.draw(kind) if part in kind.__name__ else None
+        if layout is not None:
+            shown[kind.__name__] = layout
+    return shown
+
+
+def settings_of(owner):
+    """Return the paths of the switches and choices in ``owner`` and in the groups within it, from its data-block.
+
+    Not the settings themselves: a choice may replace the group that another one lies in.
+    """
+    found = []
+    for item in owner.bl_rna.properties:
+        ours = item.type in ("POINTER", "COLLECTION") and item.fixed_type.identifier.startswith("PHYSGEN_PG_")
+        if ours:
+            value = getattr(owner, item.identifier)
+            for part in [value] if item.type == "POINTER" else value:
+                found += settings_of(part)
+        elif item.type in ("BOOLEAN", "ENUM") and not item.is_readonly and not getattr(item, "is_array", False):
+            found.append((owner.path_from_id(), item.identifier))
+    return found
+
+
+def choices(owner, name):
+    item = owner.bl_rna.properties[name]
+    if item.type == "BOOLEAN":
+        return [not getattr(owner, name)]
+    every = [choice.identifier for choice in item.enum_items if choice.identifier]
+    return [{choice} for choice in every] if item.is_enum_flag else every
+
+
+def draw_every_choice(*owners):
+    """Draw all panels with every switch and every choice of ``owners`` in turn, once a kind of group; return which."""
+    varied, kinds_seen = set(), set()
+    for block, path, name in [(owner.id_data, *setting) for owner in owners for setting in settings_of(owner)]:
+        try:
+            group = block.path_resolve(path)
+        except ValueError:
+            continue
+        if (group.bl_rna.identifier, name) in kinds_seen:
+            continue
+        kinds_seen.add((group.bl_rna.identifier, name))
+        before = getattr(group, name)
+        for value in choices(group, name):
+            setattr(block.path_resolve(path), name, value)
+            draw_all()
+        setattr(block.path_resolve(path), name, before)
+        varied.add(name)
+    return varied
+
+
+def a_body():
+    bpy.ops.mesh.primitive_cube_add(size=1)
+    bpy.ops.physgen.add_bodies()
+    return bpy.context.active_object
+
+
+def test_every_choice_of_the_panels_is_drawn():
+    item, scene = a_body(), bpy.context.scene
+    for name in EFFECT_ITEMS:
+        bpy.ops.physgen.add_stack_effect(effect=name[0])
+    bpy.ops.mesh.primitive_cube_add(size=4)
+    bpy.ops.physgen.add_colliders()
+    bpy.context.view_layer.objects.active = item
+    varied = draw_every_choice(scene.physgen, item.physgen)
+    assert {"role", "quality", "device", "use_ground", "engine"} <= varied
+    # Of the ground, of a collider: the active object is another one.
+    bpy.context.view_layer.objects.active = bpy.data.objects["Cube.001"]
+    assert draw_every_choice(bpy.context.active_object.physgen)
+
+
+@pytest.mark.parametrize("ready", [True, False])
+@pytest.mark.parametrize("trouble", ["", "the worker has ended. In a terminal: python -m pip install taichi"])
+@pytest.mark.parametrize("status", ["none", "paused", "baked", "stale", "missing"])
+def test_every_state_of_a_bake_is_drawn(status, trouble, ready):
+    scene = bpy.context.scene
+    scene.frame_end = 250
+    found = bake_state.BakeState(
+        status=status,
+        frames_done=12,
+        frames=48,
+        disk_bytes=3_000_000,
+        trouble=trouble,
+        advice=bake_state.MESSAGES.get(status, ""),
+        estimate_text="About 20 s and 0.4 GB",
+    )
+    layout = checked_layout.CheckedLayout()
+    simulate_panel._draw_bake(layout, checked_layout.Context(), found, ready=ready)
+    free = status in ("paused", "baked", "stale", "missing") and ready
+    assert not free or "physgen.free_bake" in layout.names
+    shown = " ".join(layout.words)
+    assert (status == "none" and not ready) or not trouble or "the worker has ended" in shown
+    assert "pip install" not in shown
+
+
+def test_a_job_that_runs_locks_what_it_reads_and_can_be_cancelled():
+    a_body()
+    go_on = threading.Event()
+    job = background_jobs.Job("Bake", lambda on_event, cancelled: go_on.wait(60) and {"event": "done"})
+    job.message = "frame 3 of 12"
+    background_jobs._running.append(job)
+    job.start()
+    try:
+        shown = draw_all()
+        assert any("Bake is running" in " ".join(layout.words) for layout in shown.values())
+    finally:
+        go_on.set()
+        job.wait()
+        background_jobs._running.clear()
+
+
+NUMBERS = st.floats(-1, 1e6, width=32) | st.sampled_from([-1.0, 0.0, math.nan, math.inf])
+"""A ``.blend`` may hold any number, whatever the report was."""
+
+
+@given(st.lists(NUMBERS, min_size=8, max_size=8), st.booleans(), st.sampled_from(["none", "unknown", "air_drag"]))
+def test_every_diagnosis_is_drawn(numbers, resolvable, verdict):
+    state = bpy.context.scene.physgen_diagnose
+    state.root = bpy.data.collections.get("root") or bpy.data.collections.new("root")
+    state.before_root, state.has_report, state.resolvable, state.verdict = state.root, True, resolvable, verdict
+    state.summary, state.alternatives, state.next_experiment = "Air drag is missing.", "wind, magnus", "a longer throw"
+    for name, value in zip(
+        ("before_m", "refitted_m", "after_m", "floor_m", "closed", "numerics_m"), numbers, strict=False
+    ):
+        setattr(state, name, value)
+    state.effects.clear()
+    state.warnings.clear()
+    state.warnings.add().text = "One trial is short."
+    for name in ("air_drag", "none"):
+        effect = state.effects.add()
+        effect.name, effect.probability, effect.closed, effect.has_closed = name, 0.5, numbers[6], resolvable
+        parameter = effect.parameters.add()
+        parameter.name, parameter.unit, parameter.value, parameter.low = "coefficient", "1/m", numbers[7], numbers[0]
+    shown = draw_all("diagnose")
+    assert {"PHYSGEN_PT_diagnose_causes", "PHYSGEN_PT_diagnose_add"} <= shown.keys()
+    for kind in ("ball", "cylinder", "box", "mesh"):
+        state.video.kind = kind
+        draw_all("diagnose_video")
+
+
+def test_a_photo_is_drawn_with_its_boxes():
+    bpy.ops.physgen.open_photo(filepath=str(COFFEE))
+    photo = bpy.context.scene.physgen_photo
+    for name in ("ball", "cup"):
+        photo.boxes.add().name = name
+    assert len(draw_every_choice(photo)) > 5
+
+
+def test_every_popup_is_drawn():
+    a_body()
+    drawn = 0
+    for kind in kinds(bpy.types.Operator):
+        if "draw" in vars(kind):
+            layout = checked_layout.CheckedLayout()
+            kind.draw(checked_layout.Drawn(kind, layout), checked_layout.Context())
+            drawn += bool(layout.names or layout.words)
+    assert drawn > 3
