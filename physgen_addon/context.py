@@ -111,8 +111,11 @@ def _leave_sidebar_free(view: bpy.types.RegionView3D, region: bpy.types.Region, 
 
 
 def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
-    """Show ``image`` and the sidebar's ``tab`` in an image editor, or beside the 3D viewport if there is none."""
-    if context.window is None:
+    """Show ``image`` and the sidebar's ``tab`` in an image editor, or beside the 3D viewport if there is none.
+
+    Nothing in the background: areas have no size there, and Blender does not come back from closing a split one.
+    """
+    if bpy.app.background or context.window is None:
         return
     areas = context.window.screen.areas
     area = next((area for area in areas if area.type == "IMAGE_EDITOR"), None) or _beside_viewport(context)

@@ -118,3 +118,12 @@ def test_menus_and_key_come_and_go():
 def test_every_operator_that_one_would_type_has_its_name():
     titles = {kind.bl_label for kind, _ in quick_ops.QUICK}
     assert titles == {"Quick Jelly", "Quick Sand", "Quick Liquid", "Quick Rigid"}
+
+
+def test_opening_a_photo_in_the_background_leaves_the_areas_alone():
+    """They have no size there: Blender did not come back from closing the one that was split off."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    screen = bpy.context.window.screen
+    before = [area.type for area in screen.areas]
+    assert bpy.ops.physgen.open_sample(sample="PHOTO") == {"FINISHED"}
+    assert [area.type for area in screen.areas] == before and "IMAGE_EDITOR" not in before
