@@ -18,7 +18,20 @@ from .playback import point_caches
 from .playback.bake_record import BAKES
 from .props.body_props import bodies
 
-IGNORED = {"rna_type", "name", "bake", "cache", "unsaved", "estimate", "estimate_of", "body_index", "effect_index"}
+SHOWN = "_shown"
+"""End of the names of properties that show the number of another one."""
+IGNORED = {
+    "rna_type",
+    "name",
+    "bake",
+    "cache",
+    "unsaved",
+    "estimate",
+    "estimate_of",
+    "body_index",
+    "effect_index",
+    "likeness",
+}
 """Properties that do not affect the motion; changes of the bake itself are detected elsewhere."""
 
 
@@ -47,7 +60,7 @@ def _properties(group: Any) -> list[tuple[str, str]]:
     return [
         (prop.identifier, "ARRAY" if getattr(prop, "is_array", False) else prop.type)
         for prop in group.bl_rna.properties
-        if prop.identifier not in IGNORED
+        if prop.identifier not in IGNORED and not prop.identifier.endswith(SHOWN)
     ]
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import bpy
@@ -90,12 +91,70 @@ def count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
+PRESSURE = {
+    "METRIC": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
+    "IMPERIAL": {"psi": 6894.757, "ksi": 6894.757e3},
+}
+DENSITY = {"METRIC": {"kg/m³": 1.0}, "IMPERIAL": {"lb/ft³": 16.018463}}
+VISCOSITY = {"METRIC": {"mPa s": 1e-3, "Pa s": 1.0}}
+"""Units of a kind of number by Blender's unit system, from the smallest to the largest, and each in that of SI.
+
+Blender's own properties have lengths, angles, times, velocities and the like, but none of these.
+"""
+Units = Mapping[str, Mapping[str, float]]
+_TYPED = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
+
+
+def quantity(value: float, units: Units, system: str = "METRIC", *, digits: int = 4) -> str:
+    """Return ``value``, of the unit of SI, in the unit of ``system`` that suits it: ``500 kPa``, ``72.5 psi``.
+
+    A bare number where the scene has no units.
+    """
+    if system == "NONE":
+        return _digits(value, digits)
+    known = units.get(system, units["METRIC"])
+    fitting = [unit for unit, size in known.items() if abs(value) >= size * (1 - 0.5 * 0.1**digits)]
+    unit = fitting[-1] if fitting else next(iter(known))
+    if not fitting and value == 0 and 1.0 in known.values():
+        unit = next(name for name, size in known.items() if size == 1.0)
+    return f"{_digits(value / known[unit], digits)} {unit}"
+
+
+def _digits(value: float, digits: int) -> str:
+    """Return ``value`` with so many digits, and never as a power of ten where it is large."""
+    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.10g}"
+
+
+def typed_quantity(words: str, units: Units, shown: str) -> float | None:
+    """Return the number of SI that ``words`` name, such as ``0.5 MPa``, ``1 g/cm3`` or ``20``; None if they name none.
+
+    units: of the kind, whose units of every system are known. shown: what the field showed before: a bare number has
+    its unit, as in Blender's own fields.
+    """
+    match = _TYPED.fullmatch(words.strip())
+    if match is None:
+        return None
+    number, unit = float(match[1]), _plain(match[2])
+    sizes = {_plain(name): size for known in units.values() for name, size in known.items()}
+    if units is DENSITY:
+        sizes |= {"g/cm3": 1e3, "g/l": 1.0}
+    if not unit:
+        before = _TYPED.fullmatch(shown.strip())
+        unit = _plain(before[2]) if before is not None else ""
+    if not unit:
+        return number
+    # No kind has both milli- and mega-, so that capitals need not be minded.
+    size = {name.lower(): size for name, size in sizes.items()}.get(unit.lower())
+    return None if size is None else number * size
+
+
+def _plain(unit: str) -> str:
+    return unit.replace("³", "3").replace("^3", "3").replace("·", "").replace("*", "").replace(" ", "")
+
+
 def pressure(pascals: float) -> str:
     """Return a pressure such as ``25 kPa`` or ``70 GPa``."""
-    for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
-        if pascals >= size * 0.9995:
-            return f"{pascals / size:.3g} {unit}"
-    return f"{pascals:.3g} Pa"
+    return quantity(pascals, PRESSURE, digits=3)
 
 
 def storage(size: int) -> str:

@@ -71,7 +71,8 @@ LONGEST = (
     "test_track.py",
     "test_compose_physics.py",
     "test_splats.py",
-    "test_panels.py",
+    "test_world_and_render_panels.py",
+    "test_diagnose_jobs.py",
     "test_guidance_diffusers.py",
     "test_explain.py",
 )

@@ -365,5 +365,6 @@ class PHYSGEN_OT_copy_material(OfBody, bpy.types.Operator):
         for item in others:
             set_material(item.physgen.material, material)
             item.physgen.material.preset_name = source.preset_name
+            item.physgen.material.likeness = source.likeness
         self.report({"INFO"}, f"Material copied to {count(len(others), 'object')}")
         return {"FINISHED"}

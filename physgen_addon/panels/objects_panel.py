@@ -27,7 +27,7 @@ from ..operators.compose_ops import Compose, PHYSGEN_OT_compose_objects, chosen_
 from ..playback import splats
 from ..props import material_props
 from ..props.body_props import bodies, is_body
-from ..props.material_props import LAW_FIELDS, is_modified
+from ..props.material_props import ADVANCED, LAW_FIELDS, WITH_UNITS, is_modified, shown_as
 from .sidebar import (
     COMPOSE,
     MOTION,
@@ -43,13 +43,6 @@ from .sidebar import (
 )
 
 ROLE_ICONS = {"dynamic": "PHYSICS", "collider": "MOD_PHYSICS"}
-UNITS = {
-    "youngs_modulus": text.pressure,
-    "yield_stress": text.pressure,
-    "bulk_modulus": text.pressure,
-    "fibre_modulus": text.pressure,
-}
-"""Text of a value that spans many orders of magnitude, beside its field."""
 SURFACE = ("friction", "static_friction", "restitution", "contact_mode")
 
 
@@ -74,9 +67,10 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         row.prop(item, "name", text="", emboss=False, icon="ERROR" if is_unfit else ROLE_ICONS[body.role])
         row = row.row()
         row.alignment = "RIGHT"
-        words = "Collider" if body.role == "collider" else material_props.preset_title(body.material.preset_name)
-        if words == material_props.preset_title(material_props.CUSTOM) and body.source:
-            words = "Recognised"
+        chosen = body.material.preset_name
+        words = "Collider" if body.role == "collider" else material_props.preset_title(chosen)
+        if body.role == "dynamic" and chosen == material_props.CUSTOM:
+            words = material_props.own_title(body.material.likeness)
         # A narrow list has no room for the bracket.
         row.label(
             text=words.partition(" (")[0] + ("*" if body.role == "dynamic" and is_modified(body.material) else "")
@@ -162,13 +156,9 @@ class PHYSGEN_PT_material(_Part, bpy.types.Panel):
         material = active_body(context).physgen.material
         column = settings(self.layout, context)
         column.prop(material, "law")
-        _number(column, material, "density", "kg/m³")
-        for name in LAW_FIELDS[material.law]:
-            if name == "fibre_axis":
-                if material.fibre_modulus > 0:
-                    column.prop(material, name)
-                continue
-            _number(column, material, name, UNITS[name](getattr(material, name)) if name in UNITS else "")
+        for name in ("density", *LAW_FIELDS[material.law]):
+            if name not in ADVANCED:
+                _draw_number(column, material, name)
         body = context.active_object.physgen
         for kind in ("stiffness", "density") if material.law != "rigid" else ("density",):
             group = f"{kind}_group"
@@ -202,18 +192,44 @@ def draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material
         row.operator(PHYSGEN_OT_delete_preset.bl_idname, text="", icon="TRASH").name = broken
 
 
-def _number(layout: bpy.types.UILayout, data: Any, name: str, words: str) -> None:
-    """Draw a field with its unit or its value in words beside it, aligned with the other fields."""
-    split = layout.split(factor=0.4, align=True)
-    split.use_property_split = False
-    title = split.row()
-    title.alignment = "RIGHT"
-    title.label(text=data.bl_rna.properties[name].name)
-    field = split.split(factor=0.58, align=True)
-    field.prop(data, name, text="")
-    unit = field.row()
-    unit.active = False
-    unit.label(text=words)
+def _draw_number(layout: bpy.types.UILayout, material: Any, name: str) -> None:
+    """Draw a number of the material with its unit, and the dot that animates it."""
+    if name in WITH_UNITS:
+        row = layout.row(align=True)
+        row.prop(material, shown_as(name))
+        # Keyframes and drivers are those of the number, not of the words that show it.
+        row.prop_decorator(material, name)
+    else:
+        layout.prop(material, name)
+
+
+class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
+    """What few materials need: fibres, and stiffness that gives way"""
+
+    bl_parent_id = "PHYSGEN_PT_material"
+    bl_label = "Advanced"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown for laws that have such numbers."""
+        return super().poll(context) and any(
+            name in ADVANCED for name in LAW_FIELDS[active_body(context).physgen.material.law]
+        )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw a switch each, and its numbers where it is on."""
+        material = active_body(context).physgen.material
+        column = settings(self.layout, context)
+        known = LAW_FIELDS[material.law]
+        if "relaxing_share" in known:
+            optional(column, material, "relaxes", "relaxing_share", "Gives Way")
+            if material.relaxes:
+                column.prop(material, "relaxation_time")
+        if "fibre_modulus" in known:
+            optional(column, material, "has_fibres", shown_as("fibre_modulus"), "Fibres")
+            if material.has_fibres:
+                column.prop(material, "fibre_axis")
 
 
 class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
@@ -421,7 +437,6 @@ class PHYSGEN_PT_pins(_Part, bpy.types.Panel):
             text.sentences(locked, context, "A pin is a box: the part of the object inside it is held.")
             locked.operator(PHYSGEN_OT_add_pin.bl_idname, icon="PINNED")
         column = locked.column()
-        column.prop(body, "goal_stiffness")
-        damping = column.column()
-        damping.active = body.goal_stiffness > 0
-        damping.prop(body, "goal_damping")
+        optional(column, body, "holds_shape", "goal_stiffness", "Hold Shape")
+        if body.holds_shape:
+            column.prop(body, "goal_damping")

@@ -60,7 +60,7 @@ def draw_details(layout: bpy.types.UILayout, context: bpy.types.Context, box: An
     inflated = shape.column()
     inflated.active = box.shape in ("auto", "inflated")
     inflated.prop(box, "back")
-    inflated.prop(box, "thickness")
+    optional(inflated, box, "own_thickness", "thickness", "Thickness")
     column.prop(box, "mesh")
     if box.mesh.strip():
         column.prop(box, "mesh_up")

@@ -52,7 +52,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     if rendering.engine == "cycles":
         choices.prop(rendering, "device")
     optional(choices, rendering, "own_samples", "samples", "Samples")
-    choices.prop(rendering, "scale")
+    choices.prop(rendering, "size", slider=True)
     choices.prop(rendering, "format")
     choices.prop(rendering, "video")
     choices.prop(rendering, "output")

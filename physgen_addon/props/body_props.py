@@ -126,7 +126,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         SceneObject,
         "shell_thickness",
         "Wall",
-        "Wall thickness of a hollow object; 0: the thinnest that the quality resolves",
+        "Wall thickness of a hollow object",
         min=0.0,
         soft_max=0.1,
     )
@@ -224,7 +224,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     )
     start_frame: IntProperty(
         name="Starts at Frame",
-        description="Static and without collisions before this frame. 0: start of the simulation",
+        description="Static and without collisions before this frame",
         default=0,
         min=0,
         soft_max=250,
@@ -247,15 +247,18 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     goal_stiffness: from_field(
         SceneObject,
         "goal_stiffness",
-        "Hold Shape",
-        "Stiffness towards the initial shape: acceleration over distance in 1/s²; 0: none",
+        "Pull",
+        "Stiffness towards the initial shape: acceleration over distance in 1/s²",
         soft_max=1000.0,
+    )
+    holds_shape: switch(
+        "goal_stiffness", "Hold Shape", "Pull it back to its initial shape; off: it stays as it is bent", 100.0
     )
     goal_damping: from_field(
         SceneObject,
         "goal_damping",
         "Hold Damping",
-        "Damping of Hold Shape, as a share of critical damping",
+        "Damping of the pull, as a share of critical damping",
         subtype="FACTOR",
     )
 

@@ -8,7 +8,10 @@ import typing
 from collections.abc import Callable
 from typing import Any
 
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
+
+from ..text import Units, quantity, typed_quantity
 
 UNITS = {
     "metres": {"unit": "LENGTH"},
@@ -52,6 +55,48 @@ def switch(field: str, name: str, description: str, on: float) -> Any:
             setattr(self, field, on if wanted else 0)
 
     return BoolProperty(name=name, description=description, get=get, set=put)
+
+
+def with_unit(field: str, name: str, description: str, units: Units) -> Any:
+    """Return a field that shows the number ``field`` of its group with its unit, and takes one with any of ``units``.
+
+    Nothing is stored besides the number, which is clamped to its own range; words that name no number change nothing.
+    """
+
+    def get(self: Any) -> str:
+        scene = getattr(bpy.context, "scene", None)
+        return quantity(getattr(self, field), units, scene.unit_settings.system if scene is not None else "METRIC")
+
+    def put(self: Any, words: str) -> None:
+        shown = get(self)
+        # Four digits are shown: what was only looked at keeps the others.
+        value = None if words == shown else typed_quantity(words, units, shown)
+        if value is not None:
+            setattr(self, field, value)
+
+    return StringProperty(name=name, description=description, get=get, set=put)
+
+
+def percentage(field: str, name: str, description: str, *, low: float = 0.0, high: float = 100.0) -> Any:
+    """Return a slider in per cent, ``low`` to ``high``, of the number ``field`` of its group, which alone is stored."""
+
+    def get(self: Any) -> float:
+        return 100.0 * float(getattr(self, field))
+
+    def put(self: Any, shown: float) -> None:
+        setattr(self, field, shown / 100.0)
+
+    return FloatProperty(
+        name=name,
+        description=description,
+        subtype="PERCENTAGE",
+        min=low,
+        max=high,
+        soft_max=min(high, 100.0),
+        precision=0,
+        get=get,
+        set=put,
+    )
 
 
 def _unscaled(value: Any) -> Any:

@@ -14,8 +14,8 @@ from ...sim.constitutive import models
 from ...sim.errors import InputError
 from ...sim.scene.material import PRESET_FOLDER, Material, PresetFolder, read_presets
 from .. import paths
-from ..text import decimal, readable
-from .generated_properties import from_field
+from ..text import DENSITY, PRESSURE, VISCOSITY, Units, decimal, readable
+from .generated_properties import from_field, switch, with_unit
 
 CUSTOM = "custom"
 _SHIPPED = read_presets(PRESET_FOLDER)
@@ -62,14 +62,17 @@ def find_preset(name: str) -> Material | None:
     return _SHIPPED.good.get(name) or own_presets().good.get(name)
 
 
-def preset_items(chosen: str) -> list[tuple[str, str, str, str, int]]:
-    """Return the menu's entries, numbered by position; ``chosen`` is included even if missing."""
+def preset_items(chosen: str, likeness: str = "") -> list[tuple[str, str, str, str, int]]:
+    """Return the menu's entries, numbered by position; ``chosen`` is included even if missing.
+
+    likeness: preset that recognised numbers come from, which then names the entry for numbers of no preset.
+    """
     own = own_presets()
     rows = [(name, preset_title(name), _SHIPPED.descriptions[name], "NONE") for name in _SHIPPED.good]
     rows += [(name, name, own.descriptions[name] or "User preset", "USER") for name in own.good]
     # The colon is in no valid name, so that a broken file never stands in for a preset.
     rows += [(f"broken:{name}", f"{name} (broken)", f"Unusable: {why}", "ERROR") for name, why in own.broken.items()]
-    rows.append((CUSTOM, preset_title(CUSTOM), "Numbers of no preset, such as those that a photo's object got", "NONE"))
+    rows.append((CUSTOM, own_title(likeness), "Numbers of no preset, such as those that a photo's object got", "NONE"))
     if chosen not in (row[0] for row in rows):
         rows.append((chosen, f"{chosen} (missing)", "Not on this computer; the object keeps its values", "ERROR"))
     return [_items.setdefault((row[0], repr((row, index))), (*row, index)) for index, row in enumerate(rows)]
@@ -87,6 +90,11 @@ TITLES = {
 def preset_title(name: str) -> str:
     """Return the display name of the preset ``name``."""
     return TITLES.get(name) or (name.capitalize() if name in _SHIPPED.good else name)
+
+
+def own_title(likeness: str) -> str:
+    """Return the display name of numbers of no preset, such as ``Like Plastic (hard)`` where they were recognised."""
+    return f"Like {preset_title(likeness)}" if likeness else preset_title(CUSTOM)
 
 
 def _summary(model: type) -> str:
@@ -121,6 +129,9 @@ def _from_medium(field: str, name: str, description: str = "", **arguments: Any)
 NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "preset")
 """Fields of ``sim.scene.material.Material`` that the user can set."""
 
+ADVANCED = ("relaxing_share", "relaxation_time", "fibre_modulus", "fibre_axis")
+"""Fields that few change."""
+
 LAW_FIELDS = {
     "rigid": ("rigid_restitution",),
     **{model.law: tuple(name for name in model.reads if name not in model.hidden) for model in models()},
@@ -131,7 +142,7 @@ LAW_FIELDS = {
 def _preset_items(
     self: "PHYSGEN_PG_material", context: bpy.types.Context | None
 ) -> list[tuple[str, str, str, str, int]]:
-    return preset_items(self.preset_name)
+    return preset_items(self.preset_name, self.likeness)
 
 
 def _get_preset(self: "PHYSGEN_PG_material") -> int:
@@ -186,6 +197,7 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
     )
     preset_name: StringProperty(default=STARTS_AS)
     """Shown by ``preset``; also if there is no such preset on this computer."""
+    likeness: StringProperty(description="Preset from which the numbers of a recognised object were derived")
     law: _from_medium("law", "Behaviour", "Constitutive model", items=LAW_ITEMS)
     density: _from_medium(
         "density",
@@ -199,7 +211,7 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
     youngs_modulus: _from_medium(
         "youngs_modulus",
         "Stiffness",
-        "Young's modulus in Pa: jelly 2.5e4, soft rubber 1e6. Ten times as stiff takes three times as long",
+        "Young's modulus: jelly 25 kPa, soft rubber 1 MPa. Ten times as stiff takes three times as long",
         soft_max=1e8,
         precision=0,
     )
@@ -212,17 +224,18 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
     damping_time: _from_medium(
         "damping_time",
         "Damping",
-        "Damping time in seconds: viscosity over stiffness (Kelvin-Voigt). 0: none",
+        "Damping time: viscosity over stiffness (Kelvin-Voigt)",
         soft_max=0.1,
         precision=4,
     )
     relaxing_share: _from_medium(
         "relaxing_share",
         "Relaxing Share",
-        "Stiffness that gives way with time, over the lasting one. 0: bounces on; rubber 0.1, plush 2",
+        "Stiffness that gives way with time, over the lasting one: rubber 0.1, plush 2",
         soft_max=5.0,
         precision=2,
     )
+    relaxes: switch("relaxing_share", "Gives Way", "A part of the stiffness gives way with time: it bounces less", 0.5)
     relaxation_time: _from_medium(
         "relaxation_time",
         "Relaxation Time",
@@ -235,11 +248,12 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         "Bounce",
         "Speed after over speed before an impact on hard things, where surfaces say none",
         precision=2,
+        subtype="FACTOR",
     )
     yield_stress: _from_medium(
         "yield_stress",
         "Yield Stress",
-        "Stress in Pa above which deformation is permanent",
+        "Stress above which deformation is permanent",
         soft_max=1e8,
         precision=0,
     )
@@ -251,32 +265,60 @@ class PHYSGEN_PG_material(bpy.types.PropertyGroup):
         "Compression",
         "Compressive strain above which snow packs permanently",
         precision=4,
+        subtype="FACTOR",
     )
-    critical_stretch: _from_medium("critical_stretch", "Stretch", "Tensile strain above which snow tears", precision=4)
+    critical_stretch: _from_medium(
+        "critical_stretch", "Stretch", "Tensile strain above which snow tears", precision=4, subtype="FACTOR"
+    )
     hardening: _from_medium("hardening", "Hardening", "Stiffening of packed snow")
     bulk_modulus: _from_medium(
         "bulk_modulus",
         "Bulk Modulus",
-        "Bulk modulus of a fluid in Pa. Real water has 2.2e9; 2e5 is enough here, and faster",
+        "Bulk modulus of a fluid. Real water has 2.2 GPa; 200 kPa is enough here, and faster",
         soft_max=1e7,
         precision=0,
     )
     viscosity: _from_medium(
         "viscosity",
         "Viscosity",
-        "Dynamic viscosity in Pa s: water 0.001, honey 10",
+        "Dynamic viscosity: water 1 mPa s, honey 10 Pa s",
         soft_max=100.0,
         precision=3,
     )
     fibre_modulus: _from_medium(
         "fibre_modulus",
         "Fibre Modulus",
-        "Stiffness in Pa that fibres add along their axis; 0 for none",
+        "Stiffness that fibres add along their axis",
         soft_max=1e8,
         precision=0,
     )
+    has_fibres: switch("fibre_modulus", "Fibres", "Fibres make it stiffer along their axis", 1e6)
     fibre_axis: _from_medium("fibre_axis", "Fibre Axis", "Direction of the fibres at rest", subtype="DIRECTION")
 
+
+WITH_UNITS = {
+    "density": DENSITY,
+    "youngs_modulus": PRESSURE,
+    "yield_stress": PRESSURE,
+    "bulk_modulus": PRESSURE,
+    "fibre_modulus": PRESSURE,
+    "viscosity": VISCOSITY,
+}
+"""Fields of kinds that Blender's properties have no unit for → units; ``shown_as(field)`` shows one with its unit."""
+
+
+def shown_as(field: str) -> str:
+    """Return the name of the property that shows ``field`` with its unit."""
+    return f"{field}_shown"
+
+
+def _shown(field: str, units: Units) -> Any:
+    # A deferred property: its arguments are those of the call.
+    given = PHYSGEN_PG_material.__annotations__[field].keywords
+    return with_unit(field, given["name"], f"{given['description']}. Any unit may be typed", units)
+
+
+PHYSGEN_PG_material.__annotations__.update({shown_as(name): _shown(name, kind) for name, kind in WITH_UNITS.items()})
 
 # Parameters that a constitutive model adds to the material.
 PHYSGEN_PG_material.__annotations__.update(

@@ -59,7 +59,7 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         ObjectRequest,
         "size_m",
         "Size",
-        "Largest extent of the object. One known size sets the scale of the scene; 0: estimated from the photo",
+        "Largest extent of the object. One known size sets the scale of the scene",
         min=0.0,
         soft_max=2.0,
         precision=3,
@@ -120,11 +120,12 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         ObjectRequest,
         "thickness",
         "Thickness",
-        "Depth of the body over its width, 0.02 to 3; 1 makes a ball of a disc. 0: judged by what it is",
+        "Depth of the body over its width, 0.02 to 3; 1 makes a ball of a disc",
         min=0.0,
         precision=2,
         step=5,
     )
+    own_thickness: switch("thickness", "Own Thickness", "Give its thickness; off: judged by what it is", 0.5)
     mesh: StringProperty(
         name="Mesh",
         description="OBJ, GLB, PLY or STL file that is fitted to the photo, in place of a body from the outline",

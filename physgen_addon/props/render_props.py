@@ -11,7 +11,7 @@ from ...sim.validation import range_of
 from ..paths import RELATIVE
 from ..render.render_options import RenderOptions
 from ..text import decimal
-from .generated_properties import from_field, help_text, switch
+from .generated_properties import from_field, help_text, percentage, switch
 
 LEAST_F_NUMBER = range_of(RenderOptions, "f_number")[0]
 """Of a real lens; 0 stands for none."""
@@ -56,7 +56,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         RenderOptions,
         "samples",
         "Samples",
-        f"{help_text(RenderOptions, 'samples')}; 0 is the engine's default",
+        help_text(RenderOptions, "samples"),
         default=0,
         min=0,
         soft_max=256,
@@ -65,12 +65,13 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     scale: from_field(
         RenderOptions,
         "scale",
-        "Size",
+        "Scale",
         "Share of the photo's resolution",
         min=0.05,
         soft_max=1.0,
         subtype="FACTOR",
     )
+    size: percentage("scale", "Size", "Share of the photo's resolution", low=5.0, high=400.0)
     format: EnumProperty(
         name="Format",
         description="Of the frames' files; each format needs an output folder of its own",
@@ -110,7 +111,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         RenderOptions,
         "f_number",
         "F-Number",
-        f"{help_text(RenderOptions, 'f_number')}; 0: off",
+        help_text(RenderOptions, "f_number"),
         min=0.0,
         soft_max=22.0,
         precision=1,
@@ -125,7 +126,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         RenderOptions,
         "focus_distance",
         "Focus",
-        "Distance of the plane of focus; 0: each object is in focus at rest",
+        "Distance of the plane of focus",
         soft_max=10.0,
     )
     result: StringProperty(name="Result", description="Last rendered file", subtype="FILE_PATH", options=RELATIVE)

@@ -96,7 +96,7 @@ def fill_body(
     settings = scene.physgen.simulation
     rate, first = settings.slow * scene.render.fps / scene.render.fps_base, settings.frame_start
     body.enabled, body.source, body.role = True, source.name, source.role
-    _fill_material(body.material, source.material)
+    fill_material(body.material, source.material)
     body.fill, body.shell_thickness = source.fill, source.shell_thickness or 0.0
     body.velocity, body.spin = source.velocity, source.spin
     body.asleep, body.held = source.asleep, source.held
@@ -125,11 +125,13 @@ def fill_body(
         _animate_collider(item, source.motion, first, rate)
 
 
-def _fill_material(target: bpy.types.PropertyGroup, material: Material) -> None:
+def fill_material(target: bpy.types.PropertyGroup, material: Material) -> None:
+    """Set ``target`` to ``material``: its preset, or its own numbers and the preset that they were derived from."""
     set_material(target, material)
-    target.preset_name = material.preset
+    target.preset_name, target.likeness = material.preset, ""
     if material_props.find_preset(material.preset) is None or is_modified(target):
         target.preset_name = material_props.CUSTOM
+        target.likeness = material.preset if material_props.find_preset(material.preset) is not None else ""
 
 
 def _fill_surface(body: bpy.types.PropertyGroup, source: SceneObject, ground: Ground) -> None:

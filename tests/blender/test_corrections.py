@@ -36,7 +36,7 @@ from physgen.physgen_addon.photo.photo_request import (
     take_camera,
 )
 from physgen.physgen_addon.props.body_props import PHYSGEN_PG_body
-from physgen.physgen_addon.props.material_props import PHYSGEN_PG_material, is_modified
+from physgen.physgen_addon.props.material_props import WITH_UNITS, PHYSGEN_PG_material, is_modified, shown_as
 from physgen.physgen_addon.props.photo_props import PHYSGEN_PG_photo_box
 from physgen.physgen_addon.scene_io import import_physics
 from physgen.physgen_addon.scene_io.import_scene import import_scene
@@ -331,10 +331,11 @@ def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
     kept = {name for names in import_physics.OF_BODY for name in names}
     others = {"rna_type", "name", "enabled", "source", "cache", "material", "speed", "pins", "pin_index", "original"}
     # Ways to show and set the number or the choice that is kept.
-    others |= {"surface", "own_wall", "waits"}
+    others |= {"surface", "own_wall", "waits", "holds_shape"}
     assert set(PHYSGEN_PG_body.bl_rna.properties.keys()) == kept | others
     kept = {name for names in import_physics.OF_MATERIAL for name in names}
-    assert set(PHYSGEN_PG_material.bl_rna.properties.keys()) == kept | {"rna_type", "name", "preset"}
+    others = {"rna_type", "name", "preset", "likeness", "relaxes", "has_fibres", *map(shown_as, WITH_UNITS)}
+    assert set(PHYSGEN_PG_material.bl_rna.properties.keys()) == kept | others
 
 
 # -- panels -----------------------------------------------------------------------------------------------------------
