@@ -49,7 +49,8 @@ class Layers:
     """Layers of a photo, (H, W) bool or (H, W, 3) uint8 at working size, in the order of the objects.
 
     seen: visible pixels of each object; full: its whole mask. shadows, holes: of each object, without other objects.
-    colours: the photo with the hidden part of each object painted in its own colours. front_to_back: indices.
+    colours: the photo with the hidden part of each object painted in its own colours. background: the clean plate; the
+    photo until ``make_clean_plate``. front_to_back: indices.
     uncovered: by index, the picture after each removal that revealed something. unboxed: things without a box, or
     None.
     """
@@ -94,34 +95,27 @@ def separate_layers(
     unboxed = UnboxedThings(stay=np.asarray(cast["stay"], dtype=bool), whole=np.asarray(cast["whole"], dtype=bool))
     steps.begin("order")
     order = _order(seen, names, options, depth, steps.notice)
-    fill = _filler(pixels, view, options, inpainter, unboxed.whole)
+    fill = _filler(view, options, inpainter, unboxed.whole)
     full, colours, uncovered = _complete(
         pixels, seen, shadows, unboxed.whole, boxes, names, order, view, options, fill, store, steps
     )
     # Where the penumbra is known, less dilation is needed.
     share = PENUMBRA_DILATION / PAPER_DILATION if options.shadow_threshold is None else 1.0
     holes = object_holes(seen, darkened, share * options.hole_dilation * max(pixels.shape[:2]) / 1024.0, unboxed.stay)
-    steps.begin("background")
-    union, objects = np.logical_or.reduce(holes), np.logical_or.reduce(list(seen))
-    made = store.run(
-        "background",
-        {**_fill_inputs(pixels, view, options), "hole": union, "objects": objects, "barred": unboxed.whole},
-        partial(_filled, fill, pixels, union, objects),
-    )
     return Layers(
         seen=tuple(seen),
         full=tuple(full),
         shadows=tuple(shadows),
         holes=tuple(holes),
         colours=tuple(colours),
-        background=made["picture"],
+        background=pixels,
         front_to_back=order,
         uncovered=uncovered,
         unboxed=unboxed.whole,
     )
 
 
-def separate_gloss(
+def make_clean_plate(
     layers: Layers,
     pixels: Pixels,
     surfaces: Sequence[TexturedSurface],
@@ -132,10 +126,10 @@ def separate_gloss(
     store: StageCache,
     steps: Steps,
 ) -> tuple[Layers, GroundGloss]:
-    """Return ``layers`` whose background is free of mirror images in the ground, and its gloss.
+    """Return ``layers`` with the background, free of objects, shadows and mirror images, and the ground's gloss.
 
-    surfaces: of the objects' bodies, in the unit of ``view``. Other arguments as of ``separate_layers``. Where nothing
-    is mirrored, ``layers`` are returned as they are.
+    surfaces: of the objects' bodies, in the unit of ``view``. Other arguments as of ``separate_layers``. Raises
+    InputError when hardly any background is left.
     """
     unboxed = np.zeros_like(layers.seen[0]) if layers.unboxed is None else layers.unboxed
     objects = np.logical_or.reduce(list(layers.seen))
@@ -148,16 +142,21 @@ def separate_gloss(
     reflectivity, roughness, correlation, by_chance = (float(v) for v in made["numbers"])
     images = tuple(np.asarray(image, dtype=bool) for image in made["images"])
     gloss = GroundGloss(reflectivity, roughness, correlation, by_chance, images, made["bare"])
-    if reflectivity == 0.0:
-        return layers, gloss
-    union = np.logical_or.reduce(layers.holes)
-    fill = _filler(pixels, view, options, inpainter, unboxed)
+    holes = tuple(hole | image for hole, image in zip(layers.holes, images, strict=True))
+    union, mirrored = np.logical_or.reduce(layers.holes), np.logical_or.reduce(images)
+    steps.begin("background")
+    fill = _filler(view, options, inpainter, unboxed, mirrored)
     filled = store.run(
         "background",
-        {**_fill_inputs(gloss.pixels, view, options), "hole": union, "objects": objects, "barred": unboxed},
+        {
+            **_fill_inputs(gloss.pixels, view, options),
+            "hole": union,
+            "objects": objects,
+            "barred": unboxed,
+            "mirrored": mirrored,
+        },
         partial(_filled, fill, gloss.pixels, union, objects),
     )
-    holes = tuple(hole | image for hole, image in zip(layers.holes, images, strict=True))
     return replace(layers, holes=holes, background=filled["picture"]), gloss
 
 
@@ -179,13 +178,19 @@ Fill = Callable[[Pixels, Mask, Mask, Notice], Pixels]
 
 
 def _filler(
-    pixels: Pixels, view: Camera, options: ReconstructOptions, inpainter: Inpainter | None, unboxed: Mask
+    view: Camera,
+    options: ReconstructOptions,
+    inpainter: Inpainter | None,
+    unboxed: Mask,
+    mirrored: Mask | None = None,
 ) -> Fill:
     settings = FillOptions(radius=options.patch_radius, limit=options.inpaint_pixels, seed=options.seed)
 
     def fill(picture: Pixels, hole: Mask, objects: Mask, notice: Notice) -> Pixels:
         if inpainter is None:
-            return fill_background(picture, hole, objects, view, settings, notice, barred=unboxed)
+            # What was mirrored is levelled, which an adapter does not do: it keeps the photo without it.
+            whole = hole if mirrored is None else hole | (mirrored & ~unboxed)
+            return fill_background(picture, whole, objects, view, settings, notice, unboxed, mirrored)
         return blend(picture, inpainter(picture, hole), hole, objects) if hole.any() else picture.copy()
 
     return fill

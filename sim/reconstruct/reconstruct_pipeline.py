@@ -33,7 +33,7 @@ from .camera.depth_map import DepthMap, read_depth
 from .lighting.ground_gloss import GroundGloss
 from .lighting.light_estimate import ENVIRONMENT_FILE, LitScene, estimate_light
 from .photo import Photo, load_photo
-from .photo_layers import Layers, separate_gloss, separate_layers
+from .photo_layers import Layers, make_clean_plate, separate_layers
 from .reasoning.answer_parser import Answers, read_answer
 from .reasoning.chat_client import ChatRequest
 from .reasoning.material_decision import (
@@ -223,7 +223,7 @@ def reconstruct_photo(
             steps=steps,
         )
         bodies = make_bodies(layers, estimate.camera, objects, options, store, steps, depth=depth)
-        layers, gloss = separate_gloss(
+        layers, gloss = make_clean_plate(
             layers,
             picture.pixels,
             [body.surface for body in bodies],

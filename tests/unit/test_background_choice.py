@@ -162,12 +162,14 @@ def test_fill_is_not_extended_into_shade():
     photo = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     hole = disc(100, 75, 30)
     shade = ~hole & disc(100, 75, 40)
-    photo[shade] = 20
-    photo[hole] = 120
     filling = np.full_like(photo, 120)
     inner, thing = disc(100, 75, 26), disc(100, 75, 15)
-    assert blend(photo, filling, hole, thing)[inner].min() < 110
+    photo[shade] = 95
+    assert blend(photo, filling, hole, thing)[inner].max() < 110
     assert blend(photo, filling, hole, thing, shade)[inner].min() == 120
+    # So dark beside the hole is a thing, and no difference of level.
+    photo[shade] = 20
+    assert blend(photo, filling, hole, thing)[inner].min() == 120
 
 
 def test_a_soft_filling_becomes_as_grainy_as_its_surroundings():

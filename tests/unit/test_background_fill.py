@@ -116,7 +116,10 @@ def test_no_object_shows_through_the_border():
     assert (blended[~hole] == photo[~hole]).all()
     # The filling is led up to the photo's level at the border, and nothing is brighter than that.
     assert blended[hole].max() <= 121
-    assert blended[disc(120, 90, 5)].max() <= 104
+    assert blended[disc(120, 90, 5)].min() >= 117
+    # Nor is it led up to the thing.
+    dark = blend(photo, np.full_like(photo, 20), hole, thing)
+    assert dark[disc(120, 90, 26)].max() <= 21
     assert blended[hole & ~disc(120, 90, 33)].mean() > 112
 
 

@@ -18,8 +18,9 @@ from ...composite.inpaint import FillOptions
 from ...errors import InputError
 from ...scene.model import Camera
 from .inpainting_methods import METHODS, InpaintingTask, MethodChoice, box, choose_method
+from .relit_ground import continued, relit
 from .surface_edges import Edge, edges_behind
-from .surface_inpainting import logarithms
+from .surface_inpainting import DARKEST, logarithms
 
 Mask = NDArray[np.bool_]
 
@@ -27,9 +28,10 @@ FEATHER = 4.0
 """Pixels at 1024 over which the inpainting fades into the photo, inside the hole only."""
 CLEAR = 2.0
 """Pixels beside an object that are mixed with it."""
-LEVEL, REACH = 3.0, 10.0
-"""Pixels at 1024: blur in which levels are compared along the border, and depth over which a difference is
-compensated."""
+LEVEL = 3.0
+"""Pixels at 1024: blur in which levels are compared along the border."""
+STEP = 0.4
+"""Difference in logarithms along the border above which it is the edge of a thing, and not one of level."""
 
 
 def blend(
@@ -73,9 +75,13 @@ def feather(hole: Mask, objects: Mask) -> NDArray[np.float32]:
 def _lead(
     photo: NDArray[np.float32], filled: NDArray[np.float32], hole: Mask, objects: Mask, unit: float
 ) -> NDArray[np.float32]:
-    """Correction (H, W, 3) that matches the level of ``filled`` to the photo's at the border of the hole."""
+    """Correction (H, W, 3) that matches the level of ``filled`` to the photo's at the border of the hole.
+
+    The difference along the border is continued inside as a membrane, so that no border of its own stays in sight.
+    """
     rows, columns = np.flatnonzero(hole.any(axis=1)), np.flatnonzero(hole.any(axis=0))
-    room = round(4 * REACH * unit) + 4
+    band = max(2.0, LEVEL * unit)
+    room = round(4 * band) + 4
     window = (
         slice(max(0, rows[0] - room), rows[-1] + 1 + room),
         slice(max(0, columns[0] - room), columns[-1] + 1 + room),
@@ -83,7 +89,6 @@ def _lead(
     inside, stood = hole[window], objects[window]
     depth = ndimage.distance_transform_edt(np.pad(inside, 1, mode="edge"))[1:-1, 1:-1]
     outer = ndimage.distance_transform_edt(~inside) if not inside.all() else np.full(inside.shape, np.inf)
-    band = max(2.0, LEVEL * unit)
     clear = ndimage.distance_transform_edt(~stood) > CLEAR + 1.0 if stood.any() else np.ones_like(inside)
     shown = ~inside & (outer <= band) & clear
     new = inside & (depth <= band)
@@ -99,15 +104,13 @@ def _lead(
 
     seen, seen_weight = level(photo[window], shown)
     mine, my_weight = level(filled[window], new)
-    rim = new & (depth <= 1.5) & (seen_weight > 1e-3) & (my_weight > 1e-3)
+    gap = seen - mine
+    # A larger step is the edge of a thing.
+    small = np.abs(np.log(np.maximum(seen, DARKEST)) - np.log(np.maximum(mine, DARKEST))).max(axis=-1) < STEP
+    rim = new & (depth <= 1.5) & (seen_weight > 1e-3) & (my_weight > 1e-3) & small
     if not rim.any():
         return result
-    gap = np.where(rim[..., None], seen - mine, 0.0).astype(np.float32)
-    spread = REACH * unit
-    weight = cv2.GaussianBlur(rim.astype(np.float32), (0, 0), spread)
-    smooth = cv2.GaussianBlur(gap, (0, 0), spread) / np.maximum(weight, 1e-6)[..., None]
-    fade = np.exp(-np.square(depth / (2.0 * spread)))[..., None]
-    result[window] = np.where(inside[..., None] & (weight > 1e-5)[..., None], smooth * fade, 0.0)
+    result[window] = np.where(inside[..., None], continued(gap, rim, inside), 0.0)
     return result
 
 
@@ -160,6 +163,8 @@ Notice = Callable[[str], None]
 
 SMALL = 2e-4
 """Share of the photo below which a part uses the default method without a trial."""
+SPECK = 0.02
+"""Share of a surface's part of the hole below which pieces of it are inpainted together."""
 GUESSED = 1.0
 """Gain in decibels over a plain colour below which the inpainting is a guess."""
 GOOD = 32.0
@@ -178,6 +183,7 @@ def fill_background(
     options: FillOptions | None = None,
     notice: Notice = lambda _: None,
     barred: Mask | None = None,
+    changed: Mask | None = None,
 ) -> NDArray[np.uint8]:
     """Return ``pixels`` (H, W, 3) sRGB with ``hole`` (H, W) inpainted; outside the hole it equals the photo bit for
     bit.
@@ -208,7 +214,7 @@ def fill_background(
         # Leftover shadow outside of the hole is neither a source nor a reference level.
         dark = leftover_shadow(logarithms(filling), part, open_hole | barred)
         shade |= dark
-        _fill_part(filling, part, open_hole, barred | dark, camera, options, notice)
+        _fill_part(filling, part, open_hole, barred | dark, objects, changed, camera, options, notice)
         open_hole &= ~part
     return blend(pixels, filling, hole, objects, shade)
 
@@ -230,6 +236,8 @@ def _fill_part(
     part: Mask,
     open_hole: Mask,
     barred: Mask,
+    objects: Mask,
+    changed: Mask | None,
     camera: Camera,
     options: FillOptions,
     notice: Notice,
@@ -238,24 +246,57 @@ def _fill_part(
     edges = edges_behind(logarithms(filling), part, open_hole | barred)
     for side, ground in _sides(edges, part.shape):
         target = part & side
-        if not target.any():
-            continue
-        task = InpaintingTask(filling, target, barred | (open_hole & ~part) | ~side, camera, options)
-        # Surfaces beyond the ground's far border never use the top view.
-        ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
-        choice = (
-            choose_method(task, ways) if target.sum() > SMALL * target.size else MethodChoice(PHOTO_WAYS[0], {}, np.inf)
-        )
-        reliable = choice.certain >= GUESSED or choice.scores.get(choice.way, 0.0) >= GOOD
-        if not reliable and target.sum() > NOTICED * target.size:
-            rows, columns = box(target, 0)
-            notice(
-                f"the background behind columns {columns.start} to {columns.stop}, rows {rows.start} to {rows.stop} "
-                "is a guess: its surroundings do not determine it; give a photo without the objects (--inpainter"
-                " picture:FILE) if it matters"
-            )
-        filling[target] = METHODS[choice.way](task)[target]
+        if ground:
+            closed = barred | (open_hole & ~part) | ~side
+            filling[...], target = relit(filling, target, closed, objects, changed)
+        others = barred | (open_hole & ~part) | ~side
+        _fill_surface(filling, target, others, objects, ground, camera, options, notice)
     _soften(filling, part, edges)
+
+
+def _fill_surface(
+    filling: Picture,
+    target: Mask,
+    closed: Mask,
+    objects: Mask,
+    ground: bool,
+    camera: Camera,
+    options: FillOptions,
+    notice: Notice,
+) -> None:
+    """Inpaint ``target`` of one surface in ``filling``, in place, piece by piece, each at the level of its border."""
+    pieces = _pieces(target)
+    if not pieces:
+        return
+    # Surfaces beyond the ground's far border never use the top view.
+    ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
+    largest = pieces[-1]
+    task = InpaintingTask(filling, largest, closed | (target & ~largest), camera, options)
+    choice = MethodChoice(PHOTO_WAYS[0], {}, np.inf)
+    if largest.sum() > SMALL * largest.size:
+        choice = choose_method(task, ways)
+    reliable = choice.certain >= GUESSED or choice.scores.get(choice.way, 0.0) >= GOOD
+    if not reliable and largest.sum() > NOTICED * largest.size:
+        rows, columns = box(largest, 0)
+        notice(
+            f"the background behind columns {columns.start} to {columns.stop}, rows {rows.start} to {rows.stop} "
+            "is a guess: its surroundings do not determine it; give a photo without the objects (--inpainter"
+            " picture:FILE) if it matters"
+        )
+    left = target
+    for piece in pieces:
+        left = left & ~piece
+        task = InpaintingTask(filling, piece, closed | left, camera, options)
+        filled = METHODS[choice.way](task)
+        filled += _lead(filling, filled, piece, objects | closed | left, max(piece.shape) / 1024.0)
+        filling[piece] = np.clip(filled, 0.0, 255.0)[piece]
+
+
+def _pieces(target: Mask) -> list[Mask]:
+    """The connected parts of ``target``, smallest first; specks come together."""
+    parts = _parts(target)
+    specks = [part for part in parts if part.sum() <= max(SMALL * part.size, SPECK * target.sum())]
+    return parts if len(specks) < 2 else [np.logical_or.reduce(specks), *parts[len(specks) :]]
 
 
 def _sides(edges: list[Edge], shape: tuple[int, int]) -> list[tuple[Mask, bool]]:

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""Ground in shadow keeps its texture: only the light that it lacks is put back, and the rest of the hole is smaller.
+
+A shadow, or a mirror image that was not wholly taken out, changes the ground's level and leaves its pattern in sight.
+What the level should be is continued from the border of the hole as a membrane (Pérez et al., Poisson image editing,
+SIGGRAPH 2003) over a smooth field of light. The lack is the difference, smoothed at each place over the largest scale
+that explains it as well as finer ones do, by the deviations that the surface's own pattern has at these scales
+(Lepski's rule). Where the lack is too deep, changes too suddenly, or leaves colours that the surface has nowhere, the
+place is inpainted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg
+
+from .surface_inpainting import AXES, light_field, logarithms
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.float32]
+
+CELLS = 80_000
+"""Largest size of the copy on which levels are compared."""
+MARGIN = 0.6
+"""Margin of the photo around the hole, over its larger extent."""
+SCALES = (0.2, 0.1, 0.05, 0.025, 0.0125)
+"""Blurs over the hole's size at which the lack of light is measured."""
+USUAL = 2.5
+"""Deviations of the surface's pattern up to which a coarser scale explains the lack as well as a finer one."""
+EXPECTED = 0.7
+"""The same where the picture was changed, and so certainly is wrong by a little."""
+STRANGE = 3.0
+"""The same beyond which a colour is not the surface's."""
+LEAST = 0.015
+"""Smallest deviation in logarithms: below it is noise."""
+DEEPEST = 0.7
+"""Lack in logarithms of sRGB values, four times less light, above which noise would show."""
+SLIVER = 0.02
+"""Half the least width over the hole's size of a part whose light is put back."""
+FEWEST = 40
+"""Fewest cells of shaded ground, and of ground around it."""
+RIM = 10.0
+"""Pixels at 1024 around objects that are always inpainted: their outline may be wrong by so much, and there shadows are
+deepest."""
+
+
+def membrane(values: Picture, fixed: Mask, free: Mask) -> Picture:
+    """Return ``values`` (h, w, c) continued from the pixels ``fixed`` (h, w) over ``free`` without curvature.
+
+    It solves Laplace's equation with the values at ``fixed``, and no flux across any other border. 0 in parts of
+    ``free`` that touch no fixed pixel; elsewhere as given.
+    """
+    free = free & ~fixed
+    count = int(free.sum())
+    result = values.astype(np.float32, copy=True)
+    if not count:
+        return result
+    index = np.full(free.shape, -1, dtype=np.int64)
+    index[free] = np.arange(count)
+    diagonal = np.full(count, 1e-7)
+    target = np.zeros((count, values.shape[-1]))
+    entries: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    ahead, behind = slice(1, None), slice(None, -1)
+    whole = slice(None)
+    for mine, other in (
+        ((ahead, whole), (behind, whole)),
+        ((behind, whole), (ahead, whole)),
+        ((whole, ahead), (whole, behind)),
+        ((whole, behind), (whole, ahead)),
+    ):
+        both = free[mine] & free[other]
+        entries.append((index[mine][both], index[other][both]))
+        held = free[mine] & fixed[other]
+        np.add.at(target, index[mine][held], values[other][held])
+        for joined in (both, held):
+            np.add.at(diagonal, index[mine][joined], 1.0)
+    rows, columns = (np.concatenate(part) for part in zip(*entries, strict=True))
+    system = sparse.csc_matrix((np.full(len(rows), -1.0), (rows, columns)), shape=(count, count))
+    system = (system + sparse.diags(diagonal)).tocsc()
+    result[free] = linalg.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(target)
+    return result
+
+
+MEMBRANE_PIXELS = 30_000
+"""Largest size of the copy on which a membrane over a full picture is solved: it has no detail."""
+
+
+def continued(values: Picture, fixed: Mask, free: Mask) -> Picture:
+    """Return the ``membrane`` over ``free`` (h, w) at full size, solved on a smaller copy; 0 where there is none."""
+    height, width = free.shape
+    scale = min(1.0, float(np.sqrt(MEMBRANE_PIXELS / free.size)))
+    if scale > 0.9:
+        return np.where((free | fixed)[..., None], membrane(values, fixed, free), 0.0).astype(np.float32)
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    held = fixed.astype(np.float32)
+    total, share, inner = (
+        cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+        for part in (np.asarray(values * held[..., None], np.float32), held, free.astype(np.float32))
+    )
+    means = np.asarray(total.reshape(*share.shape, -1) / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
+    small = membrane(means, share > 0.0, inner > 0.0)
+    # What is interpolated beside the border must not mix in cells that the membrane does not cover.
+    covered = (share > 0.0) | (inner > 0.0)
+    small = np.where(covered[..., None], small, smoothed(small, covered, 1.0))
+    whole = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole.reshape(values.shape), dtype=np.float32)
+
+
+def smoothed(values: Picture, where: Mask, blur: float) -> Picture:
+    """Return the mean (h, w, c) of ``values`` over pixels ``where`` (h, w) nearby; 0 where none is near."""
+    weight = where.astype(np.float32)
+    total = cv2.GaussianBlur(np.ascontiguousarray(values * weight[..., None], dtype=np.float32), (0, 0), blur)
+    share = cv2.GaussianBlur(weight, (0, 0), blur)
+    return np.asarray(total.reshape(values.shape) / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """A coarse copy around the hole: logarithms (h, w, 3); cells of known ground, of the hole, and of its core, which
+    is inpainted in any case."""
+
+    logs: Picture
+    known: Mask
+    hole: Mask
+    core: Mask
+
+    @property
+    def side(self) -> float:
+        """Size of the hole in cells."""
+        return float(np.sqrt(max(int(self.hole.sum()), 1)))
+
+
+def relit(
+    picture: Picture, target: Mask, closed: Mask, objects: Mask, changed: Mask | None = None
+) -> tuple[Picture, Mask]:
+    """Return ``picture`` (H, W, 3), 0 to 255, with the light that the ground in ``target`` (H, W) lacks put back, and
+    what of ``target`` is left to inpaint.
+
+    One surface. closed: (H, W) other pixels that say nothing about it. objects: (H, W) pixels that do not show the
+    ground. changed: (H, W) where something was taken out of the picture, such as a mirror image; there the level may
+    have to fall as well. Outside of ``target`` the picture is returned as it is.
+    """
+    rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
+    room = round(MARGIN * max(np.ptp(rows), np.ptp(columns))) + 8
+    window = (
+        slice(max(0, int(rows[0]) - room), int(rows[-1]) + 1 + room),
+        slice(max(0, int(columns[0]) - room), int(columns[-1]) + 1 + room),
+    )
+    inside = target[window]
+    height, width = inside.shape
+    reach = RIM * max(target.shape) / 1024.0
+    near = objects[window] & inside
+    if near.any():
+        near = cv2.distanceTransform((~near).astype(np.uint8), cv2.DIST_L2, 5) <= reach
+    shaded = inside & ~near
+    scale = min(1.0, float(np.sqrt(CELLS / inside.size)))
+    if shaded.sum() * scale**2 < FEWEST:
+        return picture, target
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    logs = logarithms(picture[window])
+
+    def part_of(mask: Mask) -> Picture:
+        return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+    cut = part_of(inside)
+    cells = _Cells(
+        logs=np.asarray(cv2.resize(logs, size, interpolation=cv2.INTER_AREA), dtype=np.float32),
+        known=np.asarray((part_of(closed[window] & ~inside) + cut) < 1e-3),
+        hole=np.asarray(cut > 0.0),
+        core=np.asarray(part_of(near & inside) > 0.0),
+    )
+    if cells.known.sum() < FEWEST:
+        return picture, target
+    lack, trusted = _lack(cells, None if changed is None else part_of(changed[window]) > 0.0)
+    gain = cv2.resize(lack, (width, height), interpolation=cv2.INTER_LINEAR)
+    sure = cv2.resize(trusted.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    take = shaded & sure
+    result = picture.copy()
+    result[window] = np.where(take[..., None], np.exp(logs + gain), picture[window])
+    left = target.copy()
+    left[window] &= ~take
+    return result, left
+
+
+def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
+    """The light (h, w, 3) that the cells of the hole lack, in logarithms, and where that is sure."""
+    slow, _ = light_field(cells.logs, cells.known, cells.hole)
+    pattern = cells.logs - slow
+    # The border's level, not its single pixels, is continued inside.
+    border = smoothed(pattern, cells.known, max(1.0, SCALES[-1] * cells.side))
+    level = membrane(np.where(cells.known[..., None], border, 0.0).astype(np.float32), cells.known, cells.hole)
+    ground = cells.known | (cells.hole & ~cells.core)
+    difference = np.where(ground[..., None], level - pattern, 0.0).astype(np.float32)
+    blurs = [max(1.0, scale * cells.side) for scale in SCALES]
+    means = [smoothed(difference, ground, blur) @ AXES.T for blur in blurs]
+    usual = [smoothed(pattern, cells.known, blur) @ AXES.T for blur in blurs]
+    away = cv2.distanceTransform((~cells.hole).astype(np.uint8), cv2.DIST_L2, 5)
+    around = cells.known & (away > 2.0)
+    if around.sum() < FEWEST:
+        around = cells.known
+    altered = np.zeros_like(cells.hole) if changed is None else changed
+    most = np.where(altered, EXPECTED, USUAL).astype(np.float32)
+    chosen, sudden = means[-1].copy(), np.zeros_like(cells.hole)
+    for coarse in range(len(blurs) - 2, -1, -1):
+        fits = np.ones(cells.hole.shape, dtype=bool)
+        for fine in range(coarse + 1, len(blurs)):
+            spread = np.maximum(_spread((usual[fine] - usual[coarse])[around]), LEAST)
+            fits &= (np.abs(means[fine] - means[coarse]) < most[..., None] * spread).all(axis=-1)
+            if coarse == len(blurs) - 2:
+                sudden = (np.abs(means[fine] - means[coarse]) > USUAL * spread).any(axis=-1)
+        chosen = np.where(fits[..., None], means[coarse], chosen)
+    lack = np.asarray(cv2.GaussianBlur(chosen.astype(np.float32), (0, 0), 1.0))
+    axes = pattern @ AXES.T
+    own = axes - level @ AXES.T + lack
+    strange = np.abs(own) > STRANGE * np.maximum(_spread((axes - usual[0])[around]), 2.0 * LEAST)
+    trusted = ~strange.any(axis=-1) & (np.abs(lack[..., 0]) < DEEPEST) & ~cells.core & ~sudden
+    # Between what is inpainted, slivers of the photo would be islands.
+    wide = 2 * max(1, round(SLIVER * cells.side)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
+    sure = cv2.morphologyEx((trusted | cells.known).astype(np.uint8), cv2.MORPH_OPEN, disc, borderValue=1)
+    trusted = cv2.erode(sure, np.ones((3, 3), np.uint8), borderValue=1) > 0
+    # A shadow takes light away.
+    lack[..., 0] = np.where(altered, lack[..., 0], np.maximum(lack[..., 0], 0.0))
+    back = lack @ np.linalg.inv(AXES).T.astype(np.float32)
+    return np.asarray(back, dtype=np.float32), np.asarray(trusted)
+
+
+def _spread(values: Picture) -> Picture:
+    """Robust standard deviation (c,) of ``values`` (n, c)."""
+    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0), dtype=np.float32)
