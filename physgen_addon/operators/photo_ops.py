@@ -28,7 +28,17 @@ from ..photo.photo_image import (
     why_not_seen,
     write_masks,
 )
-from ..photo.photo_request import LEAST_PX, arguments, mask_files, photo_file, report_page, scene_folder, take_camera
+from ..photo.photo_request import (
+    LEAST_PX,
+    arguments,
+    mask_files,
+    named_boxes,
+    photo_file,
+    report_page,
+    scene_folder,
+    take_camera,
+)
+from ..props.body_props import bodies
 from ..props.preferences import python
 from ..scene_io.import_physics import find_edits, remember_imported, restore_edits
 from ..text import report_errors
@@ -377,6 +387,7 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         changed = find_edits(scene, photo)
         sentence = show_scene(scene, root)
         close_beside(scene)
+        set_materials(scene)
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)
@@ -385,6 +396,14 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
             simulation = scene.physgen.simulation
             simulation.frame_end, simulation.slow = simulation.frame_start + clip["frames"] - 1, clip["slow"]
         return sentence
+
+
+def set_materials(scene: bpy.types.Scene) -> None:
+    """Give the imported objects of ``scene`` the materials that were chosen for their boxes."""
+    chosen = {name: box.preset for name, box in named_boxes(scene.physgen_photo) if box.preset != "auto"}
+    for item in bodies(scene):
+        if preset := chosen.get(item.physgen.source):
+            item.physgen.material.preset = preset
 
 
 class PHYSGEN_OT_open_photo_report(bpy.types.Operator):

@@ -2,6 +2,7 @@
 """Operators: render into the photo, export as Alembic, USD, or a .blend that needs no extension."""
 
 import contextlib
+import itertools
 import os
 import sys
 import tempfile
@@ -23,16 +24,20 @@ from .. import bake_state, paths
 from ..background_jobs import JobOperator, Work
 from ..compat import OperatorMixin
 from ..context import show_result
-from ..frames.frame_index import frame_name
+from ..frames.frame_index import FRAME_NAME, frame_name
 from ..interpreter import find_python, missing_modules, require_renderer
 from ..paths import require_folder
 from ..playback import bake_record, particles, show_bake
 from ..props import preferences
 from ..props.body_props import bodies
 from ..props.render_props import render_options
+from ..render import look_nodes
 from ..render.render_options import render_arguments
 from ..scene_io import export_animation
+from ..text import count, report_errors
 
+FIRST_NUMBER = 1
+"""Number of the file of a bake's first sample."""
 SCRIPT = Path(__file__).resolve().parents[2] / "batch" / "render.py"
 
 
@@ -191,6 +196,44 @@ class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
         path = Path(str(final["out"])) / str(final["video"])
         scene.physgen.rendering.result = str(path)
         return f"rendered {path}"
+
+
+class PHYSGEN_OT_look_nodes(bpy.types.Operator):
+    """Open the rendered frames in Blender's compositor, their layers apart: plate, shadow, objects, masks, grain.
+    Untouched, the nodes give the frames themselves
+    """
+
+    bl_idname = "physgen.look_nodes"
+    bl_label = "Compositor Nodes"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled in Blender 5.0 and later, once frames with layers were rendered."""
+        rendering = context.scene.physgen.rendering
+        if not look_nodes.available():
+            cls.poll_message_set("Needs Blender 5.0")
+            return False
+        if rendering.format != "exr_layers" or not rendering.result:
+            cls.poll_message_set("Render with the format EXR Layers first")
+            return False
+        return True
+
+    @report_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Make or refresh them."""
+        scene = context.scene
+        out = _output_folder(scene)
+        found = {int(path.stem): path for path in out.glob("*.exr") if FRAME_NAME.fullmatch(path.name)}
+        if not found:
+            raise InputError(f"{out}: has no frames with layers; render with the format EXR Layers")
+        # Numbers begin at 1 for the bake's first sample. A sequence of Blender has no gaps.
+        first = min(found)
+        frames = [found[number] for number in itertools.takewhile(found.__contains__, itertools.count(first))]
+        start = scene.physgen.simulation.frame_start + first - FIRST_NUMBER
+        look_nodes.add_look_nodes(scene, frames, first_frame=start)
+        self.report({"INFO"}, f"{count(len(frames), 'frame')} in the compositor; render the image (F12) to see them")
+        return {"FINISHED"}
 
 
 class _ExportOperator(OperatorMixin):

@@ -96,8 +96,11 @@ def open_photo(context: bpy.types.Context) -> str:
         drop_mask(box)
     state.boxes.clear()
     state.camera, state.pitch = "PITCH", math.radians(known["pitch"])
-    for corners, name, size in zip(known["boxes"], known["names"], known["sizes"], strict=True):
+    given = zip(known["boxes"], known["names"], known["sizes"], known["presets"], strict=True)
+    for corners, name, size, preset in given:
         x0, y0, x1, y1 = (round(number) for number in corners)
-        add_box(scene, (x0, y0, x1, y1), name).size_m = size
+        box = add_box(scene, (x0, y0, x1, y1), name)
+        # Of jelly, as in the demo: one of plastic bakes seven times as long and shows nothing but that it slides.
+        box.size_m, box.preset = size, preset
     show_beside(context, state.image, TAB)
     return "The sample is open: press Reconstruct"

@@ -53,6 +53,7 @@ def draw_details(layout: bpy.types.UILayout, context: bpy.types.Context, box: An
     if column is None:
         return
     column.prop(box, "kind")
+    column.prop(box, "preset")
     draw_mask(column, context, box)
     shape = column.column()
     shape.active = not box.mesh.strip()

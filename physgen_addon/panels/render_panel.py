@@ -13,6 +13,7 @@ from ..interpreter import missing_modules
 from ..operators.render_ops import (
     PHYSGEN_OT_export_alembic,
     PHYSGEN_OT_export_usd,
+    PHYSGEN_OT_look_nodes,
     PHYSGEN_OT_make_independent,
     PHYSGEN_OT_render_still,
     PHYSGEN_OT_render_video,
@@ -127,6 +128,10 @@ class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
         if rendering.blurs_depth:
             optional(column, rendering, "own_focus", "focus_distance", "Focus")
         text.sentences(column, context, "Frame 1 always equals the photo.")
+        if rendering.format == "exr_layers":
+            column.operator(PHYSGEN_OT_look_nodes.bl_idname, icon="NODE_COMPOSITING")
+        else:
+            text.sentences(column, context, "To grade layers by hand: format EXR Layers.")
 
 
 class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):

@@ -68,7 +68,7 @@ def preset_items(chosen: str, likeness: str = "") -> list[tuple[str, str, str, s
     likeness: preset that recognised numbers come from, which then names the entry for numbers of no preset.
     """
     own = own_presets()
-    rows = [(name, preset_title(name), _SHIPPED.descriptions[name], "NONE") for name in _SHIPPED.good]
+    rows = [(*item, "NONE") for item in shipped_items()]
     rows += [(name, name, own.descriptions[name] or "User preset", "USER") for name in own.good]
     # The colon is in no valid name, so that a broken file never stands in for a preset.
     rows += [(f"broken:{name}", f"{name} (broken)", f"Unusable: {why}", "ERROR") for name, why in own.broken.items()]
@@ -90,6 +90,11 @@ TITLES = {
 def preset_title(name: str) -> str:
     """Return the display name of the preset ``name``."""
     return TITLES.get(name) or (name.capitalize() if name in _SHIPPED.good else name)
+
+
+def shipped_items() -> list[tuple[str, str, str]]:
+    """Return the shipped presets as entries of a menu, by name."""
+    return [(name, preset_title(name), _SHIPPED.descriptions[name]) for name in _SHIPPED.good]
 
 
 def own_title(likeness: str) -> str:

@@ -22,6 +22,7 @@ from ..paths import RELATIVE
 from ..photo.photo_consent import agree, forget, is_agreed
 from ..photo.photo_maths import USUAL_FOV, USUAL_PITCH
 from .generated_properties import from_field, switch
+from .material_props import shipped_items
 
 UP_ITEMS = [
     ("auto", "Automatic", "By file format and fit"),
@@ -91,6 +92,11 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
         name="Drop",
         description="Strokes over what does not belong to the object, such as the floor in a hole",
         update=_on_box,
+    )
+    preset: EnumProperty(
+        name="Material",
+        description="Material of the reconstructed object; it can be changed afterwards, too",
+        items=[("auto", "Automatic", "By what it is"), *shipped_items()],
     )
     shape: from_field(
         ObjectRequest,

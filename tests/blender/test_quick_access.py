@@ -9,7 +9,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import paths
-from physgen.physgen_addon.operators import quick_ops, sample_ops
+from physgen.physgen_addon.operators import photo_ops, quick_ops, sample_ops
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
@@ -68,6 +68,7 @@ def test_the_photo_sample_needs_nothing_but_reconstruct(tmp_path):
     assert words[words.index("--box") + 1] == "70,12,488,392" and "--pitch=50" in words
     assert scene_folder(state).parent == tmp_path / "samples"
     assert bpy.ops.physgen.reconstruct.poll()
+    assert [box.preset for box in state.boxes] == ["jelly"]
     # A copy that the user has changed is the user's.
     assert (tmp_path / "samples" / "coffee.jpg").read_bytes() == (sample_ops.DEMO / "coffee.jpg").read_bytes()
 
@@ -118,6 +119,17 @@ def test_menus_and_key_come_and_go():
 def test_every_operator_that_one_would_type_has_its_name():
     titles = {kind.bl_label for kind, _ in quick_ops.QUICK}
     assert titles == {"Quick Jelly", "Quick Sand", "Quick Liquid", "Quick Rigid"}
+
+
+def test_a_material_chosen_for_a_box_is_that_of_its_object():
+    assert bpy.ops.physgen.open_sample(sample="PHOTO") == {"FINISHED"}
+    photo_ops.add_box(bpy.context.scene, (10, 10, 50, 50), "spoon")
+    for name in ("cup", "spoon"):
+        a_cube().physgen.enabled = True
+        bpy.context.object.physgen.source = name
+    photo_ops.set_materials(bpy.context.scene)
+    found = {item.physgen.source: item.physgen.material.preset for item in bodies(bpy.context.scene)}
+    assert found == {"cup": "jelly", "spoon": "medium"}, "a box of its own choice, and one that is left to what it is"
 
 
 def test_opening_a_photo_in_the_background_leaves_the_areas_alone():
