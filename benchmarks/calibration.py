@@ -2,12 +2,12 @@
 """Calibration of the diagnosis on fresh generated captures: fits recorded in DIR, then verdicts judged in seconds.
 
     python -m physgen.benchmarks.calibration DIR --cases 300 --seed 1 [--shard 0/4] [--matter rigid] [--two 0.3]
-    python -m physgen.benchmarks.calibration DIR [--tune]
+    python -m physgen.benchmarks.calibration DIR [--tune] [--numbers 0:200]
 
 The first form fits captures that have no record in DIR yet, so it can be stopped and run again; shards run on several
 machines or one after the other, and their files are put into one folder. The second prints the reliability table;
 ``--tune`` with constants chosen by cross-validation over effects left out. A rigid capture takes 5 to 50 CPU seconds,
-a soft one minutes. ``--quick`` fits one.
+a soft one minutes. ``--numbers`` judges these cases only, so that others stay unseen. ``--quick`` fits one.
 """
 
 from __future__ import annotations
@@ -37,6 +37,15 @@ def parse_shard(text: str) -> tuple[int, int]:
         return int(number), int(of)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no shard: write 0/4") from None
+
+
+def parse_numbers(text: str) -> range:
+    """Return the case numbers of ``0:200``, the second one not included."""
+    first, _, end = text.partition(":")
+    try:
+        return range(int(first), int(end))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} are no case numbers: write 0:200") from None
 
 
 def collect(folder: Path, options: argparse.Namespace) -> None:
@@ -69,6 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--two", type=float, default=0.1, metavar="SHARE", help="of two causes, 0 to 0.5 (default: 0.1)"
     )
     parser.add_argument("--tune", action="store_true", help="choose constants by cross-validation over effects")
+    parser.add_argument("--numbers", type=parse_numbers, metavar="A:B", help="judge cases A to B - 1 only")
     options = parser.parse_args(arguments)
     if options.folder is None and not options.quick:
         parser.error("give DIR")
@@ -77,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             folder = options.folder or Path(scratch)
             if options.cases is not None:
                 collect(folder, options)
-            records = load_records(folder)
+            records = load_records(folder, numbers=options.numbers)
     except PhysGenError as error:
         print(error, file=sys.stderr)
         return 1

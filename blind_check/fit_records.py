@@ -147,13 +147,17 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def load_records(folder: Path) -> list[FitRecord]:
+def load_records(folder: Path, *, numbers: range | None = None) -> list[FitRecord]:
     """Return the records in ``folder`` by name, without captures that could not be diagnosed.
 
+    numbers: of the cases to read, None for all: what is looked at and what is kept for the end stay apart.
     Raises InputError where a file is none, or no file is there.
     """
     found = []
     paths = sorted(folder.glob("case-*.json"))
+    if numbers is not None:
+        wanted = {f"case-{i:04d}" for i in numbers}
+        paths = [p for p in paths if p.stem in wanted]
     for path in paths:
         value = read_json(path)
         if not isinstance(value, dict) or value.get("format") != FORMAT:
@@ -165,7 +169,8 @@ def load_records(folder: Path) -> list[FitRecord]:
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: malformed ({error!r}); delete it and run the calibration again") from None
     if not paths:
-        raise InputError(f"{folder}: holds no records; run the calibration with --cases first")
+        some = "" if numbers is None else f" from {numbers.start} to {numbers.stop - 1}"
+        raise InputError(f"{folder}: holds no records{some}; run the calibration with --cases first")
     return found
 
 

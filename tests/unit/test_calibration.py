@@ -94,6 +94,14 @@ def test_a_calibration_goes_on_where_it_stopped(folder):
         missing_cases(folder, 8, (2, 2))
 
 
+def test_cases_kept_for_the_end_are_not_read(folder):
+    """A damaged one outside of the numbers does not even disturb."""
+    (folder / "case-0004.json").write_text("kept for the end")
+    assert [r.effect for r in load_records(folder, numbers=range(0, 2))] == ["none", "air_drag"]
+    with pytest.raises(InputError, match="from 7 to 8"):
+        load_records(folder, numbers=range(7, 9))
+
+
 def test_a_damaged_record_is_named(folder):
     (folder / "case-0001.json").write_text('{"format": "physgen-fit-record/1", "matter": "rigid"}')
     with pytest.raises(InputError, match="case-0001"):

@@ -13,6 +13,7 @@ from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, CandidateEffect
 from .rigid_search import (
     BEHIND,
     BEHIND_SHARE,
+    CONTACTS,
     FOLLOWED_GAIN,
     FOLLOWED_MISFIT,
     BodyFits,
@@ -64,6 +65,17 @@ def _bases(body: BodyFits) -> list[tuple[str, Fit]]:
     return found[:BASES]
 
 
+def _elsewhere(body: BodyFits, base: str, wanted: list[CandidateEffect]) -> list[CandidateEffect]:
+    """Return the effects that gain by themselves where ``base`` does not act: at contacts, or beside them in flight.
+
+    States between contacts absorb a part of what another contact effect would explain, so that little structure is
+    left; but what each gains alone adds up.
+    """
+    least = body.fits[()].evidence + FOLLOWED_GAIN
+    found = [c for c in wanted if (c.name in CONTACTS) != (base in CONTACTS) and (c.name,) in body.fits]
+    return [c for c in found if body.fits[(c.name,)].evidence > least]
+
+
 def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
     """Fit pairs of the best single effects with every other one; those that still gain are fitted to convergence."""
     bases = _bases(body)
@@ -74,7 +86,7 @@ def search_pairs(body: BodyFits, wanted: list[CandidateEffect]) -> None:
         bases = sorted(singles, key=lambda item: -item[1].evidence)[:1]
     if not bases:
         return
-    others = wanted if leaves_structure(bases[0][1]) else hidden
+    others = wanted if leaves_structure(bases[0][1]) else [*hidden, *_elsewhere(body, bases[0][0], wanted)]
     tried: list[tuple[str, str]] = []
     for name, fit in bases:
         begun = _begin(body, [(name, other.name) for other in others], fit)

@@ -115,8 +115,14 @@ FOLLOWED_GAIN, FOLLOWED_MISFIT = 20.0, 1.2
 FOLLOWED = 3
 """Best single effects that are followed through their own contacts."""
 
-RECONSIDERED = 3
-"""Best effects from whose states the nominal model is restarted."""
+RECONSIDERED, RESTARTED = 3, 5
+"""Best effects from whose states the nominal model is restarted, and which are restarted from its states."""
+
+LEVELLED, LEVEL = 2, 1.0
+"""Most rounds of both, and nats that the nominal model has to gain for another one."""
+
+CONTAINED = (("air_drag", "wind"),)
+"""Effects whose numbers are the first of another one's: drag is wind in still air."""
 
 MOVED_GUESS = 0.3
 """Camera displacement from poses alone, in prior standard deviations, above which ``camera_pose`` is re-tracked."""
@@ -176,19 +182,52 @@ def fit_nominal(body: BodyFits) -> None:
 
 
 def reconsider_nominal(body: BodyFits) -> None:
-    """Restart the nominal model from the states of the best effects; keep it where it is better.
+    """Restart the nominal model from the states of the best effects, and the effects from its states where it gained.
 
     Every effect contains the nominal model. One that gains with zero amount has only found better states, which the
-    nominal model must get too.
+    nominal model must get too; and with these an effect explains at least as much.
     """
-    singles = [f for k, f in body.fits.items() if len(k) == 1 and f.problem is body.problem]
-    for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
+    for _ in range(LEVELLED):
+        before = body.fits[()].evidence
+        singles = [f for k, f in body.fits.items() if len(k) == 1 and f.problem is body.problem]
+        for fit in sorted(singles, key=lambda f: -f.evidence)[:RECONSIDERED]:
+            if not body.work.left():
+                body.work.skip(("none",), "restarted from the best effects' states")
+                return
+            keep(body, (), solve(body.problem, Model(candidates=()), fit.z[: BELIEFS.size], fit.states, rounds=5))
+        if body.fits[()].evidence < before + LEVEL:
+            break
+        _reconsider_effects(body)
+    _reconsider_contained(body)
+
+
+def _reconsider_contained(body: BodyFits) -> None:
+    """Restart an effect that another one contains from the other's states and first numbers, where that fits better."""
+    for part, whole in CONTAINED:
+        if (part,) not in body.fits or (whole,) not in body.fits:
+            continue
+        small, large = body.fits[(part,)], body.fits[(whole,)]
+        if large.evidence < small.evidence + LEVEL or large.evidence < body.fits[()].evidence + LEVEL:
+            continue
         if not body.work.left():
-            body.work.skip(("none",), "restarted from the best effects' states")
-            return
-        again = solve(body.problem, Model(candidates=()), fit.z[: BELIEFS.size], fit.states, rounds=5)
-        if again.evidence > body.fits[()].evidence:
-            body.fits[()] = again
+            body.work.skip((part,), f"restarted from the states of {whole}")
+            continue
+        z = large.z[: small.model.size]
+        keep(body, (part,), solve(large.problem, small.model, z, large.states, rounds=ROUNDS))
+
+
+def _reconsider_effects(body: BodyFits) -> None:
+    """Restart the best effects from the states of the nominal model."""
+    nominal = body.fits[()]
+    singles = sorted((k for k in body.fits if len(k) == 1), key=lambda k: -body.fits[k].evidence)
+    likely = [k for k in singles if body.fits[k].evidence > body.fits[singles[0]].evidence - BEHIND]
+    for key in likely[:RESTARTED]:
+        if not body.work.left():
+            body.work.skip(key, "restarted from the nominal model's states")
+            continue
+        fit = body.fits[key]
+        z = np.concatenate([nominal.z[: BELIEFS.size], fit.z[BELIEFS.size :]])
+        keep(body, key, solve(body.problem, fit.model, z, nominal.states, rounds=5))
 
 
 def begin_search(body: BodyFits, candidates: tuple[CandidateEffect, ...], base: Fit | None = None) -> Fit:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ..capture_geometry import mean_known
 from .multiple_shooting import eliminate_states
 from .observed_poses import ObservedBody, as_matrix, frame_pose, perturbed
-from .resting_contact import resting_state
+from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidBody, RigidWorlds
 from .shooting_problem import Model, Problem, Segment, SegmentedTrial
@@ -113,6 +113,12 @@ SETTLED = 1e-4
 
 LOST = 40.0
 """RMS residual in noise standard deviations above which the model has lost the body."""
+
+NEAR_GROUND = 2e-3
+"""Height in m, beside three standard deviations of a point, below which a body may roll or slide from the start."""
+
+LYING_SPEED = 0.02
+"""Standard deviation in m/s of the speed along the normal of a body that rolls or slides from the start."""
 
 GUESS_HEIGHT = 0.01
 """Standard deviation in m of a height estimated from one frame's pixels."""
@@ -295,36 +301,54 @@ def track_states(
 
 
 def _set_down(scene: BodyScene, simulator: RigidWorlds, trials: list[SegmentedTrial], model: Model, z: Array) -> None:
-    """Start on the ground where that explains the first frames better: pixels leave the initial height open."""
+    """Start on the ground where that explains the first frames better.
+
+    Pixels leave the initial height open. A first state of points assumes free flight, so that a body which rolls or
+    slides from the start would seem to rise.
+    """
+    normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
     near = []
     for trial in trials:
-        if trial.observations.camera is None:
+        seen = trial.observations
+        if seen.camera is not None:
+            lying = None if model.setting(scene, z).camera is not None else resting_state(scene, seen)
+            if lying is not None:
+                trial.states, trial.guess, trial.prior = lying[0][None], lying[0].copy(), lying[1]
+                continue
+        elif abs(height(scene, trial.states[0])[0]) > NEAR_GROUND + 3 * seen.sigma:
             continue
-        lying = None if model.setting(scene, z).camera is not None else resting_state(scene, trial.observations)
-        if lying is None:
-            near.append(trial)
-        else:
-            trial.states, trial.guess, trial.prior = lying[0][None], lying[0].copy(), lying[1]
+        near.append(trial)
     if not near:
         return
-    normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
-    options = []
+    options, fees = [], []
     for trial in near:
-        down = trial.states.copy()
+        down, prior = trial.states.copy(), trial.prior.copy()
         corners = down[0, :3] + scene.body.corners @ as_matrix(down[0, 3:7]).T
         down[0, :3] -= ((corners - foot) @ normal - scene.body.radius).min() * normal
         down[0, 7:10] -= (down[0, 7:10] @ normal) * normal
-        end = min(
-            trial.end, int(np.searchsorted(trial.observations.times - trial.observations.times[0], PIXEL_WINDOW)) + 1
-        )
-        options += [dataclasses.replace(trial, end=end), dataclasses.replace(trial, end=end, states=down)]
+        window, guess = PIXEL_WINDOW, trial.guess
+        if trial.observations.camera is None:
+            window, guess = CONTACT_WINDOW, down[0].copy()
+            if abs(normal[2]) > 0.999:
+                prior[8] = LYING_SPEED
+        frames = int(np.searchsorted(trial.observations.times - trial.observations.times[0], window)) + 1
+        end = min(trial.end, max(frames, 5))
+        options += [
+            dataclasses.replace(trial, end=end),
+            dataclasses.replace(trial, end=end, states=down, prior=prior, guess=guess),
+        ]
+        # Fewer motions are plausible on the ground, as in the evidence.
+        fees.append(2 * float(np.log(trial.prior / prior).sum()))
     problem = Problem(scene=scene, simulator=simulator, trials=options)
     settled = fit_states(problem, model, z, [t.states for t in options], 6)
     costs = [part.cost for part in problem.evaluate(model, z, settled, slopes=False).linear]
-    for k, trial in enumerate(near):
-        best = 2 * k + int(costs[2 * k + 1] < costs[2 * k])
+    for k, (trial, fee) in enumerate(zip(near, fees, strict=True)):
+        best = 2 * k + int(costs[2 * k + 1] < costs[2 * k] + fee)
         trial.states = settled[best]
         trial.guess = settled[best][0].copy()
+        trial.prior = options[best].prior
+        if trial.observations.camera is None:
+            trial.guess = options[best].guess
 
 
 def _window(trial: SegmentedTrial, record: Array) -> int:
