@@ -89,10 +89,12 @@ _IMPORT_FIELDS: tuple[tuple[str, Any, str], ...] = (
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen capture``."""
     parser.add_argument("action", choices=("import",), help="what to do")
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="CSV, Tracker's .trk, DeepLabCut's CSV")
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="CSV, .trk, C3D, MCAP, a bag's folder")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="new folder for the capture")
     mapped = "our name and the table's heading, such as time=Zeit x=X"
     parser.add_argument("--column", nargs="+", type=parse_column, default=[], metavar="OURS=THEIRS", help=mapped)
+    chosen = "points to use; of a bag the frame or topic that is the body (default: all)"
+    parser.add_argument("--points", nargs="+", default=[], metavar="NAME", help=chosen)
     for name, kind, text in _IMPORT_FIELDS:
         parser.add_argument(f"--{name}", type=kind, metavar="VALUE", help=text)
 
@@ -111,7 +113,7 @@ def run_capture(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
         terminal.line(f"{question} [y/N]")
         return sys.stdin.readline().strip().lower() in ("y", "yes")
 
-    request = ImportRequest(columns=dict(options.column), **given)
+    request = ImportRequest(columns=dict(options.column), points=tuple(options.points), **given)
     capture = import_capture(
         options.files, request, out=options.out, confirm=confirm if asks else None, on_event=terminal
     )

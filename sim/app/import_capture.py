@@ -45,7 +45,8 @@ class ImportRequest:
 
     diameter: of a ball in m; or mesh: file of the body in its rest frame, m. density: kg/m³; or mass: kg. name: of the
     object. rest: CSV with NAME,x,y,z of the markers in the mesh's frame; not needed for a single point, which is the
-    centre, nor for poses. columns: our name → heading of the table.
+    centre, nor for poses. points: which of the recorded points are used (markers; of a bag the moving frame or topic),
+    all where empty. columns: our name → heading of the table; of a bag time is ``stamp`` or ``log``.
     time_unit (s, ms, us, ns), length_unit (m, cm, mm, px), up (z, y, -y, -z): None to guess from the motion.
     scale: m per pixel. fps: of tables whose rows are frames. ground: height of the ground, m. friction, restitution: of
     the ground. noise: standard deviation of a coordinate in m; None to measure it. hold_out: share of the last take
@@ -58,6 +59,7 @@ class ImportRequest:
     mass: float | None = None
     name: str = "body"
     rest: Path | None = None
+    points: tuple[str, ...] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
     time_unit: str | None = None
     length_unit: str | None = None
@@ -97,7 +99,9 @@ def import_capture(
     confirm: Confirm | None = None,
     on_event: OnEvent = ignore,
 ) -> Capture:
-    """Return the capture of the recordings ``files`` (CSV, Tracker's .trk, DeepLabCut's CSV), written to ``out``.
+    """Return the capture of the recordings ``files``, written to ``out``.
+
+    They are CSV, Tracker's .trk, DeepLabCut's CSV, C3D, or bags of ROS 2 (MCAP, db3, or a folder of them).
 
     Every guess is reported as a notice. One that changes numbers (milliseconds, millimetres, another axis up)
     must be confirmed: ``confirm`` is asked with a sentence; None refuses, naming the option that answers.
@@ -111,7 +115,7 @@ def import_capture(
     out = Path(out)
     if out.exists():
         raise InputError(f"{out}: already exists; choose another folder")
-    tables = [t for file in files for t in read_recording(Path(file), request.columns)]
+    tables = [t for file in files for t in read_recording(Path(file), request.columns, request.points)]
     if not tables:
         raise InputError("no file was given")
     if len({t.labels for t in tables}) > 1:
@@ -130,6 +134,9 @@ def import_capture(
         say(guess)
 
     item = _body(request)
+    for table in tables:
+        for note in table.notes:
+            say(f"take {table.name!r}: {note}")
     times = [_times(t, request, settle) for t in tables]
     points = _lengths(tables, request, settle)
     points, turns = _upright(tables, points, times, request, settle)
@@ -266,7 +273,10 @@ def _upright(
             if FREE_FALL[0] < -sign * fall[axis] < FREE_FALL[1]:
                 up = name
                 break
-        if up != "z":
+        if up == "z" and tables[0].up and not FREE_FALL[0] < -fall[2] < FREE_FALL[1]:
+            up = tables[0].up
+            settle(f"take {tables[0].name!r} calls {up} up, and nothing falls freely", f"--up={up}")
+        elif up != "z":
             settle(f"things fall along {'+' if up[0] == '-' else '-'}{up[-1]}: {up} looks like up", f"--up={up}")
     if up == "z":
         return points, [t.turns for t in tables]

@@ -8,6 +8,7 @@ Nothing here is metres or Z up yet: a table gives numbers, names and what its he
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -44,7 +45,8 @@ class RecordedTable:
 
     times: (T,) in ``time_unit`` ("" where unsaid), or None where rows are frames. points: (T, K, 3) in ``length_unit``,
     NaN where not seen; of a picture's plane (x right, y down) in ``px``, with zeros as third. turns: (T, 3, 3) of a
-    table of poses, whose only point is the body's reference.
+    table of poses, whose only point is the body's reference. up: the axis that the file calls up, "" where it is z or
+    unsaid. notes: what was decided in reading, as sentences.
     """
 
     name: str
@@ -55,13 +57,35 @@ class RecordedTable:
     length_unit: str = ""
     planar: bool = False
     turns: Array | None = None
+    up: str = ""
+    notes: tuple[str, ...] = ()
 
 
-def read_recording(path: Path, columns: Mapping[str, str] | None = None) -> list[RecordedTable]:
+def read_recording(
+    path: Path, columns: Mapping[str, str] | None = None, points: Sequence[str] = ()
+) -> list[RecordedTable]:
     """Return the takes in the file ``path``. columns: our name (``time``, ``trial``, ``x``, …) → the table's heading.
 
-    Raises InputError with file, row and remedy for anything that is no such table.
+    points: labels of the points to keep, in this order; all where empty. Raises InputError with file, row and remedy
+    for anything that is no such table.
     """
+    from .recorded_files import is_recorded_file, read_recorded_file
+
+    if is_recorded_file(path):
+        return read_recorded_file(path, columns, points)
+    tables = _read_tables(path, columns)
+    if not points:
+        return tables
+    missing = [name for name in points if any(name not in table.labels for table in tables)]
+    if missing:
+        raise InputError(f"{path}: there is no point {missing[0]!r}; there are {', '.join(tables[0].labels)}")
+    return [
+        dataclasses.replace(t, points=t.points[:, [t.labels.index(name) for name in points]], labels=tuple(points))
+        for t in tables
+    ]
+
+
+def _read_tables(path: Path, columns: Mapping[str, str] | None) -> list[RecordedTable]:
     try:
         text = read_text(path, MAX_BYTES, what="table of motion").removeprefix("\ufeff")
     except FileNotFoundError:
@@ -69,7 +93,7 @@ def read_recording(path: Path, columns: Mapping[str, str] | None = None) -> list
     if path.suffix.lower() == ".trk":
         return [_read_tracker(path, text)]
     if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        raise InputError(f"{path}: {path.suffix or 'no ending'} is not read; export CSV, or give Tracker's .trk")
+        raise InputError(f"{path}: {path.suffix or 'no ending'} is not read; export CSV, C3D, or MCAP")
     first = text.partition("\n")[0]
     separator = max(",;\t", key=first.count)
     try:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +160,40 @@ def _tracker(folder: Path) -> None:
     )
 
 
+def _c3d(folder: Path) -> None:
+    import ezc3d
+
+    made = ezc3d.c3d()
+    group = made["parameters"]["POINT"]
+    group["RATE"]["value"], group["LABELS"]["value"], group["UNITS"]["value"] = [100.0], ["a", "b"], ["mm"]
+    made["data"]["points"] = np.random.default_rng(0).normal(size=(4, 2, 12))
+    made["data"]["meta_points"]["residuals"] = np.zeros((1, 2, 12))
+    made["data"]["meta_points"]["camera_masks"] = np.zeros((7, 2, 12), dtype=bool)
+    made.write(str(folder / "t.c3d"))
+
+
+def _bag(folder: Path, storage: str) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    kind = "geometry_msgs/msg/PointStamped"
+    made = store.types
+    with Writer(folder / "made", version=9, storage_plugin=StoragePlugin[storage]) as writer:
+        connection = writer.add_connection("/ball", kind, typestore=store)
+        for i in range(12):
+            stamp = made["builtin_interfaces/msg/Time"](sec=5, nanosec=10_000_000 * i)
+            header = made["std_msgs/msg/Header"](stamp=stamp, frame_id="map")
+            point = made["geometry_msgs/msg/Point"](x=0.1 * i, y=0.0, z=1.0)
+            message = made[kind](header=header, point=point)
+            writer.write(connection, 10_000_000 * i, store.serialize_cdr(message, kind))
+    (file,) = (p for p in (folder / "made").iterdir() if p.suffix in (".mcap", ".db3"))
+    target = folder / ("t.mcap" if storage == "MCAP" else "bag/t.db3")
+    target.parent.mkdir(exist_ok=True)
+    file.rename(target)
+    shutil.rmtree(folder / "made")
+
+
 def _falling(folder: Path) -> None:
     rows, columns = np.mgrid[:60, :80] + 0.5
     frames = []
@@ -176,6 +211,9 @@ def _follow(folder: Path) -> None:
 add("table of poses", "t.csv", _table, lambda f: read_recording(f / "t.csv"))
 add("table of markers", ("t.csv", "rest.csv"), _markers, _import)
 add("table of DeepLabCut", "t.csv", _deeplabcut, lambda f: read_recording(f / "t.csv"))
+add("C3D file", "t.c3d", _c3d, lambda f: read_recording(f / "t.c3d"))
+add("bag of ROS 2, MCAP", "t.mcap", lambda f: _bag(f, "MCAP"), lambda f: read_recording(f / "t.mcap"))
+add("bag of ROS 2, SQLite", "bag/t.db3", lambda f: _bag(f, "SQLITE3"), lambda f: read_recording(f / "bag"))
 add("project of Tracker", "t.trk", _tracker, lambda f: read_recording(f / "t.trk"))
 add(
     "body that was filmed",

@@ -97,6 +97,15 @@ def test_example_parameter_sweep(tmp_path):
     assert flattening[2e4] > 2 * flattening[5e5] > 0
 
 
+def test_example_recordings_to_captures(tmp_path):
+    pytest.importorskip("ezc3d")
+    c3d, mcap, bag = example("recordings_to_captures").main(tmp_path)
+    assert np.isnan(c3d.trials[0].points[20]).all() and np.isfinite(mcap.trials[0].points).all()
+    np.testing.assert_array_equal(mcap.trials[0].points, bag.trials[0].points)
+    seen = np.isfinite(c3d.trials[0].points)
+    np.testing.assert_allclose(c3d.trials[0].points[seen], bag.trials[0].points[seen], atol=1e-6)
+
+
 def test_example_csv_to_verdict(tmp_path):
     def slope(_, state):
         v = state[3:]
