@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from physgen.batch.cli import main
 from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.motion_view import understand_motion
-from physgen.sim.diagnose.track.moving_regions import find_moving_regions
+from physgen.sim.diagnose.track.moving_regions import Region, find_moving_regions
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
-from physgen.sim.diagnose.track.region_track import true_times, with_missing_frames
+from physgen.sim.diagnose.track.region_track import RegionPath, true_times, with_missing_frames
 from physgen.sim.errors import InputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "video_to_cause.py"
@@ -124,6 +124,39 @@ def test_a_slow_ball_that_covers_its_place_all_the_time_is_seen_whole_on_a_plain
     for centre, regions in zip(centres, found.regions, strict=True):
         assert regions[0].area == pytest.approx(np.pi * 40**2, rel=0.05)
         assert np.linalg.norm(regions[0].middle - 0.5 - centre) < 1.5
+
+
+def region(frame, middle, area=300.0, axes=(5.0, 4.6), **other):
+    return Region(
+        frame=frame, middle=np.asarray(middle, float), area=area, axes=np.array(axes), angle=0.0,
+        outline=np.zeros((3, 2)), colour=np.zeros(3), cut=False, solid=1.0, **other,
+    )  # fmt: skip
+
+
+def test_a_short_toss_that_turns_has_a_way_and_a_column_of_compression_has_none():
+    height = 40 + 5.4 * (np.arange(11) - 4.5) ** 2
+    toss = RegionPath([region(k, (380, y)) for k, y in enumerate(height)])
+    assert toss.travel > 0.8 * np.abs(np.diff(height)).sum() and toss.freedom() > 100
+    assert RegionPath([region(k, (126, y), axes=(5.0, 0.1)) for k, y in enumerate(height)]).freedom() == 0
+
+
+def test_a_plain_table_beside_a_hedge_and_a_ledge_fills_neither(tmp_path):
+    rng = np.random.default_rng(7)
+    scene = np.full((240, 320, 3), 170.0) + 0.1 * np.mgrid[0:240, 0:320][1][..., None]
+    hedge = rng.integers((10, 40, 10), (90, 150, 90), (15, 54, 3)).astype(np.uint8)
+    scene[:90] = cv2.resize(hedge, (320, 90)).astype(float)
+    scene[90:96, 60:300] = 40.0
+    writer = cv2.VideoWriter(str(tmp_path / "ledge.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (320, 240))
+    for k in range(40):
+        frame = np.clip(scene + rng.normal(0, 2, scene.shape), 0, 255).astype(np.uint8)
+        cv2.circle(frame, (120 + round(1.5 * k), 138), 38, (40, 60, 200), -1, cv2.LINE_AA)
+        writer.write(frame)
+    writer.release()
+    found = find_moving_regions(tmp_path / "ledge.avi")
+    away = np.abs(found.background.astype(float) - scene).max(axis=-1)
+    assert away[98:186, 80:220].max() < 30
+    assert np.percentile(away[:96], 98) < 40
+    assert all(len(r) and r[0].area == pytest.approx(np.pi * 38**2, rel=0.08) for r in found.regions)
 
 
 @settings(max_examples=25, deadline=None)

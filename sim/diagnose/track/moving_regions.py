@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,11 +32,15 @@ LIKE_AROUND, LEAST_SHARE = 22.0, 0.03
 """Grey levels within which a value counts as that of the surroundings, and least share of them that it must have."""
 LIKE_RARE = 12.0
 """Distance in grey levels (BGR) to any pixel of the surroundings, however rare, within which a value counts, too."""
-PLAIN_SHARE, PLAIN_SPREAD = 0.55, 7.0
-"""A hole lies in a plain surface if this share of what is around it follows one smooth course of colours, within three
-times its scatter, and that is at most so many grey levels."""
-WIDE = 2.5
-"""Area of a hull over its contents from which it is no compact body."""
+PLAIN_SHARE, PLAIN_BESIDE, PLAIN_SPREAD = 0.4, 0.55, 8.0
+"""A hole lies in a plain surface if this share of what is around it, and right beside most of its sides, follows one
+smooth course of colours, within three times its scatter, and that is at most so many grey levels."""
+LEAST_AROUND = 0.25
+"""Share of a hole and its surroundings that has to lie outside of it to tell what is within."""
+COMMON = 30
+"""Grey levels about the commonest brightness around a hole that belong to the surface at first."""
+WIDE = 1.3
+"""Area of a hull over its contents from which it is more than the way of one body."""
 LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
 """Difference from the background that counts as moving: grey levels, and standard deviations of the pixel."""
 SHADOW = (0.45, 0.97, 0.09)
@@ -152,8 +157,8 @@ def _background(stack: NDArray[np.uint8]) -> tuple[Picture, Array]:
     for top in range(0, stack.shape[1], 64):  # in bands: percentiles copy what they sort
         band = np.percentile(stack[:, top : top + 64], (4, 25, 50, 75, 96), axis=0)
         levels[:, top : top + 64] = band.astype(np.uint8)
-        wide[top : top + 64] = (band[4] - band[0]).max(axis=-1)
-        noise[top : top + 64] = (band[3] - band[1]).max(axis=-1) / 1.35
+        wide[top : top + 64] = _largest(band[4] - band[0])
+        noise[top : top + 64] = _largest(band[3] - band[1]) / 1.35
         out[top : top + 64] = band[2].astype(np.uint8)
     unsure = cv2.morphologyEx((wide > UNSURE + 6 * np.median(noise)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     unsure = cv2.morphologyEx(unsure, cv2.MORPH_CLOSE, np.ones((9, 9)))
@@ -250,21 +255,31 @@ def _plain_surface(median: Picture, holes: Picture, box: tuple[int, int, int, in
     v, u = rows / part.shape[0] - 0.5, columns / part.shape[1] - 0.5
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     around = np.flatnonzero(near.ravel() == 0)
+    ring = (cv2.dilate(near, np.ones((2 * (pad // 3) + 1,) * 2, np.uint8)) > near).ravel()
+    top, left = y - at[0].start, x - at[1].start
+    sides = [(ring & away.ravel()) for away in (rows < top, rows >= top + h, columns < left, columns >= left + w)]
     # Beside a large hole most of what is left may be something else: then the median within it counts, too.
     for free in (around, np.arange(near.size)):
-        if len(free) < 60:
+        if len(free) < max(60, LEAST_AROUND * near.size):
             continue
         free = free[:: max(1, len(free) // 4000)]
         a, b = terms.reshape(-1, 6)[free].astype(np.float64), part.reshape(-1, 3)[free].astype(np.float64)
-        weights, off = np.ones(len(a)), np.zeros(len(a))
-        fit = np.zeros((6, 3))
+        # Something else stands beside many a table: what has the commonest brightness begins, and counts alone for
+        # how much the surface scatters.
+        grey = b.mean(axis=1)
+        common = np.convolve(np.bincount(grey.astype(int), minlength=256), np.ones(2 * COMMON + 1), "same").argmax()
+        weights = (np.abs(grey - common) <= COMMON).astype(np.float64)
+        off, usual, fit = np.zeros(len(a)), 0.0, np.zeros((6, 3))
         for step in range(16):
             fit = np.linalg.lstsq(a * weights[:, None], b * weights[:, None], rcond=None)[0]
             off = np.abs(b - a @ fit).max(axis=1)
-            usual = max(float(np.median(off)), 0.5)
+            usual = max(float(np.median(off[weights > 0 if step == 0 else off < 3 * usual])), 0.5)
             weights = 1.0 / np.maximum(1.0, off / usual) * (1.0 if step < 8 else off < 6 * usual)
-        spread = max(1.48 * float(np.median(off)), 1.0)
-        if spread <= PLAIN_SPREAD and (off < 3 * spread).mean() >= PLAIN_SHARE:
+        spread = max(1.48 * usual, 1.0)
+        # A table below a hedge is plain, and says nothing about the hedge: it has to lie on most sides of the hole.
+        plain = off < 3 * spread
+        beside = [plain[side[free]].mean() >= PLAIN_BESIDE for side in sides if side[free].sum() >= 12]
+        if spread <= PLAIN_SPREAD and plain.mean() >= PLAIN_SHARE and 2 * sum(beside) > len(beside):
             break
     else:
         return None
@@ -292,6 +307,14 @@ def _bare_plain(
         known = apart[rare, np.arange(len(rare))] < LIKE_RARE
         places = np.flatnonzero(strange)[known]
         chosen[places] = seen[rare[known], places]
+    # A hull reaches over things that stand still beside the body's way: what never changes and goes on outside of the
+    # hole is one of them.
+    still = np.zeros(inside.shape, np.uint8)
+    still[inside] = strange & (np.abs(seen[4] - seen[3]).max(axis=-1) < plain.tolerance)
+    rim = cv2.dilate((~inside).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, things = cv2.connectedComponents(still)
+    stays = (still > 0) & np.isin(things, np.unique(things[rim & (still > 0)]))
+    chosen[stays[inside]] = seen[0][stays[inside]]
     out[plain.at][inside] = chosen.round().astype(np.uint8)
     noise[plain.at][inside] = plain.tolerance / 3
 
@@ -358,9 +381,21 @@ def _warped(picture: Picture, matrix: Array) -> Picture:
     return np.asarray(cv2.warpAffine(picture, matrix, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
+def _largest(colours: NDArray[Any]) -> NDArray[Any]:
+    """Return (H, W) the largest channel of (H, W, 3); numpy reduces a short last axis ten times slower."""
+    b, g, r = cv2.split(colours)
+    return np.asarray(cv2.max(cv2.max(b, g), r))
+
+
+def _least(colours: NDArray[Any]) -> NDArray[Any]:
+    """Return (H, W) the least channel of (H, W, 3)."""
+    b, g, r = cv2.split(colours)
+    return np.asarray(cv2.min(cv2.min(b, g), r))
+
+
 def difference(picture: Picture, background: Picture) -> NDArray[np.float32]:
     """Return (H, W) the largest difference of a channel, grey levels, smoothed over neighbours."""
-    return np.asarray(cv2.GaussianBlur(cv2.absdiff(picture, background).max(axis=-1).astype(np.float32), (3, 3), 0))
+    return np.asarray(cv2.GaussianBlur(_largest(cv2.absdiff(picture, background)).astype(np.float32), (3, 3), 0))
 
 
 def _regions(picture: Picture, background: Picture, limit: Array, index: int) -> Iterator[Region]:
@@ -368,7 +403,10 @@ def _regions(picture: Picture, background: Picture, limit: Array, index: int) ->
     mask = (away > limit).astype(np.uint8)
     if not mask.any():
         return
-    mask &= ~_shadows(picture, background, away) if mask.mean() < 0.5 else mask
+    if mask.mean() < 0.5:
+        x, y, w, h = cv2.boundingRect(mask)
+        near = slice(max(0, y - 2), y + h + 2), slice(max(0, x - 2), x + w + 2)
+        mask[near] &= ~_shadows(picture[near], background[near], away[near], float(away.max()))
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     height, width = mask.shape
@@ -410,14 +448,16 @@ def _regions(picture: Picture, background: Picture, limit: Array, index: int) ->
         )
 
 
-def _shadows(picture: Picture, background: Picture, away: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return (H, W): where the background is only darker, all colours alike; never all of what moves."""
+def _shadows(picture: Picture, background: Picture, away: NDArray[np.float32], most: float) -> NDArray[np.uint8]:
+    """Return (H, W): where the background is only darker, all colours alike; never all of what moves.
+
+    away: (H, W) difference from the background. most: its largest value in the frame."""
     low, high, apart = SHADOW
     ratio = (picture.astype(np.float32) + 4) / (background.astype(np.float32) + 4)
     ratio = np.asarray(cv2.blur(ratio, (3, 3)), np.float32)
-    dark = (ratio.max(axis=-1) < high) & (ratio.min(axis=-1) > low)
-    dark &= (ratio.max(axis=-1) - ratio.min(axis=-1)) < apart
-    strong = away > 0.55 * float(away.max())
+    top, bottom = _largest(ratio), _least(ratio)
+    dark = (top < high) & (bottom > low) & (top - bottom < apart)
+    strong = away > 0.55 * most
     return (dark & ~strong).astype(np.uint8)
 
 

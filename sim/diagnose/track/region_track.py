@@ -18,6 +18,8 @@ LONGEST_HIDDEN = 0.35
 """Largest share of the path so far that a body may be hidden before its path goes on."""
 LEAST_TRAVEL = 0.5
 """Way in sizes of the body that counts as motion."""
+THIN_PX = 0.45
+"""Standard deviation across, in working px, below which a region is a column of compression and no body."""
 LEAST_FRAMES = 8
 """Frames of the shortest path."""
 COLOUR_STEP, SIZE_STEP = 40.0, 0.45
@@ -52,9 +54,9 @@ class RegionPath:
 
     @property
     def travel(self) -> float:
-        """Return the length of the smoothed path in working px."""
+        """Return the length of the smoothed path in working px; a short one may be a toss that turns within it."""
         places = self.middles
-        width = min(5, len(places))
+        width = int(np.clip(len(places) // 5, 1, 5))
         smooth = np.stack([np.convolve(places[:, i], np.ones(width) / width, mode="valid") for i in (0, 1)], axis=1)
         return float(np.linalg.norm(np.diff(smooth[:: max(1, width - 1)], axis=0), axis=1).sum())
 
@@ -73,6 +75,8 @@ class RegionPath:
             return 0.0
         inner = [r for r in self.regions if not r.cut]
         if len(inner) < LEAST_FRAMES or self.travel < LEAST_TRAVEL * self.size:
+            return 0.0
+        if np.median([r.axes[1] for r in inner]) < THIN_PX:
             return 0.0
         across = np.log([r.axes[1] for r in inner])
         steady = float(np.exp(-3.0 * np.median(np.abs(across - np.median(across)))))
