@@ -22,6 +22,9 @@ MOST_HASHED = 2**40
 """Of a file of which only a hash is taken, so that memory does not matter."""
 MAX_PICTURE_BYTES = 2**30
 """Of a picture's file; how many pixels it may have is its reader's to say."""
+PICTURE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "TGA")
+"""Pillow's names of what it may decode, whatever the file is called; JPEG includes MPO. PostScript is not among them:
+for it, Pillow starts Ghostscript, which runs what the file says."""
 
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOCTTY", 0)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ...sim.atomic import scratch_prefix
+from ...sim.composite.srgb import read_rgb
 from ...sim.errors import InputError
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene, require_photo
@@ -119,8 +120,8 @@ def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[N
     uv, image = getattr(visual, "uv", None), _base_colour(visual)
     if uv is not None and image is not None and len(uv) == len(mesh.vertices) and np.isfinite(uv).all():
         return np.asarray(uv, dtype=np.float64), _load_image(source.name, image)
-    with Image.open(folder.file(folder.model.photo_files[0])) as photo:
-        return photo_uv(folder.model.camera, mesh.vertices), _load_image(source.name, photo.convert("RGB"))
+    photo = Image.fromarray(read_rgb(folder.file(folder.model.photo_files[0])))
+    return photo_uv(folder.model.camera, mesh.vertices), _load_image(source.name, photo)
 
 
 def _base_colour(visual: Any) -> Image.Image | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..errors import InputError
-from ..files import MAX_PICTURE_BYTES, open_file
+from ..files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 
 Linear = NDArray[np.float32]
 """(H, W, 3) linear light, Rec. 709 primaries, 1 is the white of an 8-bit image."""
@@ -61,7 +61,10 @@ def _read(path: Path, mode: str) -> NDArray[np.uint8]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
+            with (
+                open_file(path, MAX_PICTURE_BYTES, what="picture") as file,
+                Image.open(file, formats=PICTURE_FORMATS) as image,
+            ):
                 return np.asarray(image.convert(mode))
     except InputError:
         raise

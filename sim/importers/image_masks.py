@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..errors import InputError
-from ..files import MAX_PICTURE_BYTES, open_file
+from ..files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 from ..npz import read_npy, read_npz
 
 
@@ -44,7 +44,10 @@ def read_grey_image(path: Path) -> NDArray[Any]:
         with warnings.catch_warnings():
             # Pillow only warns between its limit and twice that; our own check below has the better message.
             warnings.simplefilter("ignore")
-            with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
+            with (
+                open_file(path, MAX_PICTURE_BYTES, what="picture") as file,
+                Image.open(file, formats=PICTURE_FORMATS) as image,
+            ):
                 if image.width * image.height > MAX_PIXELS:
                     raise InputError(f"{path}: has {image.width}x{image.height} pixels, too many for a mask")
                 image.load()

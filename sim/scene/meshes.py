@@ -6,7 +6,9 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import threading
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files import read_bytes
+from ..files import PICTURE_FORMATS, read_bytes
 from ..npz import array_body, array_header, open_npz
 from .folder import Scene, inside
 from .model import SceneObject
@@ -73,7 +75,8 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     try:
         content = io.BytesIO(read_bytes(path, MAX_MESH_BYTES, what="mesh"))
         kind, beside = path.suffix.lower().removeprefix("."), _files_beside(path.parent)
-        mesh = trimesh.load(content, file_type=kind, resolver=beside, process=False, force="mesh")
+        with _without_postscript():
+            mesh = trimesh.load(content, file_type=kind, resolver=beside, process=False, force="mesh")
     except InputError:
         raise
     except FileNotFoundError:
@@ -84,6 +87,37 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     except Exception as error:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again") from error
     return _checked_mesh(mesh, path)
+
+
+_pillow = threading.RLock()
+
+
+@contextlib.contextmanager
+def _without_postscript() -> Iterator[None]:
+    """Keep Pillow, which trimesh hands a mesh's textures whatever they are, from starting Ghostscript."""
+    try:
+        from PIL import EpsImagePlugin
+    except ModuleNotFoundError:
+        # Then textures are not decoded at all.
+        yield
+        return
+    with _pillow:
+        former = EpsImagePlugin.gs_binary
+        EpsImagePlugin.gs_binary = False
+        try:
+            yield
+        finally:
+            EpsImagePlugin.gs_binary = former
+
+
+def _check_textures(mesh: Any, path: Path) -> None:
+    """Raise InputError for a texture of a format that none of ours is: Pillow decodes it only where it is used."""
+    material = getattr(getattr(mesh, "visual", None), "material", None)
+    for part in (material, *(getattr(material, "materials", None) or ())):
+        for value in {**getattr(part, "_data", {}), **getattr(part, "__dict__", {})}.values():
+            found = getattr(value, "format", None)
+            if isinstance(found, str) and found not in (*PICTURE_FORMATS, "MPO"):
+                raise InputError(f"{path}: has a texture as {found}; export it again with PNG or JPEG textures")
 
 
 def _checked_mesh(mesh: Any, path: Path) -> trimesh.Trimesh:
@@ -98,6 +132,7 @@ def _checked_mesh(mesh: Any, path: Path) -> trimesh.Trimesh:
     faces = np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(mesh.vertices):
         raise InputError(f"{path}: has faces with vertex indices out of range; export it again")
+    _check_textures(mesh, path)
     return mesh
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Reads damaged files with every loader: only PhysGenError may escape, within seconds and a bounded address space.
+No loader may start a program, call anybody, or write, rename or remove anything outside its temporary folders.
 
     python tests/fuzz/run.py --count 300                     every loader, 300 inputs each
     python tests/fuzz/run.py --only "mesh OBJ" --index 17    one input again, with its traceback
@@ -29,6 +30,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -54,6 +56,67 @@ class TooSlow(BaseException):
     """An input took longer than ``CPU_S``; no loader catches it."""
 
 
+class Forbidden(BaseException):
+    """A loader did what none may: started a program, called somebody, or changed a file elsewhere."""
+
+
+RUNS = ("subprocess.Popen", "os.system", "os.exec", "os.spawn", "os.posix_spawn", "os.fork", "os.forkpty", "pty.spawn")
+CALLS = ("socket.connect", "socket.bind", "socket.getaddrinfo", "socket.gethostbyname", "urllib.Request")
+CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod")
+
+
+class Guard:
+    """Python's audit events of what no loader may do, while one reads. Hooks cannot be removed, so it is one object."""
+
+    def __init__(self) -> None:
+        """Watch nothing yet."""
+        self.places: tuple[str, ...] | None = None
+
+    def see(self, event: str, given: tuple[Any, ...]) -> None:
+        """Raise Forbidden for such an event."""
+        if self.places is None:
+            return
+        if event in RUNS or event in CALLS:
+            raise Forbidden(f"{event} {str(given)[:100]}")
+        if event == "open":
+            _, mode, flags = (*given, None, None)[:3]
+            writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+            if not (writes or (isinstance(mode, str) and set("wax+") & set(mode))):
+                return
+        elif event not in CHANGES:
+            return
+        count = 2 if event in ("os.rename", "os.link") else 1
+        at = given[count:] if event in CHANGES else ()
+        for index, path in enumerate(given[:count]):
+            where = at[index] if index < len(at) and isinstance(at[index], int) else -1
+            if isinstance(path, str | bytes) and not self._is_ours(os.fsdecode(path), where, follows=event == "open"):
+                raise Forbidden(f"{event} {os.fsdecode(path)[:100]}")
+
+    def _is_ours(self, path: str, where: int, *, follows: bool) -> bool:
+        """Return whether ``path``, from the open folder ``where`` if that is none of -1, is in one of the places.
+
+        follows: whether a link of that name is followed, too, and not only those of the folders that it is in.
+        """
+        assert self.places is not None
+        path = os.path.join(f"/proc/self/fd/{where}" if where >= 0 else "", path)  # noqa: PTH118 - may be no name at all
+        real = os.path.realpath(path)
+        if not follows:
+            real = os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))  # noqa: PTH118, PTH119, PTH120
+        return real == os.devnull or any(real.startswith(f"{place}{os.sep}") for place in self.places)
+
+    @contextlib.contextmanager
+    def watching(self, folder: Path) -> Iterator[None]:
+        """Watch; ``folder`` and the temporary folder may be written to."""
+        self.places = (os.path.realpath(folder), os.path.realpath(tempfile.gettempdir()))
+        try:
+            yield
+        finally:
+            self.places = None
+
+
+guard = Guard()
+
+
 def _pipe(path: Path) -> None:
     os.mkfifo(path)
 
@@ -75,7 +138,12 @@ def _sparse(path: Path) -> None:
         file.truncate(2**42)
 
 
-INSTEAD = (_pipe, _endless, _circle, _outside, Path.mkdir, Path.touch, _sparse, lambda path: None)
+def _postscript(path: Path) -> None:
+    """For which Pillow starts Ghostscript, whatever the file is called."""
+    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n")
+
+
+INSTEAD = (_pipe, _endless, _circle, _outside, _postscript, Path.mkdir, Path.touch, _sparse, lambda path: None)
 """What is put in the place of a file: the first inputs of every loader. The last one is nothing."""
 
 
@@ -115,7 +183,7 @@ def attempt(name: str, loader: Loader, template: Path, folder: Path, seed: int, 
     shutil.copytree(template, folder)
     place_input(name, loader, folder, seed, index)
     try:
-        with _bounded():
+        with _bounded(), guard.watching(folder):
             loader.read(folder)
     except PhysGenError as error:
         return None if str(error) else error
@@ -154,6 +222,7 @@ def _child(name: str, loader: Loader, seed: int, first: int, count: int, at: mma
             os.write(out, f"{json.dumps([-1, 'as it is: ' + _where(error)])}\n".encode())
             return
         _limit_memory()
+        sys.addaudithook(guard.see)
         for index in range(first, count):
             at[:8] = struct.pack("<q", index)
             if time.process_time() > cpu_s:
@@ -223,7 +292,9 @@ def again(name: str, seed: int, index: int) -> None:
         place_input(name, loader, place / "input", seed, index)
     print(f"{name}, seed {seed}, input {index}: {place / 'input'}")  # noqa: T201
     _limit_memory()
-    loader.read(place / "input")
+    sys.addaudithook(guard.see)
+    with guard.watching(place / "input"):
+        loader.read(place / "input")
 
 
 def main() -> int:

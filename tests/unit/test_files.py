@@ -20,6 +20,47 @@ from physgen.sim.npz import read_npy, read_npz
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import read_mesh
 from physgen.sim.validation import MOST_WHOLE, parse, read_json
+from PIL import EpsImagePlugin, Image
+
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n"
+
+
+def textured_box(suffix, folder, picture):
+    """A box in ``folder`` whose texture is ``picture``: in the GLB itself, or beside an OBJ; its file."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    paint = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.effect_noise((32, 32), 90).convert("RGB"))
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], material=paint)
+    path = folder / f"box{suffix}"
+    box.export(path)
+    if suffix == ".obj":
+        (texture,) = folder.glob("*.png")
+        texture.write_bytes(picture)
+        return path
+    content = path.read_bytes()
+    first, last = content.find(b"\x89PNG"), content.find(b"IEND") + 8
+    assert first > 0 and len(picture) <= last - first
+    path.write_bytes(content[:first] + picture.ljust(last - first) + content[last:])
+    return path
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a program that is a script")
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_a_texture_in_postscript_starts_no_program(tmp_path, monkeypatch, suffix):
+    """Pillow starts Ghostscript for pictures that begin so; trimesh lets it decode whatever a mesh has."""
+    ran = tmp_path / "ran"
+    program = tmp_path / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\necho yes >> {ran}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    (tmp_path / "mesh").mkdir()
+    path = textured_box(suffix, tmp_path / "mesh", POSTSCRIPT)
+    with pytest.raises(InputError, match="box"):
+        np.asarray(read_mesh(path).visual.material.to_color(np.zeros((1, 2))))
+    assert not ran.exists()
+    # It is Pillow as before for everybody else in this process, such as another add-on.
+    assert EpsImagePlugin.gs_binary is None and EpsImagePlugin.has_ghostscript() and ran.exists()
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ...errors import InputError
-from ...files import MAX_PICTURE_BYTES, open_file
+from ...files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 from ...trust import trusted_spec
 from ..adapters.adapter_registry import adapter_content
 from ..adapters.protocols import SoftSegmenter
@@ -48,7 +48,10 @@ def read_mask(path: Path, width: int, height: int) -> Mask:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
+            with (
+                open_file(path, MAX_PICTURE_BYTES, what="picture") as file,
+                Image.open(file, formats=PICTURE_FORMATS) as image,
+            ):
                 return _decode(path, image, width, height)
     except InputError:
         raise
