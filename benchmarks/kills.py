@@ -70,7 +70,7 @@ LONGEST_S = 900.0
 END_CODES = (0, 3, 4, 5)
 """Of a command of whose processes another one was killed (docs/cli.md)."""
 
-REFUSED = "already exists; choose another"
+REFUSED = re.compile(r"already exists; choose another|is there already; name a new")
 """What commands that never replace anything say."""
 
 
@@ -108,7 +108,7 @@ STEPS = (
 )
 QUICK = ("variant", "light", "capture", "collect")
 
-MEASURED = re.compile(r"bake/(times|manifest)\.json|.*\.log|job/(tasks/.*|summary\..*)")
+MEASURED = re.compile(r"(.*/)?times\.json|.*\.log|job/(\.farm/records/.*|summary(\..*|/.*))")
 """Files that say by the clock how long something took: they have to be there, whatever they say."""
 
 
@@ -317,7 +317,7 @@ def measure(root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Ste
             started = time.monotonic()
             differs = difference(contents(place.work), whole[step.name])
             problem, _ = run(place, step)
-            if problem and REFUSED in problem and differs is None:
+            if problem and REFUSED.search(problem) and differs is None:
                 # Killed after its result was whole: some commands then say that it is there already.
                 problem = None
             problem = problem or difference(contents(place.work), whole[step.name]) or ""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -65,8 +66,12 @@ def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def drop_checkpoint(out: Path) -> None:
-    """Forget the checkpoint of the bake folder ``out``."""
+    """Forget the checkpoint of the bake folder ``out``, and its folder if that is empty then: whether there was one
+    depends on the machine's speed.
+    """
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        (out / CHECKPOINT_FILE).parent.rmdir()
 
 
 def resume(out: Path, manifest: BakeManifest, world: Any) -> tuple[int, list[dict[str, Any]], str | None]:

@@ -141,6 +141,7 @@ class Fits(FittedModels, Protocol):
 
 FORMAT = "physgen-diagnosis/1"
 REPORT_FILE, WHERE_FILE, PREDICTION_FILE, PAGE_FILE = "report.json", "where.npz", "prediction.npz", "report.html"
+TIMES_FILE = "times.json"
 
 NONE, UNKNOWN = "none", "unknown"
 
@@ -278,7 +279,8 @@ class Diagnosis:
     controls: ``wrong_effect_rms_m`` and ``last_residual_rms_m``.
     summary: the verdict in a sentence. warnings: of the capture and of the diagnosis. confirmation: verification runs.
     pair: the fit of both causes where the verdict names two, else None.
-    seconds: wall time, the only number that differs when the same capture is diagnosed again. work: budget and use.
+    seconds: wall time, the only number that differs when the same capture is diagnosed again (``times.json``). work:
+    budget and use.
     provenance: capture, command, version.
 
     >>> import physgen
@@ -307,7 +309,10 @@ class Diagnosis:
 
 
 def write_diagnosis(diagnosis: Diagnosis, out: Path) -> None:
-    """Write ``report.json``, ``where.npz`` and ``prediction.npz`` into the folder ``out``."""
+    """Write ``report.json``, ``where.npz``, ``prediction.npz`` and ``times.json`` into the folder ``out``.
+
+    How long it took is apart from what was found, so that the same diagnosis has the same bytes.
+    """
     where, prediction = {}, {}
     for name, trial in diagnosis.trials.items():
         for key in ("frame_score", "point_score", "residual"):
@@ -319,6 +324,7 @@ def write_diagnosis(diagnosis: Diagnosis, out: Path) -> None:
     np.savez_compressed(out / WHERE_FILE, **where)  # type: ignore[arg-type]
     np.savez_compressed(out / PREDICTION_FILE, **prediction)  # type: ignore[arg-type]
     write_json(out / REPORT_FILE, report_json(diagnosis))
+    write_json(out / TIMES_FILE, {"seconds": _plain(diagnosis.seconds)})
 
 
 def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -343,7 +349,6 @@ def report_json(diagnosis: Diagnosis) -> dict[str, Any]:
             },
             "confirmation": dict(diagnosis.confirmation),
             "warnings": list(diagnosis.warnings),
-            "seconds": diagnosis.seconds,
             "work": None if diagnosis.work is None else to_json(diagnosis.work),
             "provenance": None if diagnosis.provenance is None else to_json(diagnosis.provenance),
         }

@@ -134,7 +134,6 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         verification=[
             (shortened(str(key).replace("_", " "), 60), _value(value)) for key, value in diagnosis.confirmation.items()
         ],
-        took=f"{diagnosis.seconds:.0f} s" if _finite(diagnosis.seconds) > 0 else None,
         marks=_MARKS,
         bar_class=bar_class,
         bar_width=lambda probability: short_number(max(min(_finite(probability), 1.0) * _BAR, 1.0)),
