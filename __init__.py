@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .sim.app.diagnose import diagnose
     from .sim.app.evaluate import EvaluateOptions, evaluate
     from .sim.app.explain import Explanation, explain
+    from .sim.app.export_usd import export_usd
     from .sim.app.import_capture import ImportRequest, import_capture
     from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
@@ -87,6 +88,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "explain",
+    "export_usd",
     "import_capture",
     "load_bake",
     "load_capture",
@@ -132,6 +134,7 @@ _HOMES = {
     "diagnose": ".sim.app.diagnose",
     "evaluate": ".sim.app.evaluate",
     "explain": ".sim.app.explain",
+    "export_usd": ".sim.app.export_usd",
     "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",
     "load_capture": ".sim.diagnose.capture",

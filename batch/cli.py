@@ -81,6 +81,9 @@ def build_parser() -> argparse.ArgumentParser:
     scene_commands.add_pack(
         command("pack", scene_commands.run_pack, "a bake packed for the way, with --unpack back again")
     )
+    scene_commands.add_export(
+        command("export", scene_commands.run_export, "scene folder, and its bake → USD with UsdPhysics bodies")
+    )
     scene_commands.add_free(
         command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
     )

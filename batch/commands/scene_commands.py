@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scene and bake folders: ``variant``, ``bake``, ``estimate``, ``preview``, ``pack``, ``free`` and ``check``."""
+"""Scene and bake folders: `variant`, `bake`, `estimate`, `preview`, `pack`, `export`, `free` and `check`."""
 
 from __future__ import annotations
 
@@ -63,6 +63,26 @@ def run_pack(options: argparse.Namespace, terminal: Terminal, cancelled: IsCance
         size = pack_bake(load_bake(options.bake), out=options.out, cancelled=cancelled)
     terminal({"event": "done", "stage": "pack", "bytes": size, "out": str(options.out)})
     terminal.line(f"{size / 2**20:.1f} MiB: {options.out}")
+    return 0
+
+
+def add_export(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``physgen export``."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("--bake", type=Path, metavar="BAKE", help="bake folder, whose motion is written too")
+    parser.add_argument("--usd", type=Path, required=True, metavar="FILE", help="new file, .usda (text) or .usdc")
+
+
+def run_export(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
+    """Run ``physgen export``; the exit code."""
+    from ...sim.app.export_usd import export_usd, require_scene
+
+    require_scene(options.scene)
+    bake = None if options.bake is None else load_bake(options.bake)
+    for note in export_usd(load_scene(options.scene), options.usd, bake=bake, cancelled=cancelled):
+        terminal({"event": "notice", "stage": "export", "message": note})
+    terminal({"event": "done", "stage": "export", "out": str(options.usd)})
+    terminal.line(f"USD: {options.usd}")
     return 0
 
 

@@ -191,7 +191,7 @@ def _usd(item: CaptureObject, settings: _Settings, found: Mapping[str, Mapping[s
     lines += [f"        float physics:{kind}Friction = {settings.friction:.9g}" for kind in ("static", "dynamic")]
     if settings.restitution is not None:
         lines.append(f"        float physics:restitution = {settings.restitution:.9g}")
-    lines += ["    }", "", f'    over "{_prim(item.name)}" (']
+    lines += ["    }", "", f'    over "{prim_name(item.name)}" (']
     lines.append('        prepend apiSchemas = ["PhysicsMassAPI", "MaterialBindingAPI"]')
     if data:
         lines += ["        customData = {", "            dictionary physgen = {"]
@@ -206,7 +206,7 @@ def _usd(item: CaptureObject, settings: _Settings, found: Mapping[str, Mapping[s
     return "\n".join([*lines, "    }", "}", ""])
 
 
-def _prim(name: str) -> str:
+def prim_name(name: str) -> str:
     """Return ``name`` as USD takes it: letters, digits and _, not beginning with a digit."""
     clean = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) or "body"
     return f"_{clean}" if clean[0].isdigit() else clean

@@ -87,6 +87,19 @@ def test_example_drop_a_mesh(tmp_path):
     assert heights[4] == pytest.approx(0.3 - 4.905 * (4 / 24) ** 2, abs=0.01)
 
 
+def test_example_scene_to_usd(tmp_path):
+    pytest.importorskip("pxr")
+    stage = example("scene_to_usd").main(tmp_path, frames=4)
+    from pxr import UsdGeom, UsdPhysics
+
+    crate = stage.GetPrimAtPath("/World/crate")
+    density = UsdPhysics.MaterialAPI(stage.GetPrimAtPath("/World/Materials/crate")).GetDensityAttr().Get()
+    assert UsdPhysics.MassAPI(crate).GetMassAttr().Get() == pytest.approx(density * 0.2 * 0.2 * 0.1, rel=1e-5)
+    # Free fall over three frames of a 24th of a second.
+    height = UsdGeom.Xformable(crate).GetLocalTransformation(4).ExtractTranslation()[2]
+    assert height == pytest.approx(0.4 - 4.905 * (3 / 24) ** 2, abs=2e-3)
+
+
 def test_example_sand_and_honey(tmp_path):
     reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=6)
     assert 0.0707 < reach["sand"] < reach["water"]

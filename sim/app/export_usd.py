@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: MIT
+"""A scene, and the motion of a bake, as USD: UsdPhysics bodies, meshes with texture coordinates, points, camera.
+
+Metres, kilograms, +Z up; time codes are frames. pxr (usd-core, ``pip install 'physgen[usd]'``) is imported when it is
+needed. Schemas: openusd.org, UsdPhysics, UsdGeom, UsdShade.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import replacing, write_bytes
+from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
+from ..cache.pc2 import Pc2Reader
+from ..errors import Cancelled, InputError
+from ..events import IsCancelled, never
+from ..files import is_file
+from ..mpm.surface_contact import SurfaceContact
+from ..scene.folder import SCENE_FILE, Scene
+from ..scene.scene_object import SceneObject
+from ..scene.textured_mesh import TexturedMesh, read_textured_mesh
+from .export_patch import prim_name
+from .world_setup import surface
+
+Array = NDArray[np.float64]
+ENDINGS = (".usda", ".usdc")
+RIGID_FIT = 1e-4
+"""Farthest that a vertex of a rigid body may be from the fitted pose, over its size; beyond it, points are written."""
+FOCAL_LENGTH = 35.0
+"""Of the camera, tenths of a unit: only its ratio to the aperture counts."""
+PICTURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mass:
+    """mass kg; centre (3,) m, world; inertia (3,) kg m² about ``axes`` (3, 3), columns, right-handed."""
+
+    mass: float
+    centre: Array
+    inertia: Array
+    axes: Array
+
+
+def mass_of(item: SceneObject, vertices: Array, faces: NDArray[np.int64], *, thickness: float | None = None) -> Mass:
+    """Return the mass of the object with ``vertices`` (V, 3), world m: of the solid that its mesh encloses.
+
+    thickness: of the wall of a hollow one, m, which then counts as a thin shell. Raises InputError where the mesh
+    encloses nothing.
+    """
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    corners: tuple[Array, ...]
+    # Of tetrahedra from the origin (Tonon 2004, J. Math. Stat. 1), or of triangles: sums over corners are exact.
+    if thickness is None:
+        part = np.einsum("ij,ij->i", a, normal) / 6
+        corners, whole = (a, b, c, np.zeros_like(a)), 20.0
+    else:
+        part = np.linalg.norm(normal, axis=1) / 2 * thickness
+        corners, whole = (a, b, c), 12.0
+    volume, total = float(part.sum()), sum(corners)
+    if not volume > 0:
+        raise InputError(f"object {item.name}: its mesh encloses no volume, so it has no mass; close it")
+    centre = part @ total / (volume * len(corners))
+    second = np.einsum("n,ni,nj->ij", part, total, total)
+    for corner in corners:
+        second = second + np.einsum("n,ni,nj->ij", part, corner, corner)
+    second = second / whole - volume * np.outer(centre, centre)
+    density = item.material.density
+    inertia, axes = np.linalg.eigh(density * (np.trace(second) * np.eye(3) - second))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return Mass(mass=density * volume, centre=centre, inertia=inertia, axes=axes)
+
+
+def export_usd(
+    scene: Scene, file: str | Path, *, bake: Bake | None = None, cancelled: IsCancelled = never
+) -> tuple[str, ...]:
+    """Write ``scene``, with the motion of ``bake``, to ``file`` (``.usda`` or ``.usdc``); return what USD lacks.
+
+    Textures go into ``STEM_textures`` beside it. What moves as a rigid body has a pose a frame, everything else its
+    points; time code n is frame n.
+
+    >>> import physgen
+    >>> physgen.export_usd(physgen.load_scene("scene"), "scene.usdc", bake=physgen.load_bake("bake"))  # doctest: +SKIP
+
+    Raises InputError where usd-core is missing, the file exists, or the bake is of another scene; Cancelled.
+    """
+    file = Path(file)
+    if file.suffix.lower() not in ENDINGS:
+        raise InputError(f"{file}: give a name that ends in {' or '.join(ENDINGS)}")
+    if file.exists():
+        raise InputError(f"{file}: is there already; choose another name")
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError:
+        raise InputError("export to USD needs usd-core: pip install 'physgen[usd]'") from None
+    if bake is not None and bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
+        raise InputError(f"{bake.root}: is the bake of another scene than {scene.root}; bake this one")
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    if bake is not None:
+        stage.SetTimeCodesPerSecond(bake.manifest.fps)
+        stage.SetFramesPerSecond(bake.manifest.fps)
+        stage.SetStartTimeCode(bake.first_frame)
+        stage.SetEndTimeCode(bake.last_frame)
+    writer = _Writer(stage, scene, bake, file, cancelled)
+    writer.write()
+    # Only now: a texture or a file is never left of an export that failed.
+    for path, content in writer.pictures.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, content)
+    with replacing(file) as partial:
+        if not stage.GetRootLayer().Export(str(partial)):
+            raise InputError(f"{file}: cannot be written; free space or choose another folder")
+    return tuple(writer.notes)
+
+
+class _Writer:
+    """One export; ``pictures`` are written by the caller, ``notes`` are what USD cannot say."""
+
+    def __init__(self, stage: Any, scene: Scene, bake: Bake | None, file: Path, cancelled: IsCancelled) -> None:
+        self.stage, self.scene, self.bake, self.file, self.cancelled = stage, scene, bake, file, cancelled
+        self.notes: list[str] = []
+        self.pictures: dict[Path, bytes] = {}
+        self.names: set[str] = set()
+        ground = scene.model.ground
+        self.ground = (
+            SurfaceContact() if ground is None else
+            SurfaceContact(
+                friction=ground.friction, static_friction=ground.static_friction, restitution=ground.restitution
+            )
+        )  # fmt: skip
+
+    def write(self) -> None:
+        """Fill the stage."""
+        from pxr import Gf, UsdPhysics
+
+        model = self.scene.model
+        physics = UsdPhysics.Scene.Define(self.stage, "/World/physicsScene")
+        size = float(np.linalg.norm(model.gravity))
+        down = np.array(model.gravity) / size if size > 0 else np.array([0.0, 0.0, -1.0])
+        physics.CreateGravityDirectionAttr(Gf.Vec3f(*map(float, down)))
+        physics.CreateGravityMagnitudeAttr(size)
+        if model.ground is not None:
+            self._ground(model.ground.point, model.ground.normal)
+        self._camera()
+        baked = {item.name: item for item in self.bake.manifest.objects} if self.bake else {}
+        for item in model.objects:
+            self._object(item, baked.get(item.name))
+        kinds = {"named contacts": model.contacts, "effects": model.effects, "keyed gravity": model.gravity_track}
+        missing = [kind for kind, there in kinds.items() if there]
+        if missing:
+            self.notes.append(f"USD Physics has no {', '.join(missing)}: left out")
+
+    def _name(self, name: str) -> str:
+        found = base = prim_name(name)
+        number = 1
+        while found in self.names or found in ("physicsScene", "ground", "camera", "Materials"):
+            number += 1
+            found = f"{base}_{number}"
+        self.names.add(found)
+        return found
+
+    def _place(self, prim: Any, matrix: Array) -> tuple[Any, Any]:
+        """Set the pose (4, 4) of ``prim``; return its operations for translation and orientation."""
+        from pxr import Gf, UsdGeom
+
+        xform = UsdGeom.Xformable(prim)
+        moved, turned = xform.AddTranslateOp(), xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+        moved.Set(Gf.Vec3d(*map(float, matrix[:3, 3])))
+        turned.Set(_quaternion(matrix[:3, :3]))
+        return moved, turned
+
+    def _ground(self, point: Sequence[float], normal: Sequence[float]) -> None:
+        from pxr import UsdGeom, UsdPhysics
+
+        up = np.array(normal) / np.linalg.norm(normal)
+        along = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+        along /= np.linalg.norm(along)
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.column_stack([along, np.cross(up, along), up])
+        matrix[:3, 3] = point
+        plane = UsdGeom.Plane.Define(self.stage, "/World/ground")
+        plane.CreateAxisAttr(UsdGeom.Tokens.z)
+        plane.CreateWidthAttr(20.0)
+        plane.CreateLengthAttr(20.0)
+        # It holds what falls; the photo shows it.
+        plane.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        self._place(plane, matrix)
+        UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
+        self._bind(plane.GetPrim(), self._material("ground", self.ground, None, None))
+
+    def _camera(self) -> None:
+        from pxr import Gf, UsdGeom
+
+        camera = self.scene.model.camera
+        found = UsdGeom.Camera.Define(self.stage, "/World/camera")
+        found.CreateFocalLengthAttr(FOCAL_LENGTH)
+        found.CreateHorizontalApertureAttr(FOCAL_LENGTH * camera.width / camera.fx)
+        found.CreateVerticalApertureAttr(FOCAL_LENGTH * camera.height / camera.fy)
+        found.CreateHorizontalApertureOffsetAttr(FOCAL_LENGTH * (camera.width / 2 - camera.cx) / camera.fx)
+        found.CreateVerticalApertureOffsetAttr(FOCAL_LENGTH * (camera.cy - camera.height / 2) / camera.fy)
+        found.CreateClippingRangeAttr(Gf.Vec2f(0.001, 10_000.0))
+        # USD looks along -z with y up, the scene's camera along z with y down.
+        self._place(found, np.asarray(camera.world_from_camera) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+    def _object(self, item: SceneObject, baked: BakedObject | None) -> None:
+        from pxr import Gf, UsdGeom, UsdPhysics
+
+        mesh = read_textured_mesh(self.scene.file(item.mesh))
+        matrix = np.asarray(item.world_from_mesh, dtype=np.float64)
+        world = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        faces = mesh.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else mesh.faces
+        rigid = item.role == "dynamic" and item.material.law == "rigid"
+        mass = None
+        if item.role == "dynamic":
+            thickness = None
+            if not item.fill:
+                thickness = item.shell_thickness
+                if thickness is None:
+                    self.notes.append(
+                        f"{item.name} is hollow without a shell_thickness: its mass is that of a full one"
+                    )
+            mass = mass_of(item, world, faces, thickness=thickness)
+        centre = mass.centre if rigid and mass is not None else np.zeros(3)
+        name = self._name(item.name)
+        body = UsdGeom.Xform.Define(self.stage, f"/World/{name}")
+        pose = np.eye(4)
+        pose[:3, 3] = centre
+        operations = self._place(body, pose)
+        shape = self._mesh(f"/World/{name}/mesh", mesh, world - centre, faces)
+        if rigid or item.role == "collider":
+            UsdPhysics.CollisionAPI.Apply(shape)
+            exact = UsdPhysics.Tokens.none if item.role == "collider" else UsdPhysics.Tokens.convexDecomposition
+            UsdPhysics.MeshCollisionAPI.Apply(shape).CreateApproximationAttr(exact)
+        prim = body.GetPrim()
+        if rigid or item.motion is not None:
+            api = UsdPhysics.RigidBodyAPI.Apply(prim)
+            api.CreateKinematicEnabledAttr(not rigid)
+            if rigid:
+                api.CreateVelocityAttr(Gf.Vec3f(*map(float, item.velocity)))
+                # Degrees a second, as UsdPhysics has it.
+                api.CreateAngularVelocityAttr(Gf.Vec3f(*(math.degrees(v) for v in item.spin)))
+                api.CreateStartsAsleepAttr(bool(item.asleep))
+        if mass is not None:
+            api = UsdPhysics.MassAPI.Apply(prim)
+            api.CreateMassAttr(mass.mass)
+            api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, mass.centre - centre)))
+            api.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, mass.inertia)))
+            api.CreatePrincipalAxesAttr(Gf.Quatf(_quaternion(mass.axes)))
+        self._bind(shape, self._material(name, surface(item, self.ground), item, mesh))
+        if not rigid:
+            self._matter(prim, item)
+        if self.bake is not None and baked is not None:
+            self._motion(name, baked, matrix, world, centre, shape, operations if rigid else None)
+
+    def _matter(self, prim: Any, item: SceneObject) -> None:
+        """Keep what UsdPhysics has no schema for with the body."""
+        material = item.material
+        prim.SetCustomDataByKey("physgen:law", material.law)
+        for field in ("density", "youngs_modulus", "poisson_ratio"):
+            prim.SetCustomDataByKey(f"physgen:{field}", float(getattr(material, field)))
+        if item.role == "dynamic":
+            self.notes.append(f"USD Physics has no {material.law} bodies: the matter of {item.name} is custom data")
+
+    def _mesh(self, path: str, mesh: TexturedMesh, points: Array, faces: NDArray[np.int64]) -> Any:
+        from pxr import Sdf, UsdGeom, Vt
+
+        made = UsdGeom.Mesh.Define(self.stage, path)
+        made.CreatePointsAttr(_vectors(points))
+        made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+        made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).ravel()))
+        made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        made.CreateExtentAttr(_vectors(np.stack([points.min(axis=0), points.max(axis=0)])))
+        values = UsdGeom.PrimvarsAPI(made)
+        if mesh.uv is not None:
+            kind = Sdf.ValueTypeNames.TexCoord2fArray
+            found = Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uv, np.float32))
+            values.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex).Set(found)
+        if mesh.colours is not None:
+            made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(mesh.colours))
+        return made.GetPrim()
+
+    def _material(self, name: str, contact: SurfaceContact, item: SceneObject | None, mesh: TexturedMesh | None) -> Any:
+        from pxr import Sdf, UsdPhysics, UsdShade
+
+        path = f"/World/Materials/{name}"
+        made = UsdShade.Material.Define(self.stage, path)
+        api = UsdPhysics.MaterialAPI.Apply(made.GetPrim())
+        api.CreateDynamicFrictionAttr(contact.friction)
+        api.CreateStaticFrictionAttr(contact.sticking)
+        api.CreateRestitutionAttr(contact.restitution)
+        if item is None or mesh is None:
+            return made
+        api.CreateDensityAttr(item.material.density)
+        shader = UsdShade.Shader.Define(self.stage, f"{path}/surface")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+        made.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+        ending = next((end for head, end in PICTURES.items() if (mesh.picture or b"").startswith(head)), None)
+        if mesh.picture is None or mesh.uv is None or ending is None:
+            return made
+        folder = f"{self.file.stem}_textures"
+        self.pictures[self.file.parent / folder / f"{name}{ending}"] = mesh.picture
+        reader = UsdShade.Shader.Define(self.stage, f"{path}/coordinates")
+        reader.CreateIdAttr("UsdPrimvarReader_float2")
+        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+        texture = UsdShade.Shader.Define(self.stage, f"{path}/texture")
+        texture.CreateIdAttr("UsdUVTexture")
+        texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./{folder}/{name}{ending}")
+        texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+        found = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(found)
+        colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+        return made
+
+    def _bind(self, prim: Any, material: Any) -> None:
+        from pxr import UsdShade
+
+        api = UsdShade.MaterialBindingAPI.Apply(prim)
+        api.Bind(material)
+        api.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+
+    def _motion(
+        self, name: str, baked: BakedObject, matrix: Array, world: Array, centre: Array, shape: Any, pose: Any
+    ) -> None:
+        """Write the samples of one object: as poses of ``pose``, where it moves rigidly, else as points."""
+        from pxr import Gf, UsdGeom, Vt
+
+        assert self.bake is not None
+        turn = matrix if baked.space == MESH_SPACE else np.eye(4)
+        first, count = self.bake.manifest.frame_start, self.bake.manifest.frames_done
+
+        def samples(file: str) -> Any:
+            reader = Pc2Reader(self.bake.root / file)  # type: ignore[union-attr]
+            for index in range(count):
+                if self.cancelled():
+                    raise Cancelled("export cancelled; nothing was written")
+                yield first + index, reader.sample(index) @ turn[:3, :3].T + turn[:3, 3]
+
+        size = max(float(np.ptp(world, axis=0).max()), 1e-9)
+        if pose is not None:
+            poses = [(frame, *_rigid(world - centre, points)) for frame, points in samples(baked.file)]
+            if max((error for *_, error in poses), default=0.0) < RIGID_FIT * size:
+                before = None
+                for frame, rotation, shift, _ in poses:
+                    turned = _quaternion(rotation)
+                    # Of q and -q the one that is nearer: readers interpolate component by component.
+                    if before is not None and Gf.Dot(before, turned) < 0:
+                        turned = -turned
+                    before = turned
+                    pose[0].Set(Gf.Vec3d(*map(float, shift)), frame)
+                    pose[1].Set(turned, frame)
+                return
+            self.notes.append(f"{name} does not stay rigid in the bake: its points were written")
+        mesh = UsdGeom.Mesh(shape)
+        for frame, points in samples(baked.file):
+            local = points - centre
+            mesh.GetPointsAttr().Set(_vectors(local), frame)
+            mesh.GetExtentAttr().Set(_vectors(np.stack([local.min(axis=0), local.max(axis=0)])), frame)
+        if baked.points_file is not None:
+            cloud = UsdGeom.Points.Define(self.stage, f"/World/{name}/particles")
+            found = None
+            for frame, points in samples(baked.points_file):
+                found = points if found is None else found
+                cloud.GetPointsAttr().Set(_vectors(points), frame)
+                cloud.GetExtentAttr().Set(_vectors(np.stack([points.min(axis=0), points.max(axis=0)])), frame)
+            assert found is not None
+            cloud.GetPointsAttr().Set(_vectors(found))
+            width = 2 * (3 * _volume(world, shape) / (4 * math.pi * len(found))) ** (1 / 3)
+            cloud.CreateWidthsAttr(Vt.FloatArray([width]))
+            cloud.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        if baked.splats:
+            self.notes.append(f"the splats of {name} are not written")
+        if baked.torn_file is not None:
+            self.notes.append(f"{name} tears in the bake: the skin before the crack is written, as it stretches")
+
+
+def _volume(world: Array, shape: Any) -> float:
+    from pxr import UsdGeom
+
+    faces = np.asarray(UsdGeom.Mesh(shape).GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    a, b, c = (world[faces[:, i]] for i in range(3))
+    return max(abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6, 1e-12)
+
+
+def _vectors(points: Array) -> Any:
+    from pxr import Vt
+
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
+
+
+def _quaternion(rotation: Array) -> Any:
+    from pxr import Gf
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = map(float, Rotation.from_matrix(rotation).as_quat())
+    return Gf.Quatd(w, x, y, z)
+
+
+def _rigid(rest: Array, points: Array) -> tuple[Array, Array, float]:
+    """Return rotation (3, 3), shift (3,) that take ``rest`` (V, 3) to ``points``, and the largest error (Kabsch)."""
+    middle, centre = rest.mean(axis=0), points.mean(axis=0)
+    u, _, v = np.linalg.svd((rest - middle).T @ (points - centre))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(v.T @ u.T))])
+    rotation = v.T @ flip @ u.T
+    shift = centre - rotation @ middle
+    error = float(np.linalg.norm(rest @ rotation.T + shift - points, axis=1).max())
+    return rotation, shift, error
+
+
+def require_scene(folder: Path) -> None:
+    """Raise InputError with the way out where ``folder`` is a bake, not a scene."""
+    if not is_file(folder / SCENE_FILE) and is_file(folder / "manifest.json"):
+        raise InputError(f"{folder}: is a bake: give its scene, and the bake with --bake")
