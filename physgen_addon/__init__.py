@@ -30,6 +30,7 @@ MODULES = (
     "operators.world_ops",
     "operators.bake_ops",
     "operators.render_ops",
+    "operators.farm_ops",
     "operators.diagnose_ops",
     "operators.compose_ops",
     "preview.live_preview",

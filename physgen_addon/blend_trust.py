@@ -26,7 +26,7 @@ GROUPS = ("physgen", "physgen_photo", "physgen_diagnose", "physgen_compose")
 """Our properties of a scene."""
 
 PATHS = ("FILE_PATH", "DIR_PATH")
-WRITTEN = ("output", "cache", "bake", "report", "scene_folder", "after")
+WRITTEN = ("output", "farm_folder", "cache", "bake", "report", "scene_folder", "after")
 """Properties whose files or folders are written, or deleted; the others are read."""
 
 

@@ -10,6 +10,7 @@ import bpy
 from .. import blend_trust, text
 from ..background_jobs import running
 from ..interpreter import missing_modules
+from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command
 from ..operators.render_ops import (
     PHYSGEN_OT_export_alembic,
     PHYSGEN_OT_export_usd,
@@ -132,6 +133,42 @@ class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
             column.operator(PHYSGEN_OT_look_nodes.bl_idname, icon="NODE_COMPOSITING")
         else:
             text.sentences(column, context, "To grade layers by hand: format EXR Layers.")
+
+
+class PHYSGEN_PT_farm(Sidebar, bpy.types.Panel):
+    """The whole clip as a job for this machine or a farm"""
+
+    bl_parent_id = "PHYSGEN_PT_render"
+    bl_label = "Farm"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Shown with a photo."""
+        return bool(context.scene.physgen.folder)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw where it runs, the button, and the command that does the same."""
+        rendering = context.scene.physgen.rendering
+        layout = self.layout
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.enabled = running() is None
+        column.prop(rendering, "farm")
+        column.prop(rendering, "farm_folder", text="Folder")
+        column.prop(rendering, "farm_chunk")
+        draw_job(layout, context, PHYSGEN_OT_farm.job_title)
+        here = rendering.farm == "local"
+        layout.operator(
+            PHYSGEN_OT_farm.bl_idname,
+            text="Bake and Render Here" if here else "Write the Job",
+            icon="RENDER_ANIMATION" if here else "EXPORT",
+        )
+        box = layout.box()
+        row = box.row(align=True)
+        row.label(text="The same in a terminal:", icon="CONSOLE")
+        row.operator(PHYSGEN_OT_copy_farm_command.bl_idname, text="", icon="COPYDOWN")
+        text.sentences(box, context, command(context.scene))
 
 
 class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):

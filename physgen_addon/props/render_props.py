@@ -5,7 +5,7 @@ Blender reads the class's annotations as properties, so they must not be postpon
 """
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
+from bpy.props import EnumProperty, IntProperty, StringProperty
 
 from ...sim.validation import range_of
 from ..paths import RELATIVE
@@ -129,6 +129,23 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
         "Distance of the plane of focus",
         soft_max=10.0,
     )
+    farm: EnumProperty(
+        name="Where",
+        description="What the job is run by",
+        items=[
+            ("local", "This Machine", "Baked and rendered here, several tasks at a time; resumed when run again"),
+            ("flamenco", "Flamenco", "Written as a job of Blender Studio's render farm"),
+            ("slurm", "SLURM", "Written as scripts for a cluster; submit.sh hands them over"),
+        ],
+    )
+    farm_folder: StringProperty(
+        name="Farm Folder",
+        description="Folder of the job and its results; all machines of a farm need it at the same path",
+        subtype="DIR_PATH",
+        default="//physgen_farm",
+        options=RELATIVE,
+    )
+    farm_chunk: IntProperty(name="Frames per Task", description="Frames that one task renders", default=24, min=1)
     result: StringProperty(name="Result", description="Last rendered file", subtype="FILE_PATH", options=RELATIVE)
 
 

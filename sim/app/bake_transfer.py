@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Transfer the bake of a scene exported from Blender to the photo's scene that was imported there.
+"""Transfer the bake, or the physics, of a scene exported from Blender to the photo's scene that was imported there.
 
 Blender bakes its own objects: meshes in their own space, under the names they have there. The render stage needs the
 photo's scene folder and world metres.
@@ -21,7 +21,8 @@ from ..errors import InputError
 from ..events import OnEvent, ignore
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
-from ..scene.model import SceneObject
+from ..scene.model import SceneModel, SceneObject
+from ..scene.overrides import PHYSICS_FIELDS
 
 MOVED_SHARE = 0.01
 """Fraction of an object's size; farther from its position in the photo it counts as moved."""
@@ -99,3 +100,63 @@ def _write_transformed(reader: Pc2Reader, matrix: NDArray[np.float64], samples: 
 
 def _transformed(sample: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return sample.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+KEPT_FIELDS = ("role", "splats", "motion", "stiffness_map", "density_map")
+"""Physics of an object that is not taken over: the photo's own, or given in the mesh of the export."""
+
+
+def transfer_physics(photo: Scene, exported: Scene, names: Mapping[str, str]) -> SceneModel:
+    """Return the content of ``photo`` with the physics of ``exported``: of its objects, ground and world.
+
+    names: as in ``transfer_bake``. A farm bakes the result itself, in world metres.
+
+    Raises InputError for what the photo's scene cannot say: objects that are in one of the two only, were moved or
+    reshaped since, collide along keyframes, or have weights painted on their mesh.
+    """
+    bodies = {item.name: item for item in exported.objects}
+    back = {theirs: ours for ours, theirs in names.items()}
+    strangers = [name for name in bodies if name not in back]
+    if strangers:
+        raise InputError(
+            f"not in the photo: {', '.join(strangers)}; a farm renders into the photo: take them out of the simulation"
+        )
+    objects = []
+    for item in photo.objects:
+        body = bodies.get(names.get(item.name, ""))
+        if body is None:
+            raise InputError(f"object {item.name!r}: is in the photo and not in the simulation; add it, as a collider")
+        _require_same_place(photo, item, exported, body)
+        for field, what in (("motion", "moves by keyframes"), ("stiffness_map", WEIGHTS), ("density_map", WEIGHTS)):
+            if getattr(body, field) is not None:
+                raise InputError(f"object {body.name!r}: {what}, which a farm's scene cannot have; bake it here")
+        taken = {field: getattr(body, field) for field in PHYSICS_FIELDS if field not in KEPT_FIELDS}
+        objects.append(dataclasses.replace(item, role=body.role, **taken))
+    ground = exported.model.ground
+    if ground is not None and photo.model.ground is not None:
+        # The mirror in the photo's floor is the photo's; Blender has no such numbers.
+        kept = {name: getattr(photo.model.ground, name) for name in ("reflectivity", "reflection_roughness")}
+        ground = dataclasses.replace(ground, **kept)
+    effects = tuple(
+        dataclasses.replace(item, objects=tuple(back[name] for name in item.objects)) for item in exported.model.effects
+    )
+    return dataclasses.replace(
+        photo.model,
+        objects=tuple(objects),
+        ground=ground,
+        effects=effects,
+        gravity=exported.model.gravity,
+        gravity_track=exported.model.gravity_track,
+    )
+
+
+WEIGHTS = "has weights painted on its mesh"
+
+
+def _require_same_place(photo: Scene, item: SceneObject, exported: Scene, body: SceneObject) -> None:
+    rest, now = load_object_mesh(photo, item).vertices, load_object_mesh(exported, body).vertices
+    if rest.shape != now.shape or np.abs(rest - now).max() > MOVED_SHARE * item.size_m:
+        raise InputError(
+            f"object {body.name!r}: is not where and as the photo shows it, and a farm's scene is the photo's; move it "
+            "back, or bake and render it here"
+        )

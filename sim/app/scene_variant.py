@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..atomic import replacing
 from ..cache.folder_lock import folder_lock
@@ -24,7 +25,10 @@ from ..scene.folder import (
     scene_to_json,
 )
 from ..scene.model import SceneModel
-from .reconstruct import Physics, with_physics
+
+# Imported where they are used: Blender's process, which may lack what reconstruction needs, saves scenes with this.
+if TYPE_CHECKING:
+    from .reconstruct import Physics
 
 
 def make_variant(
@@ -42,9 +46,14 @@ def make_variant(
 
     Raises InputError for unusable scenes, physics or effects, and for a folder with other content.
     """
+    from .reconstruct import with_physics
+
     scene = with_physics(source.model, physics)
-    if effects is not None:
-        scene = _with_effects(scene, effects)
+    return save_variant(source, scene if effects is None else _with_effects(scene, effects), out=out)
+
+
+def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
+    """Write ``scene``, which has the files of ``source``, as the scene folder ``out``, as ``make_variant`` does."""
     if out.resolve() == source.root.resolve():
         raise InputError(f"{out}: is the scene itself; choose another folder for the variant")
     if out.exists() and not out.is_dir():

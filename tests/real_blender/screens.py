@@ -48,14 +48,17 @@ def panels() -> list[type[bpy.types.Panel]]:
     return sorted(found, key=lambda kind: bool(getattr(kind, "bl_parent_id", "")))
 
 
-def open_all() -> list[str]:
-    """Let panels that begin closed begin open, because no script can open one; names of the panels of the tab."""
+def open_all(names: Sequence[str] = ()) -> list[str]:
+    """Let panels that begin closed begin open, because no script can open one; names of the panels of the tab.
+
+    names: of the classes that begin open, with their children closed; none for all.
+    """
     kinds = panels()
     for kind in reversed(kinds):
         bpy.utils.unregister_class(kind)
     for kind in kinds:
         options = getattr(kind, "bl_options", None)
-        if options and "DEFAULT_CLOSED" in options:
+        if options and "DEFAULT_CLOSED" in options and (not names or kind.__name__ in names):
             kind.bl_options = set(options) - {"DEFAULT_CLOSED"}
         bpy.utils.register_class(kind)
     return [kind.__name__ for kind in kinds]

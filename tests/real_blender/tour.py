@@ -8,6 +8,7 @@ default cube to a playing bake, and from the sample photo to a still, are counte
 from __future__ import annotations
 
 import importlib
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -32,7 +33,7 @@ def running():
     return extension("physgen_addon.background_jobs").running()
 
 
-def ended(what: str, seconds: float = 300):
+def ended(what: str, seconds: float = 900):
     """Wait until no job runs."""
     yield from session.until(lambda: running() is None, seconds, what)
 
@@ -45,6 +46,7 @@ def arranged():
     """Two viewports with sidebars of the two widths, in this file and in new ones."""
     preferences = bpy.context.preferences.addons[TASK["addon"]].preferences
     preferences.python = TASK["python"]
+    SCREENS.mkdir(exist_ok=True)
     yield from screens.arrange(WIDTHS)
 
 
@@ -193,7 +195,7 @@ def sample_photo():
     yield from screens.shoot(SCREENS, "19_reconstructed")
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the bake", 400)
+    yield from ended("the bake")
     bpy.context.scene.frame_set(9)
     yield from screens.shoot(SCREENS, "20_photo_baked")
     windows = set(bpy.context.window_manager.windows)
@@ -201,7 +203,7 @@ def sample_photo():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
     yield 2.0
     yield from screens.shoot(SCREENS, "21_rendering")
-    yield from ended("the still", 400)
+    yield from ended("the still")
     took = time.monotonic() - began
     result = bpy.context.scene.physgen.rendering.result
     assert result.endswith("0009.png") and Path(result).is_file(), f"no still: {result!r}"
@@ -213,6 +215,84 @@ def sample_photo():
     yield 0.5
     yield from screens.shoot(SCREENS, "23_rendered")
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
+
+
+def material():
+    """The panels of the material and of what few need, open: with units, in metric and imperial, and recognised."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+    opened = ("PHYSGEN_PT_material", "PHYSGEN_PT_advanced", "PHYSGEN_PT_pins")
+    screens.open_all(opened)
+    numbers = bpy.data.objects["Cube"].physgen.material
+    numbers.has_fibres, bpy.data.objects["Cube"].physgen.holds_shape = True, True
+    yield from screens.shoot(SCREENS, "24_material")
+    numbers.likeness, numbers.preset, numbers.law = "hard", "custom", "fluid"
+    bpy.context.scene.unit_settings.system = "IMPERIAL"
+    yield from screens.shoot(SCREENS, "25_material_imperial")
+
+
+def strange():
+    """A file of somebody else that names folders outside its own: the box that asks, and what it shows."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+    bpy.context.scene.physgen.rendering.output = "//../frames of somebody else"
+    mine, theirs = OUT / "mine" / "scene" / "a.blend", OUT / "theirs" / "scene" / "a.blend"
+    for path in (mine, theirs):
+        path.parent.mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(mine))
+    shutil.copyfile(mine, theirs)
+    bpy.ops.wm.open_mainfile(filepath=str(theirs))
+    yield from screens.drawn()
+    assert extension("physgen_addon.blend_trust").pending(bpy.context.scene), "a stranger's path does not wait"
+    yield from screens.shoot(SCREENS, "26_strange_file")
+    screens.aim()
+    with screens.focus():
+        bpy.ops.physgen.trust_file("INVOKE_DEFAULT", go_on=False)
+    yield 0.7
+    screens.picture(screens.window(), SCREENS / "27_trust.png")
+    yield from screens.press("Escape")
+
+
+def dropped():
+    """A photo dragged by the mouse from Blender's file browser and dropped on the sidebar's tab."""
+    yield from home()
+    folder = OUT / "to drop"
+    folder.mkdir()
+    samples = Path(extension("physgen_addon.operators.sample_ops").DEMO)
+    shutil.copyfile(samples / "coffee.jpg", folder / "coffee.jpg")
+    before = set(screens.window().screen.areas)
+    view = screens.viewport()
+    with bpy.context.temp_override(window=screens.window(), area=view, region=screens.region(view, "WINDOW")):
+        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.7)
+    browser = min(set(screens.window().screen.areas) - before, key=lambda area: area.height)
+    browser.ui_type = "FILES"
+    yield from screens.drawn(4)
+    parameters = browser.spaces.active.params
+    parameters.directory, parameters.display_type = str(folder).encode(), "LIST_VERTICAL"
+    parameters.filter_glob = "*.jpg"
+    browser.tag_redraw()
+    yield from screens.drawn(6)
+    yield 1.0
+    listed = screens.region(browser, "WINDOW")
+    bar = screens.region(screens.viewport(), "UI")
+    x, y = listed.x + 60, screens.window().height - (listed.y + listed.height - 30)
+    goal = (bar.x + bar.width // 2, screens.window().height - (bar.y + bar.height // 3))
+    yield from screens.point(x, y)
+    screens.xdotool("mousedown", 1)
+    yield 0.5
+    for share in (0.1, 0.4, 0.8, 1.0):
+        screens.xdotool("mousemove", round(x + share * (goal[0] - x)), round(y + share * (goal[1] - y)))
+        yield 0.4
+    yield from screens.drawn()
+    screens.picture(screens.window(), SCREENS / "28_dragging.png")
+    screens.xdotool("mouseup", 1)
+    yield 1.5
+    yield from screens.drawn()
+    screens.picture(screens.window(), SCREENS / "29_dropped.png")
+    found = bpy.context.scene.physgen_photo.path
+    assert Path(found) == folder / "coffee.jpg", f"the dropped photo was not opened: {found!r}"
 
 
 def documented():
@@ -230,7 +310,7 @@ def documented():
         yield from screens.shoot(SCREENS, f"docs_{sample.lower()}")
     with screens.focus():
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from ended("the bake", 500)
+    yield from ended("the bake")
     bpy.context.scene.frame_set(16)
     yield from screens.shoot(SCREENS, "docs_baked")
 
@@ -240,5 +320,6 @@ def wanted(step) -> bool:
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
-STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, documented]
+STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
+STEPS += [dropped, strange, material, documented]
 session.run("tour", [step for step in STEPS if wanted(step)])
