@@ -113,7 +113,7 @@ def test_every_property_with_a_path_waits_for_the_word(tmp_path, monkeypatch):
     named = {
         "physgen": ("folder",),
         "physgen.simulation": ("cache", "bake"),
-        "physgen.rendering": ("output", "result"),
+        "physgen.rendering": ("output", "farm_folder", "result"),
         "physgen_photo": ("path", "depth", "output"),
         "physgen_diagnose": ("capture", "report", "scene_folder", "before", "after"),
     }
