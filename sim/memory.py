@@ -7,6 +7,7 @@ The figures of a stage are its largest process's peak resident memory, measured 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import sys
@@ -103,6 +104,29 @@ LACK = (
 def ran_out(error: BaseException) -> bool:
     """Return whether ``error`` says that memory ran out, by whatever name."""
     return isinstance(error, MemoryError) or any(words in str(error).lower() for words in LACK)
+
+
+def memory_kills(vmstat: Path = Path("/proc/vmstat")) -> int | None:
+    """Return how many processes the kernel has killed for lack of memory since it started, in all control groups; None
+    where the system does not say (all but Linux).
+    """
+    with contextlib.suppress(OSError, ValueError):
+        for line in vmstat.read_text().splitlines():
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    return None
+
+
+def how_it_was_killed(kills_before: int | None) -> str:
+    """Return what to say of a process that SIGKILL has ended, which cannot say it itself: a clause.
+
+    kills_before: ``memory_kills`` when it began. Another process that the kernel has killed meanwhile counts as this.
+    """
+    now, left = memory_kills(), available_memory()
+    free = "" if left is None else f"; {left / MIB:,.0f} MiB are available now"
+    if None not in (kills_before, now) and now != kills_before:
+        return f"it was killed by the system, as memory ran out{free}"
+    return f"it was killed, possibly because memory ran out{free}"
 
 
 def available_memory(reserved: int = 0) -> int | None:

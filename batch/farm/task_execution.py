@@ -16,7 +16,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from queue import Empty, Queue
 from types import TracebackType
@@ -34,6 +34,7 @@ from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
 from ...sim.cache.folder_lock import is_held
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ...sim.memory import how_it_was_killed, memory_kills
 from ...sim.scene.folder import file_hash, inside
 from ...sim.validation import parse, read_json, to_json
 from ...sim.version import VERSION
@@ -247,7 +248,7 @@ LOOK_S = 0.1
 class _Ended:
     """How a command ended. code: negative for a signal. final: its ``done`` or ``error`` event. words: last line.
 
-    cancelled: whether it was asked to stop.
+    cancelled: whether it was asked to stop. kills_before: ``memory_kills`` when it began.
     """
 
     code: int = 0
@@ -256,6 +257,7 @@ class _Ended:
     final: Event | None = None
     words: str = ""
     cancelled: bool = False
+    kills_before: int | None = field(default_factory=memory_kills)
 
 
 def execute_task(
@@ -337,7 +339,8 @@ def _message(ended: _Ended) -> str:
             name = signal.Signals(-ended.code).name
         except ValueError:
             name = f"signal {-ended.code}"
-        return f"the command was ended by {name}" + (f": {ended.words}" if ended.words else "")
+        killed = f" ({how_it_was_killed(ended.kills_before)})" if name == "SIGKILL" else ""
+        return f"the command was ended by {name}{killed}" + (f": {ended.words}" if ended.words else "")
     return f"the command ended with code {ended.code}: {ended.words or 'no output'}"
 
 

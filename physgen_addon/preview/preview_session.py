@@ -22,11 +22,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.app.stage_process import parse_event, read_errors, start_process
+from ...sim.app.stage_process import how_it_ended, parse_event, read_errors, start_process
 from ...sim.atomic import scratch_prefix
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event
+from ...sim.memory import memory_kills
 from ...sim.npz import read_npy
 from ...sim.scene.folder import inside
 from ...sim.validation import to_json
@@ -178,6 +179,7 @@ class Client:
             self._at_end()
 
     def _serve(self, command: list[str]) -> None:
+        kills = memory_kills()
         process = start_process(command, stdin=subprocess.PIPE)
         tail: deque[str] = deque(maxlen=10)
         threads = [
@@ -195,7 +197,9 @@ class Client:
         self._requests.put(None)
         for thread in threads:
             thread.join(1.0)
-        words = "" if self._stopped.is_set() else "\n".join(tail).strip() or f"the worker ended with code {code}"
+        words = (
+            "" if self._stopped.is_set() else "\n".join(tail).strip() or how_it_ended(code, kills, what="the worker")
+        )
         self._events.put({"event": "ended", "message": words})
 
     def _write(self, process: subprocess.Popen[bytes]) -> None:

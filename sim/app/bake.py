@@ -34,7 +34,7 @@ from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError, SimulationError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
-from ..scene.folder import Scene
+from ..scene.folder import Scene, inside
 from ..scene.meshes import load_object_mesh
 from ..scene.scene_sums import changed_files
 from ..version import VERSION
@@ -122,11 +122,16 @@ def bake(
 
 
 def _refuse_foreign_folder(out: Path) -> None:
-    """Raise InputError for a folder with files that are no bake, so that nothing is ever overwritten."""
+    """Raise InputError for a folder with files that are no bake, so that nothing is ever overwritten, and for a bake
+    with a link that leads out of it, through which caches and checkpoints would be written.
+    """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder for the bake")
     if out.is_dir() and not (out / MANIFEST_FILE).is_file() and any(not p.name.startswith(".") for p in out.iterdir()):
         raise InputError(f"{out}: holds other files and no bake; choose an empty or new folder")
+    for path in out.iterdir() if out.is_dir() else ():
+        if path.is_symlink():
+            inside(out, path.name)
 
 
 @contextlib.contextmanager

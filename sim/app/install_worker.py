@@ -19,7 +19,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..memory import memory_kills
 from .requirements import RENDERER, REQUIREMENTS
+from .stage_process import how_it_ended
 
 MODULE = "sim.app.install_worker"
 """From the tree's root, for ``own_command``."""
@@ -75,6 +77,7 @@ class Installation:
 
     def _run(self, command: Sequence[str]) -> None:
         """Run one program and report what it is doing; RuntimeError with its last words when it fails."""
+        kills = memory_kills()
         self._process = process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -100,7 +103,7 @@ class Installation:
                 _say(event="progress", message=words[:80], done=done, total=total)
         if process.wait() != 0:
             raise RuntimeError(
-                last.removeprefix("ERROR: ") or f"{Path(command[0]).name} ended with code {process.returncode}"
+                last.removeprefix("ERROR: ") or how_it_ended(process.returncode, kills, what=Path(command[0]).name)
             )
 
 

@@ -22,6 +22,7 @@ from queue import Empty, Queue
 from ..children import note_child
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ..events import Event, IsCancelled, OnEvent
+from ..memory import how_it_was_killed, memory_kills
 
 CANCEL_GRACE_S = 1.0
 """Time for a stage to clean up before it is killed: a command ends within two seconds of being asked to
@@ -105,6 +106,7 @@ def run_stage(
     Raises the PhysGenError that the stage reported; Cancelled when ``cancelled()`` became true; ``failure`` with the
     last lines of its output when it died without reporting an error.
     """
+    kills = memory_kills()
     while True:
         final, code, tail = _run_once(command, on_event, cancelled)
         if restarts == 0 or final is not None or not _crashed(code):
@@ -116,7 +118,7 @@ def run_stage(
     # A process that is asked to stop after its work was done may be killed by the signal while it ends.
     if final is None or (code != 0 and not cancelled()):
         words = "\n".join(tail).strip() or "no output"
-        raise failure(f"{_how_it_ended(code)}: {words}")
+        raise failure(f"{how_it_ended(code, kills)}: {words}")
     return final
 
 
@@ -126,11 +128,14 @@ def _crashed(code: int) -> bool:
     return -code in faults or (os.name == "nt" and code & 0xF0000000 == 0xC0000000)
 
 
-def _how_it_ended(code: int) -> str:
-    """Return the start of a sentence about a process with this exit code."""
-    text = f"the process ended with code {code}"
+def how_it_ended(code: int, kills_before: int | None, *, what: str = "the process") -> str:
+    """Return the start of a sentence about a process with this exit code. kills_before: ``memory_kills`` at its start.
+
+    A process that the kernel kills for lack of memory has no last word; whoever waits for it says it.
+    """
+    text = f"{what} ended with code {code}"
     if code == -getattr(signal, "SIGKILL", 0):
-        return f"{text} (it was killed, possibly because memory ran out)"
+        return f"{text} ({how_it_was_killed(kills_before)})"
     return f"{text} (it crashed)" if _crashed(code) else text
 
 

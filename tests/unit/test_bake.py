@@ -15,12 +15,14 @@ from physgen.sim.app import bake as bake_module
 from physgen.sim.app import bake_worker
 from physgen.sim.app.bake import bake
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.cache.bake_folder import load_manifest
+from physgen.sim.cache.bake_folder import BakedObject, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import Cancelled, InputError, SimulationError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Effect, Ground, Key, Light, Material, Motion
+
+from ..conftest import complete_manifest
 
 QUICK = BakeOptions(frames=6, fps=24.0, quality="preview")
 SHORT = dataclasses.replace(QUICK, frames=2)
@@ -197,6 +199,21 @@ def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("name", ["ball0.pc2", "checkpoints", "ball0.points.pc2"])
+def test_nothing_is_written_through_a_link_that_leads_out_of_a_bake(ball_scene, tmp_path, name):
+    """A bake from somebody else: its caches would be written where they lead, and the checkpoint removed there."""
+    home, out = tmp_path / "home", tmp_path / "bake"
+    home.mkdir()
+    out.mkdir()
+    for file in ("letter", "state.npz"):
+        (home / file).write_text("mine")
+    (out / name).symlink_to(home if name == "checkpoints" else home / "letter")
+    save_manifest(out, complete_manifest(BakedObject(name="ball0", file="ball0.pc2", vertices=642)))
+    with pytest.raises(InputError, match=f"{name}.*leads out"):
+        bake(ball_scene(), out=out, options=BakeOptions(frames=2, quality="preview"))
+    assert {path.name: path.read_text() for path in home.iterdir()} == {"letter": "mine", "state.npz": "mine"}
+
+
 def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, own_kernels, tmp_path):
     folder = ball_scene()
     job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)

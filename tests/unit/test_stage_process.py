@@ -7,6 +7,7 @@ import textwrap
 import time
 
 import pytest
+from physgen.sim import memory
 from physgen.sim.app import stage_process
 from physgen.sim.app.stage_process import run_stage
 from physgen.sim.errors import Cancelled, InputError, RenderError
@@ -36,8 +37,19 @@ def test_an_error_keeps_its_kind_and_words():
 def test_a_stage_that_dies_without_a_word_is_quoted():
     with pytest.raises(RenderError, match=r"code 1(.|\n)*no such GPU"):
         run_stage(stage("import sys; sys.exit('no such GPU')"), print, lambda: False, failure=RenderError)
-    with pytest.raises(RenderError, match="code -9"):
+    with pytest.raises(RenderError, match=r"code -9 \(it was killed, possibly because memory ran out; [\d,]+ MiB are"):
         run_stage(stage("import os; os.kill(os.getpid(), 9)"), print, lambda: False, failure=RenderError)
+
+
+def test_the_kernels_count_of_processes_killed_for_memory_tells_why(tmp_path, monkeypatch):
+    """A control group's limit ends a process with no last word: whoever waits for it says it."""
+    counts = tmp_path / "vmstat"
+    counts.write_text("oom_kill_disable 1\noom_kill 7\n")
+    assert memory.memory_kills(counts) == 7 and memory.memory_kills(tmp_path / "none") is None
+    before = memory.memory_kills(counts)
+    monkeypatch.setattr(memory, "memory_kills", lambda: 8)
+    assert memory.how_it_was_killed(before).startswith("it was killed by the system, as memory ran out; ")
+    assert memory.how_it_was_killed(8).startswith("it was killed, possibly because memory ran out; ")
 
 
 def test_a_stage_that_ends_well_without_a_result_is_an_error():

@@ -30,6 +30,7 @@ from ...children import note_child
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled
 from ...files import MAX_PICTURE_BYTES, open_file
+from ...memory import how_it_was_killed, memory_kills
 from ...npz import read_npy, read_npz
 from ...scene.meshes import MAX_MESH_BYTES
 from .adapter_registry import CommandFile, program_python
@@ -85,6 +86,7 @@ def run_command(
     and leaves ``output``; raises Cancelled.
     """
     kept = {name: text for name, text in os.environ.items() if not name.upper().startswith(_STRIPPED)}
+    kills = memory_kills()
     try:
         process = subprocess.Popen(
             list(arguments),
@@ -113,7 +115,8 @@ def run_command(
     if reason is not None:
         raise InputError(f"{where}: {reason}; it was killed. Last output: {words}")
     if process.returncode != 0:
-        raise InputError(f"{where}: ended with code {process.returncode}. Last output: {words}")
+        killed = f" ({how_it_was_killed(kills)})" if process.returncode == -getattr(signal, "SIGKILL", 0) else ""
+        raise InputError(f"{where}: ended with code {process.returncode}{killed}. Last output: {words}")
     if not output.is_file() and not output.is_dir():
         raise InputError(f"{where}: wrote no {output.name}; it must write to {{output}}. Last output: {words}")
     if output.is_file() and output.stat().st_size > most_bytes:
