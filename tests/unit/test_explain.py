@@ -105,6 +105,50 @@ def test_a_body_that_rests_and_is_struck_slides_on_a_level_surface():
     assert 185 < view.first < 205 and 265 < view.last < 320
 
 
+def understood(t, places, **other):
+    known = {"diameter_px": 17, "diameter": 0.03, "clearance": 0.005, "elevation": 1.0, "where": "v"}
+    return understand_motion(t, places, **(known | other))
+
+
+def test_a_motion_that_fills_little_of_a_video_is_understood_like_the_same_motion_alone():
+    t = np.arange(60) / 240
+    way = 160 * t - 0.5 * 640 * t**2
+    way[t > 0.25] = way.max()
+    noise = np.random.default_rng(3).normal(0, 0.05, (900, 2))
+    places = np.stack([190 + np.r_[way, np.full(840, way.max())], np.full(900, 105.0)], axis=1) + noise
+    long = understood(np.arange(900) / 240, places)
+    assert long.kind == "surface" and long.first <= 12 and 50 < long.last < 90
+    pace = np.polyfit(t[long.first : 55], long.points[: 55 - long.first, 0], 2)[0]
+    assert 2 * pace == pytest.approx(-640 / 17 * 0.03, rel=0.1)
+
+
+def test_a_fall_that_is_none_names_the_size_and_the_frame_rate():
+    t = np.arange(40) / 30
+    drop = np.stack([np.full(40, 160.0), 20 + 0.5 * (9.81 / 16) * 400 * t**2], axis=1)
+    drop += np.random.default_rng(0).normal(0, 0.1, drop.shape)
+    # Recorded at 120 frames per second, played at 30: four times the frame rate.
+    with pytest.raises(InputError, match=r"falls with 0\.6.* 4(\.0\d?)? times the frame rate"):
+        understood(t, drop, diameter_px=16, diameter=0.04)
+    view = understood(t / 4, drop, diameter_px=16, diameter=0.04)
+    assert view.kind == "flight"
+    toss = np.stack([60 + 100 * t, 200 - 150 * t + 0.5 * (9.81 / 16) * 400 * t**2], axis=1)
+    with pytest.raises(InputError, match="--fps-override"):
+        understood(t, toss, diameter_px=16, diameter=0.04)
+
+
+def test_braking_beyond_friction_and_a_body_on_a_pivot_are_refused():
+    t = np.arange(60) / 240
+    way = np.stack([150 + 2000 * t - 0.5 * 16000 * np.minimum(t, 0.125) ** 2 - 2000 * np.maximum(t - 0.125, 0),
+                    np.full(60, 90.0)], axis=1)  # fmt: skip
+    way += np.random.default_rng(0).normal(0, 0.05, way.shape)
+    with pytest.raises(InputError, match="more than friction can"):
+        understood(t, way)
+    turn = 9 * np.arange(200) / 240
+    round_ = np.stack([200 + 75 * np.cos(turn), 110 + 75 * np.sin(turn)], axis=1)
+    with pytest.raises(InputError, match="around one point"):
+        understood(np.arange(200) / 240, round_ + np.random.default_rng(0).normal(0, 0.3, round_.shape))
+
+
 def test_a_slow_ball_that_covers_its_place_all_the_time_is_seen_whole_on_a_plain_table(tmp_path):
     rng = np.random.default_rng(5)
     rows, columns = np.mgrid[0:240, 0:320]

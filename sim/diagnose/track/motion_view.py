@@ -7,7 +7,7 @@ seen from the side, and motion on a level surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,6 +40,17 @@ LET_GO = 5.0
 """Distance from the later motion, in its own scatter, up to which a body counts as let go."""
 REST_SHARE = 0.12
 """Time at rest after a stop that is kept, as a share of the motion."""
+BESIDE_SHARE, BESIDE_FRAMES = 0.5, 16
+"""Rest before and after a motion that is looked at, as a share of it and at least, in frames: in a long video the
+widths over which velocities are taken would else outgrow a short motion."""
+ROUND_TURN, ROUND_MISS = np.radians(240), 0.06
+"""Angle around one point, and scatter of the distance from it over the distance, from which a body is held there."""
+STEEPEST = 60.0
+"""Degrees of the steepest slope: what goes down more steeply falls."""
+MOST_BRAKING = 2.0
+"""Deceleration over g on a level surface beyond any friction."""
+ACROSS_SHARE = 0.5
+"""Share of an acceleration across the motion that no friction has."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,6 +199,53 @@ def understand_motion(
     Raises InputError where nothing moves freely for long enough, and for what gains speed on a level surface.
     """
     scale = diameter_px / diameter
+    begin, end = _active_part(places)
+    times, places = times[begin : end + 1], places[begin : end + 1]
+    if _goes_round(places):
+        raise InputError(
+            f"{where}: what moves goes around one point: a pivot, an axle or a string holds it, which is not "
+            "simulated; film a body that is free"
+        )
+    view = _setting(times, places, scale, diameter_px, clearance, elevation, where, from_above)
+    return replace(view, first=view.first + begin, last=view.last + begin)
+
+
+def _active_part(places: Array) -> tuple[int, int]:
+    """Return the first and last sample to look at: the motion with a little of the rest before and after it."""
+    count = len(places)
+    least = 4 * noise_px(places)
+    far = [np.linalg.norm(places - np.median(end, axis=0), axis=1) for end in (places[:5], places[-5:])]
+    moved, left = (np.flatnonzero(f > max(0.01 * float(f.max()), least)) for f in far)
+    if len(moved) == 0 or len(left) == 0 or left[-1] <= moved[0]:
+        return 0, count - 1
+    spare = max(BESIDE_FRAMES, round(BESIDE_SHARE * (left[-1] - moved[0])))
+    return max(0, int(moved[0]) - spare), min(count - 1, int(left[-1]) + spare)
+
+
+def _goes_round(places: Array) -> bool:
+    """Return whether all of the path lies on one circle and goes around most of it (circle by Kåsa's method)."""
+    middle = places.mean(axis=0)
+    off = places - middle
+    a = np.column_stack([2 * off, np.ones(len(off))])
+    x, y, c = np.linalg.lstsq(a, (off**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(c + x * x + y * y, 0.0)))
+    arms = off - (x, y)
+    if radius <= 0 or np.std(np.linalg.norm(arms, axis=1)) > ROUND_MISS * radius:
+        return False
+    return float(np.ptp(np.unwrap(np.arctan2(arms[:, 1], arms[:, 0])))) > ROUND_TURN
+
+
+def _setting(
+    times: Array,
+    places: Array,
+    scale: float,
+    diameter_px: float,
+    clearance: float,
+    elevation: float,
+    where: str,
+    from_above: bool,
+) -> MotionView:
+    """Return the view as ``understand_motion`` does, of a path that is mostly motion. scale: px/m by the size."""
     impacts = jumps(times, places)
     pieces = _pieces(times, places, impacts)
     flights = [p for p in pieces if _flies(p, scale)]
@@ -207,8 +265,41 @@ def understand_motion(
                 f"{where}: the body gains speed, and its outline is one from above: film a slope from its side; "
                 "a disc that rolls on its rim cannot be simulated"
             )
+        way = places[best.last] - places[best.first]
+        if np.degrees(np.arctan2(way[1], abs(way[0]))) > STEEPEST:
+            raise _strange_fall(best, scale, where)
         return _slope(times, places, best, scale, clearance)
+    if _curves_down(best, times, places):
+        raise _strange_fall(best, scale, where)
+    braking = -float(best.acceleration @ best.begin) / max(float(np.linalg.norm(best.begin)), 1e-9) / scale
+    if braking > MOST_BRAKING * GRAVITY:
+        raise InputError(
+            f"{where}: it slows down by {braking:.3g} m/s², more than friction can: check the body's size and "
+            "--fps-override, or choose a part with --start-frame and --end-frame"
+        )
     return _surface(times, places, best, scale, clearance, elevation)
+
+
+def _curves_down(piece: _Piece, times: Array, places: Array) -> bool:
+    """Return whether the path bends downwards, all of it by one acceleration that friction cannot have."""
+    size = float(np.linalg.norm(piece.acceleration))
+    middle = 0.5 * (piece.begin + piece.end)
+    if size <= 0 or piece.acceleration[1] / size < ALONG_COSINE:
+        return False
+    way = middle / max(float(np.linalg.norm(middle)), 1e-9)
+    across = float(np.linalg.norm(piece.acceleration - (piece.acceleration @ way) * way))
+    sag = across * float(times[piece.stops] - times[piece.first]) ** 2 / 8
+    length = float(np.linalg.norm(places[piece.stops] - places[piece.first]))
+    return across > ACROSS_SHARE * size and sag > max(10 * piece.miss, 0.04 * length)
+
+
+def _strange_fall(piece: _Piece, scale: float, where: str) -> InputError:
+    fall = float(np.linalg.norm(piece.acceleration)) / scale
+    return InputError(
+        f"{where}: it falls with {fall:.3g} m/s² by the body's size and the frame rate: free fall would be a body "
+        f"{GRAVITY / fall:.3g} times as large, or {np.sqrt(GRAVITY / fall):.3g} times the frame rate; "
+        "check the size and --fps-override"
+    )
 
 
 def _pieces(times: Array, places: Array, impacts: list[int]) -> list[_Piece]:
