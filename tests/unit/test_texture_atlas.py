@@ -280,6 +280,49 @@ def test_the_back_is_as_bright_on_both_sides():
     assert max(sides) / min(sides) < 1.15
 
 
+def test_no_flat_spots_on_a_round_side():
+    """Even faces of a round body are no flat side: with another light, or pixels of its outline, they were dots."""
+    pixels = np.full((HEIGHT, WIDTH, 3), (60, 50, 45), np.float64)
+    across, up = (COLUMNS - 160) / 70.0, (150 - ROWS) / 80.0
+    pixels[TOY] = (np.array([230, 215, 200]) * (0.75 + 0.25 * (up + 0.4 * across))[..., None].clip(0.2, 1.0))[TOY]
+    surface = made(np.clip(pixels, 0, 255).astype(np.uint8))
+    for turn in (100, 140, 180, 220, 260):
+        image = seen_from(surface, turn)
+        inside = ndimage.binary_erosion(image[..., 3] > 0, iterations=4)
+        nearest = ndimage.distance_transform_edt(image[..., 3] == 0, return_distances=False, return_indices=True)
+        grey = cv2.medianBlur(image[..., :3].mean(axis=2).astype(np.float32), 3)[tuple(nearest)]
+        spots = [cv2.morphologyEx(grey, kind, np.ones((11, 11))) for kind in (cv2.MORPH_BLACKHAT, cv2.MORPH_TOPHAT)]
+        assert np.max(spots, axis=0)[inside].max() < 12, turn
+
+
+def test_a_hidden_side_of_a_box_has_its_colours_up_to_the_edge():
+    """Along an edge between a visible and a hidden side, a vertex has the photo's pixel: it must not be mixed in."""
+    view = camera_above_ground(WIDTH, HEIGHT, 380.0, math.radians(25.0))
+    size = np.array([0.5, 0.4, 0.35])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 2)]) * size / 2
+    turn = math.radians(35.0)
+    matrix = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+    solid = trimesh.convex.convex_hull(corners @ matrix.T + (0, 2.1, 0))
+    at = view.project(solid.vertices)
+    shown = rasterise(at, solid.faces, (WIDTH, HEIGHT))
+    pixels, mask = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.uint8), np.zeros((HEIGHT, WIDTH), bool)
+    mask[shown.rows, shown.columns] = True
+    top = solid.face_normals[shown.faces][:, 2] > 0.5
+    pixels[shown.rows, shown.columns] = np.where(top[:, None], (20, 40, 190), (200, 150, 60))
+    request = ObjectRequest(box=(0, 0, 9, 9), name="box", shape="box")
+    box = build_body(view, mask, request, ReconstructOptions(mesh_vertices=3000), lambda said: None).mesh
+    surface = textured_body(view, box, crop_texture(pixels, mask), mask)
+    # The tops of the hidden walls, as seen from outside.
+    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    wall = (np.abs(normal[:, 2]) < 0.3 * np.linalg.norm(normal, axis=1)) & ((normal * (view.position - a)).sum(1) < 0)
+    height, width = surface.picture.shape[:2]
+    uv = surface.uv[surface.faces[wall]].mean(axis=1)
+    texels = surface.picture[((1 - uv[:, 1]) * height).astype(int), (uv[:, 0] * width).astype(int)].astype(int)
+    assert wall.sum() > 200
+    assert (texels[:, 0] > texels[:, 2]).mean() == 1.0
+
+
 def test_a_ball_is_as_bright_behind_as_in_front_at_the_same_height():
     """Light from above on a saturated colour, whose light is not told from paint: mirrored about the camera, which
     looks down, the back would be pale."""

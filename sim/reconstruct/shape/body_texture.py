@@ -40,6 +40,9 @@ DEEPEST = 0.35
 """Largest inward distance of source colours, over the widest inscribed circle."""
 NEAR = 0.06
 """Distance from the primitive's surface, over its size, up to which a vertex belongs to it."""
+INSET = (0.05, 0.4)
+"""Least distance of source colours from the edges of a box' face, over the box' longest side, and at most over half of
+the face's own: along its edges the photo shows what lies around the corner, and a warped outline."""
 STEPS = 24
 """Steps of the inward march."""
 
@@ -73,16 +76,40 @@ def colour_pixels(camera: Camera, mesh: BodyMesh, crop: Crop, primitive: Primiti
     return look
 
 
+def corner_pixels(camera: Camera, mesh: BodyMesh, crop: Crop, box: Box) -> Points:
+    """Return photo pixels (T, 3, 2) whose colours the corners of each face of ``mesh``, a ``box``, take.
+
+    Those of its vertices where the camera sees the face. Along an edge a vertex belongs to two sides: where one is
+    hidden, its colours are those of its own counterpart up to the edge.
+    """
+    assert mesh.colours is not None
+    look = mesh.colours[mesh.faces]
+    cosine, normal = _facing(camera, mesh)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    away = np.abs(np.minimum(box.inside(mesh.vertices, 0.0), mesh.vertices[:, 2])) > NEAR * extent
+    hidden = (cosine <= GRAZING) & ~away[mesh.faces].any(axis=1)
+    corners = mesh.vertices[mesh.faces[hidden]].reshape(-1, 3)
+    found = camera.project(_on_box(camera, box, corners, np.repeat(normal[hidden], 3, axis=0)))[:, :2]
+    size = float(np.sqrt(crop.mask.sum()))
+    found = _inwards(crop, found, np.full(len(found), max(RIM[0], RIM[1] * size)))
+    look[hidden] = found.reshape(-1, 3, 2)
+    return look
+
+
 def seen_vertices(camera: Camera, mesh: BodyMesh) -> NDArray[np.bool_]:
     """Return whether (V,) any face at a vertex faces the camera well enough."""
+    seen = np.zeros(len(mesh.vertices), dtype=bool)
+    seen[mesh.faces[_facing(camera, mesh)[0] > GRAZING]] = True
+    return seen
+
+
+def _facing(camera: Camera, mesh: BodyMesh) -> tuple[NDArray[np.float64], Points]:
+    """Cosine (T,) of each face's angle to the camera, and its normal (T, 3), of any length."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
     towards = camera.position - (a + b + c) / 3.0
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
-    facing = (normal * towards).sum(axis=1) / np.maximum(length, 1e-300) > GRAZING
-    seen = np.zeros(len(mesh.vertices), dtype=bool)
-    seen[mesh.faces[facing]] = True
-    return seen
+    return (normal * towards).sum(axis=1) / np.maximum(length, 1e-300), normal
 
 
 def _counterparts(camera: Camera, primitive: Primitive, points: Points) -> Points:
@@ -145,7 +172,11 @@ def _folded(angle: Points, rim: float | Points) -> Points:
     return np.asarray(np.clip(np.where(angle > rim, rim - (angle - rim) * rim / (np.pi - rim), angle), 0.0, rim))
 
 
-def _on_box(camera: Camera, box: Box, points: Points) -> Points:
+def _on_box(camera: Camera, box: Box, points: Points, normals: Points | None = None) -> Points:
+    """Points (n, 3) on a visible side of ``box`` that correspond to ``points`` (n, 3) on hidden sides.
+
+    normals: (n, 3) of the sides that they belong to; None for the nearest ones.
+    """
     frame = np.eye(3)
     frame[:2, :2] = np.stack(box.axes)
     half = np.array([box.width, box.depth, box.height]) / 2.0
@@ -157,18 +188,19 @@ def _on_box(camera: Camera, box: Box, points: Points) -> Points:
         return points
     # The face that faces the camera most.
     best = int(np.argmax(np.where(shown, np.abs(eye) - half, -np.inf)))
-    axis = np.argmax(np.abs(local) - half, axis=1)
+    axis = np.argmax(np.abs(local) - half if normals is None else np.abs(normals @ frame.T), axis=1)
+    inner = half - np.minimum(INSET[0] * 2.0 * float(half.max()), INSET[1] * half)
     result = local.copy()
     for own in range(3):
         rows = axis == own
-        if shown[own]:
-            result[rows, own] = towards[own] * half[own]
-            continue
-        # Neither this face nor the opposite one is visible: fold the best one over their common edge.
-        back = half[best] - towards[best] * local[rows, best]
-        inward = back * min(1.0, half[own] / half[best])
-        result[rows, own] = np.sign(local[rows, own]) * (half[own] - inward)
-        result[rows, best] = towards[best] * half[best]
+        face = own if shown[own] else best
+        if not shown[own]:
+            # Neither this face nor the opposite one is visible: fold the best one over their common edge.
+            back = half[best] - towards[best] * local[rows, best]
+            inward = back * min(1.0, half[own] / half[best])
+            result[rows, own] = np.sign(local[rows, own]) * (half[own] - inward)
+        result[rows] = np.clip(result[rows], -inner, inner)
+        result[rows, face] = towards[face] * half[face]
     return np.asarray(result @ frame + box.centre)
 
 

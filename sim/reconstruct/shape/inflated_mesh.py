@@ -41,13 +41,15 @@ class BodyMesh:
     """A closed triangle surface. vertices: (V, 3) world units; faces: (T, 3), counter-clockwise from outside.
 
     pixels: (V, 2) photo pixels at which the camera sees each vertex. colours: (V, 2) photo pixels whose colours the
-    vertices have; None for ``pixels``.
+    vertices have; None for ``pixels``. corner_colours: (T, 3, 2) those of the corners of each face, which differ from
+    the vertices' along the edges of a box; None for the vertices'.
     """
 
     vertices: Points
     faces: Faces
     pixels: Points
     colours: Points | None = None
+    corner_colours: Points | None = None
 
 
 class _DepthField:

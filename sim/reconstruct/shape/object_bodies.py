@@ -28,7 +28,7 @@ from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..segmentation.matting import foreground_colours, soft_alpha
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
-from .body_texture import TexturedSurface, colour_pixels, crop_texture
+from .body_texture import TexturedSurface, colour_pixels, corner_pixels, crop_texture
 from .depth_front import front_of
 from .furniture import furniture_boards
 from .furniture_mesh import furniture_mesh
@@ -38,7 +38,7 @@ from .inflated_mesh import BodyMesh, inflated_mesh, shadow_mesh
 from .object_supports import TriangleMesh, place_on_supports
 from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
-from .primitives import rasterize
+from .primitives import Box, rasterize
 from .separation import PlacedBody, separate
 from .support import support_of
 from .surface_mesh import WORTH_SAYING
@@ -132,7 +132,10 @@ def build_body(
         notice(f"{name}: {lost:.0%} of its surface was disconnected and was removed; check its mask")
     if margin < TOPPLES:
         notice(f"{name}: may topple, its centre of mass is not above its base; a larger thickness helps")
-    mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, None if choice is None else choice.primitive))
+    primitive = None if choice is None else choice.primitive
+    mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, primitive))
+    if isinstance(primitive, Box):
+        mesh = replace(mesh, corner_colours=corner_pixels(camera, mesh, crop, primitive))
     return BuiltBody(mesh=mesh, shape=shape, stability=margin, fit=fit)
 
 

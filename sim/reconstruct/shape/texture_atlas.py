@@ -46,6 +46,10 @@ book's fore-edge, is a strip of several pixels, none of them mixed with the back
 BENT = (1.0, 0.4)
 """Curvature times the body's extent (2 on a ball) from which ``CLEAR`` holds not at all, and up to which fully: the
 pixels along the outline of a round side are mixed with the background, and other cameras would see them as a line."""
+SMOOTHINGS = 6
+"""Rounds of averaging of the distance behind the rim."""
+FLAT_RINGS = 2
+"""Faces by which a flat side has to reach on all sides: patches that are smaller count as round."""
 EVEN = 0.12
 """Distance behind the rim, over the root of the object's area, at which two thirds of its light are taken out."""
 DENSITY = 1.25
@@ -67,7 +71,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     """Return ``body`` with its texture; vertices along the borders of charts occur once per chart.
 
     texture: the photo around the object; mask: (H, W) the object. ``body.colours`` are the photo's pixels that
-    correspond to each vertex. Deterministic.
+    correspond to each vertex, ``body.corner_colours`` to each face's corners. Deterministic.
     """
     shown, cosine = _shown(camera, body, mask)
     photo = shown & (cosine > SQUARE)
@@ -95,13 +99,16 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
     values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
     size_px = float(np.sqrt(inside.sum()))
-    behind = distance_behind(body, seen_vertices(camera, body), size_px)
+    behind = _smoothed(body, distance_behind(body, seen_vertices(camera, body), size_px))
     # Beyond an edge, light is another one at once.
     values = np.column_stack([values, np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), values[:, 11])])
     light = light_on(camera, body, texture, inside)
+    values = values[charts.source]
+    if body.corner_colours is not None:
+        values[charts.faces, 6:8] = body.corner_colours[~photo]
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
     found = rasterise(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
-    texel = found.interpolated(charts.faces, values[charts.source])
+    texel = found.interpolated(charts.faces, values)
     soft = texture.alpha is not None
     below = np.zeros((charts.size[1], size[0], 4 if soft else 3), dtype=np.uint8)
     if len(found.rows):
@@ -179,8 +186,19 @@ def _vertex_share(body: BodyMesh, faces: Mask) -> NDArray[np.float64]:
     return count / np.maximum(total, 1.0)
 
 
+def _smoothed(body: BodyMesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``values`` (V,) averaged with those of neighbours: what begins at a row of faces would begin in teeth."""
+    count = np.bincount(body.faces.ravel(), minlength=len(values))
+    for _ in range(SMOOTHINGS):
+        total = np.zeros(len(values))
+        for corner in range(3):
+            np.add.at(total, body.faces[:, corner], values[body.faces].mean(axis=1))
+        values = total / np.maximum(count, 1)
+    return values
+
+
 def _flatness(body: BodyMesh, normals: Points) -> NDArray[np.float64]:
-    """Flatness (V,) of the flattest face at each vertex, 0 where curved as a ball and 1 on a plane."""
+    """Flatness (V,) of the flattest side at each vertex, 0 where curved as a ball and 1 on a plane."""
     ends = np.sort(np.stack([body.faces, np.roll(body.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     pairs = np.flatnonzero((ends[order][1:] == ends[order][:-1]).all(axis=1))
@@ -193,6 +211,12 @@ def _flatness(body: BodyMesh, normals: Points) -> NDArray[np.float64]:
         around[one, edge % 3] = bend
     extent = float(np.ptp(body.vertices, axis=0).max())
     flat = 1.0 - smoothstep(np.median(around, axis=1) * extent, *BENT[::-1])
+    # A few even faces of a round side are no flat side: they would get other light than what is around them.
+    for spread in (np.minimum, np.maximum):
+        for _ in range(FLAT_RINGS):
+            before = flat.copy()
+            spread.at(flat, first, before[second])
+            spread.at(flat, second, before[first])
     result = np.zeros(len(body.vertices))
     for corner in range(3):
         np.maximum.at(result, body.faces[:, corner], flat)
