@@ -13,6 +13,7 @@ from ..physgen_addon.render.render_options import RenderOptions
 from ..sim.app.add_drops import Drop
 from ..sim.app.bake_options import BakeOptions
 from ..sim.app.reconstruct import Physics
+from ..sim.app.set_light import LightRequest
 from ..sim.errors import InputError, PhysGenError
 from ..sim.files import read_toml
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -40,7 +41,7 @@ class DemoConfig:
     """A photo from scikit-image and its physics; units as on the command line (docs/cli.md).
 
     overrides: ``OBJECT.FIELD=VALUE``, as of ``--set``. drops: what falls into the picture. clip: the render of
-    ``make demo``; best: of ``make demo BEST=1``.
+    ``make demo``; best: of ``make demo BEST=1``. light: as of ``physgen light``; None is the photo's estimate.
     """
 
     description: str
@@ -53,6 +54,7 @@ class DemoConfig:
     pitch: float | None = None
     overrides: tuple[str, ...] = ()
     drops: tuple[Drop, ...] = ()
+    light: LightRequest | None = None
     frames: int
     fps: float
     slow: float = 1.0
@@ -98,6 +100,7 @@ def request(config: DemoConfig, out: Path, *, best: bool = False) -> stages.RunR
             samples=clip.samples, light_scale=clip.light_scale, orbit=clip.orbit, motion_blur=clip.motion_blur
         ),
         drops=config.drops,
+        light=config.light,
     )
 
 

@@ -32,6 +32,7 @@ from ..sim.scene.overrides import check_overrides
 
 if TYPE_CHECKING:
     from ..sim.app.default_motion import DefaultMotion
+    from ..sim.app.set_light import LightRequest
 
 
 def run_bake(folder: Scene, out: Path, options: BakeOptions, on_event: OnEvent, cancelled: IsCancelled) -> Event:
@@ -132,7 +133,8 @@ class RunRequest:
     """A job from photo to ``video``; ``work`` holds ``scene``, ``bake`` and ``frames``.
 
     physics: per object, in the order of ``objects``; by default ``medium`` and at rest. choices: what is chosen
-    instead. drops: what falls into the picture. The same request always gives the same video.
+    instead. drops: what falls into the picture. light: in place of the photo's estimated one. The same request always
+    gives the same video.
     """
 
     photo: Path
@@ -146,6 +148,7 @@ class RunRequest:
     render: RenderOptions = dataclasses.field(default_factory=RenderOptions)
     choices: Choices = dataclasses.field(default_factory=Choices)
     drops: tuple[Drop, ...] = ()
+    light: LightRequest | None = None
 
 
 def expected_seconds(frames: int, *, stages: Sequence[str] = ("reconstruct", "bake", "render")) -> dict[str, float]:
@@ -242,6 +245,11 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
         cancelled=cancelled,
     )
     options = request.bake
+    if request.light is not None:
+        # Imported here: it needs SciPy, which most commands do without.
+        from ..sim.app.set_light import set_light
+
+        scene = set_light(scene, request=request.light, on_event=on_event)
     if request.drops:
         scene = add_drops(scene, request.drops)
     if request.choices.motion and not scene.model.effects:

@@ -23,9 +23,10 @@ from physgen.batch import demo, stages
 from physgen.benchmarks.common import benchmark_parser
 from physgen.sim.app.add_drops import add_drops
 from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.app.set_light import set_light
 from physgen.sim.cache.bake_folder import load_bake, load_manifest
 from physgen.sim.events import ignore, never
-from physgen.sim.scene.folder import load_scene
+from physgen.sim.scene.folder import Scene, load_scene
 
 
 def measure(stage: Callable[[], object]) -> dict[str, float]:
@@ -35,6 +36,11 @@ def measure(stage: Callable[[], object]) -> dict[str, float]:
     after = os.times()
     cpu = sum(after[:4]) - sum(before[:4])
     return {"wall_s": round(time.perf_counter() - started, 2), "cpu_s": round(cpu, 2)}
+
+
+def lit(scene: Scene, job: stages.RunRequest) -> Scene:
+    """Return ``scene`` in the light of ``job``."""
+    return scene if job.light is None else set_light(scene, request=job.light)
 
 
 def run(frames: int | None, out: Path, *, quick: bool = False) -> dict[str, Any]:
@@ -48,8 +54,8 @@ def run(frames: int | None, out: Path, *, quick: bool = False) -> dict[str, Any]
         job = dataclasses.replace(job, bake=dataclasses.replace(job.bake, quality="preview"), render=render)
     scene, bake, images = out / "scene", out / "bake", out / "frames"
     calls: dict[str, Callable[[], object]] = {
-        "reconstruct": lambda: reconstruct(
-            job.photo, job.objects, out=scene, options=job.reconstruct, physics=job.physics
+        "reconstruct": lambda: lit(
+            reconstruct(job.photo, job.objects, out=scene, options=job.reconstruct, physics=job.physics), job
         ),
         "bake": lambda: stages.run_bake(add_drops(load_scene(scene), job.drops), bake, job.bake, ignore, never),
         "render": lambda: stages.render(

@@ -28,7 +28,7 @@ from . import render_engines
 from .motion_blur import Moment
 from .render_options import RenderOptions
 from .render_regions import NEAR_REACH, Box, feather, ground_depth, object_box, shadow_region
-from .render_scene import BlenderScene, RenderObject, get_rest_light, set_rest_light
+from .render_scene import BlenderScene, RenderObject, environment_lamps, get_rest_light, set_rest_light
 
 RAY_BUDGET = 400_000
 """Rays of one object, divided among its vertices and the lamps."""
@@ -223,6 +223,8 @@ class GroundShadow:
         scale = min(1.0, max(1.0 / COARSE, LEAST_COARSE_PX / max(width, height)))
         self._coarse = max(1, round(width * scale)), max(1, round(height * scale))
         self._empty: dict[Size, Linear] = {}
+        # Their shadows are as crisp as the sun's, so they are rendered as finely.
+        self._lamps = environment_lamps(built.folder)
 
     def ratio(self, moment: Moment, camera: Camera, size: Size) -> Linear:
         """Return the shadow ratio seen by ``camera`` at ``moment``, (H, W, 3) of ``size``; 1 out of reach of all
@@ -232,12 +234,12 @@ class GroundShadow:
         if not self._options.crop:
             ratio = self._of(scene, moment, self._fine, Box(0, 0, *self._fine), np.ones((*self._fine[::-1], 3)))
             return _enlarged(ratio, size)
-        far = shadow_region(scene, moment.swept, self._coarse)
+        far = shadow_region(scene, moment.swept, self._coarse, lamps=self._lamps)
         ratio = np.ones((*self._coarse[::-1], 3), np.float32)
         if far is not None:
             ratio = self._of(scene, moment, self._coarse, far.box, ratio)
         ratio = _enlarged(ratio, self._fine)
-        near = shadow_region(scene, moment.swept, self._fine, sky_reach=NEAR_REACH)
+        near = shadow_region(scene, moment.swept, self._fine, sky_reach=NEAR_REACH, lamps=self._lamps)
         if near is not None:
             ratio = self._of(scene, moment, self._fine, near.box, ratio)
         return _enlarged(ratio, size)
@@ -252,7 +254,7 @@ class GroundShadow:
         # Objects only remove light from the ground here; a ratio above 1 is noise.
         quotient = np.clip(lit / np.maximum(empty, 1e-6), 0.0, 1.0)
         weight = feather(box, size)
-        region = shadow_region(scene, moment.swept, size)
+        region = shadow_region(scene, moment.swept, size, lamps=self._lamps)
         if region is not None:
             # Towards the horizon pixels cover ever more ground, and above it none at all.
             depth = ground_depth(scene, size)[box.slices]

@@ -73,14 +73,19 @@ def shadow_region(
     size: tuple[int, int],
     *,
     sky_reach: float = SHADOW_REACH,
+    lamps: Sequence[tuple[NDArray[np.float64], float]] = (),
 ) -> ShadowRegion | None:
-    """Return the pixels whose ground the objects can darken: along the sun with its penumbra, and all around by the
-    sky.
+    """Return the pixels whose ground the objects can darken: along sun and lamps with their penumbras, and all around
+    by the sky.
 
-    sky_reach: margin all around, over the height of an object's top.
+    sky_reach: margin all around, over the height of an object's top. lamps: of the environment, unit vectors (3,)
+    towards them and their diameters in radians.
     """
+    light = scene.light
+    if light.sun_direction is not None and light.sun_strength > 0:
+        lamps = [(np.asarray(light.sun_direction), light.sun_angle), *lamps]
     found = []
-    for points in (_footprint(scene, v, sky_reach) for v in vertices):
+    for points in (_footprint(scene, v, sky_reach, lamps) for v in vertices):
         box = _bounds(scene.camera, points, size, MARGIN_PX)
         if box is not None:
             found.append((box, float(scene.camera.project(points)[:, 2].max())))
@@ -104,7 +109,12 @@ def ground_depth(scene: SceneModel, size: tuple[int, int]) -> NDArray[np.float32
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf).astype(np.float32)
 
 
-def _footprint(scene: SceneModel, vertices: NDArray[np.floating], sky_reach: float) -> NDArray[np.float64]:
+def _footprint(
+    scene: SceneModel,
+    vertices: NDArray[np.floating],
+    sky_reach: float,
+    lamps: Sequence[tuple[NDArray[np.float64], float]],
+) -> NDArray[np.float64]:
     """Return points (N, 3) on the ground whose hull contains one object's shadow."""
     normal, origin = np.asarray(scene.ground_plane.normal), np.asarray(scene.ground_plane.point)
     points = np.asarray(vertices, dtype=np.float64)
@@ -113,12 +123,10 @@ def _footprint(scene: SceneModel, vertices: NDArray[np.floating], sky_reach: flo
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     reach = sky_reach * max(float(heights.max()), 0.25 * size)
     spans = [_grown(feet, normal, reach)]
-    sun = scene.light.sun_direction
-    if sun is not None and scene.light.sun_strength > 0:
-        direction = np.asarray(sun)
+    for direction, angle in lamps:
         cosine = max(float(direction @ normal), 0.05)
-        # Half the sun's disc either way, stretched by its inclination to the ground.
-        penumbra = float(heights.max()) * math.tan(min(scene.light.sun_angle, 2.5) / 2) / cosine**2
+        # Half the lamp's disc either way, stretched by its inclination to the ground.
+        penumbra = float(heights.max()) * math.tan(min(angle, 2.5) / 2) / cosine**2
         shadow = feet - heights[:, None] * (direction / cosine - normal)
         spans.append(_grown(shadow, normal, penumbra + 0.05 * size))
     return np.concatenate(spans)

@@ -18,6 +18,7 @@ from PIL import Image
 from ...sim.atomic import scratch_prefix
 from ...sim.composite.srgb import read_rgb
 from ...sim.errors import InputError
+from ...sim.scene.environment import lamps_in
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene, require_photo
 from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
@@ -319,6 +320,11 @@ def _sky(folder: Scene) -> _Sky:
     if not (math.isfinite(sky.irradiance) and sky.irradiance > 0):
         raise InputError(f"{path}: lights the ground with {sky.irradiance}; give an environment with finite light")
     return sky
+
+
+def environment_lamps(folder: Scene) -> list[tuple[NDArray[np.float64], float]]:
+    """Return the lamps in the environment of ``folder`` as ``lamps_in`` does. Raises InputError if it is unreadable."""
+    return lamps_in(_sky(folder).radiance, folder.model.ground_plane.unit_normal)
 
 
 def _read_environment(path: Path) -> NDArray[np.float32]:

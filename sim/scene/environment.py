@@ -186,6 +186,33 @@ def sun_in(radiance: Radiance, normal: NDArray[np.float64]) -> float:
     return float(light[towards @ brightest > math.cos(math.radians(SPOT_DEG))].sum()) / total
 
 
+LAMP_BRIGHTNESS = 8.0
+"""Luminance over the map's mean from which a pixel belongs to a lamp; an overcast zenith has three times that of its
+horizon."""
+LAMP_SHARE = 0.04
+"""Least share of the ground's light of a lamp whose shadows have borders worth rendering finely."""
+
+
+def lamps_in(radiance: Radiance, normal: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:
+    """Return the small bright spots above the ground of unit ``normal`` (3,): unit vectors (3,) towards their middles,
+    and their diameters in radians. A spot across the map's left and right edge counts as two.
+    """
+    luminance = radiance @ LUMINANCE
+    towards, solid = directions(*luminance.shape)
+    light = luminance * solid * np.maximum(towards @ normal, 0.0)
+    bright = luminance > LAMP_BRIGHTNESS * float((luminance * solid).sum() / solid.sum())
+    number, labels = cv2.connectedComponents(bright.astype(np.uint8), connectivity=8)
+    shares = np.bincount(labels.ravel(), light.ravel(), number) / max(float(light.sum()), 1e-12)
+    found = []
+    for label in np.flatnonzero(shares[1:] >= LAMP_SHARE) + 1:
+        own = labels == label
+        middle = (towards[own] * light[own][:, None]).sum(axis=0)
+        middle /= np.linalg.norm(middle)
+        lit = own & (light > 0)
+        found.append((middle, 2.0 * float(np.arccos(np.clip(towards[lit] @ middle, -1.0, 1.0)).max())))
+    return found
+
+
 def write_environment(path: Path, radiance: Radiance) -> None:
     """Write ``radiance`` as a 32-bit EXR. Raises InputError if that fails."""
     height, width, channels = radiance.shape

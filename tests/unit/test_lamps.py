@@ -10,7 +10,7 @@ from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on
 from physgen.sim.reconstruct.lighting.ground_lighting import MAX_SHARE
 from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps, ground_axes
 from physgen.sim.reconstruct.lighting.light_estimate import with_spots
-from physgen.sim.scene.environment import ground_light
+from physgen.sim.scene.environment import ground_light, lamps_in
 from physgen.sim.scene.model import Ground
 
 WIDTH, HEIGHT, RADIUS = 320, 240, 0.13
@@ -78,3 +78,17 @@ def test_a_spot_gives_the_ground_what_its_lamp_gives():
     near = ways @ ground_axes(Ground()) @ np.array(lamp.direction) > math.cos(0.09)
     assert weights[near].sum() / weights[~near].sum() == pytest.approx(0.5, rel=0.06)
     assert with_spots(even, Ground(), []) is even
+
+
+def test_a_spot_in_a_map_is_found_again_and_an_even_or_overcast_sky_has_none():
+    even = np.full((32, 64, 3), 1.0, np.float32)
+    normal = np.array([0.0, 0.0, 1.0])
+    lamps = [(LampEstimate(d, 0.3, a, 10.0), 0.4) for d, a in (((0.0, 0.6, 0.8), 0.1), ((0.48, 0.6, 0.64), 0.2))]
+    found = sorted(lamps_in(with_spots(even, Ground(), lamps), normal), key=lambda lamp: lamp[1])
+    assert len(found) == 2
+    for (lamp, _), (direction, angle) in zip(lamps, found, strict=True):
+        assert math.degrees(math.acos(min(1.0, float(direction @ np.array(lamp.direction))))) < 1.0
+        assert angle == pytest.approx(lamp.angle, abs=0.04)
+    height = np.clip(np.sin(np.linspace(math.pi / 2, -math.pi / 2, 32)), 0.0, 1.0)[:, None, None]
+    overcast = np.broadcast_to((1.0 + 2.0 * height) / 3.0, even.shape).astype(np.float32)
+    assert lamps_in(even, normal) == [] and lamps_in(overcast, normal) == []
