@@ -12,13 +12,15 @@ a(m), the probability that the right candidate leaves a misfit of m (logistic in
 held-out trials better has no gain, whatever its evidence, but where bounces make them chaotic, and is never sure there;
 where one predicts them down to the noise, unknown yields to it, whatever its misfit. ``none`` is never said while the
 nominal model's held-out error is many times noise and grain (the simulator's own uncertainty): what it would get goes
-to ``unknown``. The constants were set on captures of known cause made by other simulators (docs/diagnosis.md).
+to ``unknown``. However large the evidence, a small share of every probability stays spread over all answers: for what
+no model of the errors knows of, in the search and in the models themselves. The constants were set on captures of known
+cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +50,8 @@ class ComparisonSettings:
         trials no better than its better single effect.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
     many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
+    lapse: share that is spread evenly over the vocabulary, ``none`` and ``unknown``; what falls to effects that were
+        not tested goes to ``unknown``. From Laplace's rule of succession on sure verdicts (docs/measurements.md).
     alternative: effects with at least this fraction of the verdict's probability are named as alternatives.
     """
 
@@ -64,6 +68,7 @@ class ComparisonSettings:
     second_fee: float = 20.0
     predicted: tuple[float, float] = (0.9, 0.98)
     many: float = 3.0
+    lapse: float = 0.02
     alternative: float = 0.1
 
 
@@ -127,7 +132,8 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
             best[name] = (probability, fit)
     probabilities[UNKNOWN] = max(0.0, 1.0 - sum(probabilities.values()))
     total = sum(probabilities.values())
-    probabilities = {name: p / total for name, p in probabilities.items()}
+    barred = {NONE} if _far_off(fits, weighing) else set()
+    probabilities = _never_sure({name: p / total for name, p in probabilities.items()}, weighing.lapse, barred)
     found = {name: fit for name, (_, fit) in best.items()}
     verdict = _verdict(probabilities, found, weighing)
     reasons = {
@@ -136,6 +142,14 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
         if name not in (verdict.effect, *verdict.effects, *verdict.alternatives)
     }
     return ModelComparison(verdict=verdict, probabilities=probabilities, best=found, reasons=reasons)
+
+
+def _never_sure(probabilities: Mapping[str, float], lapse: float, barred: Collection[str]) -> dict[str, float]:
+    """Return ``probabilities``, the share ``lapse`` of them spread over all answers, tested or not, but ``barred``."""
+    each = lapse / (VOCABULARY + 2)
+    found = {name: (1.0 - lapse) * p + each * (name not in barred) for name, p in probabilities.items()}
+    found[UNKNOWN] += max(0.0, 1.0 - sum(found.values()))
+    return found
 
 
 RESOLVABLE = 1.5

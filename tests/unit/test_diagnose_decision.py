@@ -205,6 +205,17 @@ def test_the_simulators_own_grain_is_no_gap():
     assert compare_models(dataclasses.replace(fits, grain_rms_m=0.002), ComparisonSettings()).verdict.effect == UNKNOWN
 
 
+def test_no_evidence_makes_a_verdict_sure():
+    """Untested effects are unknown, and what every answer keeps is too little to be named as an alternative."""
+    lapse = ComparisonSettings().lapse
+    sure = weighed(fit("air_drag", evidence=1e6), fit("wind", evidence=0), nominal_misfit=10.0)
+    assert 1 - lapse < sure.verdict.probability < 1 - 0.9 * lapse
+    assert sum(sure.probabilities.values()) == pytest.approx(1.0) and sure.verdict.alternatives == ()
+    assert sure.probabilities[UNKNOWN] > 10 * sure.probabilities["wind"] == pytest.approx(10 * lapse / 20)
+    plain = weighed(fit("air_drag", evidence=1e6), nominal_misfit=10.0, weighing=ComparisonSettings(lapse=0.0))
+    assert plain.verdict.probability > 0.999 > sure.verdict.probability
+
+
 def test_what_predicts_down_to_the_noise_is_not_unknown():
     """A large misfit alone does not reject an effect that closes the whole gap on held-out trials."""
     rough = [fit("wind", evidence=900, misfit=9.0, rms=rms) for rms in (0.0041, 0.0047, 0.008)]
@@ -213,7 +224,7 @@ def test_what_predicts_down_to_the_noise_is_not_unknown():
     ]
     found = [compare_models(f, ComparisonSettings()) for f in fits]
     assert [f.verdict.effect for f in found] == ["wind", "wind", UNKNOWN]
-    assert found[0].probabilities[UNKNOWN] < 1e-6
+    assert found[0].probabilities[UNKNOWN] <= ComparisonSettings().lapse
     assert found[2].reasons["wind"] == "leaves 9.0 times the noise unexplained"
 
 
