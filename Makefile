@@ -1,4 +1,4 @@
-# make demo | test | test-all | test-explore | coverage | fuzz | lock | audit | lint | docs | benchmark | extension | test-blender-app | clean   (make setup is part of each)
+# make demo | test | test-all | test-explore | coverage | fuzz | lock | audit | lint | docs | benchmark | extension | assets | test-blender-app | clean   (make setup is part of each)
 # PYTHON=… chooses the interpreter, VENV=… the virtual environment, TESTS=… what the tests run on, MARKS=… which of them,
 # BEST=1 renders the demo as the documentation shows it, WORKERS=… how many processes share the tests,
 # NAMES=… which benchmarks `make benchmark` runs (all, or names; QUICK=1: only whether they run),
@@ -20,7 +20,7 @@ SEED ?= 0
 SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTEST := $(BIN)/python -m pytest $(SPREAD)
 
-.PHONY: setup demo test test-all test-explore coverage fuzz lint lock audit docs benchmark extension test-blender-app clean
+.PHONY: setup demo test test-all test-explore coverage fuzz lint lock audit docs benchmark extension assets test-blender-app clean
 
 setup:
 	@test -n "$(PYTHON)" || exit 1
@@ -80,6 +80,10 @@ benchmark: setup
 extension:
 	@test -n "$(PYTHON)" || exit 1
 	@"$(PYTHON)" setup/extension.py $(if $(ZIPS),--zips $(ZIPS))
+
+# Materials and the sample scene as Blender assets, with previews, in dist/assets.
+assets: setup
+	@$(BIN)/python setup/assets.py
 
 test-blender-app: setup extension
 	$(BIN)/python tests/real_blender/run.py --blender "$(BLENDER)" --python "$(abspath $(BIN)/python)"

@@ -36,6 +36,7 @@ MODULES = (
     "preview.live_preview",
     "operators.sample_ops",
     "operators.quick_ops",
+    "operators.asset_ops",
     "gizmos",
     "cache_bar",
     "handlers",

@@ -154,7 +154,7 @@ class PHYSGEN_OT_remove_box(bpy.types.Operator):
 
 
 class PHYSGEN_FH_photo(bpy.types.FileHandler):
-    """Drop of a photo on PhysGen's tab. Elsewhere Blender's own handling of images comes first."""
+    """Drop of a photo on a 3D viewport or an image editor, where Blender asks which of its ways to take is meant."""
 
     bl_idname = "PHYSGEN_FH_photo"
     bl_label = "PhysGen: Start from This Photo"
@@ -163,11 +163,11 @@ class PHYSGEN_FH_photo(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:
-        """Accept drops on a sidebar that shows the tab."""
+        """Accept drops on the view and on the sidebar, in Object Mode."""
         area, region = context.area, context.region
-        if area is None or region is None or area.type not in ("VIEW_3D", "IMAGE_EDITOR") or region.type != "UI":
+        if area is None or region is None or context.mode != "OBJECT":
             return False
-        return region.active_panel_category == TAB
+        return area.type in ("VIEW_3D", "IMAGE_EDITOR") and region.type in ("WINDOW", "UI")
 
 
 def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:

@@ -193,29 +193,16 @@ def draw_preset(layout: bpy.types.UILayout, context: bpy.types.Context, material
 
 
 def _draw_number(layout: bpy.types.UILayout, material: Any, name: str) -> None:
-    """Draw a number of the material with its unit, and the dot that animates it."""
-    if name in WITH_UNITS:
-        row = layout.row(align=True)
-        row.prop(material, shown_as(name))
-        # Keyframes and drivers are those of the number, not of the words that show it.
-        row.prop_decorator(material, name)
-    else:
-        layout.prop(material, name)
+    """Draw a number of the material, with its unit."""
+    layout.prop(material, shown_as(name) if name in WITH_UNITS else name)
 
 
 class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
-    """What few materials need: fibres, and stiffness that gives way"""
+    """What few materials need: fibres, stiffness that gives way, and numbers to be animated"""
 
     bl_parent_id = "PHYSGEN_PT_material"
     bl_label = "Advanced"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Shown for laws that have such numbers."""
-        return super().poll(context) and any(
-            name in ADVANCED for name in LAW_FIELDS[active_body(context).physgen.material.law]
-        )
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw a switch each, and its numbers where it is on."""
@@ -230,6 +217,14 @@ class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
             optional(column, material, "has_fibres", shown_as("fibre_modulus"), "Fibres")
             if material.has_fibres:
                 column.prop(material, "fibre_axis")
+        animated = [name for name in known if name in WITH_UNITS and name != "fibre_modulus"]
+        if animated:
+            # Keyframes and drivers are those of numbers, and words that show one have none.
+            text.sentences(column, context, "To be animated, in Pa and Pa s:")
+            numbers = column.column(align=True)
+            numbers.use_property_decorate = True
+            for name in animated:
+                numbers.prop(material, name)
 
 
 class PHYSGEN_PT_inside(_Part, bpy.types.Panel):

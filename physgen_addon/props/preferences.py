@@ -46,6 +46,9 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
             row.progress(factor=self.progress, text=self.progress_text)
             row.operator("physgen.cancel_job", text="", icon="X")
         _draw_check(self, context)
+        row = layout.row(align=True)
+        row.label(text="Materials to drag onto objects (built by make assets):")
+        row.operator("physgen.add_assets", icon="ASSET_MANAGER")
         _draw_key(layout, context)
 
 

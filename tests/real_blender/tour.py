@@ -256,7 +256,7 @@ def strange():
 
 
 def dropped():
-    """A photo dragged by the mouse from Blender's file browser and dropped on the sidebar's tab."""
+    """A photo dragged by the mouse from Blender's file browser and dropped on the sidebar, and on the viewport."""
     yield from home()
     folder = OUT / "to drop"
     folder.mkdir()
@@ -275,10 +275,19 @@ def dropped():
     browser.tag_redraw()
     yield from screens.drawn(6)
     yield 1.0
+    for number, kind in ((28, "UI"), (30, "WINDOW")):
+        yield from drop(browser, screens.region(screens.viewport(), kind), number)
+        found = bpy.context.scene.physgen_photo.path
+        assert Path(found) == folder / "coffee.jpg", f"dropped on {kind}, the photo was not opened: {found!r}"
+        bpy.context.scene.physgen_photo.image, bpy.context.scene.physgen_photo.path = None, ""
+
+
+def drop(browser, onto, number):
+    """Drag the first file that ``browser`` lists and drop it on the region ``onto``; Blender asks what is meant."""
     listed = screens.region(browser, "WINDOW")
-    bar = screens.region(screens.viewport(), "UI")
-    x, y = listed.x + 60, screens.window().height - (listed.y + listed.height - 30)
-    goal = (bar.x + bar.width // 2, screens.window().height - (bar.y + bar.height // 3))
+    high = screens.window().height
+    x, y = listed.x + 60, high - (listed.y + listed.height - 30)
+    goal = (onto.x + onto.width // 2, high - (onto.y + onto.height // 3))
     yield from screens.point(x, y)
     screens.xdotool("mousedown", 1)
     yield 0.5
@@ -286,13 +295,15 @@ def dropped():
         screens.xdotool("mousemove", round(x + share * (goal[0] - x)), round(y + share * (goal[1] - y)))
         yield 0.4
     yield from screens.drawn()
-    screens.picture(screens.window(), SCREENS / "28_dragging.png")
+    screens.picture(screens.window(), SCREENS / f"{number}_dragging.png")
     screens.xdotool("mouseup", 1)
+    yield 1.0
+    yield from screens.drawn()
+    screens.picture(screens.window(), SCREENS / f"{number + 1}_dropped.png")
+    # The letter that the menu underlines in Start from a Photo.
+    yield from screens.press("s")
     yield 1.5
     yield from screens.drawn()
-    screens.picture(screens.window(), SCREENS / "29_dropped.png")
-    found = bpy.context.scene.physgen_photo.path
-    assert Path(found) == folder / "coffee.jpg", f"the dropped photo was not opened: {found!r}"
 
 
 def documented():
@@ -321,5 +332,5 @@ def wanted(step) -> bool:
 
 
 STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
-STEPS += [dropped, strange, material, documented]
+STEPS += [material, strange, dropped, documented]
 session.run("tour", [step for step in STEPS if wanted(step)])
