@@ -156,13 +156,16 @@ def _curve(
 
     x = at(withheld, 0)[0]
     cv2.rectangle(sheet, (x, high), (right, low), (232, 232, 232), -1)
-    _text(sheet, "second half", (x + 4, high + 12), max(right - x - 6, 40), (110, 110, 110))
+    _text(
+        sheet, "second half: predicted, nothing is fitted here", (x + 4, high + 12), max(right - x - 6, 40), (110,) * 3
+    )
+    _text(sheet, "first half: starts fitted to the recording", (left + 4, high + 12), max(x - left - 8, 40), (110,) * 3)
     cv2.line(sheet, (left, low), (right, low), FAINT, 1)
     unit, factor = ("mm", 1e3) if most < 0.5 else ("m", 1.0)
     _text(sheet, f"{most * factor:.3g} {unit}", (4, high + 6), left - 6, INK)
     _text(sheet, "0", (left - 14, low + 4), 12, INK)
     _text(sheet, f"{span:.2f} s", (right - 46, low + 16), 46, INK)
-    _text(sheet, "distance to the real centre", (left, high - 6), 300, INK)
+    _text(sheet, "distance to the real centre (the cross above)", (left, high - 6), 400, INK)
     for gap, colour in zip(gaps, (BEFORE, AFTER), strict=True):
         good = np.isfinite(gap)
         line = np.array([at(t, g) for t, g in zip(times[good], gap[good], strict=True)], np.int32)

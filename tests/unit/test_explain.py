@@ -23,7 +23,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "video_to_cause.py"
 FPS, SCALE = 120.0, 400.0
 
 
-def draw(path, places, radius, size=(320, 240), shift=None, twins=False):
+def draw(path, places, radius, size=(320, 240), shift=None, twins=False, light=None):
     """Write a video of a red ball at ``places`` (T, 2) px before a still, textured wall."""
     rng = np.random.default_rng(3)
     wall = cv2.GaussianBlur(rng.integers(90, 200, (size[1] + 40, size[0] + 40, 3), dtype=np.uint8), (0, 0), 2)
@@ -36,6 +36,8 @@ def draw(path, places, radius, size=(320, 240), shift=None, twins=False):
         cv2.circle(large, centre, round(radius * 4), (30, 30, 210), -1)
         frame = cv2.resize(large, size, interpolation=cv2.INTER_AREA)
         frame = np.clip(frame + rng.normal(0, 1.5, frame.shape), 0, 255).astype(np.uint8)
+        if light is not None:
+            frame = np.clip(frame * light[k], 0, 255).astype(np.uint8)
         writer.write(frame)
         if twins and k % 6 == 5:
             writer.write(frame)
@@ -65,6 +67,17 @@ def test_a_tossed_ball_gives_scale_gravity_and_its_path(tmp_path):
     # The picture of the world is where the ball was drawn, on a background that does not drift.
     apart = found.view.pixels(seen) - places[found.frames]
     assert np.linalg.norm(apart - apart.mean(axis=0), axis=1).max() < 1.0
+
+
+def test_lamps_that_flicker_make_no_frame_a_repetition(tmp_path):
+    _, places = tossed()
+    light = 1 + 0.04 * np.sin(1.7 * np.arange(60))
+    video = draw(tmp_path / "toss.avi", places, radius=8, light=light)
+    body = parse_body(f"ball:diameter={16 / SCALE}")
+    found = follow_plain_body(physgen.VideoTrial(path=video, fps_override=FPS), body)
+    assert found.view.kind == "flight" and len(found.frames) > 54
+    assert np.linalg.norm(found.places - places[found.frames], axis=1).max() < 1.0
+    assert found.view.scale == pytest.approx(SCALE, rel=0.04)
 
 
 def test_a_repeated_frame_is_left_out_and_the_rest_spread_evenly():

@@ -360,7 +360,7 @@ def find_moving_regions(
             if moving_camera:
                 found_maps.append(aligner.map(picture).copy())
                 picture = _warped(picture, found_maps[-1])
-            change.append(0.0 if before is None else float(cv2.norm(picture, before, cv2.NORM_L1)) / picture.size)
+            change.append(0.0 if before is None else _change(picture, before))
             before = picture
             stamps.append(frame.time)
             regions.append(list(_regions(picture, background, limit, index)))
@@ -374,6 +374,13 @@ def find_moving_regions(
         to_background=np.array(found_maps) if moving_camera else None,
         first=start,
     )
+
+
+def _change(picture: Picture, before: Picture) -> float:
+    """Return the mean difference in grey levels, less what is one factor for all pixels: lamps flicker with the mains,
+    and every second frame of slow motion would seem to repeat the one before."""
+    gain = float(np.clip(np.mean(picture, dtype=np.float64) / max(np.mean(before, dtype=np.float64), 1.0), 0.5, 2.0))
+    return float(cv2.norm(picture, cv2.convertScaleAbs(before, alpha=gain), cv2.NORM_L1)) / picture.size
 
 
 def _warped(picture: Picture, matrix: Array) -> Picture:

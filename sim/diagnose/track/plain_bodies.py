@@ -32,6 +32,8 @@ CLEAR, FROM_ABOVE = 0.1, math.radians(55)
 CENTRE_PX = 0.2
 """Standard deviation of a centre in px that no scatter shows: an edge is known to about half a pixel, and its contrast
 changes along the way."""
+RIVAL = 0.4
+"""Share of the chosen path's freedom from which another moving body is told of."""
 MISSHAPEN = 0.35
 """Relative difference between an outline and the body's from which a warning is given."""
 
@@ -94,6 +96,12 @@ def follow_plain_body(
     warnings = [notes] if notes else []
     if found.to_background is not None:
         warnings.append(f"the camera drifts by up to {found.drift:.1f} px; frames are aligned to the background")
+    if len(chosen) > 1 and chosen[1].freedom() > RIVAL * chosen[0].freedom():
+        x, y = chosen[0].middles[0] / found.scale
+        warnings.append(
+            f"more than one body moves; the one that begins at x = {x:.0f}, y = {y:.0f} px is followed: "
+            "--start-frame and --end-frame choose another"
+        )
     regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
     if len(regions) < LEAST_FRAMES:
         raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
