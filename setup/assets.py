@@ -92,7 +92,7 @@ def ball_scene(pixels: int, samples: int) -> tuple[bpy.types.Scene, bpy.types.Ob
         bpy.context.collection.objects.unlink(item)
         scene.collection.objects.link(item)
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    sun.data.energy, sun.data.angle, sun.rotation_euler = 3.0, 0.2, (0.7, -0.2, 0.6)
+    sun.data.energy, sun.data.angle, sun.rotation_euler = 1.4, 0.2, (0.7, -0.2, 0.6)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.lens, camera.location = 60.0, (0.0, -2.3, 0.7)
     camera.rotation_euler = (Vector((0, 0, -0.02)) - camera.location).to_track_quat("-Z", "Y").to_euler()
@@ -118,7 +118,7 @@ def set_up(scene: bpy.types.Scene, pixels: int, samples: int) -> None:
     world = bpy.data.worlds.new("preview")
     tree = compat.node_tree(world)
     sky, output = tree.nodes.new("ShaderNodeBackground"), tree.nodes.new("ShaderNodeOutputWorld")
-    sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.75, 0.85, 1.0, 1.0), 0.6
+    sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.75, 0.85, 1.0, 1.0), 0.35
     tree.links.new(sky.outputs[0], output.inputs[0])
     scene.world = world
 
@@ -146,7 +146,11 @@ def build(out: Path, *, pixels: int, samples: int) -> Path:
     if pixels:
         with tempfile.TemporaryDirectory() as scratch:
             set_up(main, pixels, samples)
+            # A small square picture shows the middle alone.
+            lens = main.camera.data.lens
+            main.camera.data.lens = 1.3 * lens
             give_preview(sample, main, Path(scratch))
+            main.camera.data.lens = lens
             scene, ball = ball_scene(pixels, samples)
             for material in made:
                 ball.data.materials.clear()
