@@ -94,6 +94,13 @@ class FrameIndex:
         if other is not None:
             raise InputError(f"{folder}: holds frames as {other.name}; choose another folder for {suffix} files")
 
+    def begin(self) -> None:
+        """Write the index where there is none, before the first frame: killed between a frame and its entry, a render
+        would leave frames of which nobody knows whose they are, and the next one would refuse the folder.
+        """
+        if not (self.folder / INDEX_FILE).is_file():
+            self._write()
+
     @classmethod
     def of(cls, folder: Path) -> FrameIndex:
         """Return the index of the frames that ``folder`` holds, whatever their format. Raises InputError."""

@@ -317,6 +317,7 @@ def _make(
             else:
                 renderer = renderer or OpenRenderer(scene, bake, options, shot, progress.notice)
                 layers, data = renderer.layers(frame)
+                frame_index.begin()
                 write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             frame_index.record(frame.number, frame.inputs)
         progress.report(len(planned))

@@ -14,6 +14,8 @@ import contextlib
 import dataclasses
 import json
 import os
+import pickle
+import re
 import shutil
 import signal
 import sys
@@ -26,8 +28,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 from physgen import batch  # noqa: F401
+from physgen.batch.farm.planning.plan import Task
+from physgen.batch.farm.task_execution import execute_task
+from physgen.physgen_addon.frames.frame_files import write_png
+from physgen.physgen_addon.frames.frame_index import FrameIndex
 from physgen.sim import atomic
 from physgen.sim.app import rest_check  # noqa: F401 - before the fork
+from physgen.sim.app.diagnose import diagnose
+from physgen.sim.app.explain import explain
 from physgen.sim.app.pack_bake import pack_bake, unpack_bake
 from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
 from physgen.sim.app.reconstruct_record import STAMP_FILE, read_stamp, require_request
@@ -36,6 +44,8 @@ from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, save_manifest
 from physgen.sim.cache.folder_lock import LOCK_FILE, remove_dead_lock
 from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.diagnose import run_diagnosis
+from physgen.sim.diagnose.capture import load_capture
 from physgen.sim.evaluate.model_judge import CRITERIA
 from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -199,14 +209,94 @@ def do_collect(folder):
     collect_questionnaire([folder / "answers.json"], key=folder / "key.json", out=folder / "results")
 
 
-OUTPUTS = {"compose": ("fitted",), "pack": ("packed", "unpacked"), "collect": ("results",)}
+def tossed(folder):
+    """A video of a ball, its capture, and what is found of both; Taichi computes it in a process of its own."""
+    from physgen.sim.app import explain as app
+    from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions
+    from physgen.sim.diagnose.run_diagnosis import diagnose as run
+
+    wall = cv2.GaussianBlur(np.random.default_rng(1).integers(90, 200, (120, 160, 3), dtype=np.uint8), (0, 0), 2)
+    video = cv2.VideoWriter(str(folder / "toss.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 60.0, (160, 120))
+    for t in np.arange(30) / 60:
+        frame, place = wall.copy(), (30 + 220 * t, 95 - 200 * (2.4 * t - 4.905 * t * t))
+        cv2.circle(frame, tuple(int(16 * v) for v in place), 5 * 16, (30, 30, 210), -1, cv2.LINE_AA, 4)
+        video.write(frame)
+    video.release()
+
+    def keep(capture, options, on_event, cancelled):
+        found = run(capture, DiagnoseOptions(budget_s=10.0, effects=("wind",), confirm=False), on_event, cancelled)
+        (folder / "found.pickle").write_bytes(pickle.dumps(found))
+        return found
+
+    app.run_diagnosis.diagnose = keep
+    app.explain(folder / "toss.avi", BALL, out=folder / "explained")
+    shutil.move(folder / "explained" / "capture", folder / "captured")
+    shutil.rmtree(folder / "explained")
+
+
+BALL = "ball:diameter=0.05"
+
+
+def found_before(folder):
+    """In the place of the fits, which change nothing on the disk: what they found."""
+    found = pickle.loads((folder / "found.pickle").read_bytes())
+    run_diagnosis.diagnose = lambda *given, **options: found
+
+
+def do_diagnose(folder):
+    found_before(folder)
+    diagnose(load_capture(folder / "captured"), out=folder / "diagnosis")
+
+
+def do_explain(folder):
+    found_before(folder)
+    if not (folder / "explained").exists():
+        explain(folder / "toss.avi", BALL, out=folder / "explained")
+
+
+def do_frames(folder):
+    """What a render does with its frames: those that are there, whole and of these inputs, stay."""
+    index = FrameIndex(folder / "frames", fps=24.0)
+    index.begin()
+    for number in range(1, 5):
+        inputs = f"inputs of {number}"
+        if not index.is_complete(number, inputs):
+            write_png(index.path(number), np.full((12, 16, 3), 30 * number, np.uint8))
+            index.record(number, inputs)
+
+
+def do_batch(folder):
+    """A task of a farm, carried out by a process of its own."""
+    scene = "pair"
+    produces = ("out/scene.json", "out/meshes/a.ply")
+    argv = ("variant", scene, "--out", "out", "--preset=soft")
+    task = Task(id="s/a/variant", stage="variant", argv=argv, inputs=(f"{scene}/scene.json",), produces=produces)
+    outcome = execute_task(task, folder, version=VERSION, worker="here")
+    assert outcome.state in ("done", "kept"), outcome
+
+
+OUTPUTS = {
+    "compose": ("fitted",),
+    "pack": ("packed", "unpacked"),
+    "collect": ("results",),
+    "diagnose": ("diagnosis",),
+    "explain": ("explained",),
+}
 """Folders that a scenario makes: each as it was before, or as the whole run makes it."""
+GOES_ON = {"bake": "bake", "frames": "frames", "batch": "out"}
+"""Folders of which a scenario keeps what it has, so that another run goes on from there, to the same bytes."""
+CLOCKED = re.compile(r"(manifest|metrics|times)\.json|.*\.lock")
+"""Files that may differ: they say when, or how long."""
 
 SCENARIOS = {
     "bake": do_bake,
     "compose": do_compose,
     "pack": do_pack,
     "collect": do_collect,
+    "diagnose": do_diagnose,
+    "explain": do_explain,
+    "frames": do_frames,
+    "batch": do_batch,
     "correct": do_correct,
     "journal": do_correct_with_a_journal,
     "reconstruct": do_reconstruct,
@@ -224,25 +314,22 @@ def state(folder):
 
 
 def leftovers(folder):
-    return [str(path.relative_to(folder)) for path in folder.rglob(".*")]
+    return [str(path.relative_to(folder)) for path in folder.rglob(".*") if path.name != Task.farm_folder]
 
 
 def contents(folder):
     """What is in ``folder``; None where it is not there."""
     if not folder.is_dir():
         return None
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def caches(folder):
-    return {path.name: path.read_bytes() for path in (folder / "bake").glob("*.pc2")}
+    kept = [path for path in folder.rglob("*") if path.is_file() and not CLOCKED.fullmatch(path.name)]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in kept}
 
 
 def check(name, folder, whole, reference):
     """Return what is wrong after a kill and the next command's recovery."""
     atomic.recover(folder / "config" / "trusted.json")
     atomic.recover_scratch(folder / "scratch")
-    for part in ("scene", "windy", "bake", *OUTPUTS.get(name, ())):
+    for part in ("scene", "windy", "bake", "frames", "out", *OUTPUTS.get(name, ())):
         atomic.recover(folder / part)
         remove_dead_lock(folder / f".{part}{LOCK_FILE}")
         remove_dead_lock(folder / part / LOCK_FILE)
@@ -251,12 +338,12 @@ def check(name, folder, whole, reference):
     for part in OUTPUTS.get(name, ()):
         if contents(folder / part) not in (contents(folder.parent / "start" / part), contents(reference / part)):
             return f"{part} is neither what it was nor what it becomes"
-    if name == "bake":
+    if name in GOES_ON:
         # The next run goes on from what is there, to the same bytes.
-        if forked(lambda: do_bake(folder)) != 0:
-            return "cannot be baked any more"
-        if caches(folder) != caches(reference):
-            return "another bake than without a kill"
+        if forked(lambda: SCENARIOS[name](folder)) != 0:
+            return "cannot be gone on with"
+        if contents(folder / GOES_ON[name]) != contents(reference / GOES_ON[name]):
+            return "another result than without a kill"
     left = [*leftovers(folder), *(path.name for path in (folder / "scratch").iterdir())]
     return f"left over: {left[:4]}" if left else None
 
@@ -286,6 +373,10 @@ def main(name, folder, points):
         assert forked(lambda: do_compose(start, by=0.02)) == 0
     elif name == "pack":
         a_packable_bake(start)
+    elif name == "batch":
+        a_scene(start / "pair", {"a": ball(0), "b": ball(0.09)})
+    elif name in ("diagnose", "explain"):
+        assert forked(lambda: tossed(start)) == 0
     elif name == "collect":
         answers(start, 2)
         do_collect(start)
@@ -317,13 +408,13 @@ def main(name, folder, points):
     assert code == 0
     # The copies differ in nothing but their place.
     whole = [state(start), state(done)]
-    assert whole[0] != whole[1] or name in ("variant", "bake", *OUTPUTS)
+    assert whole[0] != whole[1] or name in ("variant", *GOES_ON, *OUTPUTS)
     wrong = [] if check(name, done, [whole[1]], done) is None else ["the whole run left something"]
     first, last, step = points
     tried = 0
     for number in range(first, min(last, calls) + 1, step):
         copy, code, _ = attempt(number, number)
-        if code == 0 and name == "bake":
+        if code == 0 and name in ("bake", "batch"):
             # It writes its manifest by the clock, and had fewer calls this time.
             continue
         tried += 1

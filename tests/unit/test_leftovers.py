@@ -60,6 +60,23 @@ def test_what_others_write_is_whole_or_not_there_at_whichever_call_they_are_kill
     assert found["wrong"] == [] and found["calls"] >= least and found["points"] >= least // 3
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("scenario", "points"), [("diagnose", "1:1000:6"), ("explain", "2:1000:12"), ("batch", "1:99:4")]
+)
+def test_reports_and_tasks_of_a_farm_are_whole_or_not_there_at_whichever_call_they_are_killed(
+    tmp_path, scenario, points
+):
+    found = kill_points(scenario, tmp_path, points)
+    assert found["wrong"] == [] and found["calls"] >= 10 and found["points"] >= 3
+
+
+@pytest.mark.long
+def test_a_render_killed_at_any_call_goes_on_to_the_same_frames(tmp_path):
+    found = kill_points("frames", tmp_path, "1:1000:1")
+    assert found["wrong"] == [] and found["points"] >= 20
+
+
 @pytest.fixture
 def dead():
     """The mark of a process that has ended."""
