@@ -117,6 +117,17 @@ def test_a_ball_leaves_with_its_restitution(restitution, speed):
     assert found[0, 9] / speed == pytest.approx(restitution, abs=0.035)
 
 
+@pytest.mark.parametrize("rub", [0.1, 0.3])
+def test_an_impact_keeps_sliding_as_its_grip_says(rub):
+    """Where friction would suffice, the sliding left at the contact is exp(-rate t) after the contact's time t."""
+    scene, restitution = scene_of(sphere(), friction=5.0), 0.9
+    start = state((0, 0, RADIUS + 0.01), (1, 0, -2))
+    found = run(scene, start, [0.1], gravity=np.zeros(3), restitution=restitution, rub=rub)[0]
+    left = found[7] - found[11] * RADIUS
+    # A nearly elastic contact lasts about half a period of its spring, in which the rate acts for rub times pi.
+    assert left == pytest.approx(np.exp(-rub * np.pi), abs=0.05)
+
+
 def test_a_sliding_cube_stops_after_v2_over_2_mu_g():
     mu, speed = 0.3, 1.0
     found = run(scene_of(box()), state((0, 0, 0.05), (speed, 0, 0)), [0.1, 1.0], friction=mu)

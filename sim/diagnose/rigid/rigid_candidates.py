@@ -25,6 +25,10 @@ AIR = 1.2
 RUB = 5.0 / np.pi
 """Tangential damping: sliding decays five times per contact half period, as without shear compliance."""
 
+GRIP_SPREAD = 0.7
+"""Standard deviation of the logarithm of ``RUB``: how far an impact stops sliding where friction would suffice. Elastic
+skins keep or return a part of it, and simulators differ: MuJoCo damps both directions alike, up to eight times less."""
+
 FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.01, 0.01, 0.1
 """Standard deviations of the nominal coefficients (relative; absolute; relative); larger deviations are an effect."""
 
@@ -49,6 +53,7 @@ class WorldSettings:
     friction: float
     restitution: float
     contact_time: float
+    rub: float = RUB
     rolling: float = 0.0
     pull: float = 0.0
     reach: float = 0.0
@@ -110,7 +115,7 @@ class BodyScene:
             out,
             np.clip([s.restitution for s in settings], 0.0, 1.0),
             np.array([s.contact_time for s in settings]),
-            np.full(len(settings), RUB),
+            np.array([s.rub for s in settings]),
         )
         return out
 
@@ -148,16 +153,17 @@ def _beliefs(scene: BodyScene, setting: WorldSettings, z: Array) -> WorldSetting
         friction=setting.friction * float(np.exp(FRICTION_SPREAD * z[0])),
         restitution=setting.restitution + spread * float(z[1]),
         contact_time=setting.contact_time * float(np.exp(CONTACT_TIME_SPREAD * np.clip(z[2], -4, 4))),
+        rub=setting.rub * float(np.exp(GRIP_SPREAD * np.clip(z[4], -4, 4))),
         gravity=setting.gravity * float(np.exp(RECORDED_GRAVITY_SPREAD * z[3])) if scene.unscaled else setting.gravity,
     )
 
 
 BELIEFS = CandidateEffect(
     name="beliefs",
-    size=4,
+    size=5,
     change=_beliefs,
     values=lambda scene, setting, z: {"friction": setting.friction, "restitution": setting.restitution},
-    starts=((0.0, 0.0, 0.0, 0.0),),
+    starts=((0.0,) * 5,),
     step=0.2,
 )
 """Return settings with the nominal model's own parameters changed."""
