@@ -66,7 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     again = "reconstruct a scene's photo again with corrected inputs"
     photo_commands.add_correct(command("correct", photo_commands.run_correct, again))
     photo_commands.add_import(
-        command("import", photo_commands.run_import, "PhysGen3D or PhysGen folder, or splat file → scene folder")
+        command("import", photo_commands.run_import, "PhysGen3D or PhysGen folder, splats, MJCF or URDF → scene folder")
     )
     varied = "scene folder → new scene folder with other physics and effects"
     scene_commands.add_variant(command("variant", scene_commands.run_variant, varied))

@@ -107,7 +107,7 @@ def add_correct(parser: argparse.ArgumentParser) -> None:
 
 def add_import(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen import``."""
-    what = "PhysGen3D or PhysGen folder (docs/reconstruction.md), or PLY file of splats (docs/splats.md)"
+    what = "PhysGen3D or PhysGen folder (docs/reconstruction.md), splats (PLY), MJCF or URDF"
     parser.add_argument("folder", type=Path, metavar="SOURCE", help=what)
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the scene folder")
     scale = "largest extent of the first object; sets the scene's scale (default: that of its simulation, else 0.15)"

@@ -22,6 +22,7 @@ from ..cache.pc2 import Pc2Reader
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file
+from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
 from ..scene.folder import SCENE_FILE, Scene
 from ..scene.scene_object import SceneObject
@@ -54,28 +55,13 @@ def mass_of(item: SceneObject, vertices: Array, faces: NDArray[np.int64], *, thi
     thickness: of the wall of a hollow one, m, which then counts as a thin shell. Raises InputError where the mesh
     encloses nothing.
     """
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    corners: tuple[Array, ...]
-    # Of tetrahedra from the origin (Tonon 2004, J. Math. Stat. 1), or of triangles: sums over corners are exact.
-    if thickness is None:
-        part = np.einsum("ij,ij->i", a, normal) / 6
-        corners, whole = (a, b, c, np.zeros_like(a)), 20.0
-    else:
-        part = np.linalg.norm(normal, axis=1) / 2 * thickness
-        corners, whole = (a, b, c), 12.0
-    volume, total = float(part.sum()), sum(corners)
-    if not volume > 0:
-        raise InputError(f"object {item.name}: its mesh encloses no volume, so it has no mass; close it")
-    centre = part @ total / (volume * len(corners))
-    second = np.einsum("n,ni,nj->ij", part, total, total)
-    for corner in corners:
-        second = second + np.einsum("n,ni,nj->ij", part, corner, corner)
-    second = second / whole - volume * np.outer(centre, centre)
-    density = item.material.density
-    inertia, axes = np.linalg.eigh(density * (np.trace(second) * np.eye(3) - second))
+    try:
+        found = mesh_properties(vertices, faces, density=item.material.density, thickness=thickness)
+    except InputError as error:
+        raise InputError(f"object {item.name}: {error}") from None
+    inertia, axes = np.linalg.eigh(found.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    return Mass(mass=density * volume, centre=centre, inertia=inertia, axes=axes)
+    return Mass(mass=found.mass, centre=found.center, inertia=inertia, axes=axes)
 
 
 def export_usd(

@@ -63,7 +63,7 @@ def scene_from_meshes(
                 velocity=velocities[index] if index < len(velocities) else (0.0, 0.0, 0.0),
             )
         )
-    scene = SceneModel(camera=_camera(extent), objects=tuple(objects), photo=None, background=None)
+    scene = SceneModel(camera=overview_camera(extent), objects=tuple(objects), photo=None, background=None)
     with replacing(out) as folder:
         folder.mkdir()
         for item, source in zip(objects, map(Path, meshes.values()), strict=True):
@@ -91,7 +91,7 @@ def _mesh_name(name: str, source: Path) -> str:
     return f"{folder}/{name}{source.suffix.lower()}"
 
 
-def _camera(extent: float) -> Camera:
+def overview_camera(extent: float) -> Camera:
     """A camera that looks at the origin from behind (-Y) and above, far enough for ``extent`` (m)."""
     pose = (
         (1.0, 0.0, 0.0, 0.0),

@@ -12,6 +12,7 @@ from loaders import BOX, PIXELS, RANDOM, add, put_json, put_picture, put_scene, 
 from physgen.sim.app import propose
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.bake_samples import load_object_splats
+from physgen.sim.app.import_folder import import_folder
 from physgen.sim.app.reconstruct import _answered, read_stamp
 from physgen.sim.app.scene_variant import _with_effects
 from physgen.sim.gaussians.mesh_to_splats import Texture
@@ -34,6 +35,27 @@ def _read_scene(folder: Path) -> None:
 
 def _physics(folder: Path) -> None:
     put_json(folder / "physics.json", {"answers": {"raw": "1. metal, 3000, hard"}, "objects": []})
+
+
+def _mjcf(folder: Path) -> None:
+    BOX.export(folder / "box.stl")
+    (folder / "m.xml").write_text(
+        "<mujoco><default><geom density='500'/></default><asset><mesh name='b' file='box.stl' scale='1 1 1'/></asset>"
+        "<worldbody><geom type='plane' size='1 1 1'/><body name='a' pos='0 0 1' euler='10 20 30'><freejoint/>"
+        "<geom type='capsule' fromto='0 0 0 0 0 0.1' size='0.02'/><geom type='mesh' mesh='b' quat='1 0 0 1'/>"
+        "<body><joint/><geom type='cylinder' size='0.02 0.05' mass='0.1'/></body></body></worldbody></mujoco>"
+    )
+
+
+def _urdf(folder: Path) -> None:
+    BOX.export(folder / "box.stl")
+    (folder / "m.urdf").write_text(
+        "<robot><link name='a'><inertial><mass value='1'/><inertia ixx='0.01' ixy='0' ixz='0' iyy='0.01' iyz='0' "
+        "izz='0.01'/></inertial><collision><geometry><mesh filename='box.stl'/></geometry></collision></link>"
+        "<link name='b'><collision><geometry><sphere radius='0.1'/></geometry></collision></link>"
+        "<joint name='j' type='fixed'><parent link='a'/><child link='b'/><origin xyz='0 0 1' rpy='0 1 0'/>"
+        "</joint></robot>"
+    )
 
 
 def _stamp(folder: Path) -> None:
@@ -183,6 +205,8 @@ def _read_splat_object(folder: Path) -> None:
     load_object_splats(scene, scene.objects[0], load_object_mesh(scene, scene.objects[0]))
 
 
+add("model of MuJoCo", ("m.xml", "box.stl"), _mjcf, lambda f: import_folder(f / "m.xml", out=f / "scene"))
+add("model in URDF", ("m.urdf", "box.stl"), _urdf, lambda f: import_folder(f / "m.urdf", out=f / "scene"))
 add("mesh GLB", "box.glb", _glb, _read_glb)
 add("mesh GLB through trimesh", "box.glb", lambda f: BOX.export(f / "box.glb"), lambda f: read_mesh(f / "box.glb"))
 add("mesh glTF", "box.gltf", _gltf, _read_gltf)

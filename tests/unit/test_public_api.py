@@ -100,6 +100,13 @@ def test_example_scene_to_usd(tmp_path):
     assert height == pytest.approx(0.4 - 4.905 * (3 / 24) ** 2, abs=2e-3)
 
 
+def test_example_mujoco_to_scene(tmp_path):
+    heights = example("mujoco_to_scene").main(None, tmp_path, frames=4)
+    # Free fall over three frames of a 24th of a second.
+    assert heights["can"] == pytest.approx(0.3 - 4.905 * (3 / 24) ** 2, abs=2e-3)
+    assert set(heights) == {"hammer", "can"}
+
+
 def test_example_sand_and_honey(tmp_path):
     reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=6)
     assert 0.0707 < reach["sand"] < reach["water"]
