@@ -34,6 +34,7 @@ from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
 from ...sim.cache.folder_lock import is_held
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ...sim.files import MOST_HASHED, open_file
 from ...sim.memory import how_it_was_killed, memory_kills
 from ...sim.scene.folder import file_hash, inside
 from ...sim.validation import parse, read_json, to_json
@@ -60,7 +61,9 @@ class TaskLog:
         self._tail_bytes = self._dropped = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            earlier = path.read_bytes()[-EARLIER_BYTES:] if path.is_file() else b""
+            if path.exists() and not path.is_file():
+                raise InputError(f"{path}: is no regular file, so no log can be written there; move it away")
+            earlier = _end_of(path, EARLIER_BYTES)[0]
             self._file = path.open("wb", buffering=0)
             self._file.write(earlier + f"==== {title}\n".encode())
         except OSError as error:
@@ -106,16 +109,22 @@ class TaskLog:
 
 def log_end(path: Path, most: int = 4096) -> str:
     """Return the last ``most`` bytes of a log, from the start of a line; empty if there is none."""
-    try:
-        with path.open("rb") as file:
-            size = file.seek(0, 2)
-            file.seek(max(0, size - most))
-            content = file.read()
-    except OSError:
-        return ""
+    content, size = _end_of(path, most)
     if size > most:
         content = content.partition(b"\n")[2]
     return content.decode("utf-8", "replace")
+
+
+def _end_of(path: Path, most: int) -> tuple[bytes, int]:
+    """Return the last ``most`` bytes of the regular file ``path``, and its size; nothing where there is none."""
+    try:
+        # A pipe would keep whoever opens it waiting, and a file that claims a terabyte takes all memory.
+        with open_file(path, MOST_HASHED) as file:
+            size = file.seek(0, 2)
+            file.seek(max(0, size - most))
+            return file.read(most), size
+    except (OSError, InputError):
+        return b"", 0
 
 
 RECORD_FORMAT = "physgen-task/1"

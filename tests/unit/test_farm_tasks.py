@@ -265,3 +265,26 @@ def test_a_log_keeps_its_beginning_and_its_end_within_bounds(tmp_path_factory, c
     assert len(content) <= EARLIER_BYTES + HEAD_BYTES + TAIL_BYTES + 200
     assert content.startswith(b"==== first\n==== second\n") and content.endswith(b"the end\n")
     assert log_end(path, 9) == "the end\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes and holes of POSIX")
+def test_logs_of_a_job_from_somebody_else_keep_nobody_waiting_and_take_no_memory(tmp_path):
+    """Each would have hung for ever, or read a terabyte."""
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.alarm(60)
+    try:
+        os.mkfifo(tmp_path / "pipe.log")
+        with (tmp_path / "long.log").open("wb") as file:
+            file.truncate(2**39)
+            file.seek(0, 2)
+            file.write(b"\nthe end\n")
+        assert log_end(tmp_path / "pipe.log") == ""
+        assert log_end(tmp_path / "long.log").endswith("the end\n")
+        with pytest.raises(InputError, match=r"pipe\.log: is no regular file"):
+            TaskLog(tmp_path / "pipe.log", "next")
+        with TaskLog(tmp_path / "long.log", "next"):
+            pass
+        assert (tmp_path / "long.log").stat().st_size < EARLIER_BYTES + 100
+        assert log_end(tmp_path / "long.log").endswith("the end\n==== next\n")
+    finally:
+        signal.alarm(0)
