@@ -88,7 +88,14 @@ TARGETS = {
     "hard": Target((0.5, 0.9), (0.0, 10.0), None, 1.0, "Physics Factbook: hollow hard plastic ball, 0.69"),
     "wood": Target((0.5, 0.7), (0.0, 0.0), None, 0.01, "Physics Factbook: wooden ball, 0.60"),
     "metal": Target((0.5, 0.8), (0.0, 0.0), None, 0.01, "Physics Factbook: steel ball bearing, 0.60"),
-    "clay": Target((0.0, 0.1), (1.0, 60.0), None, None, "Cross 1999: plasticine, 0"),
+    # KICK shears clay to three times its yield: a tenth to a quarter of critical damping.
+    "clay": Target(
+        (0.0, 0.1),
+        (1.0, 60.0),
+        (0.02, 0.05),
+        None,
+        "Cross 1999: plasticine, 0; Ishibashi & Zhang 1993: damping of clay",
+    ),
     "snow": Target((0.0, 0.2), None, None, None, "estimate"),
     "sand": Target((0.0, 0.1), None, None, None, "estimate: grains"),
     "water": Target((0.0, 0.1), None, None, None, "estimate: a splash"),

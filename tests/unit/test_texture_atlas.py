@@ -219,6 +219,22 @@ def test_islands_are_marks_and_stripes_are_not():
     assert np.abs(matter.colours[150, 120:200] - BLUE).max() < 30
 
 
+def test_a_mark_is_filled_from_what_it_lies_on():
+    """A yellow patch on a blue cushion that reaches down to the wood below leaves cushion, no wood."""
+    pixels = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.uint8)
+    mask = (np.abs(COLUMNS - 160) < 90) & (np.abs(ROWS - 130) < 100)
+    cushion = mask & (ROWS < 120)
+    pixels[mask], pixels[cushion] = (190, 140, 80), (60, 90, 170)
+    patch = (np.abs(COLUMNS - 140) < 22) & (ROWS > 70) & (ROWS < 120)
+    pixels[patch] = (250, 240, 90)
+    found = plain_matter(pixels, mask)
+    assert found.marks[patch].mean() > 0.9
+    # Its upper two thirds: at its lower end, cushion and wood are smoothed into each other everywhere.
+    filled = found.colours[patch & (ROWS < 103)]
+    assert np.abs(filled - (60, 90, 170)).max() < 20
+    assert np.abs(found.colours[(ROWS > 140) & (ROWS < 200) & (np.abs(COLUMNS - 160) < 60)] - (190, 140, 80)).max() < 20
+
+
 def test_synthesised_grain_keeps_its_contrast_and_does_not_repeat():
     swatch = np.random.default_rng(0).normal(0, 10, (48, 48, 3)).astype(np.float32)
     rows, columns = np.mgrid[:300, :300]

@@ -32,6 +32,15 @@ RIM_SHARE = 0.02
 """Width of the outline's band, which says what is no mark, over the square root of the area."""
 MARK = 9.0
 """Difference in CIELAB, lightness at half weight, above which something is a mark."""
+NEXT = 3
+"""Width of a mark's rim in pixels of that picture."""
+LEAST_RIM = 12
+"""Pixels of a rim that tell what the mark lies on."""
+MOST_OF_RIM = 2.0 / 3.0
+"""Share of a mark's rim of one colour above which the mark lies on that."""
+UNLIKE = 16.0
+"""Difference in CIELAB, lightness at half weight, from most of its rim from which something around a mark is not what
+the mark lies on."""
 SMOOTH = 0.02
 """Standard deviation of the plain colours' smoothing over the square root of the area; what is finer is grain."""
 EDGE_STEP = 60.0
@@ -119,8 +128,7 @@ def _levelled(filled: Picture, mask: Mask, size: float) -> tuple[Picture, Mask]:
     marks = ndimage.binary_dilation(difference > MARK, iterations=2) & inside
     if (inside & ~marks).any():
         # A channel alone may have a way to the outline through a shadow: what is a mark in one goes in all.
-        known = (inside & ~marks).astype(np.float32)
-        plain = np.stack([fill_gaps(plain[..., i].astype(np.float32), known) for i in range(3)], axis=-1)
+        plain = _filled(plain, marks, inside)
     colours: Picture = np.asarray(cv2.cvtColor(plain.astype(np.float32), cv2.COLOR_LAB2RGB), dtype=np.float32) * 255.0
     colours = inner_colours(colours, inside) if inside.any() else colours
     # Edges between colours stay sharp.
@@ -130,6 +138,41 @@ def _levelled(filled: Picture, mask: Mask, size: float) -> tuple[Picture, Mask]:
     large = np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
     marked = cv2.resize(marks.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return np.clip(large, 0.0, 255.0), marked & mask
+
+
+def _filled(plain: NDArray[np.float64], marks: Mask, inside: Mask) -> NDArray[np.float64]:
+    """``plain`` (h, w, 3), CIELAB, with the ``marks`` (h, w) filled from around.
+
+    Where a part of what is around a mark has another colour than most of its rim, it has no share in it: a patch on a
+    cushion that touches the stool's wood is cushion below.
+    """
+    result = _without_gaps(plain, inside & ~marks)
+    labels, _ = ndimage.label(marks)
+    for number, (rows, columns) in enumerate(ndimage.find_objects(labels), 1):
+        reach = NEXT + round(0.5 * float(np.sqrt((labels[rows, columns] == number).sum())))
+        window = (
+            slice(max(0, rows.start - reach), rows.stop + reach),
+            slice(max(0, columns.start - reach), columns.stop + reach),
+        )
+        own = labels[window] == number
+        away = ndimage.distance_transform_edt(~own)
+        around = inside[window] & ~marks[window] & (away <= reach)
+        rim = around & (away <= NEXT)
+        if rim.sum() < LEAST_RIM:
+            continue
+        difference = (plain[window] - np.median(plain[window][rim], axis=0)) * (0.5, 1.0, 1.0)
+        like = around & (np.linalg.norm(difference, axis=-1) <= UNLIKE)
+        # Stripes of two colours go on behind it.
+        if (like & rim).sum() > MOST_OF_RIM * rim.sum() and (around & ~like).any():
+            result[window][own] = _without_gaps(plain[window], like)[own]
+    return result
+
+
+def _without_gaps(values: NDArray[np.float64], known: Mask) -> NDArray[np.float64]:
+    """``values`` (h, w, 3) filled where they are not ``known`` (h, w)."""
+    weights = known.astype(np.float32)
+    filled = [fill_gaps(values[..., i].astype(np.float32), weights) for i in range(3)]
+    return np.stack(filled, axis=-1).astype(np.float64)
 
 
 def _without_islands(values: Picture, sources: Mask) -> NDArray[np.float64]:
