@@ -13,6 +13,7 @@ from physgen.sim.reconstruct.background.inpainting_methods import (
     VIEW_PIXELS,
     InpaintingTask,
     choose_method,
+    lay_grain,
     match_grain,
     similarity,
     trial_holes,
@@ -210,3 +211,28 @@ def test_a_floor_of_which_little_shows_is_still_filled_from_above():
     assert 0.02 < share < 0.06
     filled, rows = METHODS["as ground"](task), METHODS["by rows"](task)
     assert not np.array_equal(filled[hole], rows[hole])
+
+
+def test_detail_of_a_large_hole_comes_in_stretches_from_beside_it():
+    height, width = 420, 620
+    rng = np.random.default_rng(6)
+    # Grain that becomes coarser towards the camera.
+    fine, coarse = (cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), blur) for blur in (0.6, 2.0))
+    near = np.linspace(0.0, 1.0, height)[:, None]
+    grain = (1.0 - near) * fine / fine.std() + near * coarse / coarse.std()
+    photo = np.repeat((120.0 + 12.0 * grain)[..., None], 3, axis=2).astype(np.float32)
+    hole = np.zeros((height, width), dtype=bool)
+    hole[80:340, 180:420] = True
+    blurred = np.where(hole[..., None], cv2.GaussianBlur(photo, (0, 0), 6.0), photo)
+    laid = lay_grain(blurred, hole, ~hole)
+    assert np.abs(laid - photo)[~hole].max() < 1e-2
+
+    def slope(picture, rows):
+        """Step from pixel to pixel over the contrast: how fine the grain is."""
+        part = picture[rows, 200:400].mean(axis=-1)
+        return float(np.diff(part, axis=1).std() / part.std())
+
+    for rows in (slice(90, 170), slice(250, 330)):
+        assert abs(slope(laid, rows) / slope(photo, rows) - 1.0) < 0.25
+        assert laid[rows, 200:400].std() > 0.7 * photo[rows, 200:400].std()
+    assert blurred[90:170, 200:400].std() < 0.4 * photo[90:170, 200:400].std()

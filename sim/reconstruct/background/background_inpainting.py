@@ -18,7 +18,7 @@ from ...composite.inpaint import FillOptions
 from ...errors import InputError
 from ...scene.model import Camera
 from .inpainting_methods import METHODS, InpaintingTask, MethodChoice, box, choose_method
-from .relit_ground import continued, relit
+from .relit_ground import continued, near_any, relit, smoothed
 from .surface_edges import Edge, edges_behind
 from .surface_inpainting import DARKEST, logarithms
 
@@ -28,8 +28,11 @@ FEATHER = 4.0
 """Pixels at 1024 over which the inpainting fades into the photo, inside the hole only."""
 CLEAR = 2.0
 """Pixels beside an object that are mixed with it."""
-LEVEL = 3.0
-"""Pixels at 1024: blur in which levels are compared along the border."""
+LEVEL, REACH = 3.0, 10.0
+"""Pixels at 1024: blur in which levels are compared along the border, and depth over which a local difference is
+compensated."""
+STRETCH = 0.06
+"""Blur over the hole's size in which differences along the border are those of a level, and not of the pattern."""
 STEP = 0.4
 """Difference in logarithms along the border above which it is the edge of a thing, and not one of level."""
 
@@ -77,16 +80,19 @@ def _lead(
 ) -> NDArray[np.float32]:
     """Correction (H, W, 3) that matches the level of ``filled`` to the photo's at the border of the hole.
 
-    The difference along the border is continued inside as a membrane, so that no border of its own stays in sight.
+    What differs over long stretches of the border, by more than the surroundings' pattern does, is a level: it is
+    continued inside as a membrane, so that no patch of another brightness stays in sight. The rest fades within
+    ``REACH``.
     """
     rows, columns = np.flatnonzero(hole.any(axis=1)), np.flatnonzero(hole.any(axis=0))
-    band = max(2.0, LEVEL * unit)
-    room = round(4 * band) + 4
+    side = float(np.sqrt(hole.sum()))
+    band, stretch = max(2.0, LEVEL * unit), max(2.0, LEVEL * unit, STRETCH * side)
+    room = round(max(4 * REACH * unit, 0.5 * side)) + 4
     window = (
         slice(max(0, rows[0] - room), rows[-1] + 1 + room),
         slice(max(0, columns[0] - room), columns[-1] + 1 + room),
     )
-    inside, stood = hole[window], objects[window]
+    inside, stood, around = hole[window], objects[window], photo[window]
     depth = ndimage.distance_transform_edt(np.pad(inside, 1, mode="edge"))[1:-1, 1:-1]
     outer = ndimage.distance_transform_edt(~inside) if not inside.all() else np.full(inside.shape, np.inf)
     clear = ndimage.distance_transform_edt(~stood) > CLEAR + 1.0 if stood.any() else np.ones_like(inside)
@@ -95,22 +101,23 @@ def _lead(
     result = np.zeros_like(filled)
     if not shown.any() or not new.any():
         return result
-
-    def level(values: NDArray[np.float32], where: Mask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), band)
-        total = cv2.GaussianBlur(values * where[..., None].astype(np.float32), (0, 0), band)
-        mean = total / np.maximum(weight, 1e-6)[..., None]
-        return np.asarray(mean, dtype=np.float32), np.asarray(weight, dtype=np.float32)
-
-    seen, seen_weight = level(photo[window], shown)
-    mine, my_weight = level(filled[window], new)
+    seen, mine = smoothed(around, shown, band), smoothed(filled[window], new, band)
     gap = seen - mine
     # A larger step is the edge of a thing.
-    small = np.abs(np.log(np.maximum(seen, DARKEST)) - np.log(np.maximum(mine, DARKEST))).max(axis=-1) < STEP
-    rim = new & (depth <= 1.5) & (seen_weight > 1e-3) & (my_weight > 1e-3) & small
+    step = np.abs(np.log(np.maximum(seen, DARKEST)) - np.log(np.maximum(mine, DARKEST))).max(axis=-1)
+    rim = new & (depth <= 1.5) & (step < STEP) & near_any(shown, band) & near_any(new, band)
     if not rim.any():
         return result
-    result[window] = np.where(inside[..., None], continued(gap, rim, inside), 0.0)
+    known = ~inside & clear
+    usual = smoothed(around, known, stretch) - smoothed(around, known, 3.0 * stretch)
+    chance = np.square(usual[known & (outer < room)]).mean(axis=0)
+    wide = smoothed(gap, rim, stretch)
+    level = wide * np.maximum(1.0 - chance / np.maximum(np.square(wide), 1e-6), 0.0)
+    deep = continued(level, rim, inside)
+    spread = REACH * unit
+    fade = np.exp(-np.square(depth / (2.0 * spread)))[..., None]
+    rest = smoothed(gap - level, rim, spread) * fade * near_any(rim, spread)[..., None]
+    result[window] = np.where(inside[..., None], deep + rest, 0.0)
     return result
 
 

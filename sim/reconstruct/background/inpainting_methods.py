@@ -70,6 +70,50 @@ def _local(values: NDArray[np.float32], where: Mask, blur: float) -> NDArray[np.
     )
 
 
+FINE = 2.5
+"""Blur over the scale at which a large hole is solved: finer detail is laid anew, from whole stretches."""
+STRETCHES = 6
+"""Most stretches from which the detail of one hole comes."""
+LEVEL_ROWS = 0.6
+"""Cost of a stretch from other rows over that of one at the same height, where grain is as large and as sharp."""
+GRAINY = (0.5, 0.8)
+"""Robust over plain deviation of the detail: edges are below the first, grain is above the second."""
+
+
+def lay_grain(picture: Picture, hole: Mask, known: Mask) -> Picture:
+    """Return ``picture`` (h, w, 3) with the detail in ``hole`` (h, w) as strong as in its ``known`` surroundings, and
+    the finest of it copied from there.
+
+    A hole larger than ``SOLVE_SIDE`` is solved on a smaller copy, whose detail is put together of many small pieces:
+    some blurred, some repeated. Detail of a surface without edges is copied in stretches as large as possible.
+    """
+    side = float(np.sqrt(hole.sum()))
+    blur = FINE * side / SOLVE_SIDE
+    inner = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 5) > blur
+    if side <= SOLVE_SIDE or inner.sum() < 0.2 * hole.sum():
+        return match_grain(picture, hole, known)
+    smooth = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur), dtype=np.float32)
+    detail = picture - smooth
+    light = detail[inner].mean(axis=-1)
+    grain = 1.4826 * np.median(np.abs(light))
+    share = float(np.clip((grain / max(float(light.std()), 1e-3) - GRAINY[0]) / (GRAINY[1] - GRAINY[0]), 0.0, 1.0))
+    if share == 0.0:
+        return match_grain(picture, hole, known)
+    # Single spots and edges would be seen twice.
+    source, laid, left = np.clip(detail, -4.0 * grain, 4.0 * grain), detail.copy(), hole.copy()
+    for _ in range(STRETCHES):
+        shift = shift_to_known(left, inner, level=LEVEL_ROWS)
+        if shift is None:
+            break
+        there = left & shifted(inner, -shift[0], -shift[1])
+        new = shifted(source, -shift[0], -shift[1])
+        laid[there] = (1.0 - share) * detail[there] + share * new[there]
+        left &= ~there
+        if left.sum() < 0.01 * hole.sum():
+            break
+    return match_grain(np.asarray(np.where(hole[..., None], smooth + laid, picture), np.float32), hole, known)
+
+
 VIEW_PIXELS = 1_300_000
 """Largest size of one view; larger ones are coarser than the photo."""
 MIN_KNOWN = 0.06
@@ -158,7 +202,7 @@ def _in_photo(task: InpaintingTask, fill: Callable[[Picture, Mask, Mask, FillOpt
 def _searched_by_rows(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
     pixels = np.clip(picture + 0.5, 0, 255).astype(np.uint8)
     filled = inpaint_once(pixels, hole, barred, options, _heights(hole)).astype(np.float32)
-    return match_grain(np.where(hole[..., None], filled, picture), hole, ~(hole | barred))
+    return lay_grain(np.where(hole[..., None], filled, picture), hole, ~(hole | barred))
 
 
 def _searched_without_light(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
@@ -173,7 +217,7 @@ def _searched_without_light(picture: Picture, hole: Mask, barred: Mask, options:
     filled = inpaint_once(pixels, hole, barred, options, _heights(hole), SOLVE_SIDE).astype(np.float32)
     new = np.where(hole[..., None], (filled - 127.5) / gain + slow + centre, logs).astype(np.float32)
     result = np.where(hole[..., None], np.exp(clamp_to_surroundings(new, hole, known)), picture)
-    return match_grain(result.astype(np.float32), hole, known)
+    return lay_grain(result.astype(np.float32), hole, known)
 
 
 def _heights(hole: Mask) -> NDArray[np.float32]:

@@ -38,8 +38,8 @@ STRANGE = 3.0
 """The same beyond which a colour is not the surface's."""
 LEAST = 0.015
 """Smallest deviation in logarithms: below it is noise."""
-DEEPEST = 0.7
-"""Lack in logarithms of sRGB values, four times less light, above which noise would show."""
+DEEPEST = 0.5
+"""Lack in logarithms of sRGB values, a third of the light, above which noise and the shadow's own tint would show."""
 SLIVER = 0.02
 """Half the least width over the hole's size of a part whose light is put back."""
 FEWEST = 40
@@ -86,6 +86,8 @@ def membrane(values: Picture, fixed: Mask, free: Mask) -> Picture:
     return result
 
 
+FINEST_BLUR = 6.0
+"""Pixels; wider blurs are made on a copy on which they are that wide."""
 MEMBRANE_PIXELS = 30_000
 """Largest size of the copy on which a membrane over a full picture is solved: it has no detail."""
 
@@ -113,10 +115,28 @@ def continued(values: Picture, fixed: Mask, free: Mask) -> Picture:
 
 def smoothed(values: Picture, where: Mask, blur: float) -> Picture:
     """Return the mean (h, w, c) of ``values`` over pixels ``where`` (h, w) nearby; 0 where none is near."""
+    height, width = where.shape
     weight = where.astype(np.float32)
-    total = cv2.GaussianBlur(np.ascontiguousarray(values * weight[..., None], dtype=np.float32), (0, 0), blur)
-    share = cv2.GaussianBlur(weight, (0, 0), blur)
-    return np.asarray(total.reshape(values.shape) / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
+    total = np.ascontiguousarray(values * weight[..., None], dtype=np.float32)
+    scale = min(1.0, FINEST_BLUR / blur)
+    if scale < 0.7:
+        # A wide blur of a smaller copy is the same in a fraction of the time.
+        size = (max(4, round(width * scale)), max(4, round(height * scale)))
+        total, weight = (
+            np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.float32) for part in (total, weight)
+        )
+        blur *= size[0] / width
+    sums = cv2.GaussianBlur(total, (0, 0), blur).reshape(*weight.shape, -1)
+    mean = np.asarray(sums / np.maximum(cv2.GaussianBlur(weight, (0, 0), blur), 1e-6)[..., None], dtype=np.float32)
+    if scale < 0.7:
+        whole = cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(whole.reshape(values.shape), dtype=np.float32)
+    return mean
+
+
+def near_any(where: Mask, blur: float) -> Mask:
+    """Return the pixels (h, w) for which ``smoothed`` finds pixels ``where``."""
+    return np.asarray(cv2.GaussianBlur(where.astype(np.float32), (0, 0), blur) > 1e-3)
 
 
 @dataclass(frozen=True)

@@ -72,10 +72,10 @@ def _elsewhere(hole: Mask, known: Mask) -> Mask | None:
     return trial if trial.sum() >= TRIAL_SHARE * hole.sum() else None
 
 
-def shift_to_known(hole: Mask, known: Mask, pixels: int = 60_000) -> tuple[int, int] | None:
+def shift_to_known(hole: Mask, known: Mask, pixels: int = 60_000, level: float = 0.0) -> tuple[int, int] | None:
     """Return the shift (rows, columns) of ``hole`` (h, w) after which most of it is ``known``, preferring short ones.
 
-    None if there is none.
+    level: further cost of a shift by the picture's height, over what is known. None if there is none.
     """
     scale = min(1.0, float(np.sqrt(pixels / known.size)))
     size = (max(8, round(known.shape[1] * scale)), max(8, round(known.shape[0] * scale)))
@@ -86,7 +86,7 @@ def shift_to_known(hole: Mask, known: Mask, pixels: int = 60_000) -> tuple[int, 
     rows, columns = (_offsets(count) for count in torus)
     away = np.hypot(rows[:, None] / seen.shape[0], columns[None, :] / seen.shape[1])
     total = max(float(cut.sum()), 1e-6)
-    score = overlap / total - 0.1 * away
+    score = overlap / total - 0.1 * away - level * np.abs(rows / seen.shape[0])[:, None]
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
     if overlap[row, column] < 0.02 * total:
         return None
