@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -177,6 +178,16 @@ def end_at_last(terminal: Terminal) -> NoReturn:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``physgen``; returns the exit code (docs/cli.md)."""
+    try:
+        return _main(arguments)
+    finally:
+        if arguments is None:
+            # Python ends next and puts the system's own handlers back: a signal would be the exit code of work done.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
     expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)
