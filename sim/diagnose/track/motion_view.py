@@ -259,6 +259,10 @@ def _setting(
     if finer and best.miss > CRUDE * max(_most_curved(times, finer).miss, noise_px(places)):
         # A push that is weak beside the fastest motion is one all the same if nothing smooth fits across it.
         best = _most_curved(times, finer)
+    if _curves_down(best, times, places) and _flies(best, scale):
+        # Impacts at a wall had cut the flight into pieces shorter than something else.
+        known = pieces if any(p is best for p in pieces) else finer
+        return _flight(times, places, known, [best], impacts, scale, diameter_px, clearance, where)
     if _runs_down(best, scale, places):
         if from_above:
             raise InputError(
