@@ -149,6 +149,25 @@ def test_a_fall_that_is_none_names_the_size_and_the_frame_rate():
         understood(t, toss, diameter_px=16, diameter=0.04)
 
 
+def test_a_collision_out_of_sight_ends_the_motion_before_it():
+    """Touching another body, it is not told apart from it: six frames are missing, and its velocity is another."""
+    t = np.arange(190) / 240
+    struck, brake = 38 / 240, 1100.0
+
+    def slide(start, velocity, since):
+        speed = np.hypot(*velocity)
+        moving = np.clip(since, 0, speed / brake)
+        return start + np.outer(speed * moving - 0.5 * brake * moving**2, np.divide(velocity, speed))
+
+    before = slide(np.array([33.0, 75.0]), (700.0, 300.0), t)
+    at = slide(np.array([33.0, 75.0]), (700.0, 300.0), np.array([struck]))[0]
+    places = np.where((t < struck)[:, None], before, slide(at, (90.0, 265.0), t - struck))
+    places += np.random.default_rng(2).normal(0, 0.05, places.shape)
+    seen = np.abs(t - struck) > 3.1 / 240
+    view = understood(t[seen], places[seen])
+    assert view.kind == "surface" and view.first >= np.flatnonzero(t[seen] > struck)[0]
+
+
 def test_braking_beyond_friction_and_a_body_on_a_pivot_are_refused():
     t = np.arange(60) / 240
     way = np.stack([150 + 2000 * t - 0.5 * 16000 * np.minimum(t, 0.125) ** 2 - 2000 * np.maximum(t - 0.125, 0),

@@ -22,6 +22,8 @@ LEAST_PIECE = 6
 JUMP_SHARE, PUSH_SHARE, JUMP_SIGMAS = 0.3, 0.6, 7.0
 """Change of velocity that is an impact: as a share of the largest speed, on a surface (where an outline that turns
 wobbles), and in standard deviations."""
+GAP = 3.5
+"""Time between two samples over the usual one from which the body was out of sight between them."""
 CRUDE = 7.0
 """Residual of a piece over that of its parts from which it hides a push."""
 STILL = 0.05
@@ -147,6 +149,13 @@ def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
     if width <= 5 and count > 2 * width:
         # Straight lines through a curved path disagree by its steady acceleration everywhere.
         steps[width : count - width] -= np.median(steps[width : count - width], axis=0)
+    for k in _gaps(times):
+        # Fits across frames in which it was not seen, as where another body touched it, would smooth an impact away.
+        steps[max(0, k - width + 1) : k + width + 1] = 0.0
+        sides = slice(max(0, k - width), k + 1), slice(k + 1, k + 2 + width)
+        if all(len(times[side]) >= LEAST_PIECE for side in sides):
+            a, b = (np.polyfit(times[side] - times[k], places[side], 1)[0] for side in sides)
+            steps[k] = b - a
     change = np.linalg.norm(steps, axis=1)
     paces = np.linalg.norm(places[width:] - places[:-width], axis=1) / np.maximum(times[width:] - times[:-width], 1e-9)
     usual = float(np.percentile(paces, 97)) if len(paces) else 0.0
@@ -160,6 +169,12 @@ def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
         if all(abs(int(k) - f) > width for f in found):
             found.append(int(k))
     return sorted(found)
+
+
+def _gaps(times: Array) -> NDArray[np.int64]:
+    """Return the samples after which frames are missing."""
+    steps = np.diff(times)
+    return np.flatnonzero(steps > GAP * float(np.median(steps))) if len(steps) else np.zeros(0, np.int64)
 
 
 def wobble_px(times: Array, places: Array) -> float:
