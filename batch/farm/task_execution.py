@@ -29,7 +29,7 @@ from ...sim.app.stage_process import (
     parse_event,
     start_process,
 )
-from ...sim.atomic import write_json
+from ...sim.atomic import recover, write_json
 from ...sim.cache.bake_folder import MANIFEST_FILE, load_manifest
 from ...sim.cache.folder_lock import is_held
 from ...sim.errors import Cancelled, InputError, PhysGenError
@@ -295,6 +295,8 @@ def execute_task(
         )
         return dataclasses.replace(outcome, message=message)
     try:
+        for sentence in recover(record_path(task, root)):
+            on_event({"event": "notice", "task": task.id, "stage": task.stage, "message": sentence})
         record = up_to_date_record(task, root, version)
         if record is not None:
             return Outcome(

@@ -36,21 +36,27 @@ SAMPLES = 3
 
 @dataclasses.dataclass(frozen=True)
 class Loader:
-    """write: puts the files into a folder. read: reads them there, raising PhysGenError alone. files: to damage."""
+    """write: puts the files into a folder. read: reads them there, raising PhysGenError alone. files: to damage. share:
+    of the inputs that others get: what starts a process for each takes a hundred times as long."""
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
     files: tuple[str, ...]
+    share: float = 1.0
 
 
 LOADERS: dict[str, Loader] = {}
 
 
 def add(
-    name: str, files: str | tuple[str, ...], write: Callable[[Path], object], read: Callable[[Path], object]
+    name: str,
+    files: str | tuple[str, ...],
+    write: Callable[[Path], object],
+    read: Callable[[Path], object],
+    share: float = 1.0,
 ) -> None:
     """Add a loader."""
-    LOADERS[name] = Loader(write, read, (files,) if isinstance(files, str) else files)
+    LOADERS[name] = Loader(write, read, (files,) if isinstance(files, str) else files, share)
 
 
 def put_json(path: Path, value: object) -> None:

@@ -194,6 +194,9 @@ def _bag(folder: Path, storage: str) -> None:
     shutil.rmtree(folder / "made")
 
 
+READERS_SHARE = 0.25
+
+
 def _falling(folder: Path) -> None:
     rows, columns = np.mgrid[:60, :80] + 0.5
     frames = []
@@ -205,15 +208,21 @@ def _falling(folder: Path) -> None:
 
 
 def _follow(folder: Path) -> None:
-    follow_plain_body(VideoTrial(path=folder / "v.mp4"), parse_body("ball:diameter=0.04"))
+    follow_plain_body(VideoTrial(path=folder / "v.mp4", fps_override=99), parse_body("ball:diameter=0.04"))
 
 
 add("table of poses", "t.csv", _table, lambda f: read_recording(f / "t.csv"))
 add("table of markers", ("t.csv", "rest.csv"), _markers, _import)
 add("table of DeepLabCut", "t.csv", _deeplabcut, lambda f: read_recording(f / "t.csv"))
-add("C3D file", "t.c3d", _c3d, lambda f: read_recording(f / "t.c3d"))
-add("bag of ROS 2, MCAP", "t.mcap", lambda f: _bag(f, "MCAP"), lambda f: read_recording(f / "t.mcap"))
-add("bag of ROS 2, SQLite", "bag/t.db3", lambda f: _bag(f, "SQLITE3"), lambda f: read_recording(f / "bag"))
+add("C3D file", "t.c3d", _c3d, lambda f: read_recording(f / "t.c3d"), READERS_SHARE)
+add("bag of ROS 2, MCAP", "t.mcap", lambda f: _bag(f, "MCAP"), lambda f: read_recording(f / "t.mcap"), READERS_SHARE)
+add(
+    "bag of ROS 2, SQLite",
+    "bag/t.db3",
+    lambda f: _bag(f, "SQLITE3"),
+    lambda f: read_recording(f / "bag"),
+    READERS_SHARE,
+)
 add("project of Tracker", "t.trk", _tracker, lambda f: read_recording(f / "t.trk"))
 add(
     "body that was filmed",

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import mmap
 import os
 import random
@@ -43,6 +44,7 @@ import loaders_scenes  # noqa: F401
 from loaders import LOADERS, Loader
 from mutations import mutated
 from physgen.sim.errors import PhysGenError
+from physgen.sim.importers import recorded_files
 
 CPU_S, WALL_S = 5.0, 20.0
 """Longest that one input may compute, and be waited for on a busy machine."""
@@ -61,6 +63,8 @@ class Forbidden(BaseException):
 
 
 RUNS = ("subprocess.Popen", "os.system", "os.exec", "os.spawn", "os.posix_spawn", "os.fork", "os.forkpty", "pty.spawn")
+OWN_READER = [sys.executable, "-I", str(recorded_files._WORKER)]
+"""The process in which native readers run: started for every recording, whatever is in it; not watched itself."""
 CALLS = ("socket.connect", "socket.bind", "socket.getaddrinfo", "socket.gethostbyname", "urllib.Request")
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod")
 
@@ -75,6 +79,8 @@ class Guard:
     def see(self, event: str, given: tuple[Any, ...]) -> None:
         """Raise Forbidden for such an event."""
         if self.places is None:
+            return
+        if event == "subprocess.Popen" and list(given[1][:3]) == OWN_READER:
             return
         if event in RUNS or event in CALLS:
             raise Forbidden(f"{event} {str(given)[:100]}")
@@ -300,7 +306,7 @@ def again(name: str, seed: int, index: int) -> None:
 def main() -> int:
     """Run the loaders that the command line names; return 1 where anything was found."""
     parser = argparse.ArgumentParser(description="read damaged files with every loader")
-    parser.add_argument("--count", type=int, default=300, help="inputs for each loader")
+    parser.add_argument("--count", type=int, default=300, help="inputs for each loader, fewer for slow ones")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=list(LOADERS), choices=list(LOADERS), metavar="NAME")
     parser.add_argument("--index", type=int, help="this input of the one loader that --only names, with its traceback")
@@ -313,10 +319,11 @@ def main() -> int:
     results = {}
     for name in options.only:
         started = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done, found = fuzz(name, count=options.count, seed=options.seed, cpu_s=options.cpu)
+        count = math.ceil(options.count * LOADERS[name].share)
+        done, found = fuzz(name, count=count, seed=options.seed, cpu_s=options.cpu)
         ended = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = ended.ru_utime + ended.ru_stime - started.ru_utime - started.ru_stime
-        results[name] = {"inputs": done, "cpu_s": round(cpu, 2), "found": found}
+        results[name] = {"inputs": done, "asked": count, "cpu_s": round(cpu, 2), "found": found}
         if not options.json:
             kinds: dict[str, list[int]] = {}
             for index, text in found:

@@ -22,7 +22,7 @@ def fuzz(count, seed):
 def check(results, count):
     assert len(results) >= LEAST_LOADERS
     assert {name: result["found"] for name, result in results.items() if result["found"]} == {}
-    assert {result["inputs"] for result in results.values()} == {count}
+    assert all(result["inputs"] == result["asked"] >= count / 4 for result in results.values())
 
 
 def test_only_own_errors_escape_from_any_loader():

@@ -180,6 +180,8 @@ def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
         bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK, cancelled=lambda: next(asked))
     checkpoint = tmp_path / "bake" / bake_module.CHECKPOINT_FILE
     for content in (b"", b"garbage", checkpoint.read_bytes()[: checkpoint.stat().st_size // 2]):
+        # A bake that is complete leaves no folder of checkpoints.
+        checkpoint.parent.mkdir(exist_ok=True)
         checkpoint.write_bytes(content)
         save = load_manifest(tmp_path / "bake")
         assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"

@@ -273,7 +273,9 @@ def _plain_surface(median: Picture, holes: Picture, box: tuple[int, int, int, in
         for step in range(16):
             fit = np.linalg.lstsq(a * weights[:, None], b * weights[:, None], rcond=None)[0]
             off = np.abs(b - a @ fit).max(axis=1)
-            usual = max(float(np.median(off[weights > 0 if step == 0 else off < 3 * usual])), 0.5)
+            own = weights > 0 if step == 0 else off < 3 * usual
+            # A fit that has left all of its pixels begins anew with all.
+            usual = max(float(np.median(off[own] if own.any() else off)), 0.5)
             weights = 1.0 / np.maximum(1.0, off / usual) * (1.0 if step < 8 else off < 6 * usual)
         spread = max(1.48 * usual, 1.0)
         # A table below a hedge is plain, and says nothing about the hedge: it has to lie on most sides of the hole.
