@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 MAX_BYTES = {".c3d": 2**30, ".mcap": 2**35, ".db3": 2**35}
 """Largest file of each ending; bags hold pictures too, which are skipped."""
 LIBRARY = {".c3d": "ezc3d", ".mcap": "rosbags", ".db3": "rosbags"}
+PATIENCE = 20.0
+"""Time to wait for a reader over the CPU time that it may take: others may keep the processor busy."""
 MAX_FILES = 256
 """Of the folder of a bag."""
 _HEADS = {".c3d": (1, b"\x50"), ".mcap": (0, b"\x89MCAP0\r\n"), ".db3": (0, b"SQLite format 3\0")}
@@ -79,7 +81,7 @@ def _run(path: Path, folder: Path | None = None) -> tuple[dict[str, Any], dict[s
         raise InputError(f"{path}: is no {ending} file; record or export it again")
     if importlib.util.find_spec(LIBRARY[ending]) is None:
         raise InputError(f"{path}: {ending} needs {LIBRARY[ending]}: pip install 'physgen[recordings]'")
-    limit = SPARE_S + size / BYTES_A_SECOND
+    limit = SPARE_S[ending] + size / BYTES_A_SECOND
     with tempfile.TemporaryDirectory(prefix="physgen-recording-") as place:
         # A name of our own: SQLite would read what follows a question mark as options.
         link = Path(place, f"recording{ending}")
@@ -95,10 +97,10 @@ def _run(path: Path, folder: Path | None = None) -> tuple[dict[str, Any], dict[s
         )  # fmt: skip
         note_child(process)
         try:
-            # Others may keep the processor busy; the worker's own bound is on what it computes.
-            code = process.wait(timeout=4 * limit)
+            # The worker's own bound is on what it computes.
+            code = process.wait(timeout=PATIENCE * limit)
         except subprocess.TimeoutExpired:
-            raise InputError(f"{path}: not read within {4 * limit:.0f} s; record less of it") from None
+            raise InputError(f"{path}: not read within {PATIENCE * limit:.0f} s; record less of it") from None
         finally:
             process.kill()
             process.wait()

@@ -14,8 +14,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-MEMORY, SPARE_S, BYTES_A_SECOND = 3 * 2**30, 20, 2**24
-"""Bounds: address space; CPU seconds, and bytes of the file that each further one is for."""
+MEMORY, BYTES_A_SECOND = 3 * 2**30, 2**24
+SPARE_S = {".c3d": 4, ".mcap": 20, ".db3": 20}
+"""Bounds: address space; CPU seconds, and bytes of the file that each further one is for. A damaged C3D file may keep
+its reader busy for ever; messages of bags are read one by one, which takes long for a sound one, too."""
 MOST_POSES = 2_000_000
 """Poses of a bag, over all of its topics."""
 MOST_POINTS = 1024
@@ -31,7 +33,7 @@ STAMPED = {
 SEVERAL = ("geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage")
 
 
-def bound(size: int) -> None:
+def bound(path: Path) -> None:
     """Bound this process; on Windows only its time is bounded, by who started it."""
     try:
         import resource
@@ -41,7 +43,7 @@ def bound(size: int) -> None:
     most = MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard)
     resource.setrlimit(resource.RLIMIT_AS, (most, hard))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = SPARE_S + size // BYTES_A_SECOND
+    seconds = SPARE_S[path.suffix] + path.stat().st_size // BYTES_A_SECOND
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
 
 
@@ -159,7 +161,7 @@ def main() -> None:
     """Read the file of the command line."""
     path, out, *places = sys.argv[1:]
     sys.path += [place for place in places if place not in sys.path]
-    bound(Path(path).stat().st_size)
+    bound(Path(path))
     found: dict[str, Any]
     try:
         import numpy as np
