@@ -96,7 +96,7 @@ class FrameIndex:
 
     def begin(self) -> None:
         """Write the index where there is none, before the first frame: killed between a frame and its entry, a render
-        would leave frames of which nobody knows whose they are, and the next one would refuse the folder.
+        would leave frames without an index, and the next one would refuse the folder.
         """
         if not (self.folder / INDEX_FILE).is_file():
             self._write()

@@ -102,17 +102,22 @@ def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> 
     video.animation, video.use_viewport = True, True
 
 
-class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
-    """Match the photo's camera"""
+class _OfPhoto(Sidebar):
+    """Mixin of parts of the panel that a photo's scene has."""
 
     bl_parent_id = "PHYSGEN_PT_render"
-    bl_label = "Look"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Shown with a photo."""
         return bool(context.scene.physgen.folder)
+
+
+class PHYSGEN_PT_look(_OfPhoto, bpy.types.Panel):
+    """Match the photo's camera"""
+
+    bl_label = "Look"
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw a line for each effect."""
@@ -135,17 +140,10 @@ class PHYSGEN_PT_look(Sidebar, bpy.types.Panel):
             text.sentences(column, context, "To grade layers by hand: format EXR Layers.")
 
 
-class PHYSGEN_PT_farm(Sidebar, bpy.types.Panel):
+class PHYSGEN_PT_farm(_OfPhoto, bpy.types.Panel):
     """The whole clip as a job for this machine or a farm"""
 
-    bl_parent_id = "PHYSGEN_PT_render"
     bl_label = "Farm"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Shown with a photo."""
-        return bool(context.scene.physgen.folder)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw where it runs, the button, and the command that does the same."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_bytes
 from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
 from ..cache.pc2 import Pc2Reader
+from ..diagnose.capture_geometry import nearest_pose
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file
@@ -335,10 +336,14 @@ class _Writer:
 
         size = max(float(np.ptp(world, axis=0).max()), 1e-9)
         if pose is not None:
-            poses = [(frame, *_rigid(world - centre, points)) for frame, points in samples(baked.file)]
-            if max((error for *_, error in poses), default=0.0) < RIGID_FIT * size:
+            rest, poses, error = world - centre, [], 0.0
+            for frame, points in samples(baked.file):
+                rotation, shift = nearest_pose(rest, points)
+                error = max(error, float(np.linalg.norm(rest @ rotation.T + shift - points, axis=1).max()))
+                poses.append((frame, rotation, shift))
+            if error < RIGID_FIT * size:
                 before = None
-                for frame, rotation, shift, _ in poses:
+                for frame, rotation, shift in poses:
                     turned = _quaternion(rotation)
                     # Of q and -q the one that is nearer: readers interpolate component by component.
                     if before is not None and Gf.Dot(before, turned) < 0:
@@ -391,17 +396,6 @@ def _quaternion(rotation: Array) -> Any:
 
     x, y, z, w = map(float, Rotation.from_matrix(rotation).as_quat())
     return Gf.Quatd(w, x, y, z)
-
-
-def _rigid(rest: Array, points: Array) -> tuple[Array, Array, float]:
-    """Return rotation (3, 3), shift (3,) that take ``rest`` (V, 3) to ``points``, and the largest error (Kabsch)."""
-    middle, centre = rest.mean(axis=0), points.mean(axis=0)
-    u, _, v = np.linalg.svd((rest - middle).T @ (points - centre))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(v.T @ u.T))])
-    rotation = v.T @ flip @ u.T
-    shift = centre - rotation @ middle
-    error = float(np.linalg.norm(rest @ rotation.T + shift - points, axis=1).max())
-    return rotation, shift, error
 
 
 def require_scene(folder: Path) -> None:

@@ -33,7 +33,7 @@ CENTRE_PX = 0.2
 """Standard deviation of a centre in px that no scatter shows: an edge is known to about half a pixel, and its contrast
 changes along the way."""
 RIVAL = 0.4
-"""Share of the chosen path's freedom from which another moving body is told of."""
+"""Freedom of another body's path, over that of the chosen one, from which a warning names it."""
 MISSHAPEN = 0.35
 """Relative difference between an outline and the body's from which a warning is given."""
 
