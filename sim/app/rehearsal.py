@@ -14,6 +14,7 @@ import numpy as np
 
 from ..cache.bake_folder import Bake
 from ..cache.pc2 import Pc2Reader
+from ..diagnose.capture_geometry import nearest_rotation
 from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
 from ..scene.scene_object import SceneObject
@@ -104,14 +105,12 @@ def _rolls(scene: Scene, item: SceneObject) -> bool:
 
 def _turn(cache: Pc2Reader, count: int) -> float:
     """Largest angle in radians, among the first ``count`` samples of ``cache``, of the rotation that fits best from the
-    first one (Kabsch 1976)."""
+    first one."""
     rest = cache.sample(0).astype(np.float64)
     rest -= rest.mean(axis=0)
     most = 0.0
     for number in range(1, count):
         now = cache.sample(number).astype(np.float64)
-        first, _, second = np.linalg.svd(rest.T @ (now - now.mean(axis=0)))
-        sign = np.sign(np.linalg.det(first @ second))
-        turn = first @ np.diag([1.0, 1.0, sign]) @ second
+        turn = nearest_rotation((now - now.mean(axis=0)).T @ rest)
         most = max(most, math.acos(float(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
     return most
