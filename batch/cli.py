@@ -38,60 +38,45 @@ from .commands import (
     render_commands,
     scene_commands,
 )
+from .commands.command_parser import CommandParser, command_list
 from .farm import batch_command as farm_command
 from .terminal import Terminal, stop_signals
+
+ABOUT = """\
+One photo becomes a small physical world: reconstruct, simulate, render.
+
+  physgen run photo.jpg                  photo.mp4: its objects are found, and move
+  physgen COMMAND --help                 all options of a command
+"""
 
 Command = Callable[[argparse.Namespace, Terminal, IsCancelled], int]
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> CommandParser:
     """Return the parser of the ``physgen`` command."""
-    parser = argparse.ArgumentParser(
-        prog="physgen",
-        description="One photo becomes a small physical world: reconstruct, simulate, render.",
-        allow_abbrev=False,
-    )
+    parser = CommandParser(prog="physgen", usage="physgen COMMAND [options]")
     parser.add_argument("--version", action="version", version=f"physgen {VERSION}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", prog="physgen", help=argparse.SUPPRESS
+    )
+    groups: dict[str, list[tuple[str, str]]] = {}
 
-    def command(name: str, run: Command, text: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+    def command(name: str, run: Command, text: str) -> CommandParser:
+        sub = commands.add_parser(name, description=text)
         sub.add_argument("--json", action="store_true", help="progress and result as JSON lines")
         sub.set_defaults(run=run)
+        list(groups.values())[-1].append((name, text))
         return sub
 
+    groups["From a photo to a video"] = []
     photo_commands.add_run(command("run", photo_commands.run_run, "photo → video: all stages"))
-    photo_commands.add_reconstruct(command("reconstruct", photo_commands.run_reconstruct, "photo → scene folder"))
     listed = "list the objects of a photo that stand out, for --box and --pick; a numbered picture of them"
     photo_commands.add_propose(command("propose", photo_commands.run_propose, listed))
+    photo_commands.add_reconstruct(command("reconstruct", photo_commands.run_reconstruct, "photo → scene folder"))
     again = "reconstruct a scene's photo again with corrected inputs"
     photo_commands.add_correct(command("correct", photo_commands.run_correct, again))
-    photo_commands.add_import(
-        command("import", photo_commands.run_import, "PhysGen3D or PhysGen folder, splats, MJCF or URDF → scene folder")
-    )
-    varied = "scene folder → new scene folder with other physics and effects"
-    scene_commands.add_variant(command("variant", scene_commands.run_variant, varied))
-    fitted = "scene folder → new scene folder whose objects no longer intersect"
-    compose_commands.add_compose(command("compose", compose_commands.run_compose, fitted))
-    views = "multi-view images of one or two objects → scene folder with their splats"
-    compose_commands.add_fit_splats(command("fit-splats", compose_commands.run_fit_splats, views))
     photo_commands.add_light(command("light", photo_commands.run_light, "change the lighting of a scene folder"))
     scene_commands.add_bake(command("bake", scene_commands.run_bake, "scene folder → bake folder"))
-    cost = "estimate time, memory and disk space of a bake; writes nothing"
-    scene_commands.add_estimate(command("estimate", scene_commands.run_estimate, cost))
-    scene_commands.add_pack(
-        command("pack", scene_commands.run_pack, "a bake packed for the way, with --unpack back again")
-    )
-    scene_commands.add_export(
-        command("export", scene_commands.run_export, "scene folder, and its bake → USD with UsdPhysics bodies")
-    )
-    scene_commands.add_free(
-        command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
-    )
-    sound = "whether the files of a bake, scene or frames folder are what was written"
-    scene_commands.add_check(command("check", scene_commands.run_check, sound))
-    previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
-    scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
     photo_commands.add_render(
         command("render", photo_commands.run_render, "scene folder and bake folder → frames, video")
     )
@@ -99,24 +84,58 @@ def build_parser() -> argparse.ArgumentParser:
     render_commands.add_encode(command("encode", render_commands.run_encode, sheet))
     many = "job file → scenes, bakes and videos of all variants, on one or many machines"
     farm_command.add_batch(command("batch", farm_command.run_batch, many))
-    lack = "capture of a real motion → effects missing from its simulation"
-    diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
-    diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
+
+    groups["From a recording to the cause of its gap"] = []
     why = "video of one plain body → why its simulation differs, with a video of both side by side"
     diagnosis_commands.add_explain(command("explain", diagnosis_commands.run_explain, why))
+    diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
     tables = "tables of measured motion (CSV, Tracker, DeepLabCut) → capture folder"
     diagnosis_commands.add_capture(command("capture", diagnosis_commands.run_capture, tables))
+    lack = "capture of a real motion → effects missing from its simulation"
+    diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
     examined = "test the diagnosis on simulated motion with withheld labels"
     diagnosis_commands.add_blind_check(command("blind-check", diagnosis_commands.run_blind_check, examined))
-    real = "how real a video is: against recordings, by itself; a page, JSON and tables"
+
+    groups["Scenes"] = []
+    photo_commands.add_import(
+        command("import", photo_commands.run_import, "PhysGen3D or PhysGen folder, splats, MJCF or URDF → scene folder")
+    )
+    views = "multi-view images of one or two objects → scene folder with their splats"
+    compose_commands.add_fit_splats(command("fit-splats", compose_commands.run_fit_splats, views))
+    varied = "scene folder → new scene folder with other physics and effects"
+    scene_commands.add_variant(command("variant", scene_commands.run_variant, varied))
+    fitted = "scene folder → new scene folder whose objects no longer intersect"
+    compose_commands.add_compose(command("compose", compose_commands.run_compose, fitted))
+    scene_commands.add_export(
+        command("export", scene_commands.run_export, "scene folder, and its bake → USD with UsdPhysics bodies")
+    )
+
+    groups["Bakes"] = []
+    cost = "estimate time, memory and disk space of a bake; writes nothing"
+    scene_commands.add_estimate(command("estimate", scene_commands.run_estimate, cost))
+    previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
+    scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
+    sound = "whether the files of a bake, scene or frames folder are what was written"
+    scene_commands.add_check(command("check", scene_commands.run_check, sound))
+    packed = "a bake, packed to be sent; with --unpack back again"
+    scene_commands.add_pack(command("pack", scene_commands.run_pack, packed))
+    scene_commands.add_free(
+        command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
+    )
+
+    groups["How real a video is"] = []
+    real = "figures of a video against recordings, or by itself; a page, JSON and tables"
     evaluate.add_evaluate(command("evaluate", evaluate.run_evaluate, real))
     asked = "photos and videos → pages on which people judge them; with --collect: answers → results"
     questionnaire.add_questionnaire(command("questionnaire", questionnaire.run_questionnaire, asked))
+
+    groups["This installation"] = []
     listing = command("effects", _effects, "list physical effects with their equations and parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
     kept = "list, install or remove models that improve the reconstruction"
     model_commands.add_models(command("models", model_commands.run_models, kept))
     command("doctor", _doctor, "check the installation and name what is missing")
+    parser.description = ABOUT + command_list(groups)
     return parser
 
 

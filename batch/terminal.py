@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import sys
@@ -57,6 +58,50 @@ def stop_signals(at_last: Callable[[], object] | None = None) -> Iterator[IsCanc
                 signal.signal(number, handler)
 
 
+SLOWEST = 20.0
+"""How many times slower than guessed a machine is taken to be at most."""
+
+
+class RemainingTime:
+    """Seconds that a job of several stages has left, from its progress events and a first guess for each stage.
+
+    A stage's own estimate is taken where it gives one, else its pace, and its guess while it has hardly begun. What has
+    not begun counts with its guess, times how much slower than guessed the finished stages were.
+    """
+
+    def __init__(self, expected_s: dict[str, float], *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._expected = dict(expected_s)
+        self._clock = clock
+        self._begun: dict[str, float] = {}
+        self._done: dict[str, float] = {}
+        self._left: dict[str, float] = {}
+        self._slowness = 1.0
+
+    def update(self, event: Event) -> float:
+        """Take a progress event; return the seconds left of the whole job."""
+        stage, done, total = str(event.get("stage", "")), float(event["done"]), float(event["total"])
+        now = self._clock()
+        if done < self._done.get(stage, math.inf):
+            # A first event, or a stage that begins anew, such as a second rehearsal.
+            self._begun[stage] = now
+        self._done[stage] = done
+        elapsed = now - self._begun[stage]
+        guess = self._expected.get(stage, 0.0) * self._slowness
+        if done >= total:
+            self._left[stage] = 0.0
+            if stage in self._expected:
+                # What was cached or resumed is fast, and says nothing of the machine.
+                self._slowness = min(max(self._slowness, elapsed / self._expected[stage]), SLOWEST)
+        elif event.get("eta_s") is not None:
+            self._left[stage] = float(event["eta_s"])
+        else:
+            part = done / total if total > 0 else 0.0
+            by_pace = elapsed * (1 - part) / part if part > 0 else 0.0
+            self._left[stage] = part * by_pace + (1 - part) * max(guess - elapsed, elapsed * (1 - part))
+        waiting = sum(value for name, value in self._expected.items() if name not in self._left)
+        return sum(self._left.values()) + waiting * self._slowness
+
+
 class Terminal:
     """Print events: one updating line on a terminal, occasional lines in a log, or JSON lines."""
 
@@ -66,8 +111,7 @@ class Terminal:
         self._out: TextIO = out or sys.stdout
         self._live = not as_json and self._out.isatty()
         self._started = time.monotonic()
-        # Stages that have not started count with a guess, so that the remaining time is that of the whole job.
-        self._left = dict(expected_s or {})
+        self._remaining = RemainingTime(expected_s or {})
         self._last_line = 0.0
         self.reader_gone = False
         self._open_line = False
@@ -76,12 +120,7 @@ class Terminal:
         """Print ``event``."""
         kind, stage = event.get("event"), str(event.get("stage", ""))
         if kind == "progress":
-            done, total, eta = int(event["done"]), int(event["total"]), event.get("eta_s")
-            if eta is not None:
-                self._left[stage] = float(eta)
-            if done >= total:
-                self._left[stage] = 0.0
-            event = {**event, "job_eta_s": round(sum(self._left.values()), 1)}
+            event = {**event, "job_eta_s": round(self._remaining.update(event), 1)}
         if self._json:
             self._write(json.dumps(event, ensure_ascii=False) + "\n")
         elif kind == "progress":

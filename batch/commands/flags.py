@@ -113,45 +113,46 @@ def add_anyway_flag(parser: argparse.ArgumentParser) -> None:
 def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> None:
     """Add properties of single objects. boxes: also boxes, and lists in their order."""
     parser.set_defaults(wrong_usage=parser.error)
+    group = parser.add_argument_group("objects")
     if boxes:
         text = "bounding box x0,y0,x1,y1 in pixels of the upright photo, one per object (default: objects are found)"
-        parser.add_argument("--box", type=parse_box, nargs="+", action="extend", default=[], metavar="BOX", help=text)
+        group.add_argument("--box", type=parse_box, nargs="+", action="extend", default=[], metavar="BOX", help=text)
         text = "numbers of the objects to use, of those that are found without a box (physgen propose lists them)"
-        parser.add_argument("--pick", type=int, nargs="+", action="extend", default=[], metavar="N", help=text)
+        group.add_argument("--pick", type=int, nargs="+", action="extend", default=[], metavar="N", help=text)
         text = "object names, in the order of the boxes"
-        parser.add_argument("--name", nargs="+", action="extend", default=[], help=text)
+        group.add_argument("--name", nargs="+", action="extend", default=[], help=text)
         text = "largest extent in metres, one per object; the first sets the scene's scale"
-        parser.add_argument("--size", type=float, nargs="+", action="extend", default=[], metavar="METRES", help=text)
+        group.add_argument("--size", type=float, nargs="+", action="extend", default=[], metavar="METRES", help=text)
         text = "existing masks: a COCO file, or a file or folder of SAM masks; one object each"
-        parser.add_argument("--masks", type=Path, metavar="PATH", help=text)
+        group.add_argument("--masks", type=Path, metavar="PATH", help=text)
         text = "names or kinds to use from --masks (default: all)"
-        parser.add_argument("--only", nargs="+", action="extend", default=[], metavar="NAME", help=text)
+        group.add_argument("--only", nargs="+", action="extend", default=[], metavar="NAME", help=text)
     else:
         text = "largest extent in metres"
         reader = _named(float, "METRES")
-        parser.add_argument(
+        group.add_argument(
             "--size", type=reader, nargs="+", action="extend", default=[], metavar="OBJECT=METRES", help=text
         )
         text, reader = "new bounding box, in pixels of the upright photo", _named(parse_box, "x0,y0,x1,y1")
-        parser.add_argument(
+        group.add_argument(
             "--box", type=reader, nargs="+", action="extend", default=[], metavar="OBJECT=BOX", help=text
         )
     for flag, (field, read, what, text) in OBJECT_FLAGS.items():
         reader = _named(read, what)
-        parser.add_argument(
+        group.add_argument(
             f"--{flag}", dest=field, type=reader, nargs="+", action="extend", default=[], metavar=f"OBJECT={what}",
             help=text,
         )  # fmt: skip
     text = (
         "point on that mesh in its own coordinates, and its pixel in the photo; a few of them initialise the alignment"
     )
-    parser.add_argument(
+    group.add_argument(
         "--mesh-point", dest="mesh_points", type=_named(_mesh_point, "x,y,z@u,v"), nargs="+", action="extend",
         default=[], metavar="OBJECT=x,y,z@u,v", help=text,
     )  # fmt: skip
     for flag, what in (("keep", "belongs to it"), ("drop", "is background, such as what shows through a hole")):
         text = f"stroke in its box over what {what}: a line through pixels of the upright photo; may be repeated"
-        parser.add_argument(
+        group.add_argument(
             f"--{flag}", type=_named(parse_stroke, "x,y,x,y,…"), nargs="+", action="extend", default=[],
             metavar="OBJECT=x,y,x,y,…", help=text,
         )  # fmt: skip
@@ -159,23 +160,24 @@ def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> 
 
 def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
     """Add the options of the reconstruction: camera, ground, lighting from a file, adapters."""
+    group = parser.add_argument_group("reconstruction")
     text = "height of the horizon as a fraction of the photo's, 0 top, 1 bottom; may be outside (default: estimated)"
-    parser.add_argument("--horizon", dest="horizon_y", type=float, metavar="Y", help=text)
+    group.add_argument("--horizon", dest="horizon_y", type=float, metavar="Y", help=text)
     text = "how far the camera looks below the horizontal, instead of --horizon; about 50 looking down at a table"
-    parser.add_argument("--pitch", dest="pitch_deg", type=float, metavar="DEGREES", help=text)
+    group.add_argument("--pitch", dest="pitch_deg", type=float, metavar="DEGREES", help=text)
     text = "roll of the camera; positive if the horizon drops to the right (default: estimated)"
-    parser.add_argument("--roll", dest="roll_deg", type=float, metavar="DEGREES", help=text)
+    group.add_argument("--roll", dest="roll_deg", type=float, metavar="DEGREES", help=text)
     text = "field of view of the longer side (default: EXIF, else vanishing points, else 50)"
-    parser.add_argument("--fov", dest="fov_deg", type=float, metavar="DEGREES", help=text)
+    group.add_argument("--fov", dest="fov_deg", type=float, metavar="DEGREES", help=text)
     text = (
         "depth map of the photo (.npy, .npz, .exr, .pfm, 16-bit .png), used for the ground and occlusion order; or "
         "depth-anything or depth-pro, with --weights"
     )
-    parser.add_argument("--depth", type=Path, metavar="FILE|MODEL", help=text)
+    group.add_argument("--depth", type=Path, metavar="FILE|MODEL", help=text)
     text = "all objects from front to back (default: estimated)"
-    parser.add_argument("--order", nargs="+", metavar="OBJECT", help=text)
+    group.add_argument("--order", nargs="+", metavar="OBJECT", help=text)
     text = "fixed grey value below which ground is shadow, as in the paper (50), instead of the adaptive method"
-    parser.add_argument("--shadow-threshold", type=float, metavar="GREY", help=text)
+    group.add_argument("--shadow-threshold", type=float, metavar="GREY", help=text)
     for stage, what in (
         ("inpainter", "inpainting"),
         ("segmenter", "segmentation"),
@@ -183,40 +185,42 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
         ("mesher", "making meshes"),
     ):
         text = f"adapter for {what} (docs/extending.md; default: built-in)"
-        parser.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
+        group.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
     text = f"folder with the weights of {', '.join(FOLDERS)}, which --segmenter, --depth or --inpainter names"
-    parser.add_argument("--weights", type=Path, metavar="DIR", help=text)
+    group.add_argument("--weights", type=Path, metavar="DIR", help=text)
     text = "fetch the weights that --segmenter, --depth or --inpainter names, after showing size, source and licence"
-    parser.add_argument("--download", action="store_true", help=text)
+    group.add_argument("--download", action="store_true", help=text)
     text = "also write SCENE/report.html, with images of every stage"
-    parser.add_argument("--report", action="store_true", help=text)
+    group.add_argument("--report", action="store_true", help=text)
     add_environment_flags(parser)
 
 
 def add_environment_flags(parser: argparse.ArgumentParser) -> None:
     """Add an environment map from a file."""
+    group = parser.add_argument_group("lighting")
     text = ".hdr or .exr that replaces the lighting estimated from the photo; for DiffusionLight hdr/NAME.exr"
-    parser.add_argument("--environment", type=Path, metavar="FILE", help=text)
+    group.add_argument("--environment", type=Path, metavar="FILE", help=text)
     frame = (
         "direction of the map's centre: ahead and level (default), the camera's axis as in DiffusionLight, or world +X"
     )
-    parser.add_argument("--environment-frame", choices=FRAMES, default="ahead", help=frame)
-    parser.add_argument("--no-sun", action="store_true", help="no sun besides the environment")
+    group.add_argument("--environment-frame", choices=FRAMES, default="ahead", help=frame)
+    group.add_argument("--no-sun", action="store_true", help="no sun besides the environment")
 
 
 def add_reasoning_flags(parser: argparse.ArgumentParser) -> None:
     """Add the chat endpoint that is asked for the objects' materials."""
+    group = parser.add_argument_group("a model that names the materials")
     text = "OpenAI-compatible chat endpoint about the objects, such as https://host/v1 (docs/reconstruction-stages.md)"
-    parser.add_argument("--ask", metavar="URL", help=text)
+    group.add_argument("--ask", metavar="URL", help=text)
     text = "name of the endpoint's model; it must accept images"
-    parser.add_argument("--model", metavar="NAME", help=text)
+    group.add_argument("--model", metavar="NAME", help=text)
     text = "consent to sending the photo, with numbered outlines and your object names, to that endpoint"
-    parser.add_argument("--send-photo", action="store_true", help=f"{text}; without it nothing is sent")
+    group.add_argument("--send-photo", action="store_true", help=f"{text}; without it nothing is sent")
     text = f"environment variable with the API key (default {DEFAULT_KEY_VARIABLE})"
-    parser.add_argument("--key-variable", metavar="NAME", default=DEFAULT_KEY_VARIABLE, help=text)
+    group.add_argument("--key-variable", metavar="NAME", default=DEFAULT_KEY_VARIABLE, help=text)
     text = "timeout of one attempt (default 90)"
-    parser.add_argument("--ask-timeout", type=float, metavar="SECONDS", default=90.0, help=text)
-    parser.add_argument("--ask-retries", type=int, metavar="N", default=2, help="further attempts (default 2)")
+    group.add_argument("--ask-timeout", type=float, metavar="SECONDS", default=90.0, help=text)
+    group.add_argument("--ask-retries", type=int, metavar="N", default=2, help="further attempts (default 2)")
 
 
 def chat_request(options: argparse.Namespace) -> ChatRequest | None:
@@ -399,8 +403,9 @@ def light_request(options: argparse.Namespace) -> LightRequest:
 
 def add_physics_flags(parser: argparse.ArgumentParser) -> None:
     """Add materials, velocities and overrides of any field."""
+    group = parser.add_argument_group("material and motion")
     names = preset_names()
-    parser.add_argument(
+    group.add_argument(
         "--preset",
         nargs="+",
         action="extend",
@@ -409,10 +414,10 @@ def add_physics_flags(parser: argparse.ArgumentParser) -> None:
         help="material: one for all objects, or one per object",
     )
     velocity = "initial velocity x,y,z in m/s: right, away from the camera, up; one per object"
-    parser.add_argument(
+    group.add_argument(
         "--velocity", type=parse_vector, nargs="+", action="extend", default=[], metavar="V", help=velocity
     )
-    parser.add_argument(
+    group.add_argument(
         "--spin",
         type=parse_vector,
         nargs="+",
@@ -422,32 +427,33 @@ def add_physics_flags(parser: argparse.ArgumentParser) -> None:
         help="initial angular velocity x,y,z in rad/s; one per object",
     )
     change = "override a field of an object, its material, 'ground' or 'scene', such as cup.density=300"
-    parser.add_argument(
+    group.add_argument(
         "--set", nargs="+", action="extend", default=[], dest="overrides", metavar="OBJECT.FIELD=VALUE", help=change
     )
 
 
 def add_bake_flags(parser: argparse.ArgumentParser) -> None:
     """Add the options of a simulation."""
+    group = parser.add_argument_group("simulation")
     defaults = BakeOptions()
-    parser.add_argument(
+    group.add_argument(
         "--frames", type=int, default=defaults.frames, help=f"number of frames (default {defaults.frames})"
     )
-    parser.add_argument("--fps", type=float, default=defaults.fps, help=f"frames per second (default {defaults.fps:g})")
+    group.add_argument("--fps", type=float, default=defaults.fps, help=f"frames per second (default {defaults.fps:g})")
     text = "slow motion: how many times slower than real the video shows the motion"
-    parser.add_argument("--slow", type=float, default=defaults.slow, metavar="N", help=f"{text} (default 1)")
-    parser.add_argument(
+    group.add_argument("--slow", type=float, default=defaults.slow, metavar="N", help=f"{text} (default 1)")
+    group.add_argument(
         "--quality",
         default=defaults.quality,
         help=f"preview, standard, fine or papers (docs/simulation.md; default {defaults.quality})",
     )
-    parser.add_argument(
+    group.add_argument(
         "--arch",
         default=defaults.arch,
         choices=["cpu", "cuda", "vulkan", "metal"],
         help=f"backend of the simulation; falls back to cpu (default {defaults.arch})",
     )
-    parser.add_argument(
+    group.add_argument(
         "--seed",
         type=int,
         default=defaults.seed,

@@ -64,7 +64,8 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(frames=None, slow=None)
     text = "choose no motion where none is given: everything stays as in the photo"
     parser.add_argument("--still", action="store_true", help=text)
-    parser.add_argument("--out", type=Path, required=True, metavar="VIDEO.mp4", help="the video")
+    text = "the video, .mp4 or .webm (default: the photo's name with .mp4, in the current folder)"
+    parser.add_argument("--out", type=Path, metavar="VIDEO.mp4", help=text)
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="folder for scene, bake and frames (default: beside the video)"
     )
@@ -157,6 +158,8 @@ def fetch_models(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
 
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
+    if options.out is None:
+        options.out = Path(f"{options.photo.stem}.mp4")
     require_video_name(options.out)
     physics = physics_options(options)
     given = tells_motion(physics.velocities, physics.spins, physics.overrides)

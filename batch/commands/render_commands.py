@@ -21,16 +21,17 @@ from ..terminal import Terminal
 
 def add_render_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of ``RenderOptions``."""
+    group = parser.add_argument_group("rendering")
     for item, flag, kind in flagged_fields():
         text, default = item.metadata["help"], item.default
         if kind is bool:
             text += f" (default: {'on' if default else 'off'})"
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=text)
+            group.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=text)
             continue
         if default is not None:
             text += f" (default {default:g})" if isinstance(default, float) else f" (default {default})"
         choices, metavar = item.metadata["choices"], item.metadata["metavar"]
-        parser.add_argument(flag, type=kind, default=default, choices=choices, metavar=metavar, help=text)
+        group.add_argument(flag, type=kind, default=default, choices=choices, metavar=metavar, help=text)
 
 
 def render_options(options: argparse.Namespace) -> RenderOptions:

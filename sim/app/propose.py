@@ -80,7 +80,7 @@ def propose(
     from ..reconstruct.segmentation.object_proposals import proposals_from_alpha, propose_boxes, with_model
     from ..reconstruct.stage_cache import Steps
 
-    steps = Steps(2, on_event, cancelled)
+    steps = Steps(2, on_event, cancelled, stage="propose")
     steps.begin("photo")
     picture = load_photo(photo, SEARCHED)
     steps.begin("propose objects")

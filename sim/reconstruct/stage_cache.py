@@ -29,15 +29,16 @@ from ..validation import json_value, to_json
 class Steps:
     """Report progress, forward notices, and stop between steps when cancelled."""
 
-    def __init__(self, total: int, on_event: OnEvent, cancelled: IsCancelled) -> None:
+    def __init__(self, total: int, on_event: OnEvent, cancelled: IsCancelled, *, stage: str = "reconstruct") -> None:
         self._total, self._done, self._on_event, self.cancelled = total, 0, on_event, cancelled
+        self._stage = stage
         self.notices: list[str] = []
 
     def begin(self, name: str) -> None:
         """Begin the step ``name``. Raises Cancelled when cancelled."""
         if self.cancelled():
             raise Cancelled(f"reconstruction cancelled before step {name!r}; nothing was written")
-        event = {"event": "progress", "stage": "reconstruct", "step": name, "message": name}
+        event = {"event": "progress", "stage": self._stage, "step": name, "message": name}
         self._on_event({**event, "done": self._done, "total": self._total})
         self._done += 1
 
@@ -45,13 +46,13 @@ class Steps:
         """Report that all steps are done. Raises Cancelled when cancelled."""
         if self.cancelled():
             raise Cancelled("reconstruction cancelled at its end; nothing was written")
-        event = {"event": "progress", "stage": "reconstruct", "step": "done", "message": "done"}
+        event = {"event": "progress", "stage": self._stage, "step": "done", "message": "done"}
         self._on_event({**event, "done": self._total, "total": self._total})
 
     def notice(self, message: str) -> None:
         """Report a message to the user."""
         self.notices.append(message)
-        self._on_event({"event": "notice", "stage": "reconstruct", "message": message})
+        self._on_event({"event": "notice", "stage": self._stage, "message": message})
 
 
 Arrays = Mapping[str, NDArray[Any]]

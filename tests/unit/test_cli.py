@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line as a user types it: arguments, exit codes, what is on the disk afterwards."""
 
+import argparse
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -86,7 +88,29 @@ def test_wrong_usage_is_exit_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
-    assert "usage" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert "usage" in printed and "--help" in printed
+    # What is wrong is not lost below a list of sixty flags.
+    assert len(printed.splitlines()) <= 4
+
+
+def test_help_has_every_command_in_a_group_and_every_flag_of_one(capsys):
+    for name in ("", "run", "render", "diagnose"):
+        with pytest.raises(SystemExit):
+            main([*([name] if name else []), "--help"])
+        text = capsys.readouterr().out
+        parser = build_parser()
+        commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
+        wanted = commands if not name else {f for a in commands[name]._actions for f in a.option_strings}
+        assert not [word for word in wanted if not re.search(rf"(^|[ ,]){re.escape(word)}\b", text, re.M)]
+
+
+def test_the_video_takes_the_photos_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "table.jpg").write_bytes(b"no photo")
+    assert main(["run", "table.jpg", "--box", "1,2,30,40"]) == 3
+    assert "table.jpg" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith("table_work")] in ([], ["table_work"])
 
 
 def test_help_lists_every_stage(capsys):
