@@ -21,7 +21,7 @@ from ..sim.events import Event, IsCancelled, OnEvent
 from .compat import OperatorMixin
 from .context import redraw, scene_with
 from .interpreter import NoPython
-from .text import popup
+from .text import duration, popup
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """The work of a job: called in a thread, without bpy; forwards events and returns the final event, or raises."""
@@ -356,7 +356,7 @@ def progress_text(job: Job) -> str:
     if job.fraction is None:
         return f"{text}, {time.monotonic() - job.started:.0f} s"
     text += f" {100 * job.fraction:.0f} %"
-    return text if job.eta_s is None else f"{text}, {job.eta_s:.0f} s left"
+    return text if job.eta_s is None else f"{text}, {duration(job.eta_s)} left"
 
 
 def unregister_jobs() -> None:

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from ..sim.app.bake_worker import SERVE
 from ..sim.app.requirements import MODULE, NEWEST, OLDEST, RENDERER, REQUIREMENTS
 from ..sim.app.stage_process import NO_WINDOW, child_environment, own_command
 from ..sim.errors import InputError
@@ -160,6 +161,11 @@ def forget() -> None:
 def cli_command(python: Path, *arguments: str) -> Sequence[str]:
     """Return the command for ``physgen ARGUMENTS --json`` in that interpreter, running this extension's code."""
     return own_command("batch.cli", *arguments, "--json", python=str(python), packages=wheels_for(python))
+
+
+def bake_command(python: Path) -> Sequence[str]:
+    """Return the command of the process that takes bakes one after the other, in that interpreter."""
+    return own_command("sim.app.bake_worker", SERVE, python=str(python), packages=wheels_for(python))
 
 
 def wheel_folder() -> str:

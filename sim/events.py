@@ -29,7 +29,7 @@ def never() -> bool:
 class StageProgress:
     """Progress events of one stage, with the remaining time.
 
-    The remaining time follows the pace of recent units, because the first ones include compile and start-up time.
+    The remaining time follows the pace of recent units, because the first ones include start-up time.
     """
 
     def __init__(self, on_event: OnEvent, stage: str, total: int) -> None:
@@ -38,10 +38,10 @@ class StageProgress:
         self._total = total
         self._marks: list[tuple[int, float]] = []
 
-    def report(self, done: int, message: str = "") -> None:
-        """Report that ``done`` of the total units are finished."""
+    def report(self, done: int, message: str = "", *, paced: bool = True) -> None:
+        """Report that ``done`` of the total units are finished. paced: off while compiling, which tells no pace."""
         now = time.monotonic()
-        self._marks = [*self._marks[-8:], (done, now)]
+        self._marks = [*self._marks[-8:], (done, now)] if paced else [(done, now)]
         first_done, first_time = self._marks[0]
         eta = None
         if done > first_done:

@@ -129,6 +129,20 @@ def how_it_was_killed(kills_before: int | None) -> str:
     return f"it was killed, possibly because memory ran out{free}"
 
 
+def resident_memory() -> int | None:
+    """Return the bytes of main memory that this process holds (macOS: held at most); None where that is not known."""
+    try:
+        if sys.platform.startswith("linux"):
+            return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if sys.platform == "darwin":
+            import resource
+
+            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    except (OSError, ValueError, IndexError):
+        pass
+    return None
+
+
 def available_memory(reserved: int = 0) -> int | None:
     """Return the bytes of main memory that this process may still take without swapping; None where that is not known.
 

@@ -5,6 +5,7 @@
 property; an object that one is dropped on gets that preset.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import bpy
@@ -23,12 +24,10 @@ LIBRARY, FILE = "PhysGen", "physgen_assets.blend"
 """Name of the asset library in the preferences, and the file that makes a folder one."""
 
 
-def take_dropped(scene: bpy.types.Scene) -> list[str]:
-    """Give meshes of ``scene`` the presets of materials that they have got since; return the objects' names."""
-    if not any(PRESET in material for material in bpy.data.materials):
-        return []
+def take_dropped(items: Iterable[bpy.types.Object]) -> list[str]:
+    """Give those meshes of ``items`` that have got a material with a preset since that preset; return their names."""
     changed = []
-    for item in scene.objects:
+    for item in items:
         material = item.active_material if item.type == "MESH" else None
         preset = str(material.get(PRESET, "")) if material is not None else ""
         if preset == item.get(TAKEN, "") or not item.is_editable:
@@ -43,8 +42,10 @@ def take_dropped(scene: bpy.types.Scene) -> list[str]:
 
 @persistent
 def _on_change(scene: bpy.types.Scene, graph: bpy.types.Depsgraph | None = None) -> None:
-    if graph is None or any(isinstance(u.id, bpy.types.Object | bpy.types.Mesh) for u in graph.updates):
-        take_dropped(scene)
+    """Look at what has changed alone: an object that gets a material is updated itself."""
+    if graph is not None:
+        shaded = (u for u in graph.updates if u.is_updated_geometry or u.is_updated_shading)
+        take_dropped(u.id.original for u in shaded if isinstance(u.id, bpy.types.Object))
 
 
 def register_material_drop() -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 import bpy
 
 from ...sim.app.bake_options import BakeOptions, inputs_hash
+from ...sim.app.bake_worker import BakeJob, job_to_json
 from ...sim.app.stage_process import run_stage
+from ...sim.app.warm_stage import WarmStage
 from ...sim.cache.bake_folder import free_bake, load_manifest
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
@@ -16,7 +18,7 @@ from .. import background_jobs, bake_state, blend_trust, paths
 from .. import bake_state as unsaved
 from ..background_jobs import Job, JobOperator, Work
 from ..compat import OperatorMixin
-from ..interpreter import cli_command, find_python
+from ..interpreter import bake_command, cli_command, find_python
 from ..playback import bake_record, show_bake
 from ..playback.bake_record import BakeRecord, read_record, write_record
 from ..props.body_props import bodies
@@ -25,6 +27,14 @@ from ..scene_io.export_animation import clock, export_names
 from ..scene_io.export_scene import export_scene
 from ..scene_io.motion_fingerprint import fingerprint
 from ..text import count, duration, popup, report_errors, storage
+
+warm_worker = WarmStage()
+"""Of all bakes of this Blender: imports and kernels of one are there for the next."""
+
+
+def unregister_warm_worker() -> None:
+    """End it when the extension is disabled; it ends with Blender, too."""
+    warm_worker.stop()
 
 
 def exported(scene: bpy.types.Scene) -> tuple[Path, BakeOptions]:
@@ -100,7 +110,8 @@ class Bake(JobOperator):
             on_event({"event": "detail", "fingerprint": record.fingerprints[0]})
             background_jobs.wait_for(before, on_event, cancelled)
             interpreter = find_python(preferred)
-            folder = root.parent / bake_record.BAKES / inputs_hash(load_scene(root), options)[:12]
+            inputs = inputs_hash(load_scene(root), options)
+            folder = root.parent / bake_record.BAKES / inputs[:12]
             mine = BakeRecord(
                 folder=str(folder),
                 fingerprints=record.fingerprints,
@@ -109,7 +120,7 @@ class Bake(JobOperator):
             )
             write_record(mine)
             on_event({"event": "detail", "folder": str(folder)})
-            command = cli_command(interpreter, "bake", str(root), "--out", str(folder), *option_arguments(options))
+            job = BakeJob(scene=str(root), out=str(folder), options=options, expected_inputs=inputs)
             measured = False
 
             def relay(event: Event) -> None:
@@ -119,7 +130,8 @@ class Bake(JobOperator):
                     write_record(bake_record.with_spacings(mine))
                 on_event(event)
 
-            return {**run_stage(command, relay, cancelled), "folder": str(folder)}
+            done = warm_worker.run(bake_command(interpreter), job_to_json(job), relay, cancelled)
+            return {**done, "folder": str(folder)}
 
         return work
 

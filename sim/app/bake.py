@@ -297,7 +297,8 @@ class _Run:
         try:
             until = self.manifest.frames if self.mended is None else self.mended.samples
             for index in range(first := self.frames_done, until):
-                progress.report(index, "compiling" if index <= max(first, 1) else "")
+                compiling = index <= max(first, 1)
+                progress.report(index, "compiling" if compiling else "", paced=not compiling)
                 self.frame_started = time.monotonic()
                 self._advance_to(index, cancelled)
                 self._append_samples(index, writers, cancelled)

@@ -3,31 +3,38 @@
 
 The job file is ``{"format": "physgen-job/1", "use_case": "bake", "scene": …, "out": …, "options": {…}}``. Events
 go to standard output as JSON lines; SIGTERM, or the parent's death, cancels.
+
+With ``--serve`` in place of the file it takes one job after the other as lines of standard input, so that imports and
+compiled kernels are there for the next one (``warm_stage.py``); the line ``cancel`` cancels. It ends when its input is
+closed, when it has had no job for some minutes, and after a job that has left it large.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import signal
 import sys
 import threading
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, TextIO
 
 from ..atomic import remove_unfinished
 from ..cache.folder_lock import release_all
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
-from ..memory import ran_out
+from ..memory import ran_out, resident_memory
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json
 from .bake_options import BakeOptions, inputs_hash
 
 JOB_FORMAT = "physgen-job/1"
+SERVE = "--serve"
+"""The argument in place of a job file."""
 UNHEARD_S = 0.5
 """A bake checks for cancelling every tenth of a second. One that does not react within this time is compiling kernels
 or preparing the scene, so there is nothing to save, and the process ends at once, as after a crash."""
@@ -65,13 +72,16 @@ def job_to_json(job: BakeJob) -> dict[str, Any]:
 
 def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
     """Run the job file at ``path``; return the ``done`` event."""
-    data = read_json(path)
+    return _run(read_json(path), str(path), emit, cancelled)
+
+
+def _run(data: Any, where: str, emit: OnEvent, cancelled: IsCancelled) -> Event:
     if not isinstance(data, dict) or data.pop("format", None) != JOB_FORMAT:
-        raise InputError(f"{path}: not a job of format {JOB_FORMAT!r}")
+        raise InputError(f"{where}: not a job of format {JOB_FORMAT!r}")
     use_case = data.pop("use_case", None)
     if use_case != "bake":
-        raise InputError(f"{path}: use_case is {use_case!r}: this version knows 'bake'")
-    job = parse(BakeJob, data, str(path))
+        raise InputError(f"{where}: use_case is {use_case!r}: this version knows 'bake'")
+    job = parse(BakeJob, data, where)
     if job.expected_inputs not in (None, inputs_hash(load_scene(Path(job.scene)), job.options)):
         raise InputError(f"{job.scene}: was changed by another run since this one started; run it again")
     # The commands that start this process need the job's format alone.
@@ -86,11 +96,13 @@ def run_job(path: Path, emit: OnEvent, cancelled: IsCancelled) -> Event:
 class _Wish:
     """Whether this process is to stop, and whether its work has heard of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, parent: int | None = None) -> None:
         self.asked = threading.Event()
         self.heard = threading.Event()
+        self.over = threading.Event()
+        """Set when the work has ended and the process goes on."""
         self.looks = 0
-        self._parent = os.getppid()
+        self._parent = os.getppid() if parent is None else parent
 
     def listen(self) -> None:
         """Take the signals that ask to stop, at once: Python's handlers wait until the main thread's present call into
@@ -122,12 +134,13 @@ class _Wish:
 def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
     """End the process when it was asked to stop and does not."""
     while not wish.pending():
-        time.sleep(0.05)
+        if wish.over.wait(0.05):
+            return
     if not wish.heard.wait(UNHEARD_S if wish.looks < RUNNING_LOOKS else RUNNING_UNHEARD_S):
         with contextlib.suppress(OSError):
             emit(_error(Cancelled("bake cancelled in the middle of a long step; run it again to continue")))
-    else:
-        time.sleep(LAST_GRACE_S)
+    elif wish.over.wait(LAST_GRACE_S):
+        return
     remove_unfinished()
     release_all()
     os._exit(Cancelled.exit_code)
@@ -137,19 +150,103 @@ def _error(error: PhysGenError) -> Event:
     return {"event": "error", "kind": type(error).__name__, "message": str(error)}
 
 
+IDLE_S = 300.0
+"""A process that has had no job for this long ends."""
+
+MOST_KEPT_BYTES = 2**30
+"""A process that holds more than this after a job ends: memory that Taichi keeps is freed with it."""
+
+_CANCEL = b"cancel"
+
+
+def _serve(emit: OnEvent) -> None:
+    """Take jobs from standard input until it is closed, or for IDLE_S there is none."""
+    inbox = _Inbox()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: inbox.close())
+    threading.Thread(target=inbox.read, daemon=True).start()
+    # What every job needs, while the first one is not there yet.
+    from .bake import bake  # noqa: F401
+    from .simulation import build_world  # noqa: F401
+
+    while (line := inbox.next()) is not None:
+        _take_job(line, inbox.wish, emit)
+        gc.collect()
+        kept = resident_memory()
+        if kept is None or kept > MOST_KEPT_BYTES:
+            return
+
+
+def _take_job(line: bytes, wish: _Wish, emit: OnEvent) -> None:
+    """Run the job on ``line``; its error is an event, and the process lives on."""
+    threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
+    try:
+        try:
+            data = json.loads(line)
+        except (ValueError, RecursionError):
+            raise InputError("job: not a line of JSON") from None
+        final = _run(data, "job", emit, wish.cancelled)
+    except PhysGenError as error:
+        final = _error(error)
+    wish.over.set()
+    emit(final)
+
+
+class _Inbox:
+    """Lines of standard input, read in a thread."""
+
+    def __init__(self) -> None:
+        self._parent = os.getppid()
+        self._jobs: SimpleQueue[bytes | None] = SimpleQueue()
+        self.wish = _Wish(self._parent)
+
+    def next(self) -> bytes | None:
+        """Wait for a job; None when there will be none."""
+        try:
+            return self._jobs.get(timeout=IDLE_S)
+        except Empty:
+            return None
+
+    def close(self) -> None:
+        """Cancel the present job; there will be no more."""
+        self.wish.asked.set()
+        self._jobs.put(None)
+
+    def read(self) -> None:
+        """Read until the input is closed, which cancels, too."""
+        # Not sys.stdin: its lock would be held when the interpreter ends, and Taichi writes its kernels then.
+        text = b""
+        while found := os.read(0, 2**16):
+            *lines, text = (text + found).split(b"\n")
+            for line in lines:
+                if line.strip() == _CANCEL:
+                    self.wish.asked.set()
+                elif line.strip():
+                    self.wish = _Wish(self._parent)
+                    self._jobs.put(line)
+        self.close()
+
+
 def main(arguments: list[str]) -> int:
     """Entry of the process; the exit code of docs/cli.md."""
+    serves = arguments == [SERVE]
     wish = _Wish()
-    wish.listen()
+    if not serves:
+        wish.listen()
     # Libraries print to standard output; events get a descriptor of their own.
     events: TextIO = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)
 
     def emit(event: Event) -> None:
-        events.write(json.dumps(event, ensure_ascii=False) + "\n")
+        # Whoever asked may be gone: the end of the input then ends a process that serves.
+        with contextlib.suppress(OSError) if serves else contextlib.nullcontext():
+            events.write(json.dumps(event, ensure_ascii=False) + "\n")
 
-    threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
     try:
+        if serves:
+            _serve(emit)
+            return 0
+        threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
         if len(arguments) != 1:
             raise InputError(f"worker: expected one job file, found {len(arguments)} arguments")
         emit(run_job(Path(arguments[0]), emit, wish.cancelled))

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import Empty, Queue
 
@@ -113,13 +113,18 @@ def run_stage(
             break
         restarts -= 1
         on_event({"event": "notice", "message": f"the process crashed (code {code}); it is restarted and resumes"})
-    if final is not None and final.get("event") == "error":
-        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
+    raise_reported(final, failure)
     # A process that is asked to stop after its work was done may be killed by the signal while it ends.
     if final is None or (code != 0 and not cancelled()):
         words = "\n".join(tail).strip() or "no output"
         raise failure(f"{how_it_ended(code, kills)}: {words}")
     return final
+
+
+def raise_reported(final: Event | None, failure: type[PhysGenError]) -> None:
+    """Raise the PhysGenError that ``final`` reports, if it is one; ``failure`` where its kind is unknown."""
+    if final is not None and final.get("event") == "error":
+        raise _ERRORS.get(str(final.get("kind")), failure)(str(final.get("message")))
 
 
 def _crashed(code: int) -> bool:
@@ -143,57 +148,75 @@ def _run_once(
     command: Sequence[str], on_event: OnEvent, cancelled: IsCancelled
 ) -> tuple[Event | None, int, deque[str]]:
     """Return the final event of ``command`` if any, its exit code and the last lines of its other output."""
-    process = start_process(command)
-    # Bounded, so that endless output blocks instead of filling memory.
-    lines: Queue[bytes | None] = Queue(maxsize=256)
-    tail: deque[str] = deque(maxlen=30)
-    readers = [
-        threading.Thread(target=_read_events, args=(process, lines), daemon=True),
-        threading.Thread(target=read_errors, args=(process, tail), daemon=True),
-    ]
-    for reader in readers:
-        reader.start()
+    listened = Listened(start_process(command))
     try:
-        final = _relay(process, lines, tail, on_event, cancelled)
+        final = listened.relay(on_event, cancelled)
     finally:
-        _stop(process)
-        for reader in readers:
+        listened.end()
+    return final, listened.process.returncode, listened.tail
+
+
+class Listened:
+    """A process whose output is read by threads.
+
+    tail: the last lines of what it printed besides events.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self.process = process
+        self.tail: deque[str] = deque(maxlen=30)
+        # Bounded, so that endless output blocks instead of filling memory.
+        self._lines: Queue[bytes | None] = Queue(maxsize=256)
+        self._readers = [
+            threading.Thread(target=_read_events, args=(process, self._lines), daemon=True),
+            threading.Thread(target=read_errors, args=(process, self.tail), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def relay(
+        self, on_event: OnEvent, cancelled: IsCancelled, *, stop: Callable[[], None] | None = None
+    ) -> Event | None:
+        """Relay events until the process has ended; return the final one, None where it had none.
+
+        stop: how the process is asked to drop the present work, of which it then lives on: with it, the final event
+        ends the relay. By default it is asked to end. Raises Cancelled when it had to be killed, or ended without one.
+        """
+        final: Event | None = None
+        asked_at: float | None = None
+        while True:
+            if asked_at is None and cancelled():
+                asked_at = time.monotonic()
+                (stop or (lambda: ask_to_stop(self.process)))()
+            if asked_at is not None and time.monotonic() - asked_at > CANCEL_GRACE_S:
+                self.process.kill()
+                raise Cancelled("cancelled; the stage did not stop in time and was killed, complete frames are kept")
+            try:
+                line = self._lines.get(timeout=0.1)
+            except Empty:
+                continue
+            if line is None:
+                self.process.wait()
+                if final is None and asked_at is not None:
+                    raise Cancelled("cancelled while starting; run it again to continue")
+                return final
+            event = parse_event(line)
+            if event is None:
+                self.tail.append(line.decode("utf-8", "replace").rstrip())
+            elif event["event"] not in ("done", "error"):
+                on_event(event)
+            elif stop is not None:
+                return event
+            else:
+                final = event
+
+    def end(self) -> None:
+        """Kill the process if it still runs, whatever happened here; wait for its readers."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        for reader in self._readers:
             reader.join(timeout=5)
-    return final, process.returncode, tail
-
-
-def _relay(
-    process: subprocess.Popen[bytes],
-    lines: Queue[bytes | None],
-    tail: deque[str],
-    on_event: OnEvent,
-    cancelled: IsCancelled,
-) -> Event | None:
-    final: Event | None = None
-    asked_at: float | None = None
-    while True:
-        if asked_at is None and cancelled():
-            asked_at = time.monotonic()
-            ask_to_stop(process)
-        if asked_at is not None and time.monotonic() - asked_at > CANCEL_GRACE_S:
-            process.kill()
-            raise Cancelled("cancelled; the stage did not stop in time and was killed, complete frames are kept")
-        try:
-            line = lines.get(timeout=0.1)
-        except Empty:
-            continue
-        if line is None:
-            process.wait()
-            if final is None and asked_at is not None:
-                raise Cancelled("cancelled while starting; run it again to continue")
-            return final
-        event = parse_event(line)
-        if event is None:
-            tail.append(line.decode("utf-8", "replace").rstrip())
-        elif event["event"] in ("done", "error"):
-            final = event
-        else:
-            on_event(event)
 
 
 def parse_event(line: bytes) -> Event | None:
@@ -223,10 +246,3 @@ def ask_to_stop(process: subprocess.Popen[bytes]) -> None:
     """Send ``process`` the signal on which our processes stop cleanly."""
     with contextlib.suppress(ProcessLookupError):
         process.send_signal(signal.CTRL_BREAK_EVENT if os.name == "nt" else signal.SIGTERM)  # type: ignore[attr-defined]
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    """Kill the process if it still runs, whatever happened here."""
-    if process.poll() is None:
-        process.kill()
-    process.wait()

@@ -30,13 +30,17 @@ if importlib.util.find_spec("bpy") is None:
     collect_ignore_glob = ["test_*.py"]
 else:
     import bpy
+    import physgen
     from mathutils import Vector
     from physgen.physgen_addon import compat
+    from physgen.physgen_addon.props import material_props
     from physgen.physgen_addon.render import render_engines
     from physgen.physgen_addon.render.render_options import RenderOptions
     from physgen.physgen_addon.render.render_regions import Box
     from physgen.physgen_addon.render.render_scene import add_ground
     from physgen.physgen_addon.scene_io import photo_view as bridge_camera
+
+    from .panel_scenes import own_folder
 
 WIDTH, HEIGHT = 160, 120
 RADIUS = 0.05
@@ -83,6 +87,23 @@ def fresh_blender(factory_settings):
     A new file takes a fifth of the time of factory settings, which also reload preferences that no test touches.
     """
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+@pytest.fixture
+def addon(fresh_blender):
+    """The extension, registered in the empty file; tests that set something beforehand do it in autouse fixtures."""
+    physgen.register()
+    yield
+    physgen.unregister()
+
+
+@pytest.fixture
+def own_presets(tmp_path, monkeypatch):
+    """The user's own presets of materials are in a folder of the test."""
+    monkeypatch.setattr(material_props, "own_folder", lambda *, create=False: own_folder(tmp_path, create))
+    material_props.forget_presets()
+    yield
+    material_props.forget_presets()
 
 
 def floor_material() -> bpy.types.Material:

@@ -3,29 +3,10 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
-from physgen.physgen_addon.props import material_props
-
-
-@contextlib.contextmanager
-def registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The extension, with the user's own presets in a folder of the test."""
-    monkeypatch.setattr(material_props, "own_folder", lambda *, create=False: own_folder(tmp_path, create))
-    material_props.forget_presets()
-    physgen.register()
-    try:
-        yield
-    finally:
-        physgen.unregister()
-        material_props.forget_presets()
 
 
 def own_folder(tmp_path, create=False):

@@ -29,11 +29,7 @@ START = 3
 """Blender's frame of sample 0."""
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 def a_scene(frames=FRAMES, law="rigid"):

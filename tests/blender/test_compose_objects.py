@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from mathutils import Matrix
 from physgen.physgen_addon import background_jobs
 from physgen.physgen_addon.operators import compose_ops
@@ -23,12 +22,9 @@ STEPS = 6
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
+def settings(addon):
     bpy.context.scene.physgen_compose.method = "ppps"
     bpy.context.scene.physgen_compose.steps = STEPS
-    yield
-    physgen.unregister()
 
 
 def a_ball(name, x, radius=0.05, subdivisions=3):

@@ -14,7 +14,6 @@ import trimesh
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.batch.cli import build_parser
 from physgen.batch.commands.flags import object_requests, reconstruct_options
 from physgen.batch.commands.photo_commands import add_reconstruct
@@ -53,11 +52,7 @@ SIZE = (160, 120)
 """Pixels of the photo, the world's own; small, because it is reconstructed twice."""
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

@@ -30,12 +30,7 @@ from .diagnose_scenes import (
     shown_points,
 )
 
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

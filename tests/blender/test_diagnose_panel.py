@@ -39,12 +39,7 @@ from .diagnose_scenes import (
     times,
 )
 
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

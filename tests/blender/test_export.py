@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon.scene_io.export_animation import export_names
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.world_setup_checks import vertices_at
@@ -22,11 +21,8 @@ from .export_scenes import CUBE, QUADS, add, add_empty, animate, exported, prepa
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
+def settings(addon):
     bpy.context.scene.physgen.simulation.frame_end = 9
-    yield
-    physgen.unregister()
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from mathutils import Matrix
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
 from physgen.physgen_addon.scene_io.export_scene import export_scene
@@ -22,11 +21,8 @@ from .export_scenes import add, add_empty, animate, exported, prepared, refused
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
+def settings(addon):
     bpy.context.scene.physgen.simulation.frame_end = 9
-    yield
-    physgen.unregister()
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.batch.farm.planning.job_file import load_job
 from physgen.batch.farm.planning.task_graph import make_plan
 from physgen.physgen_addon.operators import farm_ops
@@ -27,11 +26,7 @@ from physgen.sim.scene.model import Ground
 NAMES = {"ball": "ball"}
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

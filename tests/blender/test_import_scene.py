@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 from physgen.physgen_addon.operators.photo_ops import (
@@ -33,11 +32,7 @@ from physgen.sim.scene.model import Box, Contact, Effect, Ground, Key, Motion
 KINDS = ("objects", "meshes", "materials", "images", "lights", "cameras", "worlds", "collections", "actions")
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon.frames.frame_files import read_picture, write_frame
 from physgen.physgen_addon.render import look_nodes
 from physgen.physgen_addon.render.render_options import FrameFormat
@@ -14,17 +13,13 @@ from physgen.sim.composite.compositing import FrameLayers, ObjectLayer, compose
 from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import InputError
 
-pytestmark = pytest.mark.skipif(not look_nodes.available(), reason="compositor node groups are Blender 5.0's")
+pytestmark = [
+    pytest.mark.skipif(not look_nodes.available(), reason="compositor node groups are Blender 5.0's"),
+    pytest.mark.usefixtures("addon"),
+]
 
 WIDTH, HEIGHT = 48, 32
 NAMES = ["cup", "ball é"]
-
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
 
 
 def layers(seed):

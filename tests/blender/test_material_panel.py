@@ -12,13 +12,9 @@ from physgen.physgen_addon.props.material_props import LAW_FIELDS, get_material,
 from physgen.physgen_addon.scene_io import import_physics
 from physgen.sim.scene.material import LAWS
 
-from .panel_scenes import a_body, a_cube, own_folder, registered, select
+from .panel_scenes import a_body, a_cube, own_folder, select
 
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
-    with registered(tmp_path, monkeypatch):
-        yield
+pytestmark = pytest.mark.usefixtures("own_presets", "addon")
 
 
 def test_a_changed_number_is_seen_and_taken_back():

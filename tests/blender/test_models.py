@@ -8,22 +8,20 @@ from pathlib import Path
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon.panels.photo_panel import draw_cutouts
 from physgen.sim.reconstruct.models import model_folder
 from physgen.sim.reconstruct.models.known_models import ISNET
 
 from .checked_layout import CheckedLayout, Context
 
+pytestmark = pytest.mark.usefixtures("addon")
+
 ARCHIVE = os.environ.get("PHYSGEN_TEST_ISNET", "")
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
+def own_models(tmp_path, monkeypatch):
     monkeypatch.setenv(model_folder.VARIABLE, str(tmp_path / "models"))
-    physgen.register()
-    yield
-    physgen.unregister()
 
 
 def drawn():

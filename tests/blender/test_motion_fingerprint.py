@@ -4,7 +4,6 @@
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from mathutils import Matrix
 from physgen.physgen_addon import compat
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
@@ -16,11 +15,8 @@ from .export_scenes import add, add_empty, animate, exported
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
+def settings(addon):
     bpy.context.scene.physgen.simulation.frame_end = 9
-    yield
-    physgen.unregister()
 
 
 @pytest.fixture

@@ -17,13 +17,9 @@ from physgen.physgen_addon.panels.sidebar import is_in
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.sim.errors import InputError
 
-from .panel_scenes import a_body, a_cube, registered, select
+from .panel_scenes import a_body, a_cube, select
 
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
-    with registered(tmp_path, monkeypatch):
-        yield
+pytestmark = pytest.mark.usefixtures("own_presets", "addon")
 
 
 # -- registering ------------------------------------------------------------------------------------------------------

@@ -20,11 +20,7 @@ from . import checked_layout
 COFFEE = Path(physgen.__file__).parent / "presets" / "demo" / "coffee.jpg"
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 def kinds(base):

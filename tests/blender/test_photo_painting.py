@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon.operators import mask_horizon_ops
 from physgen.physgen_addon.operators.mask_horizon_ops import PHYSGEN_OT_paint_mask
 from physgen.physgen_addon.operators.photo_object_ops import PHYSGEN_OT_draw_strokes, add_found, stroke_lines
@@ -45,11 +44,7 @@ from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture

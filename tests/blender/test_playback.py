@@ -27,11 +27,7 @@ STEP = np.array([0.3, 0.0, 0.0])
 SPACING = 0.05
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 def lattice():

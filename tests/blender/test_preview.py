@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon import gizmos as maths
 from physgen.physgen_addon.gizmos import SHOW_ARROWS
 from physgen.physgen_addon.interpreter import cli_command
@@ -25,11 +24,7 @@ from physgen.sim.errors import InputError
 WAIT_S = 120.0
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 def add_body(name="Ball", law="rigid", location=(0.0, 0.0, 1.0)):

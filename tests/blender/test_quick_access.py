@@ -14,17 +14,16 @@ from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 
+pytestmark = pytest.mark.usefixtures("addon")
+
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
+def own_folders(tmp_path, monkeypatch):
     def folder(name, *, create=False):
         (tmp_path / name).mkdir(exist_ok=True)
         return tmp_path / name
 
     monkeypatch.setattr(paths, "user_folder", folder)
-    physgen.register()
-    yield
-    physgen.unregister()
 
 
 def a_cube(**where):

@@ -41,11 +41,7 @@ TURNED = ((0.0, -2.0, 0.0, 0.1), (2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 0.25), (0
 COUNT = 300
 
 
-@pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
-    yield
-    physgen.unregister()
+pytestmark = pytest.mark.usefixtures("addon")
 
 
 def some(count=COUNT, radius=0.05):

@@ -7,18 +7,14 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
 
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender):
-    physgen.register()
+def settings(addon):
     bpy.context.scene.physgen.world.use_ground = False
-    yield
-    physgen.unregister()
 
 
 def a_text():

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-import physgen
 from physgen.physgen_addon import bake_state, blend_trust, paths
 from physgen.physgen_addon.operators.photo_ops import add_box, set_photo
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
@@ -17,13 +16,12 @@ from physgen.sim.errors import InputError
 from physgen.sim.trust import NotTrusted
 from physgen.sim.version import VERSION
 
+pytestmark = pytest.mark.usefixtures("addon")
+
 
 @pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
+def own_config(tmp_path, monkeypatch):
     monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "config"))
-    physgen.register()
-    yield
-    physgen.unregister()
 
 
 @pytest.fixture

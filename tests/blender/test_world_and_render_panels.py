@@ -18,13 +18,9 @@ from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS, effect_values
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.sim.effects.registry import effect
 
-from .panel_scenes import a_body, a_cube, registered, select
+from .panel_scenes import a_body, a_cube, select
 
-
-@pytest.fixture(autouse=True)
-def addon(fresh_blender, tmp_path, monkeypatch):
-    with registered(tmp_path, monkeypatch):
-        yield
+pytestmark = pytest.mark.usefixtures("own_presets", "addon")
 
 
 # -- world ------------------------------------------------------------------------------------------------------------

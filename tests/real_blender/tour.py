@@ -65,6 +65,8 @@ def first_bake():
     yield from screens.point(x, y)
     began = time.monotonic()
     yield from screens.press("shift+p")
+    # It unfolds.
+    yield from screens.drawn(4)
     screens.picture(screens.window(), SCREENS / "02_pie.png")
     yield from screens.click(x - 130, y)
     assert bpy.data.objects["Cube"].physgen.enabled, "the pie's left entry did not add the cube"
@@ -72,7 +74,7 @@ def first_bake():
     # The pie opens at the mouse.
     yield from screens.click(x - 130, y - 110)
     assert running() is not None, "the pie's upper entry did not bake"
-    until_playing = session.until(lambda: (running() is None) or (running().done or 0) > 1, 120, "the first frame")
+    until_playing = session.until(lambda: (running() is None) or (running().done or 0) > 1, 900, "the first frame")
     yield from until_playing
     first = time.monotonic() - began
     yield from screens.shoot(SCREENS, "04_baking")
@@ -172,7 +174,7 @@ def sample_meshes():
     yield from screens.shoot(SCREENS, "14_sample_meshes")
     with screens.focus():
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from session.until(lambda: running() is None or (running().done or 0) > 6, 200, "some frames")
+    yield from session.until(lambda: running() is None or (running().done or 0) > 6, 900, "some frames")
     yield from screens.shoot(SCREENS, "15_sample_baking")
     yield from ended("the bake")
     bpy.context.scene.frame_set(14)
