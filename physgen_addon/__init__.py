@@ -39,6 +39,7 @@ MODULES = (
     "operators.asset_ops",
     "gizmos",
     "cache_bar",
+    "ground_outline",
     "handlers",
     "panels.photo_panel",
     "panels.scene_panel",

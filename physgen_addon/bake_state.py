@@ -6,7 +6,8 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -41,7 +42,7 @@ class BakeState:
     ``missing`` (files deleted or damaged). frames_done of frames can be played. disk_bytes: of all bakes of the scene.
     trouble: the last error; advice: state and remedy in words. estimate_text: estimated cost of baking; empty if
     unknown. frame_start: of the bake that is shown, or would be made. bakes: all that are on the disk, newest first.
-    unfit: names of the objects whose meshes cannot be simulated.
+    unfit: the objects whose meshes cannot be simulated, by name, and why.
     """
 
     status: str = "none"
@@ -53,7 +54,7 @@ class BakeState:
     estimate_text: str = ""
     frame_start: int = 1
     bakes: tuple[bake_record.BakeOnDisk, ...] = ()
-    unfit: frozenset[str] = frozenset()
+    unfit: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def message(self) -> str:
@@ -216,21 +217,21 @@ def observe(scene: bpy.types.Scene) -> BakeState:
 
 MOST_VERTICES = 50_000
 """Of a mesh that is looked at after every change; a larger one is checked when it is added, and when it is baked."""
-_unfit_of: dict[int, tuple[str, frozenset[str]]] = {}
-"""Fingerprint, and the names found for it, by session_uid."""
+_unfit_of: dict[int, tuple[str, dict[str, str]]] = {}
+"""Fingerprint, and what was found for it, by session_uid."""
 
 
-def _unfit(scene: bpy.types.Scene) -> frozenset[str]:
+def _unfit(scene: bpy.types.Scene) -> dict[str, str]:
     current = _fingerprint(scene)[0]
     known = _unfit_of.get(scene.session_uid)
     if known is None or known[0] != current:
-        found = (item for item in bodies(scene) if item.physgen.role == "dynamic" and _is_unfit(item))
-        known = _unfit_of[scene.session_uid] = current, frozenset(item.name for item in found)
+        found = ((item.name, _trouble(item)) for item in bodies(scene) if item.physgen.role == "dynamic")
+        known = _unfit_of[scene.session_uid] = current, {name: why for name, why in found if why}
     return known[1]
 
 
-def _is_unfit(item: bpy.types.Object) -> bool:
-    return item.mode == "OBJECT" and len(item.data.vertices) <= MOST_VERTICES and bool(mesh_trouble(item))
+def _trouble(item: bpy.types.Object) -> str:
+    return mesh_trouble(item) if item.mode == "OBJECT" and len(item.data.vertices) <= MOST_VERTICES else ""
 
 
 def _first_frame(scene: bpy.types.Scene) -> int:

@@ -150,6 +150,17 @@ def show_result(context: bpy.types.Context, image: bpy.types.Image) -> None:
         area.spaces.active.image = image
 
 
+def replace_shown(old: bpy.types.Image, new: bpy.types.Image) -> bool:
+    """Let the image editors that show ``old`` show ``new``, and remove ``old``; return whether any did."""
+    areas = [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
+    showing = [area for area in areas if area.type == "IMAGE_EDITOR" and area.spaces.active.image == old]
+    for area in showing:
+        area.spaces.active.image = new
+        area.tag_redraw()
+    bpy.data.images.remove(old)
+    return bool(showing)
+
+
 def _settle(name: str, tab: str) -> None:
     """Fit the image ``name`` in the image editors that show it, and switch open sidebars to ``tab``."""
     for window in bpy.context.window_manager.windows:

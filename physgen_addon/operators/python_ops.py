@@ -71,7 +71,7 @@ class PHYSGEN_OT_install_python(bpy.types.Operator):
     bl_label = "Install"
 
     wheels: StringProperty(
-        name="Wheels",
+        name="Folder of Wheels",
         description="Folder of wheels that were downloaded elsewhere; empty: pip downloads them",
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
@@ -101,6 +101,7 @@ class PHYSGEN_OT_install_python(bpy.types.Operator):
         column.prop(self, "wheels")
         if not self.wheels.strip() and not bpy.app.online_access:
             text.paragraph(column, f"{OFFLINE}.", 76)
+            column.operator("screen.userpref_show", text="Network Preferences…", icon="PREFERENCES").section = "SYSTEM"
 
     @report_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -119,10 +120,14 @@ def install_description() -> list[str]:
         ", and Blender as a module to render photos" if renders else ""
     )
     return [
-        f"{packages}: about {download} MB to download, {disk} MB on disk.",
+        f"{packages}: about {_size(download)} to download, {_size(disk)} on disk.",
         f"Into {interpreter.home_folder()}, which is yours to delete. Nothing else is changed.",
         "From the Python package index, or whichever index pip is set to; wheels only, checked by pip.",
     ]
+
+
+def _size(megabytes: int) -> str:
+    return text.storage(megabytes * 10**6)
 
 
 class PHYSGEN_OT_install_packages(JobOperator, bpy.types.Operator):

@@ -2,6 +2,7 @@
 """Operators: render into the photo, export as Alembic, USD, or a .blend that needs no extension."""
 
 import contextlib
+import dataclasses
 import itertools
 import os
 import sys
@@ -21,9 +22,9 @@ from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.camera_path import CameraPath, save_camera_path
 from ...sim.scene.folder import SCENE_FILE, load_scene
 from .. import bake_state, paths
-from ..background_jobs import JobOperator, Work
+from ..background_jobs import Job, JobOperator, Work
 from ..compat import OperatorMixin
-from ..context import show_result
+from ..context import replace_shown, show_result
 from ..frames.frame_index import FRAME_NAME, frame_name
 from ..interpreter import find_python, missing_modules, require_renderer
 from ..paths import require_folder
@@ -32,7 +33,7 @@ from ..props import preferences
 from ..props.body_props import bodies
 from ..props.render_props import render_options
 from ..render import look_nodes
-from ..render.render_options import render_arguments
+from ..render.render_options import RenderOptions, render_arguments
 from ..scene_io import export_animation
 from ..text import count, report_errors
 
@@ -90,6 +91,16 @@ def _camera_path(scene: bpy.types.Scene, photo: Path, bake: Path) -> CameraPath 
     return export_animation.camera_path(scene, camera, frames, first_frame=manifest.frame_start)
 
 
+DRAFT_SCALE, DRAFT_SAMPLES = 0.4, 2
+"""Of the picture that is shown while a still is rendered: share of its size, and samples."""
+
+
+def draft_of(options: RenderOptions) -> RenderOptions:
+    """Return the options of the picture that is shown while a still is rendered with ``options``."""
+    samples, scale = min(options.samples, DRAFT_SAMPLES), options.scale * DRAFT_SCALE
+    return dataclasses.replace(options, samples=samples, scale=scale, format="png", bits=8)
+
+
 class _Render(JobOperator):
     job_title = "Render"
     bl_options = {"UNDO"}  # noqa: RUF012
@@ -106,15 +117,17 @@ class _Render(JobOperator):
             return False
         return super().poll(context)
 
-    def _work(self, scene: bpy.types.Scene, *choices: str) -> Work:
+    def _work(self, scene: bpy.types.Scene, *choices: str, drafts: bool = False) -> Work:
+        """Return the job that renders ``choices``. drafts: a draft of it comes first, as the detail ``draft``."""
         bake = require_folder(scene.physgen.simulation.bake, "Bake")
         if not (bake / MANIFEST_FILE).is_file():
             raise InputError(f"{bake}: holds no bake; bake again, or press Find Lost (see Cache and Device)")
         photo, baked_scene = require_folder(scene.physgen.folder, "Scene Folder"), bake.parent.parent / "scene"
         names, strangers = photo_names(scene), [item.name for item in bodies(scene) if not item.physgen.source]
         out = _output_folder(scene)
-        arguments = ["--out", str(out), "--parent", str(os.getpid()), "--json", *choices]
-        arguments += render_arguments(render_options(scene.physgen.rendering))
+        arguments = ["--out", str(out)]
+        options = render_options(scene.physgen.rendering)
+        arguments += render_arguments(options)
         preferred = preferences.python(bpy.context)
         path = _camera_path(scene, photo, bake)
 
@@ -135,10 +148,17 @@ class _Render(JobOperator):
                         names=names,
                         on_event=on_event,
                     )
-                command = [*start, str(photo), "--bake", str(rendered), *arguments]
+                command = [*start, str(photo), "--bake", str(rendered)]
+                command += ["--parent", str(os.getpid()), "--json", *choices]
                 if path is not None:
                     save_camera_path(Path(scratch) / "camera.json", path)
                     command += ["--camera", str(Path(scratch) / "camera.json")]
+                if drafts:
+                    drafted = Path(scratch) / "draft"
+                    quick = [*command, "--out", str(drafted), *render_arguments(draft_of(options))]
+                    found = run_stage(quick, on_event, cancelled, failure=RenderError, restarts=1)
+                    on_event({"event": "detail", "draft": str(drafted / str(found["files"][0]))})
+                command += arguments
                 # The result does not contain the requested range.
                 return {**run_stage(command, on_event, cancelled, failure=RenderError, restarts=1), "out": str(out)}
 
@@ -162,19 +182,35 @@ class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
             last = first + manifest.frames_done - 1
             raise InputError(f"frame {scene.frame_current} is not baked: go to one from {first} to {last}")
         number = manifest.frame_start + sample
-        work = self._work(scene, "--frames", str(number))
         name = frame_name(number, render_options(scene.physgen.rendering).frame_format.suffix)
+        # Where there is a picture already it may be up to date, and then it is there at once.
+        drafts = not bpy.app.background and not (_output_folder(scene) / name).is_file()
+        work = self._work(scene, "--frames", str(number), drafts=drafts)
+        self._draft = ""
         return lambda on_event, cancelled: {**work(on_event, cancelled), "still": name}
 
+    def progressed(self, scene: bpy.types.Scene, job: Job) -> None:
+        """Show the draft, once it is there."""
+        path = job.details.get("draft")
+        if path is not None and not self._draft and Path(path).is_file():
+            image = bpy.data.images.load(path)
+            image.name = "Draft"
+            # Its file is a temporary one.
+            image.pack()
+            self._draft = image.name
+            show_result(bpy.context, image)
+
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
-        """Show it."""
+        """Show it, in place of the draft."""
         path = Path(str(final["out"])) / str(final["still"])
         if not path.is_file():
             raise RenderError(f"{path}: is not there, although rendering has ended; render again")
         scene.physgen.rendering.result = str(path)
         image = bpy.data.images.load(str(path), check_existing=True)
         image.reload()
-        show_result(bpy.context, image)
+        draft = bpy.data.images.get(self._draft)
+        if draft is None or not replace_shown(draft, image):
+            show_result(bpy.context, image)
         return f"rendered {path}"
 
 

@@ -62,7 +62,7 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         """Draw role, name, material and visibility."""
         body = item.physgen
         row = layout.row(align=True)
-        # What cannot be baked as it is; the panel says why after pressing Bake, and did when it was added.
+        # What cannot be baked as it is; below the list stands why, of the active one.
         is_unfit = item.name in bake_state.state(context.scene).unfit
         row.prop(item, "name", text="", emboss=False, icon="ERROR" if is_unfit else ROLE_ICONS[body.role])
         row = row.row()
@@ -124,6 +124,9 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
             words = f"{active.name} is not in the simulation." if active is not None else "No object is active."
             text.sentences(layout, context, f"{words} Choose one in the list.", icon="INFO")
             return
+        why = bake_state.state(scene).unfit.get(item.name)
+        if why:
+            text.sentences(layout, context, text.brief(why), icon="ERROR")
         column = settings(layout, context, why=True)
         column.row().prop(item.physgen, "role", expand=True)
         if splats.find(item) is not None:

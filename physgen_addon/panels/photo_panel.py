@@ -165,6 +165,10 @@ def draw_asking(layout: bpy.types.UILayout, context: bpy.types.Context, state: A
     )
 
 
+JOBS = ("Reconstruction", "Finding objects", "Installation")
+"""Titles of the jobs whose progress is drawn below the photo's buttons."""
+
+
 class PHYSGEN_UL_boxes(bpy.types.UIList):
     """List of boxes: name of the object, and its size."""
 
@@ -223,7 +227,7 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     )
     if again:
         text.sentences(layout, context, "Only affected stages run again; your physics edits are kept.")
-    draw_job(layout, context, "Reconstruction", "Finding objects", "Installation")
+    draw_job(layout, context, *JOBS)
 
 
 def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:

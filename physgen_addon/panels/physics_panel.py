@@ -9,7 +9,7 @@ from .. import text
 from ..operators.bake_ops import PHYSGEN_OT_bake
 from ..props.body_props import is_body
 from .objects_panel import draw_preset
-from .sidebar import settings
+from .sidebar import draw_job, settings
 
 
 class PHYSGEN_PT_physics(bpy.types.Panel):
@@ -33,5 +33,6 @@ class PHYSGEN_PT_physics(bpy.types.Panel):
             draw_preset(column, context, body.material)
             column.prop(body, "velocity")
             column.prop(body, "spin")
-        self.layout.operator(PHYSGEN_OT_bake.bl_idname, icon="PHYSICS")
+        if not draw_job(self.layout, context, PHYSGEN_OT_bake.job_title):
+            self.layout.operator(PHYSGEN_OT_bake.bl_idname, icon="PHYSICS")
         text.sentences(self.layout, context, "Everything else: 3D viewport, N, tab PhysGen.")

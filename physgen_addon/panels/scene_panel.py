@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from .. import bake_state, blend_trust, text
-from ..background_jobs import PHYSGEN_OT_cancel_job
+from ..background_jobs import PHYSGEN_OT_cancel_job, running
 from ..operators.bake_ops import PHYSGEN_OT_pause_bake
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
@@ -18,7 +18,7 @@ from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
-from .sidebar import SCENE, Sidebar, draw_progress, draw_trust
+from .sidebar import COMMAND, SCENE, Sidebar, draw_progress, draw_trouble, draw_trust
 
 
 class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
@@ -31,12 +31,7 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw starting points; later the scene's folder."""
         layout, state = self.layout, context.scene.physgen
-        job = bake_state.bake_job(context.scene)
-        if job is not None:
-            # In sight however long the panels below are; Simulate has the same with words.
-            row = draw_progress(layout, job)
-            row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
-            row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+        _draw_in_sight(layout, context)
         draw_trust(layout, context)
         if state.folder:
             _draw_folder(layout, context, state)
@@ -53,6 +48,24 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo", icon="IMAGE_DATA")
         row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import", icon="IMPORT")
+
+
+def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw what must be seen however long the panels below are: progress, or that no Python simulates."""
+    job = running()
+    if job is None:
+        trouble = bake_state.state(context.scene).trouble
+        if COMMAND in trouble:
+            draw_trouble(layout.box(), context, trouble, icon="ERROR")
+        return
+    shows_photo = not context.scene.physgen.folder and context.scene.physgen_photo.image is not None
+    if shows_photo and job.title in photo_panel.JOBS:
+        # Drawn beside the button that has started it.
+        return
+    row = draw_progress(layout, job)
+    if bake_state.bake_job(context.scene) is not None:
+        row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
+    row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -22,7 +22,17 @@ from ..operators.bake_ops import (
 )
 from ..operators.world_ops import PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only
 from ..props.body_props import bodies
-from .sidebar import SIMULATE, Sidebar, draw_preview, draw_progress, draw_trouble, draw_trust, is_baking, settings
+from .sidebar import (
+    COMMAND,
+    SIMULATE,
+    Sidebar,
+    draw_preview,
+    draw_progress,
+    draw_trouble,
+    draw_trust,
+    is_baking,
+    settings,
+)
 
 
 class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
@@ -48,7 +58,7 @@ class PHYSGEN_PT_simulate(Sidebar, bpy.types.Panel):
         lacking = _lacking(scene)
         if not lacking:
             draw_preview(layout, context)
-        elif not is_baking(scene):
+        elif running() is None and not is_baking(scene):
             text.sentences(layout, context, lacking, icon="INFO")
         _draw_bake(layout, context, state(scene), ready=not lacking)
 
@@ -113,7 +123,9 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     """Draw the bake's state in a box, with possible actions."""
     advice = text.brief(found.advice)
     if found.status == "none":
-        if found.trouble:
+        if COMMAND in found.trouble:
+            text.sentences(layout, context, "No Python that simulates (see Scene).", icon="ERROR")
+        elif found.trouble:
             draw_trouble(layout, context, found.trouble, icon="ERROR")
         text.sentences(layout, context, advice)
         return

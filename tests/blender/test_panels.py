@@ -295,9 +295,10 @@ def test_what_cannot_be_baked_is_marked_in_the_list_until_it_is_mended():
     plane.data.transform(((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 0), (0, 0, 0, 1)))
     select(plane)
     bpy.ops.physgen.add_bodies()
-    assert bake_state.observe(bpy.context.scene).unfit == {"Plane"}
+    unfit = bake_state.observe(bpy.context.scene).unfit
+    assert set(unfit) == {"Plane"} and "is flat" in unfit["Plane"]
     plane.physgen.role = "collider"
-    assert bake_state.observe(bpy.context.scene).unfit == set()
+    assert bake_state.observe(bpy.context.scene).unfit == {}
     plane.physgen.role = "dynamic"
     plane.data = cube.data
-    assert bake_state.observe(bpy.context.scene).unfit == set()
+    assert bake_state.observe(bpy.context.scene).unfit == {}
