@@ -159,7 +159,7 @@ def arrange(widths: Sequence[int]) -> Generator[float, None, None]:
     for width in widths[:-1]:
         area = viewport()
         with bpy.context.temp_override(window=window(), area=area, region=region(area, "WINDOW")):
-            bpy.ops.screen.area_split(direction="VERTICAL", factor=(width + 130) / area.width)
+            bpy.ops.screen.area_split(direction="VERTICAL", factor=(width + 170) / area.width)
         yield 0.2
     shown = sorted((area for area in window().screen.areas if area.type == "VIEW_3D"), key=lambda area: area.x)
     for area in shown:
