@@ -2,6 +2,7 @@
 """Operators: bake, pause, estimate, free and relink bakes."""
 
 import contextlib
+import threading
 from pathlib import Path
 
 import bpy
@@ -30,6 +31,20 @@ from ..text import count, duration, popup, report_errors, storage
 
 warm_worker = WarmStage()
 """Of all bakes of this Blender: imports and kernels of one are there for the next."""
+
+
+def warm_up(context: bpy.types.Context) -> None:
+    """Start it, in a thread, for the bake that will come: it imports while the user chooses materials."""
+    if bpy.app.background:
+        return
+    preferred = python(context)
+
+    def prepare() -> None:
+        # What is wrong is said when something is baked.
+        with contextlib.suppress(PhysGenError):
+            warm_worker.prepare(bake_command(find_python(preferred)))
+
+    threading.Thread(target=prepare, name="physgen warm-up", daemon=True).start()
 
 
 def unregister_warm_worker() -> None:

@@ -15,6 +15,7 @@ from ..scene_io import stand_ins
 from ..scene_io.export_meshes import mesh_trouble, rest_bounds
 from ..scene_io.export_scene import SUNK
 from ..text import count, report_errors
+from .bake_ops import warm_up
 
 PIN_MARK = "physgen_pin"
 """Custom property of the empties made by "Add Pin"; only those are deleted with their pin."""
@@ -68,6 +69,8 @@ def add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | No
             item.select_set(True)
     if added and context.view_layer.objects.active not in added:
         context.view_layer.objects.active = added[0]
+    if added:
+        warm_up(context)
     return added
 
 

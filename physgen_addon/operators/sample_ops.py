@@ -16,6 +16,7 @@ from ..photo.photo_image import drop_mask
 from ..props.body_props import is_body
 from ..scene_io.sample_scene import add_sample
 from ..text import report_errors
+from .bake_ops import warm_up
 from .import_ops import choose, hide_all
 from .photo_ops import add_box, set_photo
 
@@ -73,6 +74,7 @@ def open_meshes(context: bpy.types.Context) -> str:
     simulation = scene.physgen.simulation
     choose(scene, add_sample(scene))
     simulation.frame_start, simulation.frame_end = 1, LAST_FRAME
+    warm_up(context)
     show_whole(context, scene, colours="MATERIAL", light="STUDIO")
     return f"The sample is open: press Bake{hidden}"
 

@@ -123,10 +123,10 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     """Draw the bake's state in a box, with possible actions."""
     advice = text.brief(found.advice)
     if found.status == "none":
-        if COMMAND in found.trouble:
-            text.sentences(layout, context, "No Python that simulates (see Scene).", icon="ERROR")
-        elif found.trouble:
-            draw_trouble(layout, context, found.trouble, icon="ERROR")
+        if found.trouble:
+            # The buttons that mend a missing Python are in sight already, in Scene.
+            words, command, _ = found.trouble.partition(COMMAND)
+            text.sentences(layout, context, text.brief(f"{words} (see Scene)" if command else words), icon="ERROR")
         text.sentences(layout, context, advice)
         return
     draw_trust(layout, context)

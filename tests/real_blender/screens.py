@@ -64,6 +64,14 @@ def open_all(names: Sequence[str] = ()) -> list[str]:
     return [kind.__name__ for kind in kinds]
 
 
+def on_screen(place: Any, shown: bpy.types.Region) -> tuple[int, int]:
+    """Where a point of the world is in a viewport's region, in pixels of the screen from its upper left corner."""
+    from bpy_extras.view3d_utils import location_3d_to_region_2d
+
+    found = location_3d_to_region_2d(shown, viewport().spaces.active.region_3d, place)
+    return round(shown.x + found.x), round(window().height - (shown.y + found.y))
+
+
 def show_sidebar() -> Generator[float, None, None]:
     """Open the sidebar on the extension's tab; a tab can only be chosen after the region has drawn once."""
     area = viewport()

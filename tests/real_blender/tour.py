@@ -219,6 +219,83 @@ def sample_photo():
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
 
 
+def farm():
+    """The panels Render, Look and Farm, open, with the photo of the step before."""
+    opened = ("PHYSGEN_PT_render", "PHYSGEN_PT_look", "PHYSGEN_PT_farm")
+    screens.open_all(opened)
+    yield 0.5
+    yield from screens.shoot(SCREENS, "32_farm")
+
+
+def nodes():
+    """A still with layers of that photo, and its nodes in the compositor."""
+    rendering = bpy.context.scene.physgen.rendering
+    rendering.format, rendering.own_samples, rendering.samples, rendering.size = "exr_layers", True, 2, 40
+    windows = set(bpy.context.window_manager.windows)
+    with screens.focus():
+        assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from ended("the layers")
+    yield 1.0
+    for shown in set(bpy.context.window_manager.windows) - windows:
+        with bpy.context.temp_override(window=shown):
+            bpy.ops.wm.window_close()
+    with screens.focus():
+        assert bpy.ops.physgen.look_nodes() == {"FINISHED"}
+    yield from screens.shoot(SCREENS, "33_look_nodes_panel")
+    area = min((a for a in screens.window().screen.areas if a.type == "VIEW_3D"), key=lambda a: a.x)
+    area.ui_type = "CompositorNodeTree"
+    area.spaces.active.show_backdrop = False
+    yield from screens.drawn(3)
+    with bpy.context.temp_override(window=screens.window(), area=area, region=screens.region(area, "WINDOW")):
+        bpy.ops.node.view_all()
+    yield from screens.drawn(4)
+    yield 1.0
+    screens.picture(screens.window(), SCREENS / "34_nodes.png")
+
+
+def dragged_material():
+    """A material of the asset library, dragged by the mouse on the cube, which then has its matter."""
+    assets = Path(__file__).resolve().parents[2] / "dist" / "assets"
+    if not assets.is_dir():
+        return {"skipped": "make assets has not been run"}
+    yield from home()
+    bpy.ops.physgen.add_assets(directory=str(assets))
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+    before = set(screens.window().screen.areas)
+    view = screens.viewport()
+    with bpy.context.temp_override(window=screens.window(), area=view, region=screens.region(view, "WINDOW")):
+        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.6)
+    browser = min(set(screens.window().screen.areas) - before, key=lambda area: area.height)
+    browser.ui_type = "ASSETS"
+    yield from screens.drawn(4)
+    parameters = browser.spaces.active.params
+    parameters.asset_library_reference = "PhysGen"
+    parameters.filter_search = "Sand"
+    yield 4.0
+    yield from screens.drawn(6)
+    listed, onto = screens.region(browser, "WINDOW"), screens.region(screens.viewport(), "WINDOW")
+    high = screens.window().height
+    x, y = listed.x + 60, high - (listed.y + listed.height - 60)
+    yield from screens.point(x, y)
+    screens.picture(screens.window(), SCREENS / "35_assets.png")
+    goal = screens.on_screen(bpy.data.objects["Cube"].location, onto)
+    screens.xdotool("mousedown", 1)
+    yield 0.5
+    for share in (0.1, 0.4, 0.8, 1.0):
+        screens.xdotool("mousemove", round(x + share * (goal[0] - x)), round(y + share * (goal[1] - y)))
+        yield 0.4
+    yield from screens.drawn(3)
+    screens.picture(screens.window(), SCREENS / "36_dragging_material.png")
+    screens.xdotool("mouseup", 1)
+    yield 1.0
+    yield from screens.drawn(3)
+    yield from screens.shoot(SCREENS, "37_dropped_material")
+    preset = bpy.data.objects["Cube"].physgen.material.preset
+    assert preset == "sand", f"the cube is of {preset!r} after Sand was dropped on it"
+    return {}
+
+
 def material():
     """The panels of the material and of what few need, open: with units, in metric and imperial, and recognised."""
     yield from home()
@@ -309,7 +386,7 @@ def drop(browser, onto, number):
 
 
 def documented():
-    """The pictures of docs/images, in Blender's own layout: both samples, and the one of meshes baked."""
+    """The pictures of docs/images, in Blender's own layout: both samples, the one of meshes previewed, and baked."""
     for sample in ("PHOTO", "MESHES"):
         bpy.ops.wm.read_homefile(use_factory_startup=True)
         yield 0.5
@@ -321,7 +398,14 @@ def documented():
             bpy.ops.physgen.open_sample(sample=sample)
         yield 1.0
         yield from screens.shoot(SCREENS, f"docs_{sample.lower()}")
+    preview = extension("physgen_addon.preview.live_preview")
     with screens.focus():
+        bpy.ops.physgen.toggle_preview()
+    yield from session.until(lambda: preview.session().clip is not None, 900, "the preview")
+    yield from session.until(lambda: preview.session().frame >= 10, 300, "the preview in flight")
+    yield from screens.shoot(SCREENS, "docs_preview")
+    with screens.focus():
+        bpy.ops.physgen.toggle_preview()
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
     yield from ended("the bake")
     bpy.context.scene.frame_set(16)
@@ -333,6 +417,6 @@ def wanted(step) -> bool:
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
-STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo]
-STEPS += [material, strange, dropped, documented]
+STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, farm, nodes]
+STEPS += [dropped, dragged_material, documented, material, strange]
 session.run("tour", [step for step in STEPS if wanted(step)])
