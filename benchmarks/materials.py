@@ -30,6 +30,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from physgen.benchmarks.common import benchmark_parser
+from physgen.sim.rigid_alignment import nearest_pose
 
 Array = NDArray[np.float64]
 Mesh = tuple[Array, NDArray[np.int64]]
@@ -202,14 +203,10 @@ def world_of(
 
 
 def shape_loss(rest: Array, now: Array) -> float:
-    """R.m.s. distance of ``now`` (N, 3) from ``rest`` (N, 3) after the best rigid motion, over rest's longest side.
-
-    The rotation is that of Kabsch, Acta Crystallographica A32 (1976).
-    """
-    a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = (u * (1.0, 1.0, np.sign(np.linalg.det(u @ vt)))) @ vt
-    return float(np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()) / np.ptp(rest, axis=0).max())
+    """R.m.s. distance of ``now`` (N, 3) from ``rest`` (N, 3) after the best rigid motion, over rest's longest side."""
+    turn, shift = nearest_pose(rest, now)
+    apart = rest @ turn.T + shift - now
+    return float(np.sqrt((apart**2).sum(axis=1).mean()) / np.ptp(rest, axis=0).max())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.diagnose.capture import Camera
-from ...sim.diagnose.capture_geometry import nearest_rotation
 from ...sim.errors import InputError
+from ...sim.rigid_alignment import nearest_rotation
 from ...sim.skinning import compact_weights
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from mathutils import Matrix, Quaternion
 from numpy.typing import NDArray
 
 from ...sim.diagnose.capture import Camera, Capture, CaptureObject, Trial
-from ...sim.diagnose.capture_geometry import nearest_rotation
 from ...sim.errors import InputError
+from ...sim.rigid_alignment import nearest_rotation
 from ...sim.scene.model import Camera as SceneCamera
 from .. import compat
 from ..render.render_regions import plane_axes

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_bytes
 from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
 from ..cache.pc2 import Pc2Reader
-from ..diagnose.capture_geometry import nearest_pose
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file
 from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
+from ..rigid_alignment import nearest_pose
 from ..scene.folder import SCENE_FILE, Scene
 from ..scene.scene_object import SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh

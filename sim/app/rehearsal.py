@@ -14,7 +14,7 @@ import numpy as np
 
 from ..cache.bake_folder import Bake
 from ..cache.pc2 import Pc2Reader
-from ..diagnose.capture_geometry import nearest_rotation
+from ..rigid_alignment import nearest_rotation
 from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
 from ..scene.scene_object import SceneObject

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 
 from ..errors import InputError
+from ..rigid_alignment import nearest_rotation
 from .capture import Array, Capture, CaptureObject, Trial
-from .capture_geometry import nearest_rotation
 
 LARGEST_M = 20.0
 """Mesh extent above which millimetres are assumed."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid alignment of points (Kabsch) and the projection of world points to what a trial observed."""
+"""What a trial observed of world points: projections, distances, means of what is known."""
 
 from __future__ import annotations
 
@@ -18,22 +18,6 @@ def mean_known(values: Array, axis: int | tuple[int, ...] | None = None) -> Arra
     count = good.sum(axis=axis)
     total = np.where(good, values, 0.0).sum(axis=axis)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
-
-
-def nearest_rotation(moment: Array, *, hand: float = 1.0) -> Array:
-    """Return the rotation (3, 3) nearest to ``moment`` (3, 3), the sum of seen times rest points about their means.
-
-    hand: 1 for a rotation, -1 for a reflection. Kabsch, Acta Cryst. A 32 (1976).
-    """
-    u, _, vt = np.linalg.svd(moment)
-    return np.asarray((u * np.array([1.0, 1.0, hand * np.sign(np.linalg.det(u @ vt))])) @ vt)
-
-
-def nearest_pose(rest: Array, seen: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) and translation (3,) that best align ``rest`` (K, 3) with ``seen`` (K, 3)."""
-    here, there = rest.mean(axis=0), seen.mean(axis=0)
-    turn = nearest_rotation((seen - there).T @ (rest - here))
-    return turn, there - turn @ here
 
 
 def project(camera: Camera, points: Array, world_from_camera: Array | None = None) -> Array:

@@ -25,9 +25,10 @@ from ..mpm.colliders import Surface
 from ..mpm.geometry.interior_sampling import sample_interior
 from ..mpm.solver_options import Ground, SolverOptions, fit_similarity
 from ..mpm.world_setup import WorldSetup
+from ..rigid_alignment import nearest_pose
 from ..scene.model import Effect as SceneEffect
 from .capture import Array, Capture, CaptureObject, Trial
-from .capture_geometry import mean_known, nearest_pose, observed_distance
+from .capture_geometry import mean_known, observed_distance
 from .diagnosis import CandidateFit
 
 HORIZON_S = 1.0

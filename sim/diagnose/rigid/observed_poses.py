@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...rigid_alignment import nearest_rotation
 from ..capture import Camera, Capture, Trial
-from ..capture_geometry import nearest_rotation
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...rigid_alignment import nearest_pose
 from ..capture import Capture, Trial
-from ..capture_geometry import nearest_pose
 from .free_flight import FlightFit, FlightFrames, Inertia, State, first_guess, fit_flight, simulate_flight
 from .soft_candidates import Candidate, WorldParameters
 from .soft_simulator import SimulationJob, SoftWorlds, is_plausible

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..capture_geometry import nearest_pose
+from ...rigid_alignment import nearest_pose
 from .soft_candidates import WorldParameters
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ from ...mpm.geometry.interior_sampling import sample_interior
 from ...mpm.solver_options import Ground, SolverOptions, fit_similarity
 from ...mpm.surface_contact import ContactTable, SurfaceContact
 from ...mpm.world import World
+from ...rigid_alignment import nearest_pose
 from ...skinning import bind, deform
 from .penetration import penetration_of_meshes
 
@@ -137,7 +138,7 @@ def check_stability(
         return PairStability(stays=False, slip=math.nan, size=size, gap=math.nan, notes=(str(error),))
     turn, shift, seen = np.eye(3), np.zeros(3), background
     if not options.background_fixed:
-        turn, shift = _rigid_fit(bodies[1].positions, world.positions(1), bodies[1].masses)
+        turn, shift = nearest_pose(bodies[1].positions, world.positions(1), weights=bodies[1].masses)
         seen = _current_surface(world, 1, background)
     masses = bodies[0].masses
     start, end = (np.average(places, axis=0, weights=masses) for places in (bodies[0].positions, world.positions(0)))
@@ -180,11 +181,3 @@ def _current_surface(world: World, index: int, surface: Surface) -> Surface:
         return Surface(vertices=surface.vertices @ pose.rotation.T + pose.translation, faces=surface.faces)
     carried = deform(bind(surface.vertices, body.positions), world.positions(index), world.deformation_gradients(index))
     return Surface(vertices=carried, faces=surface.faces)
-
-
-def _rigid_fit(rest: Array, now: Array, weights: Array) -> tuple[Array, Array]:
-    """Return rotation R (3, 3) and shift (3,) with now ≈ R rest + shift, by weighted least squares (Kabsch 1976)."""
-    before, after = (np.average(places, axis=0, weights=weights) for places in (rest, now))
-    u, _, vt = np.linalg.svd(((now - after) * weights[:, None]).T @ (rest - before))
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return turn, after - turn @ before
