@@ -58,7 +58,7 @@ lock: setup
 audit: setup
 	@test -d $(VENV)-audit || "$(PYTHON)" -m venv $(VENV)-audit
 	$(VENV)-audit/bin/pip install --quiet --disable-pip-version-check pip-audit
-	$(VENV)-audit/bin/pip-audit --require-hashes --disable-pip -r $$($(BIN)/python setup/lock.py --name)
+	$(VENV)-audit/bin/pip-audit --strict --require-hashes --disable-pip -r $$($(BIN)/python setup/lock.py --name)
 
 # Damaged and hostile files for every loader, N each; only its own errors may escape. SEED=… draws others.
 fuzz: setup
