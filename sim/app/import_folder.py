@@ -19,7 +19,8 @@ from ..importers.mesh_scene import overview_camera
 from ..importers.physgen import MASKS, SETTINGS, import_physgen
 from ..importers.physgen3d import TRANSFORM_FILE
 from ..importers.physgen3d_scene import import_physgen3d
-from ..importers.rigid_models import SUFFIXES, RigidModelBody, read_rigid_model
+from ..importers.rigid_models import SUFFIXES, read_rigid_model
+from ..importers.rigid_parts import RigidModelBody
 from ..importers.splat_scene import import_splats
 from ..reconstruct import ObjectRequest
 from ..reconstruct.photo import load_photo
