@@ -106,3 +106,27 @@ def test_nothing_is_looked_for_without_an_object():
     found = unboxed_things(np.clip(plain(), 0, 255).astype(np.uint8), [np.zeros((HEIGHT, WIDTH), bool)], CAMERA)
     assert not found.stay.any()
     assert found.count == 0
+
+
+def test_things_that_touch_are_things_one_by_one():
+    # A chain of four, longer than any thing, from near the object to the border of the picture.
+    picture = plain()
+    places = ((104, 90, 20), (142, 78, 20), (172, 100, 17), (209, 92, 20))
+    colours = ((40, 45, 120), (30, 110, 40), (200, 180, 30), (20, 20, 20))
+    thing = disc(60, 90, 20)
+    picture[thing] = (200.0, 60.0, 40.0)
+    for place, colour in zip(places, colours, strict=True):
+        picture[disc(*place)] = colour
+    found = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], CAMERA)
+    for place in places[:3]:
+        assert (found.stay & disc(*place)).sum() > 0.9 * disc(*place).sum()
+    # The ground between them is none.
+    assert not (found.stay & ~np.logical_or.reduce([disc(x, y, r + 3) for x, y, r in places])).any()
+
+
+def test_a_thing_on_the_border_of_the_range_stays_whole():
+    picture = plain()
+    thing, far = disc(40, 90, 12), disc(108, 90, 22)
+    picture[thing], picture[far] = (200.0, 60.0, 40.0), (40.0, 45.0, 120.0)
+    found = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], CAMERA)
+    assert (found.stay & far).sum() > 0.9 * far.sum()

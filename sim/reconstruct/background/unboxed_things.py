@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from skimage.morphology import h_maxima
+from skimage.segmentation import watershed
 
 from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
@@ -26,8 +28,10 @@ Values = NDArray[np.float64]
 
 OBJECT_SIDE, MOST_PIXELS = 48.0, 250_000
 """Size in pixels of the object in the copy in which things are looked for; largest size of that copy."""
-AROUND = 1.8
-"""Range in which they are looked for, over the object's longer side."""
+AROUND, FARTHER = 1.8, 3.2
+"""Range in which they are looked for, over the object's longer side; and where something reaches its border."""
+NECK = 0.75
+"""Width of a neck between two things that touch, over that of the narrower, below which they are two."""
 APART = 3.5
 """Difference from the ground's smooth colour, over the spread of the ground."""
 LEAST_LUMINANCE, LEAST_CHROMA = 0.07, 0.05
@@ -82,8 +86,32 @@ def unboxed_things(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Cam
 
 def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: Camera, stay: Mask, whole: Mask) -> None:
     """Add the things around the object ``mask`` to ``stay`` and ``whole``, in place."""
+    found = _look(pixels, mask, objects, camera, AROUND)
+    if found.cut:
+        # Whether what reaches the border of the range is a thing shows only where it ends.
+        farther = _look(pixels, mask, objects, camera, FARTHER)
+        near = np.zeros_like(mask)
+        near[found.window] = True
+        found.things += [item for item in farther.things if (item[0] & near).any()]
+    for thing, behind in found.things:
+        stay |= thing
+        if not behind:
+            whole |= thing
+
+
+@dataclass
+class _Found:
+    """window: the range, rows and columns. things: (H, W) each, and whether it continues behind an object. cut: whether
+    something that differs from the ground reaches a border of the range that is none of the photo."""
+
+    window: tuple[slice, slice]
+    things: list[tuple[Mask, bool]]
+    cut: bool
+
+
+def _look(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: Camera, around: float) -> _Found:
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    room = round(AROUND * max(len(rows), len(columns))) + 8
+    room = round(around * max(len(rows), len(columns))) + 8
     top, left = max(0, int(rows[0]) - room), max(0, int(columns[0]) - room)
     window = slice(top, int(rows[-1]) + 1 + room), slice(left, int(columns[-1]) + 1 + room)
     crop, own, taken = pixels[window], mask[window], objects[window]
@@ -100,20 +128,28 @@ def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: C
     light = cv2.resize(bytes_to_linear(np.ascontiguousarray(crop)), size, interpolation=cv2.INTER_AREA)
     logs = np.log(cv2.GaussianBlur(light, (0, 0), 0.7).astype(np.float64) + 0.01)
     area = float(own.sum()) * size[0] * size[1] / own.size
-    for thing, behind in _things(logs, ground & ~covered, covered, area):
-        full = cv2.resize(thing.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.25
-        stay[window] |= full
-        if not behind:
-            whole[window] |= full
+    found, different = _things(logs, ground & ~covered, covered, area)
+    things = []
+    for thing, behind in found:
+        full = np.zeros_like(mask)
+        full[window] = cv2.resize(thing.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.25
+        things.append((full, behind))
+    sides = (
+        (different[0], top > 0),
+        (different[-1], window[0].stop < len(pixels)),
+        (different[:, 0], left > 0),
+        (different[:, -1], window[1].stop < pixels.shape[1]),
+    )
+    return _Found(window, things, any(inside and bool(side.any()) for side, inside in sides))
 
 
-def _things(logs: Values, open_ground: Mask, covered: Mask, area: float) -> list[tuple[Mask, bool]]:
-    """Things (h, w) on the open ground, each with whether it continues behind an object.
+def _things(logs: Values, open_ground: Mask, covered: Mask, area: float) -> tuple[list[tuple[Mask, bool]], Mask]:
+    """Things (h, w) on the open ground, each with whether it continues behind an object; and all that differs from it.
 
     logs: (h, w, 3) logarithms of linear light. covered: objects. area: of the object.
     """
     if open_ground.sum() < 200:
-        return []
+        return [], np.zeros_like(open_ground)
     off, within = _relative(logs, open_ground)
     luminance = off @ LUMINANCE
     chroma = np.linalg.norm(off - luminance[..., None], axis=-1)
@@ -126,12 +162,22 @@ def _things(logs: Values, open_ground: Mask, covered: Mask, area: float) -> list
     different = (apart > 1.0) & open_ground
     different &= ~_joined(different & shade, covered, max(2, round(0.1 * np.sqrt(area))))
     parts = _parts(different, open_ground, area)
-    found = [part for part in parts if _is_thing(part, apart, open_ground, covered, area)]
+    found = []
+    for part in parts:
+        if _is_thing(part, apart, open_ground, covered, area):
+            found.append(part)
+            continue
+        pieces = _pieces(part)
+        found += [
+            piece
+            for piece in pieces
+            if len(pieces) > 1 and _is_thing(piece, apart, open_ground, covered, area, beside=part & ~piece)
+        ]
     if not found or sum(int(part.sum()) for part in found) > PATTERN * open_ground.sum():
-        return []
+        return [], different
     if len(found) >= 3 and _is_pattern(off, open_ground, found):
-        return []
-    return [(part, _contact(part, covered) > HIDDEN) for part in found]
+        return [], different
+    return [(part, _contact(part, covered) > HIDDEN) for part in found], different
 
 
 def _relative(logs: Values, known: Mask) -> tuple[Values, Mask]:
@@ -191,11 +237,23 @@ def _parts(mask: Mask, open_ground: Mask, area: float) -> list[Mask]:
     return parts
 
 
+def _pieces(part: Mask) -> list[Mask]:
+    """The pieces of ``part`` (h, w) between which it is a neck: things that touch."""
+    depth = cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1].astype(np.float64)
+    logs = np.where(part, np.log(np.maximum(depth, 0.5)), -2.0)
+    count, seeds = cv2.connectedComponents(h_maxima(logs, -np.log(NECK)).astype(np.uint8), connectivity=8)
+    labels = watershed(-depth, seeds, mask=part)
+    return [np.asarray(labels == index) for index in range(1, count)]
+
+
 def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _is_thing(part: Mask, apart: Values, open_ground: Mask, covered: Mask, area: float) -> bool:
+def _is_thing(
+    part: Mask, apart: Values, open_ground: Mask, covered: Mask, area: float, *, beside: Mask | None = None
+) -> bool:
+    """Whether ``part`` (h, w) is a thing. beside: others that touch it."""
     size = int(part.sum())
     if not SMALLEST * area <= size <= LARGEST * area:
         return False
@@ -213,6 +271,8 @@ def _is_thing(part: Mask, apart: Values, open_ground: Mask, covered: Mask, area:
     # A jump of the colour on the way out, not a slope.
     outside = (cv2.dilate(part.astype(np.uint8), _disc(3)) > 0) & ~(cv2.dilate(part.astype(np.uint8), _disc(2)) > 0)
     outside &= open_ground
+    if beside is not None:
+        outside &= ~beside
     if outside.sum() < 8:
         return False
     return float((apart[outside] < 0.7).mean()) > SHARP and float(np.median(apart[part])) > 1.0
