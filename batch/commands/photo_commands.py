@@ -253,11 +253,11 @@ def use_found_boxes(
     wanted = max(wanted, len(options.preset) if len(options.preset) > 1 else 0)
     chosen = choose(found, options.pick, wanted)
     options.box = [item.box for item in (found[index] for index in chosen)]
-    numbers = " and ".join(str(index + 1) for index in chosen)
+    numbers = ", ".join(str(index + 1) for index in chosen)
     boxes = " ".join(box_text(box) for box in options.box)
     message = (
-        f"no --box given: goes on with {numbers} of {len(found)} objects found (--box {boxes}); the picture "
-        f"{folder / PICTURE_FILE} numbers them all: choose others by --pick, or draw a --box"
+        f"no --box given: using {numbers} of the {len(found)} objects found (--box {boxes}); all are numbered in "
+        f"{folder / PICTURE_FILE}: choose others with --pick, or draw a --box"
     )
     terminal({"event": "notice", "stage": "propose", "message": message})
 

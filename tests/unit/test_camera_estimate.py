@@ -115,7 +115,7 @@ def test_without_lines_the_uncertainty_is_that_of_habit():
         found = estimate_camera(photo_of(grey), [mask_at()], ReconstructOptions(), None, said.append)
         assert found.normal_sigma_deg > 8.0
         assert found.fov_sigma_deg > 8.0
-        assert found.normal_source == "the usual pose"
+        assert found.normal_source == "a typical pose"
         assert 10 < math.degrees(cameras.pitch_and_roll(cameras.up_in_camera(found.camera))[0]) < 35
         told = " ".join(said)
         for word in ("fov_deg", "pitch_deg", "horizon_y", "roll_deg", "does not determine"):

@@ -192,7 +192,7 @@ def test_shape_decides_where_nothing_else_did():
     for shape in ("box", "cylinder", "inflated"):
         physics = decided_by_shape(unknown, shape)
         assert to_material(physics) == load_preset("wood") and to_material(physics).law == "rigid"
-        assert describe_decision("it", physics).startswith("it: wood, 550 kg/m³, by default for its shape")
+        assert describe_decision("it", physics).startswith("it: wood, 550 kg/m³, the default for its shape")
     for known in (decided(name="orange"), decided(ObjectRequest(box=BOX, preset="jelly"))):
         assert decided_by_shape(known, "box") == known
 

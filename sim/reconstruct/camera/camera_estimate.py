@@ -135,7 +135,7 @@ def _focal(picture: Photo, options: ReconstructOptions, depth: DepthMap | None) 
     if depth is not None and depth.focal is not None:
         return Gaussian(math.log(depth.focal), DEPTH_LOG_FOCAL_SIGMA), "the depth map"
     usual = cameras.focal_of_fov(width, height, cameras.DEFAULT_FOV_DEG)
-    return Gaussian(math.log(usual), DEFAULT_LOG_FOCAL_SIGMA), "the usual one"
+    return Gaussian(math.log(usual), DEFAULT_LOG_FOCAL_SIGMA), "a typical lens, as nothing tells it"
 
 
 def _prior(
@@ -164,7 +164,7 @@ def _normal_source(options: ReconstructOptions, plane: GroundPlane | None, found
     elif math.degrees(found.normal_sigma) < KNOWN_DEG and found.gain > 1.0:
         rest = "straight lines"
     else:
-        rest = "the usual pose"
+        rest = "a typical pose"
     if "roll_deg" in given and len(given) > 1:
         return " and ".join(given)
     return " and ".join([*given, rest])
@@ -183,18 +183,17 @@ def _about_plane(plane: GroundPlane | None) -> str:
 def _tell(estimate: CameraEstimate, found: PosePosterior, prior: CameraPrior, notice: Callable[[str], None]) -> None:
     if prior.log_focal.sigma > 0:
         notice(
-            f"angle of view {estimate.fov_deg:.0f}° ± {max(estimate.fov_sigma_deg, 0.5):.0f}° along the longer side, "
-            f"by {estimate.focal_source}; set fov_deg if this is wrong"
+            f"field of view {estimate.fov_deg:.0f}° ± {max(estimate.fov_sigma_deg, 0.5):.0f}° along the longer side, "
+            f"from {estimate.focal_source}; set fov_deg to change it"
         )
     if not (prior.free[1] or prior.free[2]):
         return
     left, right = (row / estimate.camera.height for row in estimate.horizon)
-    doubt = "" if estimate.normal_sigma_deg < KNOWN_DEG else ": the photo does not determine it well"
+    doubt = "" if estimate.normal_sigma_deg < KNOWN_DEG else ", which the photo hardly constrains"
     notice(
-        f"camera looks {math.degrees(found.pitch):.0f}° down, rolled {math.degrees(found.roll):.1f}° (± "
-        f"{max(estimate.normal_sigma_deg, 0.1):.1f}°) by {estimate.normal_source}{doubt}; the horizon is at "
-        f"{left:.2f} of the height on the left and {right:.2f} on the right; set pitch_deg or horizon_y, and roll_deg, "
-        "if this is wrong"
+        f"camera pitched {math.degrees(found.pitch):.0f}° down, rolled {math.degrees(found.roll):.1f}° (± "
+        f"{max(estimate.normal_sigma_deg, 0.1):.1f}°), from {estimate.normal_source}{doubt}; horizon at {left:.2f} of "
+        f"the height on the left, {right:.2f} on the right; set pitch_deg or horizon_y, and roll_deg, to change it"
     )
 
 
@@ -230,17 +229,17 @@ def metres_per_unit(
         measured = estimate.metres_per_unit
         if measured is not None and max(measured / scale, scale / measured) > CONTRADICTION:
             notice(
-                f"by {estimate.scale_source} the objects are {measured / scale:.2g} times as large as size_m says; "
+                f"from {estimate.scale_source} the objects are {measured / scale:.2g} times as large as size_m says; "
                 "size_m is used"
             )
         return scale
     if estimate.metres_per_unit is not None:
         largest = max(extents_units, default=0.0) * estimate.metres_per_unit
-        notice(f"scale by {estimate.scale_source}: the largest object is {largest:.2g} m; size_m overrides that")
+        notice(f"scale from {estimate.scale_source}: the largest object is {largest:.2g} m; size_m overrides it")
         return estimate.metres_per_unit
     if not extents_units:
         raise InputError("objects: none given; the scale of a world needs at least one")
-    notice(f"no object has a size: the first one is assumed to be {default_size_m:g} m large; set its size_m")
+    notice(f"no size is known: the first object is assumed to be {default_size_m:g} m across; set its size_m")
     return default_size_m / extents_units[0]
 
 

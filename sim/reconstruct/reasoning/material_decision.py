@@ -159,7 +159,7 @@ def describe_decision(name: str, physics: ObjectPhysics) -> str:
         "chosen": "as you chose",
         "asked": "by the model's answer",
         "named": f"as usual for {physics.name!r}",
-        "default": "by default for its shape, as it could not be identified; give its kind or preset",
+        "default": "the default for its shape, as it was not identified; set its kind or preset",
     }[physics.source]
     size = "" if physics.size_m is None else f", {physics.size_m:.3g} m"
     return f"{name}: {physics.preset}, {physics.density:.4g} kg/m³{size}, {who}"
