@@ -217,7 +217,7 @@ def test_the_surface_gives_the_grounds_friction():
 
 
 def test_the_user_is_told_who_decided():
-    assert "by default" in describe_decision("object_1", decided())
+    assert "the default" in describe_decision("object_1", decided())
     assert "'mug'" in describe_decision("cup 1", decided(ObjectRequest(box=BOX, kind="mug")))
     assert "as you chose" in describe_decision("x", decided(ObjectRequest(box=BOX, preset="sand")))
     assert "model's answer" in describe_decision("x", decided(answer="1, thing, 700, hard, 0.3, yes"))
