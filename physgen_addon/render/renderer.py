@@ -210,7 +210,7 @@ class Renderer:
             self._shadows = GroundShadow(self._scene, self._built, options, self._scratch)
             bare = self._shadows.ratio(rest, self._scene.camera, self._size)
             self._shade = self._plate.shadow_exponents(bare)
-            self._rest_shadow = bare**self._shade
+            self._rest_shadow = self._tinted(bare)
             self._reflections = reflections(self._scene, self._built, options, self._objects)
             self._rest_reflection = (
                 None if self._reflections is None else self._reflections.layer(self._scene.camera, rest)
@@ -238,7 +238,9 @@ class Renderer:
             grains.show(sample, max(sample - 1, 0) if moment.shutter > 0 else sample, view.camera.position)
         seen = self._plate.seen(view, moment.now)
         rest_shadow = view.warp(self._rest_shadow)
-        shadow = rest_shadow if sample == 0 else self._shadows.ratio(moment, view.camera, self._size) ** self._shade
+        shadow = rest_shadow
+        if sample > 0:
+            shadow = self._tinted(self._shadows.ratio(moment, view.camera, self._size))
         ground = compositing.ground_layer(
             photo=seen.photo,
             background=seen.background,
@@ -257,6 +259,11 @@ class Renderer:
         objects = self._look.objects(self._objects(view.camera, moment), view.camera, moment.now)
         beauty = self._look.finish(compositing.compose(objects, ground), objects, view.camera, moment.now, seen.at_rest)
         return compositing.FrameLayers(ground=ground, shadow=shadow, objects=objects, beauty=beauty)
+
+    def _tinted(self, ratio: NDArray[np.float32]) -> NDArray[np.float32]:
+        light = self._scene.light
+        strength = light.sun_strength if light.sun_direction is not None else 0.0
+        return compositing.tinted_shadow(ratio, self._shade, 1.0 / (1.0 + strength))
 
     def _view(self, camera: Camera | None) -> PlateView:
         """Return the view of ``camera``, one of the camera motion's; background geometry is built at the first move."""

@@ -181,6 +181,8 @@ DEPTHS, TINTS = (0.6, 1.5), (0.3, 3.0)
 """Limits of a rendered shadow's depth over the photo's, and of one channel's over that of luminance, in logarithms."""
 BLACK = 0.004
 """Linear light below which a photo's value is mostly noise: a 255th in sRGB is 0.0003, ten of them are 0.003."""
+OUTSKIRTS = 0.9
+"""Share of the light above which a shadow is in no mask of a photo's shadows, and so not in its depth either."""
 
 
 def shadow_exponents(
@@ -191,8 +193,8 @@ def shadow_exponents(
     What light reaches a shadow has mostly been reflected by the ground and the things around before, so it has their
     colour; the light of the scene knows nothing of that. The photo's shadow over the clean plate says it per channel.
     rest_shadow: (H, W, 3) rendered at rest. shaded, known: (H, W) the photo's shadow, and pixels that show ground.
-    Depths are compared as totals, because both shadows need not lie on the same pixels. Ones where the photo has no
-    shadow that could tell.
+    Depths are compared as totals, because both shadows need not lie on the same pixels, of what is darker than
+    ``OUTSKIRTS``: a soft light's shadow reaches far beyond the mask. Ones where the photo has no shadow that could tell.
     """
     ones = np.ones(3, np.float32)
     shaded = shaded & known
@@ -207,10 +209,26 @@ def shadow_exponents(
     total = float(darkening(background[shaded] @ luminance, photo[shaded] @ luminance))
     if total < FAINT * shaded.sum():
         return ones
-    rendered = float(-np.log(np.maximum(rest_shadow[known] @ luminance, MIN_SHADOW)).astype(np.float64).sum())
+    levels = rest_shadow[known] @ luminance
+    rendered = float(-np.log(np.maximum(levels[levels < OUTSKIRTS], MIN_SHADOW)).astype(np.float64).sum())
     depth = float(np.clip(total / max(rendered, 1e-6), *DEPTHS))
     tint = np.clip(darkening(background[shaded], photo[shaded]) / total, *TINTS)
     return np.asarray(depth * tint, dtype=np.float32)
+
+
+UMBRA = (0.1, 0.5)
+"""Limits of the light left in full shadow of the sun: with less or more of it the shadow would have one colour."""
+
+
+def tinted_shadow(shadow: Linear, exponents: NDArray[np.float32], umbra: float) -> Linear:
+    """Return a rendered ``shadow`` (H, W, 3) in the photo's colour, by ``shadow_exponents`` (3,).
+
+    A power down to the light ``umbra`` that is left without the sun. Below, towards a contact, the body takes reflected
+    light as it takes the sky's: colours stay and all channels go to 0 alike, where a power below 1 would leave a red
+    glow and one above 1 none of the colour.
+    """
+    full = np.float32(np.clip(umbra, *UMBRA))
+    return np.asarray(np.maximum(shadow, full) ** exponents * np.minimum(shadow / full, 1.0), dtype=np.float32)
 
 
 def compose(layer: ObjectLayer, ground: Linear) -> Linear:

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Rendered frames against the photo and against what Cycles renders of the true world."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
+from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.model import Light
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.playback.point_caches import open_bake
@@ -62,6 +66,29 @@ def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
     difference = np.abs(pictures[0] - pictures[1])
     assert difference.mean() < 0.3
     assert np.percentile(difference, 99) <= 2
+
+
+def test_under_an_even_sky_a_ball_darkens_the_ground_as_its_form_factor_says(world, bake):
+    """It fills R² h / d³ of the sky of a point of the ground, d from a centre at the height h: all of it at contact."""
+    sky = dataclasses.replace(world.folder.model, light=Light())
+    folder = dataclasses.replace(world.folder, model=sky)
+    options = RenderOptions(samples=32, motion_blur=0)
+    renderer = Renderer(folder, open_bake(load_bake(bake([(0, 0, 0), SHIFT])), folder), options)
+    shadow = renderer.frame(1).shadow
+    renderer.close()
+    camera = sky.camera
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    ground = camera.position - rays * (camera.position[2] / rays[..., 2:])
+    vertices = load_object_mesh(folder, sky.objects[0]).vertices + SHIFT
+    centre, radius = (vertices.max(axis=0) + vertices.min(axis=0)) / 2, float(np.ptp(vertices, axis=0).max()) / 2
+    assert centre[2] == pytest.approx(radius, abs=1e-3 * radius)
+    away = np.linalg.norm((ground - centre)[..., :2], axis=-1) / radius
+    true = 1.0 - (1.0 + away**2) ** -1.5
+    for near, far in ((0.0, 0.3), (0.3, 0.6), (0.6, 1.0), (1.0, 2.0), (2.0, 4.0)):
+        ring = (rays[..., 2] < 0) & (away >= near) & (away < far)
+        assert ring.sum() > 20
+        assert shadow.mean(axis=-1)[ring].mean() == pytest.approx(true[ring].mean(), abs=0.03), (near, far)
 
 
 def test_out_of_view_is_the_background_alone(world, bake):

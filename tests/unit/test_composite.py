@@ -191,6 +191,26 @@ def test_a_rendered_shadow_takes_the_colour_and_depth_of_the_photos():
     assert np.log(0.4**exponents) == pytest.approx(np.log(own), rel=0.03)
 
 
+def test_the_faint_outskirts_of_a_soft_shadow_take_nothing_from_its_depth():
+    photo, background, rendered, shaded, own = shaded_ground()
+    known = np.ones_like(shaded)
+    soft = np.where(rendered < 1.0, rendered, np.float32(0.93))
+    exponents = compositing.shadow_exponents(photo, background, soft, shaded=shaded, known=known)
+    assert np.log(0.4**exponents) == pytest.approx(np.log(own), rel=0.03)
+
+
+def test_towards_a_contact_a_tinted_shadow_is_black_in_every_colour():
+    exponents, umbra = np.array([0.65, 1.0, 1.3], np.float32), 0.3
+    levels = np.array([1.0, 0.6, 0.3, 0.15, 0.03, 0.0], np.float32)
+    found = compositing.tinted_shadow(np.repeat(levels[None, :, None], 3, axis=2), exponents, umbra)[0]
+    assert found[:3] == pytest.approx(levels[:3, None] ** exponents)
+    # Half the umbra's light is half its colour's; without light there is none.
+    assert found[3] == pytest.approx(0.5 * found[2]) and found[4] == pytest.approx(0.1 * found[2])
+    assert (found[5] == 0.0).all() and (np.diff(found, axis=0) <= 0.0).all()
+    even = compositing.tinted_shadow(np.full((1, 1, 3), 0.05, np.float32), np.ones(3, np.float32), umbra)
+    assert even == pytest.approx(0.05)
+
+
 def test_without_a_telling_shadow_it_stays_as_rendered():
     photo, background, rendered, shaded, _ = shaded_ground()
     known = np.ones_like(shaded)
