@@ -170,6 +170,8 @@ def _object_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     diffuse, emission, both = (new(f"ShaderNode{kind}") for kind in ("BsdfDiffuse", "Emission", "AddShader"))
     link(inverse.outputs["Vector"], diffuse.inputs["Color"])
     link(ambient.outputs["Vector"], emission.inputs["Color"])
+    # Cycles' last ray still meets surfaces: the ground would be lit by the bodies' undersides, most at contact.
+    link(new("ShaderNodeLightPath").outputs["Is Camera Ray"], emission.inputs["Strength"])
     link(diffuse.outputs["BSDF"], both.inputs[0])
     link(emission.outputs["Emission"], both.inputs[1])
     output = new("ShaderNodeOutputMaterial")

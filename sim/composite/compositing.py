@@ -194,7 +194,8 @@ def shadow_exponents(
     colour; the light of the scene knows nothing of that. The photo's shadow over the clean plate says it per channel.
     rest_shadow: (H, W, 3) rendered at rest. shaded, known: (H, W) the photo's shadow, and pixels that show ground.
     Depths are compared as totals, because both shadows need not lie on the same pixels, of what is darker than
-    ``OUTSKIRTS``: a soft light's shadow reaches far beyond the mask. Ones where the photo has no shadow that could tell.
+    ``OUTSKIRTS``: a soft light's shadow reaches far beyond the mask. Ones where the photo has no shadow that could
+    tell.
     """
     ones = np.ones(3, np.float32)
     shaded = shaded & known
