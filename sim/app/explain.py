@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_json
 from ..cache.folder_lock import lock_beside
+from ..composite.side_by_side import cut_out, window_around, with_body, write_comparison
 from ..diagnose import run_diagnosis
 from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
@@ -24,6 +25,15 @@ from ..diagnose.track.body_request import BodyRequest, parse_body
 from ..diagnose.track.track_input import VideoTrial
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..rigid_alignment import nearest_pose
+
+if TYPE_CHECKING:
+    from ..composite.textured_box import BoxPose
+    from ..diagnose.track.moving_regions import Region
+    from ..diagnose.track.plain_bodies import VideoMotion
+
+Picture = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
 FORMAT = "physgen-explain/1"
 EXPLAIN_FILE, VIDEO_FILE = "explain.json", "comparison.mp4"
@@ -36,6 +46,8 @@ VISIBLE = (
 cannot, and a tilt of the ground is measured in the picture: in one run it would be the same motion as friction."""
 PLAYBACK_FPS, SHOWN_S = 20.0, 8.0
 """Frames per second, and longest duration, of the comparison."""
+FACE_FRAMES = 24
+"""Frames that a box's faces are taken from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,9 +162,8 @@ def title_of_cause(diagnosis: Diagnosis) -> str:
     return "with " + " and ".join(words)
 
 
-def _compare(trial: VideoTrial, motion: Any, diagnosis: Diagnosis, path: Path) -> None:
-    """Write the comparison of ``motion``, a ``VideoMotion``."""
-    from ..composite.side_by_side import cut_out, write_comparison
+def _compare(trial: VideoTrial, motion: VideoMotion, diagnosis: Diagnosis, path: Path) -> None:
+    """Write the comparison of ``motion``."""
     from ..diagnose.track.moving_regions import aligned_frames
 
     capture, view, found = motion.capture, motion.view, motion.found
@@ -164,24 +175,80 @@ def _compare(trial: VideoTrial, motion: Any, diagnosis: Diagnosis, path: Path) -
     before, after = arrays.nominal[:, 0], arrays.found[:, 0]
     gaps = np.linalg.norm(before - real3, axis=1), np.linalg.norm(after - real3, axis=1)
     scale = found.scale
-    areas = np.array([r.area for r in motion.regions])
-    typical = int(np.argmin(np.abs(areas - np.median(areas)) + 1e-3 * np.arange(len(areas))))
     wanted = motion.frames[picks]
-    model = next(aligned_frames(trial.path, found, np.array([motion.frames[typical]])))
-    region = motion.regions[typical]
-    body = cut_out(model, region.outline, region.middle)
-    real: Iterator[NDArray[np.uint8]] = aligned_frames(trial.path, found, wanted)
+    draw = _drawn_box if motion.box is not None else _drawn_cut_out
+    one = draw(trial, motion, (arrays.nominal[picks], arrays.found[picks]))
+    others: dict[int, list[Region]] = {}
+    for other in motion.others:
+        for region in other:
+            others.setdefault(region.frame, []).append(region)
+
+    def both(k: int, picture: Picture) -> tuple[Picture, Picture]:
+        ground = found.background
+        for region in others.get(int(wanted[k]), []):
+            # What is not simulated is shown as it was recorded.
+            ground = with_body(ground, cut_out(picture, region.outline, region.middle), region.middle)
+        return one(0, k, ground), one(1, k, ground)
+
+    seen = (view.pixels(real3[picks]) if motion.box is not None else motion.places[picks]) * scale
+    believed, caused = view.pixels(before[picks]) * scale, view.pixels(after[picks]) * scale
+    size = float(np.sqrt(np.median([r.area for r in motion.regions])))
+    shown = [seen, believed, caused]
+    shown += [
+        np.array([r.middle for r in other if wanted[0] <= r.frame <= wanted[-1]]).reshape(-1, 2)
+        for other in motion.others
+    ]
+    height, width = found.background.shape[:2]
+    real: Iterator[Picture] = aligned_frames(trial.path, found, wanted)
     write_comparison(
         path,
         real,
-        background=found.background,
-        body=body,
-        seen=motion.places[picks] * scale,
-        believed=view.pixels(before[picks]) * scale,
-        found=view.pixels(after[picks]) * scale,
+        draw=both,
+        window=window_around(np.concatenate(shown), 1.2 * size, (width, height)),
+        seen=seen,
+        believed=believed,
+        found=caused,
         times=times[picks],
         gaps=(gaps[0][picks], gaps[1][picks]),
         withheld=0.5 * float(times[0] + times[-1]),
         titles=("real", "simulated as believed", title_of_cause(diagnosis)),
         fps=PLAYBACK_FPS,
     )
+
+
+Drawing = Callable[[int, int, Picture], Picture]
+"""Draws simulation 0 or 1 of frame k over a background."""
+
+
+def _drawn_cut_out(trial: VideoTrial, motion: VideoMotion, simulated: tuple[Array, Array]) -> Drawing:
+    """Return how to draw the body by its own pixels, moved without turning. simulated: two (T, N, 3) m."""
+    from ..diagnose.track.moving_regions import aligned_frames
+
+    found = motion.found
+    areas = np.array([r.area for r in motion.regions])
+    typical = int(np.argmin(np.abs(areas - np.median(areas)) + 1e-3 * np.arange(len(areas))))
+    model = next(aligned_frames(trial.path, found, np.array([motion.frames[typical]])))
+    region = motion.regions[typical]
+    body = cut_out(model, region.outline, region.middle)
+    places = [motion.view.pixels(points[:, 0]) * found.scale for points in simulated]
+    return lambda which, k, ground: with_body(ground, body, places[which][k])
+
+
+def _drawn_box(trial: VideoTrial, motion: VideoMotion, simulated: tuple[Array, Array]) -> Drawing:
+    """Return how to draw a box with the faces that the video shows, turned as simulated. simulated: two (T, N, 3) m."""
+    from ..composite.textured_box import box_faces, box_pose, with_box
+    from ..diagnose.track.moving_regions import aligned_frames
+
+    box, view, found = motion.box, motion.view, motion.found
+    assert box is not None and view.camera is not None and view.start is not None
+    trial3, camera = motion.capture.trials[0], view.camera.place - view.start
+    rest, edges = trial3.rest_points, box.edges
+
+    def pose(points: Array) -> BoxPose:
+        turn, centre = nearest_pose(rest, points)
+        return box_pose(centre, turn, edges, lambda p: view.pixels(p) * found.scale, camera)
+
+    few = np.unique(np.linspace(0, len(motion.frames) - 1, FACE_FRAMES).round().astype(int))
+    pictures = aligned_frames(trial.path, found, motion.frames[few])
+    faces = box_faces((picture, pose(trial3.observed[k])) for k, picture in zip(few, pictures, strict=True))
+    return lambda which, k, ground: with_box(ground, faces, pose(simulated[which][k]))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +66,28 @@ def with_body(background: Picture, body: SimulatedBody, place: Array) -> Picture
     return out
 
 
+def window_around(places: Array, margin: float, picture: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the part (left, top, right, bottom) of a picture of width and height ``picture`` to show: all finite
+    ``places`` (N, 2) px with ``margin`` px around, at least half of the picture along each side."""
+    known = places[np.isfinite(places).all(axis=1)]
+    size = np.array(picture)
+    if len(known) == 0:
+        return 0, 0, picture[0], picture[1]
+    low, high = known.min(axis=0) - margin, known.max(axis=0) + margin
+    short = np.maximum(np.minimum(size, size / 2) - (high - low), 0)
+    low, high = low - short / 2, high + short / 2
+    low, high = low + np.maximum(-low, 0), high + np.maximum(-low, 0)
+    past = np.maximum(high - size, 0)
+    low, high = np.floor(np.maximum(low - past, 0)), np.ceil(np.minimum(high - past, size))
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
 def write_comparison(
     path: Path,
     real: Iterator[Picture],
     *,
-    background: Picture,
-    body: SimulatedBody,
+    draw: Callable[[int, Picture], tuple[Picture, Picture]],
+    window: tuple[int, int, int, int],
     seen: Array,
     believed: Array,
     found: Array,
@@ -83,11 +99,14 @@ def write_comparison(
 ) -> int:
     """Write *real · simulated as believed · with the cause found* as a video at ``path``; return its frames.
 
-    real: T pictures of the size of ``background`` (H, W, 3). seen, believed, found: (T, 2) px. times: (T,) s. gaps: two
-    (T,) distances to the real centre in m. withheld: s from which nothing was fitted to. titles: of the three panels.
-    fps: of playback. Raises InputError when no video can be written there.
+    real: T pictures (H, W, 3). draw: the two simulations of frame k, given its real picture. window: part (left, top,
+    right, bottom) of them to show. seen, believed, found: (T, 2) px. times: (T,) s. gaps: two (T,) distances to the
+    real centre in m. withheld: s from which nothing was fitted to. titles: of the three panels. fps: of playback.
+    Raises InputError when no video can be written there.
     """
-    height, width = background.shape[:2]
+    left, top, right, bottom = window
+    corner = np.array([left, top], dtype=np.float64)
+    height, width = bottom - top, right - left
     scale = min(PANEL[0] / width, PANEL[1] / height, 2.0)
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
     total = (3 * size[0] + 16, size[1] + 34 + CURVE)
@@ -98,15 +117,15 @@ def write_comparison(
     count = 0
     try:
         for k, picture in enumerate(real):
-            panels = [picture, with_body(background, body, believed[k]), with_body(background, body, found[k])]
+            panels = [picture, *draw(k, picture)]
             sheet = np.full((total[1], total[0], 3), 250, np.uint8)
             for i, panel in enumerate(panels):
                 how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-                shown = np.asarray(cv2.resize(panel, size, interpolation=how), np.uint8)
+                shown = np.asarray(cv2.resize(panel[top:bottom, left:right], size, interpolation=how), np.uint8)
                 path_px = (believed, believed, found)[i] if i else seen
-                _trail(shown, path_px[: k + 1] * (size[0] / width), (INK, BEFORE, AFTER)[i])
+                _trail(shown, (path_px[: k + 1] - corner) * (size[0] / width), (INK, BEFORE, AFTER)[i])
                 if i:
-                    _ring(shown, seen[k] * (size[0] / width))
+                    _ring(shown, (seen[k] - corner) * (size[0] / width))
                 x = i * (size[0] + 8)
                 sheet[30 : 30 + size[1], x : x + size[0]] = shown
                 _text(sheet, titles[i], (x + 2, 20), size[0] - 4, (INK, BEFORE, AFTER)[i])

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from .box_pose import GroundCamera
 from .pose_estimation import Array
 
 GRAVITY = 9.81
@@ -61,7 +62,9 @@ class MotionView:
 
     kind: flight, slope or surface. first, last: samples of the path that are free motion. scale: px per m.
     origin: (2,) px. matrix: (2, 3) px per m, from world axes (z up). points: (N, 3) m, the centre at those samples.
-    normal: (3,) of the ground, point: (3,) m on it. notes: what was decided, in words.
+    normal: (3,) of the ground, point: (3,) m on it. notes: what was decided, in words. camera: where it is known, with
+    ``start``, (3,) m, the origin of ``points`` in the camera's world; ``origin`` and ``matrix`` are then those of a
+    picture from straight above.
     """
 
     kind: str
@@ -74,9 +77,13 @@ class MotionView:
     normal: Array
     point: Array
     notes: tuple[str, ...]
+    camera: GroundCamera | None = None
+    start: Array | None = None
 
     def pixels(self, points: Array) -> Array:
         """Return px (..., 2) of world points (..., 3)."""
+        if self.camera is not None and self.start is not None:
+            return self.camera.pixels(points + self.start)
         return np.asarray(self.origin + points @ self.matrix.T)
 
 

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ...errors import Cancelled, InputError
@@ -14,6 +15,7 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, CaptureObject, Ground, Trial
 from ..capture_checks import check_capture
 from .body_request import BodyRequest
+from .box_pose import BoxMotion, follow_box
 from .motion_view import MotionView, noise_px, stopped_at, understand_motion, wobble_px
 from .moving_regions import MovingRegions, Region, find_moving_regions
 from .pose_estimation import Array
@@ -43,14 +45,18 @@ class VideoMotion:
     """What was followed. capture: of one trial. view: where the motion lies in the picture. found: the video's regions.
 
     frames: (T,) of the video, for the capture's samples. places: (T, 2) px of the centre. regions: those of the body.
+    box: the body as a box that turns, at the same samples, where its faces tell the camera. others: regions of other
+    bodies that move as freely, each in the order of frames.
     """
 
     capture: Capture
     view: MotionView
     found: MovingRegions
-    frames: Array
+    frames: NDArray[np.int64]
     places: Array
     regions: tuple[Region, ...]
+    box: BoxMotion | None = None
+    others: tuple[tuple[Region, ...], ...] = ()
 
 
 def follow_plain_body(
@@ -105,17 +111,10 @@ def follow_plain_body(
     regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
     if len(regions) < LEAST_FRAMES:
         raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
-    clock = times[[r.frame for r in regions]]
+    seen_at = times[[r.frame for r in regions]]
     places = np.array([r.middle for r in regions]) / found.scale
-    clock, missing = with_missing_frames(clock, places)
-    if missing:
-        warnings.append(f"{missing} frames are missing in the file: the body jumps ahead and goes on as before")
+    clock, missing = with_missing_frames(seen_at, places)
     length_px, length, elevation, misfit = apparent_size(regions, body, item, found.scale)
-    if misfit > MISSHAPEN:
-        warnings.append(
-            f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
-            "its scale is rough"
-        )
     standing = float(-item.vertices[:, 2].min())
     view = understand_motion(
         clock,
@@ -127,6 +126,19 @@ def follow_plain_body(
         where=str(path),
         from_above=body.kind != "ball" and misfit < CLEAR and elevation >= FROM_ABOVE,
     )
+    path_px, box = places, None
+    if view.kind == "surface" and body.kind == "box":
+        seen_so = _seen_as_box(regions, item, found.scale, (info.width, info.height), seen_at, standing, str(path))
+        if seen_so is not None:
+            view, box, path_px, clock, missing = seen_so
+            misfit = 0.0
+    if missing:
+        warnings.append(f"{missing} frames are missing in the file: the body jumps ahead and goes on as before")
+    if misfit > MISSHAPEN:
+        warnings.append(
+            f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
+            "its scale is rough"
+        )
     last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
     step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
     kept = np.arange(view.first, last + 1, step)
@@ -134,10 +146,17 @@ def follow_plain_body(
         raise InputError(f"{path}: only {len(kept)} frames of free motion; film at a higher frame rate")
     points = view.points[kept - view.first]
     part = slice(view.first, view.last + 1)
-    noise_of_centre = noise_px(places[part])
+    noise_of_centre = noise_px(path_px[part])
     if body.kind in ("box", "mesh") and view.kind == "surface":
-        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], places[part]))
-    trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre)
+        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], path_px[part]))
+    turns = None
+    if box is not None:
+        turns = box.turns[kept]
+        # What a turn that is a little wrong moves the middles of the faces by, sideways.
+        arm = 0.5 * float(np.mean(box.edges[:2])) * view.scale
+        aside = np.stack([box.turns[part] * arm, np.zeros(part.stop - part.start)], axis=1)
+        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], aside))
+    trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre, turns)
     capture = check_capture(
         Capture(
             gravity=(0.0, 0.0, -9.81),
@@ -162,24 +181,82 @@ def follow_plain_body(
         frames=np.array([regions[k].frame for k in kept]),
         places=places[kept],
         regions=tuple(regions[k] for k in kept),
+        box=None if box is None else box.at(kept),
+        others=tuple(tuple(p.regions) for p in chosen[1:] if p.freedom() > RIVAL * chosen[0].freedom()),
     )
 
 
+def _seen_as_box(
+    regions: list[Region],
+    item: CaptureObject,
+    scale: float,
+    picture: tuple[int, int],
+    times: Array,
+    standing: float,
+    where: str,
+) -> tuple[MotionView, BoxMotion, Array, Array, int] | None:
+    """Return what three faces of a box tell: its view with the camera, its motion, its path (N, 2) in px as seen from
+    straight above, times (N,) s with those of missing frames, and how many these are. None where no such box is seen
+    sliding on a level surface. scale: working px per video px. times: (N,) s. standing: m of its centre above ground.
+    """
+    edges = np.ptp(item.vertices, axis=0)
+    box = follow_box([r.outline / scale for r in regions], edges, picture)
+    if box is None:
+        return None
+    widths = [np.sqrt(r.area) / scale for r in regions]
+    finest = float(np.median(widths)) / float(np.sqrt(edges[0] * edges[1]))
+    above = box.centres[:, :2] * (finest, -finest)
+    clock, missing = with_missing_frames(times, above)
+    try:
+        view = understand_motion(
+            clock,
+            above,
+            diameter_px=finest * float(edges[0]),
+            diameter=float(edges[0]),
+            clearance=standing,
+            elevation=math.pi / 2,
+            where=where,
+        )
+    except InputError:
+        return None
+    if view.kind != "surface":
+        return None
+    turned = math.degrees(abs(box.turns[view.last] - box.turns[view.first]))
+    camera = box.camera
+    notes = (
+        f"a box that slides on a level surface and turns by {turned:.0f}°",
+        f"the camera by its edges: {math.degrees(camera.pitch):.0f}° below the horizon, {1e3 * camera.height:.0f} mm "
+        f"above the ground, focal length {camera.focal:.0f} px; outlines fit within {box.residual:.1f} px",
+    )
+    return replace(view, notes=notes, camera=camera, start=box.centres[view.first]), box, above, clock, missing
+
+
 def _trial(
-    name: str, times: Array, points: Array, item: CaptureObject, view: MotionView, noise: float
+    name: str,
+    times: Array,
+    points: Array,
+    item: CaptureObject,
+    view: MotionView,
+    noise: float,
+    turns: Array | None,
 ) -> tuple[Trial, float]:
-    """Return the trial, and its noise in m. A ball is its centre; other bodies keep their side to the ground."""
+    """Return the trial, and its noise in m. A ball is its centre; other bodies keep their side to the ground, and turn
+    about its normal by ``turns`` (T,) rad where that is known."""
     clean = "".join(c if c.isalnum() or c in "_-" else "_" for c in name).strip("_") or "take"
     vertices = item.vertices
-    reach = np.linalg.norm(vertices, axis=1)
     rest, turn = np.zeros((1, 3)), np.eye(3)
-    if reach.min() < 0.97 * reach.max():
+    if not _is_round(item):
         half = vertices.max(axis=0)
         rest = np.array([[0, 0, 0], [half[0], 0, 0], [0, half[1], 0], [0, 0, half[2]], [-half[0], 0, 0]], dtype=float)
         across = np.array([0.0, 1.0, 0.0])
         along = np.cross(across, view.normal)
         turn = np.stack([along, across, view.normal], axis=1)
-    observed = points[:, None] + (rest @ turn.T)[None]
+    moved = (rest @ turn.T)[None]
+    if turns is not None and len(rest) > 1:
+        c, s, zero = np.cos(turns), np.sin(turns), np.zeros(len(turns))
+        spin = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], axis=1).reshape(-1, 3, 3)
+        moved = np.einsum("ij,tjk,lk->tli", turn, spin, rest)
+    observed = points[:, None] + moved
     trial = Trial(
         name=clean,
         role="fit",
@@ -190,6 +267,14 @@ def _trial(
         rest_points=rest,
     )
     return trial, float(np.hypot(noise, CENTRE_PX)) / view.scale
+
+
+def _is_round(item: CaptureObject) -> bool:
+    """Return whether the body, centred on its middle, is a ball: its faces are as far from there as its corners."""
+    a, b, c = (item.vertices[item.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    far = np.abs((normals * a).sum(axis=1)) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
+    return bool(far.min() > 0.97 * np.linalg.norm(item.vertices, axis=1).max())
 
 
 def apparent_size(
