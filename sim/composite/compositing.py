@@ -11,6 +11,7 @@ same at rest; w how much everything is still at rest there.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -75,16 +76,48 @@ def matted(layer: ObjectLayer, lack: NDArray[np.float32], reach: float) -> Objec
     """Return ``layer`` with the photo's soft outline, where its silhouette is.
 
     lack: (H, W) what the texture's alpha leaves of each pixel's coverage uncovered, premultiplied by coverage. reach:
-    pixels inside the silhouette within which that counts. Further inside, where a body has turned, its former outline
-    lies before its own other side: nothing shines through there.
+    pixels inside the silhouette within which that counts. Further inside, and where something else of the body lies
+    between, its former outline lies before its own other side, since it has turned: nothing shines through there.
     """
     if not lack.any() or reach <= 0.0:
         return layer
     depth = cv2.distanceTransform((layer.alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 5)
     weight = np.clip((SOFT_BEYOND - depth / np.float32(reach)) / (SOFT_BEYOND - 1.0), 0.0, 1.0)
+    lack = _open_to_outside(layer.alpha, lack, depth, math.ceil(SOFT_BEYOND * reach))
     alpha = np.clip(layer.alpha - lack * weight, 0.0, 1.0).astype(np.float32)
     share = np.where(layer.alpha > 1e-6, alpha / np.maximum(layer.alpha, 1e-6), np.float32(1.0))
     return replace(layer, texture=(layer.texture * share[..., None]).astype(np.float32), alpha=alpha)
+
+
+def _open_to_outside(
+    alpha: NDArray[np.float32], lack: NDArray[np.float32], depth: NDArray[np.float32], steps: int
+) -> NDArray[np.float32]:
+    """``lack`` (H, W), no larger a share of coverage than what lies on the shortest way to the outside.
+
+    Between the former outline of a body that has turned and its silhouette lies its other side, which covers all.
+    Gaps of two pixels are bridged, as between hairs. depth: (H, W) distance from the outside in pixels. steps: pixels
+    that are looked at.
+    """
+    rows, columns = np.flatnonzero(lack.any(axis=1)), np.flatnonzero(lack.any(axis=0))
+    window = (
+        slice(max(0, rows[0] - steps - 2), rows[-1] + steps + 3),
+        slice(max(0, columns[0] - steps - 2), columns[-1] + steps + 3),
+    )
+    cover, inside = alpha[window], depth[window]
+    share = np.where(cover > 1e-3, lack[window] / np.maximum(cover, 1e-3), np.float32(1.0)).astype(np.float32)
+    share = np.where(inside > 0.0, cv2.dilate(share, np.ones((3, 3), np.uint8)), np.float32(1.0))
+    smooth = cv2.GaussianBlur(inside, (0, 0), 1.0)
+    way = [-cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    length = np.maximum(np.hypot(*way), np.float32(1e-6))
+    y, x = np.mgrid[: cover.shape[0], : cover.shape[1]].astype(np.float32)
+    outwards = x + way[0] / length, y + way[1] / length
+    seen = share
+    for _ in range(steps):
+        seen = np.minimum(share, cv2.remap(seen, *outwards, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    found = lack.copy()
+    # What interpolation leaves of nothing is nothing.
+    found[window] = np.where(seen > 1e-3, np.minimum(lack[window], seen * cover), np.float32(0.0))
+    return found
 
 
 def soft_reach(alpha: NDArray[np.float32], lack: NDArray[np.float32]) -> float:

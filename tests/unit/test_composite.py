@@ -162,14 +162,28 @@ def test_a_soft_outline_at_rest_is_the_photo_whatever_lies_behind():
     assert np.abs(compositing.compose(layer, behind) - photo)[soft].max() < 1e-5
 
 
-def test_a_soft_outline_that_has_turned_to_the_front_hides_what_is_behind():
+@pytest.mark.parametrize("turned_px", [5.0, 7.0, 12.0])
+def test_a_soft_outline_that_has_turned_to_the_front_hides_what_is_behind(turned_px):
     alpha, lack, depth = disc()
     reach = compositing.soft_reach(alpha, lack)
-    turned = np.where(np.abs(depth - 12.0) < 1.5, 0.8 * alpha, 0.0).astype(np.float32)
+    turned = np.where(np.abs(depth - turned_px) < 1.5, 0.8 * alpha, 0.0).astype(np.float32)
     layer = compositing.ObjectLayer(texture=np.ones((40, 40, 3), np.float32), alpha=alpha, light=np.ones((40, 40, 3)))
     assert compositing.matted(layer, turned, reach).alpha[turned > 0].min() == 1.0
     assert compositing.matted(layer, lack, reach).alpha[lack > 0.3].max() < 0.7
     assert compositing.matted(layer, np.zeros_like(alpha), reach) is layer
+
+
+def test_gaps_between_hairs_at_the_outline_stay_open():
+    alpha, lack, depth = disc()
+    rows, columns = np.mgrid[:40, :40]
+    # Hairs a pixel wide across the soft band, every third pixel.
+    hairs = ((rows + columns) % 3 == 0) & (depth < 4.0)
+    lack = np.where(hairs, 0.0, lack).astype(np.float32)
+    layer = compositing.ObjectLayer(texture=np.ones((40, 40, 3), np.float32), alpha=alpha, light=np.ones((40, 40, 3)))
+    found = compositing.matted(layer, lack, compositing.soft_reach(alpha, lack))
+    gaps = (depth > 1.0) & (depth < 3.0) & (lack > 0.05)
+    assert gaps.sum() > 50
+    assert np.abs(found.alpha - (alpha - lack))[gaps].max() < 0.02
 
 
 def shaded_ground(seed=3):
