@@ -81,7 +81,7 @@ def matted(layer: ObjectLayer, lack: NDArray[np.float32], reach: float) -> Objec
     """
     if not lack.any() or reach <= 0.0:
         return layer
-    depth = cv2.distanceTransform((layer.alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 5)
+    depth = np.asarray(cv2.distanceTransform((layer.alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
     weight = np.clip((SOFT_BEYOND - depth / np.float32(reach)) / (SOFT_BEYOND - 1.0), 0.0, 1.0)
     lack = _open_to_outside(layer.alpha, lack, depth, math.ceil(SOFT_BEYOND * reach))
     alpha = np.clip(layer.alpha - lack * weight, 0.0, 1.0).astype(np.float32)
