@@ -19,6 +19,8 @@ from .scene_io.export_meshes import rest_bounds
 COLOUR = (0.30, 0.62, 0.95, 0.45)
 MARGIN = 1.0
 """The piece reaches beyond the objects by this share of their extent, on every side."""
+LIFT = 2e-3
+"""Height of the lines above the plane, as a share of half a side."""
 CELLS = 8
 """Lines are between this many cells a side."""
 
@@ -53,8 +55,9 @@ def _lines(world: bpy.types.PropertyGroup, corners: list[Vector]) -> Lines:
     ahead = normal.cross(right)
     low, high = (Vector(pick(corner[axis] for corner in corners) for axis in range(3)) for pick in (min, max))
     middle = (low + high) / 2
-    middle = middle - (middle - point).dot(normal) * normal
     half = (0.5 + MARGIN) * max((high - low).length, 1e-6)
+    # A little above, so that they are seen on a floor that lies on the plane.
+    middle = middle + (LIFT * half - (middle - point).dot(normal)) * normal
     steps = [half * (2 * step / CELLS - 1) for step in range(CELLS + 1)]
     ends = [(a, -half, a, half) for a in steps] + [(-half, a, half, a) for a in steps]
     found = (middle + u * right + v * ahead for a, b, c, d in ends for u, v in ((a, b), (c, d)))

@@ -72,7 +72,7 @@ def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message
     if command:
         row = layout.row(align=True)
         row.operator("physgen.install_python", text="Install…", icon="IMPORT")
-        button = row.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
+        button = row.operator("preferences.addon_show", text="Choose…", icon="PREFERENCES")
         button.module = PHYSGEN_AP_preferences.bl_idname
 
 

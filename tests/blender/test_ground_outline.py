@@ -23,12 +23,12 @@ def test_the_lines_lie_on_the_plane_below_the_objects():
     bpy.context.view_layer.update()
     world.ground_point, world.ground_normal = (0.0, 0.0, -2.0), (0.0, 0.0, 1.0)
     found = ends()
-    assert len(found) == 4 * (CELLS + 1) and np.allclose(found[:, 2], -2.0)
+    assert len(found) == 4 * (CELLS + 1) and np.allclose(found[:, 2], -2.0, atol=0.03) and found[:, 2].min() > -2.0
     assert np.allclose(found[:, :2].mean(axis=0), (3.0, 0.0), atol=1e-5)
     assert np.ptp(found[:, 0]) > 2 * item.dimensions.x
     world.ground_normal = (1.0, 0.0, 1.0)
     tilted = ends()
-    assert np.allclose((tilted - (0.0, 0.0, -2.0)) @ (1.0, 0.0, 1.0), 0.0, atol=1e-5)
+    assert np.allclose((tilted - (0.0, 0.0, -2.0)) @ (1.0, 0.0, 1.0), 0.0, atol=0.05)
 
 
 def test_no_lines_where_the_ground_is_seen_otherwise_or_there_is_none():

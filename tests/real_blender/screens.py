@@ -139,20 +139,29 @@ def widen(area: bpy.types.Area, width: int) -> Generator[float, None, None]:
     """Drag the edge of the sidebar of ``area`` until it is ``width`` px wide; nothing without xdotool."""
     if shutil.which("xdotool") is None:
         return
+    lost = 0
     for _ in range(3):
-        bar = region(area, "UI")
-        if abs(bar.width - width) <= 1:
+        yield from _drag_edge(area, width + lost)
+        missing = width - region(area, "UI").width
+        if abs(missing) <= 1:
             return
-        x, y = bar.x, window().y + window().height - (bar.y + bar.height // 2)
-        xdotool("mousemove", x - 20, y, "mousemove", x, y)
+        # What the mouse moves before Blender takes it for a drag is lost; so is a short drag, as a whole.
+        lost += missing
+        yield from _drag_edge(area, width - 150)
+
+
+def _drag_edge(area: bpy.types.Area, width: int) -> Generator[float, None, None]:
+    bar = region(area, "UI")
+    x, y = bar.x, window().y + window().height - (bar.y + bar.height // 2)
+    xdotool("mousemove", x - 20, y, "mousemove", x, y)
+    yield from drawn()
+    xdotool("mousedown", 1)
+    yield from drawn()
+    for share in (0.5, 1.0):
+        xdotool("mousemove", round(x - share * (width - bar.width)), y)
         yield from drawn()
-        xdotool("mousedown", 1)
-        yield from drawn()
-        for share in (0.5, 1.0):
-            xdotool("mousemove", round(x - share * (width - bar.width)), y)
-            yield from drawn()
-        xdotool("mouseup", 1)
-        yield from drawn()
+    xdotool("mouseup", 1)
+    yield from drawn()
 
 
 def arrange(widths: Sequence[int]) -> Generator[float, None, None]:
@@ -240,6 +249,22 @@ def read(path: Path) -> np.ndarray:
     image.pixels.foreach_get(pixels)
     bpy.data.images.remove(image)
     return pixels.reshape(height, width, 4)
+
+
+DOCUMENTED = (0, 20, 1050, 952)
+"""Of the window of ``tour.py``, from the lower left: viewport and timeline of Blender's own layout."""
+
+
+def document(source: Path, target: Path, width: int = 900) -> None:
+    """Write the part DOCUMENTED of the window ``source`` as a picture for docs/images, a JPEG ``width`` px wide."""
+    part = target.with_suffix(".png")
+    crop(source, part, DOCUMENTED)
+    image = bpy.data.images.load(str(part))
+    image.scale(width, round(width * DOCUMENTED[3] / DOCUMENTED[2]))
+    image.filepath_raw, image.file_format = str(target), "JPEG"
+    image.save(quality=85)
+    bpy.data.images.remove(image)
+    part.unlink()
 
 
 def crop(source: Path, target: Path, box: tuple[int, int, int, int]) -> None:

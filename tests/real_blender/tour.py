@@ -397,19 +397,27 @@ def documented():
         with screens.focus():
             bpy.ops.physgen.open_sample(sample=sample)
         yield 1.0
-        yield from screens.shoot(SCREENS, f"docs_{sample.lower()}")
+        yield from page({"PHOTO": "blender_photo", "MESHES": "blender_objects"}[sample])
     preview = extension("physgen_addon.preview.live_preview")
     with screens.focus():
         bpy.ops.physgen.toggle_preview()
     yield from session.until(lambda: preview.session().clip is not None, 900, "the preview")
     yield from session.until(lambda: preview.session().frame >= 10, 300, "the preview in flight")
-    yield from screens.shoot(SCREENS, "docs_preview")
+    yield from page("blender_preview")
     with screens.focus():
         bpy.ops.physgen.toggle_preview()
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
     yield from ended("the bake")
     bpy.context.scene.frame_set(16)
-    yield from screens.shoot(SCREENS, "docs_baked")
+    yield from page("blender_baked")
+
+
+def page(name):
+    """Write ``docs/NAME.jpg`` below the results, a picture for docs/images; the mouse is out of the way."""
+    yield from screens.point(640, 990)
+    yield from screens.shoot(SCREENS, name)
+    (OUT / "docs").mkdir(exist_ok=True)
+    screens.document(SCREENS / f"{name}.png", OUT / "docs" / f"{name}.jpg")
 
 
 def wanted(step) -> bool:
