@@ -42,6 +42,10 @@ def add_compose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-strain", type=float, default=default, metavar="F", help=f"{strain} (default {default:g})"
     )
+    seat = "how far parts bulge beside contacts, so that they stand, over their size, 0 to 0.02"
+    parser.add_argument(
+        "--seat", type=float, default=DEFAULTS.seat, metavar="F", help=f"{seat} (default {DEFAULTS.seat:g})"
+    )
     splats = "total for all objects without splats of their own (default 20000)"
     parser.add_argument("--splats", type=int, default=20_000, metavar="COUNT", help=splats)
     parser.add_argument("--no-picture", action="store_true", help="ignore the photo: physics only (method ppps)")
@@ -67,6 +71,7 @@ def run_compose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
             size=options.size,
             seed=options.seed,
             keep_strain=options.keep_strain,
+            seat=options.seat,
             guidance_weight=options.guidance_weight,
         ),
         splats=options.splats,

@@ -319,6 +319,7 @@ def _compose_group(
         guidance={} if guidance is None else guidance.by_object([part.name for part in parts[1:]]),
         cameras=() if guidance is None else guidance.cameras,
         options=options,
+        ground=ground if held else None,
         on_event=on_event,
         cancelled=cancelled,
     )

@@ -21,6 +21,7 @@ from physgen.sim.gaussians.views.posed_images import orbit_cameras
         ({"steps": 0}, "steps is 0"),
         ({"ssim_share": float("nan")}, "ssim_share is nan"),
         ({"keep_strain": 2.0}, "keep_strain is 2.0"),
+        ({"seat": 0.1}, "seat is 0.1"),
     ],
 )
 def test_options_out_of_range_are_named(changes, said):

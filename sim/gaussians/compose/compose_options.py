@@ -61,6 +61,10 @@ class ComposeOptions:
     """Fraction of the strain carried over from step to step, 0 to 1. 0: every step starts undeformed, as Algorithm 1
     passes on positions and velocities only. 1: an elastic body that returns to its initial shape."""
 
+    seat: float = quantity(0.0, 0, 0.02)
+    """Thickness by which deformable parts, once composed, close the air in contacts and bulge beside them, over their
+    largest extent, 0 to 0.02: so that a composition stands under gravity. 0: not. No effect with method sds."""
+
     size: int = quantity(256, 32, 1024)
     """Longer side in pixels of the images compared, 32 to 1024; larger ones are scaled down."""
 

@@ -26,7 +26,7 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...mpm.colliders import Collider
 from ...mpm.geometry.signed_distance import DistanceLattice
 from ...mpm.solver_options import SolverOptions
-from ...scene.model import Camera
+from ...scene.model import Camera, Ground
 from ..guidance.score_distillation import CheckedGuidance, Guidance, guidance_loss_gradient
 from ..image_loss import image_loss
 from ..raster.rasteriser import Rasteriser, SplatGradients
@@ -43,6 +43,7 @@ from .composition_parts import (
     part_distances,
 )
 from .physical_body import StepOptions
+from .seating import seated_parts
 
 Array = NDArray[np.float64]
 
@@ -288,6 +289,7 @@ def compose(
     guidance: Mapping[str, Guidance] = NO_GUIDANCE,
     cameras: Sequence[Camera] = (),
     options: ComposeOptions | None = None,
+    ground: Ground | None = None,
     solver: SolverOptions | None = None,
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
@@ -298,6 +300,7 @@ def compose(
         propose for more than two objects, §6).
     guidance: score distillation of deformable parts, by their names; each is rendered alone, from one of ``cameras`` a
         step; by default 16 around it, as in SyncDreamer.
+    ground: on which deformable parts are seated that come near it; it is no obstacle before.
     solver: where to compute; its grid is ignored.
 
     Raises InputError for fewer than two parts, for a method that uses images without reference and guidance, and for
@@ -360,7 +363,9 @@ def compose(
         surface = body.resolved_surface() if options.simulates else body.surface()
         fixed.append(dataclasses.replace(part, splats=optimiser.splats, surface=surface))
     notes = tuple(note for one in watched.values() for note in one.notes)
-    return Composition(parts=tuple(fixed), history=tuple(history), notes=notes)
+    seats = options.simulates and options.seat > 0
+    placed = seated_parts(fixed, options.seat, ground) if seats else tuple(fixed)
+    return Composition(parts=placed, history=tuple(history), notes=notes)
 
 
 def scaled_reference(reference: Reference, size: int) -> Reference:

@@ -231,7 +231,7 @@ def _neighbour_means(count: int, faces: NDArray[np.int64]) -> csr_matrix:
 
 
 SKIN_NEIGHBOURS = 8
-"""Splats from which a skin particle takes its velocity."""
+"""Splats from which a skin particle takes its velocity, and the like."""
 
 MIN_SKIN = 2_000
 """Least number of skin particles, if the surface has as many vertices; at most as many as splats beyond that."""
@@ -250,7 +250,7 @@ class DeformablePart:
         if len(kept) > most:
             kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
         skin = vertices[kept]
-        self._follow = _skin_weights(centres, skin)
+        self._follow = nearest_weights(centres, skin)
         self._body = PhysicalBody(
             points=np.concatenate([centres, skin]), surface=part.surface, obstacles=obstacles, options=options
         )
@@ -292,10 +292,13 @@ class DeformablePart:
         return np.concatenate([values, self._follow @ values])
 
 
-def _skin_weights(centres: Array, skin: Array) -> csr_matrix:
-    """Return the matrix (M, N) of each skin particle's mean over its nearest centres, weighted by 1 / distance²."""
-    distance, nearest = cKDTree(centres).query(skin, k=min(SKIN_NEIGHBOURS, len(centres)))
+def nearest_weights(centres: Array, places: Array) -> csr_matrix:
+    """Return the matrix (M, N) of the mean over the nearest ``centres`` (N, 3) at each of ``places`` (M, 3).
+
+    Weighted by 1 / distance².
+    """
+    distance, nearest = cKDTree(centres).query(places, k=min(SKIN_NEIGHBOURS, len(centres)))
     weights = 1.0 / np.maximum(distance, 1e-9 + 1e-3 * np.median(distance)) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(skin)), weights.shape[1])
-    return csr_matrix((weights.ravel(), (rows, nearest.ravel())), shape=(len(skin), len(centres)))
+    rows = np.repeat(np.arange(len(places)), weights.shape[1])
+    return csr_matrix((weights.ravel(), (rows, nearest.ravel())), shape=(len(places), len(centres)))
