@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.rigid import fit_rigid
-from physgen.sim.diagnose.rigid.observed_poses import as_matrix, observe_body, perturbed, state_difference
+from physgen.sim.diagnose.rigid.observed_poses import (
+    as_matrix,
+    observe_body,
+    perturbed,
+    state_difference,
+    turns_on_a_face,
+)
 from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
 from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
@@ -55,6 +61,34 @@ def run(scene, state, times, **changes):
 
 def state(place, velocity=(0, 0, 0), spin=(0, 0, 0)):
     return np.array([*place, 1, 0, 0, 0, *velocity, *spin], dtype=float)
+
+
+@pytest.mark.parametrize("inset", [0.0, 0.3])
+def test_friction_under_a_face_stops_a_turn_by_the_lever_at_which_it_acts(inset):
+    scene = scene_of(box((0.06, 0.06, 0.06)), friction=0.2)
+    times = np.linspace(0.0, 0.06, 4)
+    record = run(scene, state((0, 0, 0.03), spin=(0, 0, 12)), times, inset=inset)
+    lever, inertia = 0.06 / np.sqrt(2) * (1 - inset), 0.06**2 / 6
+    assert 12 - record[:, 12] == pytest.approx(0.2 * 9.81 * lever / inertia * times, rel=0.03, abs=0.05)
+    # What slides without turning is slowed down alike.
+    slid = run(scene, state((0, 0, 0.03), velocity=(0.5, 0, 0)), times, inset=inset)
+    assert slid[-1, 7] == pytest.approx(0.5 - 0.2 * 9.81 * times[-1], abs=0.01)
+
+
+@pytest.mark.parametrize(("rate", "rise", "found"), [(8.0, 0.0, True), (0.5, 0.0, False), (8.0, 0.2, False)])
+def test_a_body_that_slides_and_turns_on_a_face_is_told_from_others(rate, rise, found):
+    times = np.linspace(0.0, 0.3, 30)
+    c, s, zero = np.cos(rate * times), np.sin(rate * times), 0 * times
+    turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], axis=1).reshape(-1, 3, 3)
+    rest = np.array([[0, 0, 0], [0.03, 0, 0], [0, 0.03, 0], [0, 0, 0.03]])
+    points = np.einsum("tij,kj->tki", turns, rest) + np.stack([0.4 * times, zero, 0.03 + rise * times], axis=1)[:, None]
+    trial = Trial(
+        name="slide", role="fit", times=times, points=points, pixels=None,
+        object_index=np.zeros(4, dtype=np.int64), rest_points=rest,
+    )  # fmt: skip
+    scene = scene_of(box((0.06, 0.06, 0.06)), trials=(trial,))
+    seen = [observe_body(scene.capture, trial, 0, scene.body.center)]
+    assert turns_on_a_face(seen, np.array([0.0, 0.0, 1.0]), scene.body.bound) is found
 
 
 def test_an_icosphere_is_a_sphere_and_a_cube_is_not():

@@ -6,6 +6,7 @@ Quaternions are (..., 4), w first; rotation vectors (..., 3) are in world axes."
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +18,10 @@ from ...rigid_alignment import nearest_rotation
 from ..capture import Camera, Capture, Trial
 
 Array = NDArray[np.float64]
+
+LEVEL_SHARE, LEVEL_ANGLE, LEAST_TURN = 0.1, 0.1, 0.3
+"""A body slides on a face where its height changes by at most this share of its size, and its upright by this angle in
+rad; from this turn in rad on it tells where that face carries."""
 
 
 def multiply(p: Array, q: Array) -> Array:
@@ -383,3 +388,28 @@ def frame_pose(
     good, way, shift = cv2.solvePnP(places, found, lens, None, way, shift, True, cv2.SOLVEPNP_ITERATIVE)
     turn = matrix[:3, :3] @ cv2.Rodrigues(way)[0]
     return matrix[:3, :3] @ shift[:, 0] + matrix[:3, 3], turn
+
+
+def turns_on_a_face(seen: Sequence[ObservedBody], normal: Array, bound: float) -> bool:
+    """Return whether a body slides on one face in all of ``seen``, upright and at one height, and turns meanwhile.
+
+    normal: (3,) of the ground. bound: m, the body's largest distance from its centre of mass.
+    """
+    turned = 0.0
+    side = np.cross(normal, (1.0, 0.0, 0.0) if abs(normal[0]) < 0.8 else (0.0, 1.0, 0.0))
+    for observations in seen:
+        if observations.hides_spin or observations.camera is not None or not observations.poses_alone:
+            return False
+        poses = [frame_pose(observations, frame) for frame in range(len(observations.times))]
+        known = [pose for pose in poses if pose is not None]
+        if len(known) < 2:
+            return False
+        heights = np.array([place for place, _ in known]) @ normal
+        turns = np.array([turn for _, turn in known]) @ known[0][1].T
+        upright = (turns @ normal) @ normal
+        if np.ptp(heights) > LEVEL_SHARE * bound or upright.min() < np.cos(LEVEL_ANGLE):
+            return False
+        ways = turns @ side
+        angles = np.unwrap(np.arctan2(ways @ np.cross(normal, side), ways @ side))
+        turned = max(turned, float(np.ptp(angles)))
+    return turned > LEAST_TURN

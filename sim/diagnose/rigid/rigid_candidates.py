@@ -32,6 +32,11 @@ skins keep or return a part of it, and simulators differ: MuJoCo damps both dire
 FRICTION_SPREAD, RESTITUTION_SPREAD, CONTACT_TIME_SPREAD = 0.01, 0.01, 0.1
 """Standard deviations of the nominal coefficients (relative; absolute; relative); larger deviations are an effect."""
 
+FOOTING, FOOTING_SPREAD = 0.75, 0.25
+"""Where friction acts under a face that slides and turns, over its corners' distance from the middle, and the standard
+deviation of its logarithm: 1 for a face that stands on its corners, 0.54 for a square one that carries evenly. It tells
+how fast friction stops the turn."""
+
 SCALE_SPREAD, CLOCK_SPREAD = 0.01, 0.005
 RECORDED_GRAVITY_SPREAD = float(np.hypot(SCALE_SPREAD, 2 * CLOCK_SPREAD))
 """Relative standard deviations of the length scale and the clock of a recording of single points. In flight both are a
@@ -54,6 +59,7 @@ class WorldSettings:
     restitution: float
     contact_time: float
     rub: float = RUB
+    inset: float = 0.0
     rolling: float = 0.0
     pull: float = 0.0
     reach: float = 0.0
@@ -68,12 +74,14 @@ class BodyScene:
     """Nominal model of one body, shared by all candidates. middle: (3,) m, centre of the observed points.
 
     unscaled: only its centre is tracked, so neither its size nor its spin checks the recording's scale and clock.
+    turns_on_a_face: it slides and turns on one of its faces all the time, so that where this carries counts.
     """
 
     capture: Capture
     body: RigidBody
     middle: Array
     unscaled: bool = False
+    turns_on_a_face: bool = False
 
     @property
     def base(self) -> WorldSettings:
@@ -85,6 +93,7 @@ class BodyScene:
             friction=ground.friction,
             restitution=bounce,
             contact_time=CONTACT_TIME,
+            inset=1 - FOOTING if self.turns_on_a_face else 0.0,
         )
 
     def numbers(self, settings: list[WorldSettings]) -> Array:
@@ -101,6 +110,7 @@ class BodyScene:
                 row[SLOTS["string"]] = 1.0
             row[SLOTS["friction"]], row[SLOTS["rolling"]] = max(s.friction, 0.0), max(s.rolling, 0.0)
             row[SLOTS["pull"]], row[SLOTS["reach"]] = max(s.pull, 0.0), s.reach
+            row[SLOTS["inset"]] = s.inset
             inertia = body.inertia
             if s.fraction > 0:
                 pellet, turn = s.center / s.fraction, skew(s.center)
@@ -145,6 +155,11 @@ def drag_reference(body: RigidBody) -> float:
     return 0.5 * AIR * body.area / body.mass
 
 
+def _inset(z: float) -> float:
+    """Return the share by which friction acts nearer to the middle than a face's corners."""
+    return float(np.clip(1 - FOOTING * np.exp(FOOTING_SPREAD * np.clip(z, -5, 5)), 0.0, 0.95))
+
+
 def _beliefs(scene: BodyScene, setting: WorldSettings, z: Array) -> WorldSettings:
     known = scene.capture.ground.restitution is not None
     spread = RESTITUTION_SPREAD if known else UNKNOWN_RESTITUTION_SPREAD
@@ -155,6 +170,7 @@ def _beliefs(scene: BodyScene, setting: WorldSettings, z: Array) -> WorldSetting
         contact_time=setting.contact_time * float(np.exp(CONTACT_TIME_SPREAD * np.clip(z[2], -4, 4))),
         rub=setting.rub * float(np.exp(GRIP_SPREAD * np.clip(z[4], -4, 4))),
         gravity=setting.gravity * float(np.exp(RECORDED_GRAVITY_SPREAD * z[3])) if scene.unscaled else setting.gravity,
+        inset=_inset(float(z[3])) if scene.turns_on_a_face else setting.inset,
     )
 
 

@@ -42,10 +42,11 @@ TETHER, LENGTH, ANCHOR, STRING = 8, 9, 10, 13
 FRICTION, ROLLING, PULL, REACH = 14, 15, 16, 17
 CENTER, INERTIA, MOBILITY = 18, 21, 27
 SPRING, DASHPOT, RUB, STEP = 33, 34, 35, 36
-NORMAL, POINT = 37, 40
-NUMBERS = 43
+NORMAL, POINT, INSET = 37, 40, 43
+NUMBERS = 44
 """Offsets of a world's numbers. Inertia and its inverse (mobility) are per mass, as xx, yy, zz, xy, xz, yz. Spring in
-1/s², dashpot and rub (tangential damping) in 1/s, step in s."""
+1/s², dashpot and rub (tangential damping) in 1/s, step in s. Inset: share by which friction under a face, carried by
+three corners or more, acts nearer to the middle than these."""
 
 STATE = 13
 RECORD = 17
@@ -258,6 +259,15 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                             calm = False
                         total = ti.cast(0.0, ti.f64)
                         sliding = 0
+                        inset = ti.cast(0.0, ti.f64)
+                        if found > 2 and runs.p[w, INSET] > 0:
+                            inset = runs.p[w, INSET]
+                            for i in range(found):
+                                lever = dvec3(arms[i, 0], arms[i, 1], arms[i, 2])
+                                slip = spun.cross(inset * (lever.dot(n) * n - lever))
+                                slip -= slip.dot(n) * n
+                                for c in ti.static(range(3)):
+                                    wants[i, c] += ti.exp(-runs.p[w, RUB] * h) * slip[c]
                         if found > 0:
                             sweep, change = 0, 1.0
                             while sweep < (SWEEPS if found > 1 else 3) and change > 1e-7:
@@ -277,14 +287,15 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                                     push = (new_n - pn) * n
                                     v += push
                                     spin += inverse @ lever.cross(push)
-                                    u = v + spin.cross(lever)
+                                    grip = lever + inset * (lever.dot(n) * n - lever)
+                                    u = v + spin.cross(grip)
                                     off = want - u
                                     off -= off.dot(n) * n
                                     size = off.norm()
                                     new_t = old - pn * n
                                     if size > 1e-12:
                                         way = off / size
-                                        cross = lever.cross(way)
+                                        cross = grip.cross(way)
                                         new_t += off / (1.0 + cross.dot(inverse @ cross))
                                     most = runs.p[w, FRICTION] * new_n
                                     length = new_t.norm()
@@ -293,7 +304,7 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                                         sliding = 1
                                     turn = new_t - (old - pn * n)
                                     v += turn
-                                    spin += inverse @ lever.cross(turn)
+                                    spin += inverse @ grip.cross(turn)
                                     change = ti.max(change, ti.abs(new_n - pn), turn.norm())
                                     for c in ti.static(range(3)):
                                         sums[i, c] = new_t[c] + new_n * n[c]
@@ -302,6 +313,8 @@ def advance(worlds: ti.i32, longest: ti.f64, body: BodyPoints, runs: RunArrays):
                                 one = dvec3(sums[i, 0], sums[i, 1], sums[i, 2])
                                 lever = dvec3(arms[i, 0], arms[i, 1], arms[i, 2])
                                 momentum += lever.cross(one)
+                                if inset > 0:
+                                    momentum += inset * (lever.dot(n) * n - lever).cross(one - one.dot(n) * n)
                                 whole += one
                             total = whole.dot(n)
                             pushed += total

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..work import Work
 from .multiple_shooting import Fit, solve
-from .observed_poses import ObservedBody, frame_pose, observe_body
+from .observed_poses import ObservedBody, frame_pose, observe_body, turns_on_a_face
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, WorldSettings, tether_numbers
 from .rigid_simulator import RigidWorlds, rigid_body
 from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem, Segment, SegmentedTrial
@@ -164,7 +164,14 @@ def body_problem(capture: Capture, index: int, work: Work) -> Problem:
             if pose is not None:
                 places.append(pose[0])
     middle = np.median(places, axis=0) if places else np.zeros(3)
-    scene = BodyScene(capture=capture, body=body, middle=middle, unscaled=all(s.hides_spin for s in seen))
+    scene = BodyScene(
+        capture=capture,
+        body=body,
+        middle=middle,
+        unscaled=all(s.hides_spin for s in seen),
+        turns_on_a_face=len(body.corners) > 1
+        and turns_on_a_face(seen, np.asarray(capture.ground.unit_normal), body.bound),
+    )
     return Problem(scene=scene, simulator=simulator, trials=track_states(scene, simulator, seen))
 
 

@@ -171,8 +171,9 @@ SLOTS: Mapping[str, Any] = {
     "step": 36,
     "normal": slice(37, 40),
     "point": slice(40, 43),
+    "inset": 43,
 }
-NUMBERS, STATE, RECORD = 43, 13, 17
+NUMBERS, STATE, RECORD = 44, 13, 17
 
 
 @cache
