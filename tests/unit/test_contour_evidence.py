@@ -111,3 +111,29 @@ def test_a_thin_rod_survives():
     mask = segment(finished(image), (100, 45, 220, 218), "lamp")
     assert mask[64:148, 159:161].mean() > 0.9
     assert overlap(mask, truth) > 0.93
+
+
+def winged(seed=0):
+    """A yellow body with a grey wing that reaches its outline at the left, on grey ground in whose shade the wing would
+    not stand out, and the body's shadow."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    image = np.full((HEIGHT, WIDTH, 3), (176.0, 174, 178)) + rng.normal(scale=2, size=(HEIGHT, WIDTH, 1))
+    body = ((columns - 165) / 62) ** 2 + ((rows - 115) / 52) ** 2 < 1
+    # Below the body, with a soft border as a wide lamp makes it.
+    shadow = ((columns - 150) / 80) ** 2 + ((rows - 172) / 16) ** 2 < 1
+    image *= 1.0 - 0.45 * ndimage.gaussian_filter(shadow.astype(float), 9.0)[..., None]
+    image[body] = (226, 186, 62)
+    wing = body & (((columns - 128) / 62) ** 2 + ((rows - 118) / 28) ** 2 < 1)
+    image[wing] = (112, 112, 120)
+    image += rng.normal(scale=1.0, size=(HEIGHT, WIDTH, 1))
+    return finished(image), body, wing, shadow & ~body
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_wing_of_the_shaded_ground_s_colour_is_kept_and_the_shadow_below_is_not(seed):
+    photo, body, wing, shadow = winged(seed)
+    mask = segment(photo, (88, 48, 250, 195), "bird")
+    assert mask[wing].mean() > 0.95
+    assert mask[shadow].mean() < 0.1
+    assert overlap(mask, body) > 0.95

@@ -12,6 +12,8 @@ from physgen.sim.reconstruct.shape.footing import footed
 from physgen.sim.reconstruct.shape.inflate import inflate
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
 from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
+from physgen.sim.reconstruct.shape.primitive_mesh import primitive_mesh
+from physgen.sim.reconstruct.shape.primitives import Box
 from physgen.sim.reconstruct.shape.support import support_of
 from physgen.sim.scene.bake_quality import COARSEST, load_quality, quality_names
 
@@ -101,6 +103,32 @@ def test_only_what_the_photo_does_not_show_moves_and_no_farther_than_the_ground(
     assert 1.0 <= stands.share < 1.2
     again, more = footed(camera, inflate(mask > 0), after, faces)
     assert again is after and not more.any(), "what stands stays as it is"
+
+
+@pytest.mark.parametrize("turn", [0.0, 25.0])
+def test_a_thin_box_gets_a_back_farther_away_and_stays_the_same_in_the_photo(turn):
+    """A board of 0.5 × 0.12 × 0.6, whose own margin is 0.1 of its height."""
+    camera = camera_above_ground(400, 300, 430.0, np.radians(15.0))
+    angle = np.radians(turn)
+    vertices, faces = primitive_mesh(Box(0.0, 2.0, angle, 0.5, 0.12, 0.6), 4000)
+    before = support_of(vertices, faces)
+    assert before.margin / before.height == pytest.approx(0.1, abs=0.001) and before.share < 0.7
+    mask = np.zeros((300, 400), np.uint8)
+    cv2.fillConvexPoly(mask, cv2.convexHull(camera.project(vertices)[:, :2].astype(np.float32)).astype(int), 1)
+    after, moved = footed(camera, inflate(mask > 0, 1.0), vertices, faces, flat=True)
+    assert 1.0 <= support_of(after, faces).share < 1.2
+    normals = area_normals(vertices, faces)
+    assert (np.einsum("ij,ij->i", camera.position - vertices, normals)[moved] < 0).all(), "what is seen stays"
+    at = np.floor(camera.project(after[moved])[:, :2]).astype(int)
+    # Corners drawn in whole pixels cut off up to one.
+    assert cv2.dilate(mask, np.ones((3, 3)))[at[:, 1], at[:, 0]].all(), "the seen sides hide what has moved"
+    assert after[:, 2].min() >= 0.0
+    # Its back is as upright as it was: at half and at most of the height it lies about as far behind.
+    back = moved & (np.abs(camera.project(vertices)[:, 0] - 200) < 40)
+    depth = after[back] - vertices[back]
+    height = vertices[back, 2]
+    middle, high = (depth[(height > low) & (height < low + 0.1), 1].mean() for low in (0.25, 0.45))
+    assert high == pytest.approx(middle, rel=0.15)
 
 
 def test_the_coarsest_quality_is_the_coarsest():

@@ -2,8 +2,9 @@
 """Contour evidence for a mask made by colours: parts of the ground's tone that belong to it, gaps, thin rods.
 
 Colours cannot tell a book's white spine from a white wall. But the spine has a closed contour of its own, shares a long
-border with the cover, and completes it to a plain convex figure; ground does not. Gaps between slats are ground by
-colour and place, and edges surround them; rods are thin, unlike the ground, and join the object.
+border with the cover, and completes it to a plain convex figure; ground does not. Nor does ground in a bay of the
+object end at an edge across its mouth, as a wing does that the body wraps. Gaps between slats are ground by colour and
+place, and edges surround them; rods are thin, unlike the ground, and join the object.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.segmentation import felzenszwalb
 
@@ -46,6 +48,13 @@ SHADE_SHARE = 0.5
 """Share of a part or rod that looks like shaded ground above which it is a shadow."""
 LEAST_PART, MOST_PART = 0.015, 0.6
 """Area of such a part over the object's."""
+BAY, OPEN_BELOW = 0.38, 0.6
+"""Share of its contour that a part which fills a bay of the object has in common with it, and the largest share of the
+rest that may face the ground: the object's own shadow lies below it."""
+FILLED = 0.25
+"""Least gain in the share of the convex hull that is filled, over such a part's area over the object's."""
+STANDS_OUT = 1.6
+"""Least median gradient along such a part's own contour over that of an edge: shadows of wide lamps are soft."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +71,14 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Mask | None = Non
     """Return ``mask`` (h, w) with neighbouring parts that its contours close; see the module.
 
     shade: (h, w) pixels of which no such part consists, as they look like shaded ground. Works on a small copy; cost: a
-    twentieth of a second. Nothing is added to a mask that is far from convex.
+    twentieth of a second. To a mask that is far from convex nothing is added but what fills its bays.
     """
     nothing = np.zeros_like(mask)
     if mask.sum() < 50:
         return Completed(mask, nothing, nothing)
     regions = _thick_regions(view.pixels, max(20, int(0.004 * mask.sum())))
     crest = np.asarray(cv2.dilate(edge_strength(view.lab), np.ones((3, 3), np.uint8)), dtype=np.float32)
-    result, doubtful = mask.copy(), nothing.copy()
+    result, doubtful = _with_bays(view, mask, regions, crest), nothing.copy()
     for _ in range(3):
         best: tuple[float, Mask] | None = None
         doubtful = nothing.copy()
@@ -141,6 +150,74 @@ def _has_contour(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floati
     if (np.linalg.norm(outside - colour, axis=1) < APART).mean() > 0.25:
         return False
     return not _shade_of(colour, np.median(outside, axis=0))
+
+
+def _with_bays(view: BoxCrop, mask: Mask, regions: NDArray[np.int_], crest: NDArray[np.floating]) -> Mask:
+    """``mask`` (h, w) with the parts that fill a bay of it, made of ``regions`` (h, w) without an edge between them."""
+    merged = _without_weak_borders(view, mask, regions, crest)
+    result = mask
+    for index in np.unique(merged[_around(mask, 3) & view.inside]):
+        part = (merged == index) & ~mask & ~view.others
+        if (part & ~view.inside).any() or not LEAST_PART * mask.sum() <= part.sum() <= MOST_PART * mask.sum():
+            continue
+        gain = (_solidity(_joined(mask, part)) - _solidity(mask)) * float(mask.sum()) / float(part.sum())
+        if gain > FILLED and _in_bay(view, part, mask, crest):
+            result = _joined(result, part) & (view.inside | mask)
+    return result
+
+
+def _without_weak_borders(
+    view: BoxCrop, mask: Mask, regions: NDArray[np.int_], crest: NDArray[np.floating]
+) -> NDArray[np.int_]:
+    """``regions`` (h, w) outside of ``mask`` joined where their colours are alike and no edge lies between them."""
+    count = int(regions.max()) + 1
+    colours = np.stack([ndimage.median(view.lab[..., i], regions, np.arange(count)) for i in range(3)], axis=-1)
+    colours = np.nan_to_num(colours)
+    pairs, edges = [], []
+    for shift in ((0, 1), (1, 0)):
+        near, far = (slice(None, -1), slice(1, None)) if shift[0] else (slice(None), slice(None))
+        left, right = (slice(None, -1), slice(1, None)) if shift[1] else (slice(None), slice(None))
+        first, second = regions[near, left], regions[far, right]
+        border = (first != second) & ~mask[near, left] & ~mask[far, right]
+        pairs.append(np.sort(np.column_stack([first[border], second[border]]), axis=1))
+        edges.append(np.minimum(crest[near, left], crest[far, right])[border])
+    pair, strength = np.concatenate(pairs), np.concatenate(edges)
+    if not len(pair):
+        return regions
+    both, index = np.unique(pair, axis=0, return_inverse=True)
+    border_edge = ndimage.median(strength, index.ravel(), np.arange(len(both)))
+    alike = np.linalg.norm(colours[both[:, 0]] - colours[both[:, 1]], axis=1) < 2.0 * APART
+    joined = both[alike & (np.asarray(border_edge) < CREST)]
+    links = sparse.coo_matrix((np.ones(len(joined)), (joined[:, 0], joined[:, 1])), (count, count))
+    return np.asarray(connected_components(links, directed=False)[1][regions])
+
+
+def _in_bay(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) -> bool:
+    """Whether ``part`` fills a bay of ``mask`` and an edge closes it against everything else, above all.
+
+    A grey wing on a yellow body has the colour of grey ground in the shade. But ground that shows in a bay goes on
+    beyond it, and a shadow that ends there by chance lies below what casts it.
+    """
+    rim = _around(part, 1)
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    own = rim & ~near
+    if (rim & near).sum() < BAY * rim.sum() or own.sum() < 0.2 * rim.sum():
+        return False
+    if (crest[own] > CREST).mean() < CLOSED or np.median(crest[own]) < STANDS_OUT * CREST:
+        return False
+    inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    beyond = _around(part, 5) & ~_around(part, 2) & ~mask & ~near & ~view.others
+    if inner.sum() < 10 or beyond.sum() < 10:
+        return False
+    if (np.linalg.norm(view.lab[beyond] - np.median(view.lab[inner], axis=0), axis=1) < APART).mean() > 0.25:
+        return False
+    above = np.roll(part, 1, axis=0)
+    above[0] = False
+    if (own & above).sum() > OPEN_BELOW * own.sum():
+        return False
+    rows, columns = np.nonzero(part)
+    box = (int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
+    return not _shows_ground(view, part, box, mask | part)
 
 
 def _shade_of(colour: NDArray[np.floating], ground: NDArray[np.floating]) -> bool:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A broader base for inflated bodies: the side that the photo does not show is made thicker, its underside flat.
+"""A broader base for bodies: the side that the photo does not show is made thicker, its underside flat.
 
 Inflated bodies are round and would stand on a spot, where real things have settled and reach farther back. What faces
 away from the camera moves farther from it along its own ray, all of it over most of the height, so that the back stays
 upright, less where the body is thin, and no farther than the ground. Then the underside of that side settles straight
-down, as far as the body hides it from the camera. Neither the front nor the outline changes.
+down, as far as the body hides it from the camera. Neither the front nor the outline changes. A box that is too thin to
+stand safely gets a back that is farther away, and stays a box but for its hidden edges.
 """
 
 from __future__ import annotations
@@ -49,27 +50,37 @@ FALLS = 8
 """Steps in which settling is tried."""
 LYING = 0.8
 """Share of the way to the ground that becomes all of it."""
+LOWERED = 0.06
+"""Height over the body's up to which the lowest vertices of a flat side that has moved away are put on the ground: its
+lower edge lies between two rows of them."""
 EVENED = 4
 """Rounds of smoothing of how far neighbours settle."""
 
 
 def footed(
-    camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64], *, on_legs: bool = False
+    camera: Camera,
+    silhouette: Silhouette,
+    vertices: Points,
+    faces: NDArray[np.int64],
+    *,
+    on_legs: bool = False,
+    flat: bool = False,
 ) -> tuple[Points, NDArray[np.bool_]]:
     """Return ``vertices`` (V, 3) with the unseen side as much thicker as the body needs to stand safely, and which of
     them moved (V,).
 
-    camera: above the ground z = 0. on_legs: only what is low is made thicker. As safely as
-    ``support.SupportMargin.wanted`` says, or as is worth it.
+    camera: above the ground z = 0. on_legs: only what is low is made thicker. flat: the unseen side moves as a whole,
+    as a box' does. As safely as ``support.SupportMargin.wanted`` says, or as is worth it.
     """
     plain = support_of(vertices, faces)
     best, highest = vertices, plain.share
     if highest < 1.0:
         thicken = _Thickening(camera, silhouette, vertices, faces)
         # An upright back is preferred, but a body on legs stays as thick as it is.
-        for low, worse in ((True, 0.0),) if on_legs else ((False, 0.0), (True, WEDGE)):
+        ways = ((True, 0.0),) if on_legs else ((False, 0.0),) if flat else ((False, 0.0), (True, WEDGE))
+        for low, worse in ways:
             for extra in THICKEST * np.arange(STEPS + 1) / STEPS:
-                made = thicken.by(extra, low=low)
+                made = thicken.by(extra, low=low, flat=flat)
                 stands = support_of(made, faces)
                 score = (1.0 if on_legs else SAFE) if stands.share >= 1.0 else stands.share
                 score -= COST * (stands.volume / plain.volume - 1.0) + worse
@@ -112,26 +123,36 @@ class _Thickening:
         self._settle = whole * smoothstep(-normals[:, 2], *UNDER) * smoothstep(height, *SETTLED)
         self._room = np.maximum(ground_depth(camera, self._rays) - projected[:, 2], 0.0)
 
-    def by(self, extra: float, *, low: bool) -> Points:
+    def by(self, extra: float, *, low: bool, flat: bool = False) -> Points:
         """Return the vertices (V, 3) with ``extra`` half thicknesses added and settled, none below the ground.
 
-        low: only low down, less and less towards a height that rises with ``extra``.
+        low: only low down, less and less towards a height that rises with ``extra``. flat: the same at all heights.
         """
-        if low:
+        if flat:
+            profile = np.ones_like(self._height)
+        elif low:
             profile = np.clip(1.0 - self._height / (LOWEST + RISE * extra), 0.0, 1.0)
         else:
             profile = (1.0 - self._height**TOP) ** (1.0 / TOP)
         moved = extra * self._step * profile
         made = self._vertices + np.minimum(moved, self._room)[:, None] * self._rays
         made[(moved > 0.0) & (moved >= self._room), 2] = 0.0
+        if flat:
+            low_rows = np.flatnonzero((moved > 0.0) & (made[:, 2] < LOWERED * made[:, 2].max()))
+            below = made[low_rows] * (1.0, 1.0, 0.0)
+            made[low_rows[self._inside(below) > HIDDEN_PX], 2] = 0.0
         return self._settled(made)
+
+    def _inside(self, points: Points) -> Points:
+        """Pixels (n,) inside the outline at which ``points`` (n, 3) are seen."""
+        at = self._camera.project(points)[:, :2] - (self._silhouette.left + 0.5, self._silhouette.top + 0.5)
+        inside = ndimage.map_coordinates(self._silhouette.distance, at[:, ::-1].T, order=1, mode="nearest")
+        return np.asarray(inside, dtype=np.float64)
 
     def _settled(self, made: Points) -> Points:
         fallen, open_ = np.zeros(len(made)), self._settle > 0.0
         for fall in np.arange(1, FALLS + 1) / FALLS:
-            lower = made[open_] * (1.0, 1.0, 1.0 - fall)
-            at = self._camera.project(lower)[:, :2] - (self._silhouette.left + 0.5, self._silhouette.top + 0.5)
-            inside = ndimage.map_coordinates(self._silhouette.distance, at[:, ::-1].T, order=1, mode="nearest")
+            inside = self._inside(made[open_] * (1.0, 1.0, 1.0 - fall))
             open_[np.flatnonzero(open_)[inside < HIDDEN_PX]] = False
             fallen[open_] = fall
         # What nearly lies does.

@@ -30,6 +30,7 @@ from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
 from .body_texture import TexturedSurface, colour_pixels, corner_pixels, crop_texture
 from .depth_front import front_of
+from .footing import footed
 from .furniture import furniture_boards
 from .furniture_mesh import furniture_mesh
 from .hanging import hung, turned_view
@@ -53,6 +54,8 @@ BENT = 0.98
 """Silhouette overlap above which the warped primitive is the body; below, the outline is cut out of it."""
 KEPT = 0.96
 """Overlap of the finished silhouette with the mask that a primitive has to reach."""
+SAME_FIT = 0.001
+"""Overlap that a box may lose when its unseen side is moved."""
 UNLIKELY = 0.8
 """Overlap of a requested shape below which a notice reports the mismatch."""
 
@@ -130,12 +133,15 @@ def build_body(
         notice(f"{name}: the body's silhouette overlaps its mask by {fit:.2f} only; give another shape or mask")
     if lost > WORTH_SAYING:
         notice(f"{name}: {lost:.0%} of its surface was disconnected and was removed; check its mask")
-    if margin < TOPPLES:
-        notice(f"{name}: may topple, its centre of mass is not above its base; a larger thickness helps")
     primitive = None if choice is None else choice.primitive
     mesh = replace(mesh, colours=colour_pixels(camera, mesh, crop, primitive))
     if isinstance(primitive, Box):
         mesh = replace(mesh, corner_colours=corner_pixels(camera, mesh, crop, primitive))
+        if request.thickness is None:
+            mesh = _deeper(camera, mesh, full, fit)
+            margin = support_of(mesh.vertices, mesh.faces).steadiness
+    if margin < TOPPLES:
+        notice(f"{name}: may topple, its centre of mass is not above its base; a larger thickness helps")
     return BuiltBody(mesh=mesh, shape=shape, stability=margin, fit=fit)
 
 
@@ -148,6 +154,17 @@ def _solid(
     if not fitted.parts.any() and silhouette_overlap(camera, bent, full) >= BENT:
         return bent, 0.0
     return solid_mesh(camera, crop, choice.primitive, fitted, target, thickness)
+
+
+def _deeper(camera: Camera, box: BodyMesh, full: Mask, fit: float) -> BodyMesh:
+    """``box`` whose unseen side is as much farther away as it needs to stand safely, with the colours that it has.
+
+    fit: overlap of its silhouette with ``full``, which stays.
+    """
+    vertices, moved = footed(camera, inflate(full, 1.0), box.vertices, box.faces, flat=True)
+    pixels = np.where(moved[:, None], camera.project(vertices)[:, :2], box.pixels)
+    deeper = replace(box, vertices=vertices, pixels=pixels)
+    return deeper if silhouette_overlap(camera, deeper, full) > fit - SAME_FIT else box
 
 
 @dataclass(frozen=True)
