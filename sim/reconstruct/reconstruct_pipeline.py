@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -52,9 +53,13 @@ from .reconstruct_options import ObjectRequest, ReconstructOptions, object_names
 from .reconstruction_report import REPORT_FILE, ReportData, write_report
 from .scene_output import PHYSICS_FILE, replacing_folder
 from .segmentation.object_masks import segment_objects
+from .segmentation.object_proposals import propose_boxes
 from .shape.body_texture import glb_bytes, world_from_gltf
 from .shape.object_bodies import Body, make_bodies, shadow_casters
 from .stage_cache import STAGES_FOLDER, Arrays, Notice, StageCache, Steps
+
+SEARCHED = 640
+"""Longest side in pixels of the picture in which things are looked for whose sizes tell the camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +212,9 @@ def reconstruct_photo(
         objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
         steps.begin("camera")
         depth = _depth(picture, options, steps)
-        estimate = estimate_camera(picture, seen, options, depth, steps.notice)
+        estimate = estimate_camera(
+            picture, seen, options, depth, steps.notice, lambda: _boxes_of_things(picture.pixels)
+        )
         named = options.inpainter
         inpainter = None if named is None else resolve("inpainter", trusted_spec(named), cancelled)
         layers = separate_layers(
@@ -312,6 +319,15 @@ def _asked(
         steps.notice(f"{error}; the objects are judged by their names")
         return None
     return read_answer(str(made["raw"]), len(names))
+
+
+def _boxes_of_things(pixels: NDArray[np.uint8]) -> list[tuple[float, float, float, float]]:
+    """Return the boxes of all things that stand out in ``pixels`` (H, W, 3), in its pixels."""
+    scale = min(1.0, SEARCHED / max(pixels.shape[:2]))
+    small = pixels
+    if scale < 1.0:
+        small = np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return [tuple(value / scale for value in item.box) for item in propose_boxes(small)]  # type: ignore[misc]
 
 
 def _depth(picture: Photo, options: ReconstructOptions, steps: Steps) -> DepthMap | None:

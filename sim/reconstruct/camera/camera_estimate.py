@@ -15,6 +15,7 @@ from ...scene.model import Camera
 from ..photo import Photo
 from ..reconstruct_options import ReconstructOptions
 from . import ground_camera as cameras
+from .alike_sizes import Box, pitch_from_alike_sizes
 from .depth_map import DepthMap
 from .ground_plane import GroundPlane, fit_ground_plane
 from .pose_posterior import CameraPrior, Gaussian, PosePosterior, infer_pose
@@ -33,6 +34,7 @@ DEFAULT_ROLL_SIGMA_DEG = 2.0
 KNOWN_DEG = 5.0
 """A normal less uncertain than this is attributed to the lines."""
 KNOWN_LOG_FOCAL = 0.12
+TYPICAL = "a typical pose"
 
 
 @dataclass(frozen=True)
@@ -66,12 +68,13 @@ def estimate_camera(
     options: ReconstructOptions,
     depth: DepthMap | None,
     notice: Callable[[str], None],
+    things: Callable[[], Sequence[Box]] = tuple,
 ) -> CameraEstimate:
     """Return the camera of ``picture``, whose objects have the ``masks`` (H, W).
 
     depth: of the same size as the photo. Values in ``options`` are fixed. ``notice`` receives each estimate, its
-    uncertainty, and the option that overrides it. What lies above a given horizon hangs,
-    and does not count.
+    uncertainty, and the option that overrides it. What lies above a given horizon hangs, and does not count. things:
+    boxes of all things in the photo, in its pixels; asked for only where nothing else tells the camera's pitch.
     """
     width, height = picture.width, picture.height
     contacts = np.array([_contact(mask) for mask in masks]).reshape(-1, 2)
@@ -88,13 +91,17 @@ def estimate_camera(
         given = cameras.camera_above_ground(width, height, math.exp(log_f), pitch, roll)
         stands = np.array([cameras.stands_below(given, contact) for contact in contacts], dtype=bool)
         prior = replace(prior, contacts=prior.contacts[stands])
-    found = infer_pose(
-        find_segments(picture.pixels, np.logical_or.reduce([*masks, np.zeros((height, width), bool)])), prior
-    )
+    lines = find_segments(picture.pixels, np.logical_or.reduce([*masks, np.zeros((height, width), bool)]))
+    found = infer_pose(lines, prior)
+    normal_source = _normal_source(options, plane, found)
+    if normal_source == TYPICAL:
+        alike = pitch_from_alike_sizes(things(), (width, height), found.focal, DEFAULT_PITCH_SIGMA_DEG)
+        if alike is not None:
+            prior = replace(prior, pitch=alike)
+            found, normal_source = infer_pose(lines, prior), "things of alike size"
     # The mean of poses with the given horizon does not have it itself.
     averages = np.array([[math.log(found.focal), found.pitch, found.roll]])
     camera = cameras.camera_above_ground(width, height, found.focal, *map(float, prior.completed(averages)[0, 1:]))
-    normal_source = _normal_source(options, plane, found)
     if log_focal.sigma > 0.2 and found.log_focal_sigma < KNOWN_LOG_FOCAL:
         focal_source = "straight lines"
     estimate = CameraEstimate(
@@ -164,7 +171,7 @@ def _normal_source(options: ReconstructOptions, plane: GroundPlane | None, found
     elif math.degrees(found.normal_sigma) < KNOWN_DEG and found.gain > 1.0:
         rest = "straight lines"
     else:
-        rest = "a typical pose"
+        rest = TYPICAL
     if "roll_deg" in given and len(given) > 1:
         return " and ".join(given)
     return " and ".join([*given, rest])
