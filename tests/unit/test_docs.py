@@ -28,6 +28,7 @@ OTHERS = {
     "--import-mode",
     "--find-links",
     "--no-index",
+    "--strict",
     "--data",
     "--gres",
     "--nthreads",
