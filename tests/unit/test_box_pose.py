@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A box that slides and turns before a still camera: the camera, its place and its turn from its outlines."""
 
 import cv2
