@@ -258,13 +258,13 @@ class RigidArrays(NamedTuple):
     """(W,) substep in s, 0 for idle worlds."""
 
     spans: Integers
-    """(W, SPANS) first body, end of bodies, first pair, end of pairs."""
+    """(W, SPANS) first body, end of bodies, first pair, end of pairs, first collider, start in ``systems`` or -1."""
 
     world_numbers: Doubles
     """(W, WORLD) gravity (cells/s²), plane, recovery speed (cells/s)."""
 
     report: Doubles
-    """(W, REPORT) contacts, largest depth (cells), sweeps, spare."""
+    """(W, REPORT) contacts, largest depth (cells), sweeps, steps of Newton's method."""
 
     kinds: Integers
     """(S, KINDS) kind, lattices, clusters of surface points."""
@@ -327,6 +327,10 @@ class RigidContacts(NamedTuple):
 
     chosen: Integers
     """(C, BINS, CHOSEN) surface points that may touch, -1 for none."""
+
+    systems: Doubles
+    """Worlds' systems of equations one after the other (``rigid_direct``): matrix (n, n), right side (n), first column
+    of each row (n), velocities without contact (n), and an equation (12)."""
 
 
 class CouplingArrays(NamedTuple):

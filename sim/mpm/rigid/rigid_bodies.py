@@ -32,6 +32,10 @@ RECOVERY_HEIGHT = 0.02
 LEAST_RECOVERY = 1.0
 """Speed of that correction without gravity, cells/s."""
 
+MOST_TOGETHER = 40
+"""Rigid bodies of a world up to which contacts that hold are solved together (``rigid_direct``): 0.5 MB and, where
+everything touches everything, 5 million operations."""
+
 CHANGING = ("solids", "solid_kinds", "solid_numbers", "world_numbers", "memory")
 """The arrays that a checkpoint holds."""
 
@@ -172,7 +176,8 @@ class RigidBodies:
                 moves = moves or rigid.source.vertices is not None
                 kinds[i, at.KIND] = at.KINEMATIC if moves else at.STATIC
         pairs, pair_numbers, pair_spans = self._pairs(spans)
-        world_spans = np.array([[*a, *b] for a, b in zip(spans, pair_spans, strict=True)], dtype=np.int32)
+        ends, starts_of, size = self._systems(spans)
+        world_spans = np.column_stack([spans, pair_spans, ends, starts_of]).astype(np.int32)
         self._put("steps", np.zeros(worlds), ti.f64)
         self._put("world_spans", world_spans, ti.i32)
         self._put("world_numbers", self._world_numbers(), ti.f64)
@@ -192,7 +197,19 @@ class RigidBodies:
         self._put("reaches", np.zeros(len(pairs)), ti.f64)
         self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
         self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
+        self._put("systems", np.zeros(size), ti.f64)
         self._put_shapes({i: [rigid.lattices[0]] for i, rigid in enumerate(self._rigid_bodies) if rigid.lattices})
+
+    def _systems(self, spans: list[tuple[int, int]]) -> tuple[list[int], list[int], int]:
+        """Of each world the first collider and the start of its equations, -1 for none; and the numbers of all."""
+        ends, starts, size = [], [], 0
+        for first, end in spans:
+            free = sum(isinstance(self._rigid_bodies[i].source, BodyParticles) for i in range(first, end))
+            together = 1 < free <= MOST_TOGETHER
+            ends.append(first + free)
+            starts.append(size if together else -1)
+            size += 36 * free * free + 18 * free + 12 if together else 0
+        return ends, starts, max(size, 1)
 
     def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
         properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
@@ -305,7 +322,7 @@ class RigidBodies:
     @property
     def contacts(self) -> RigidContacts:
         """Pairs and their contacts as the kernels take them."""
-        names = ("pairs", "pair_numbers", "counts", "contacts", "memory", "reaches", "scores", "chosen")
+        names = ("pairs", "pair_numbers", "counts", "contacts", "memory", "reaches", "scores", "chosen", "systems")
         return RigidContacts(*(self.arrays[name] for name in names))
 
     # ---- time ---------------------------------------------------------------------------------------------------

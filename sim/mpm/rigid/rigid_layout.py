@@ -65,13 +65,15 @@ POINT = 12
 """Stride: ``collision_shapes.PATCH`` numbers and 1 where the surface is smooth, 0 at edges and corners."""
 
 # ---- per world: ``world_spans`` i32, ``world_numbers`` f64, ``world_report`` f64 ------------------------------------
-SPANS = 4  # first body, end of bodies, first pair, end of pairs
+SPANS = (
+    6  # first body, end of bodies, first pair, end of pairs, end of what is no collider, its place in ``systems`` or -1
+)
 WORLD = 16
 GRAVITY = 0  # (3)
 PLANE = 3  # two tangents and the normal of the plane (9)
 OFFSET = 12  # normal . x on the plane
 RECOVERY = 13  # fastest speed at which depth is taken out
-REPORT = 4  # contacts, largest depth, iterations, spare
+REPORT = 4  # contacts, largest depth, sweeps, steps of Newton's method
 
 # ---- pairs: ``pairs`` i32, ``pair_numbers`` f64 ---------------------------------------------------------------------
 PAIRS = 4  # body a whose points touch, body b that they touch (-1: the plane), the pair the other way round or -1
@@ -103,6 +105,7 @@ GAP = 27
 PLACE = 28  # in b's frame (3)
 PULL = 31  # impulse of the adhesion
 BOUNCE = 32
+LIMIT = 33  # of RUB's length and of ROLL's
 
 MEMORY = 12  # place in b's frame (3), impulse, rub (3), roll (3), used
 

@@ -16,6 +16,7 @@ from ..kernels.kernel_bundles import func, kernel
 from ..kernels.layout import CONTROL_ROW, FULL, IDLE, PHASE, STEP
 from ..kernels.time_stepping import forget_reports, settle
 from .rigid_contact import find_contacts, gather_points
+from .rigid_direct import solve_together
 from .rigid_layout import (
     ACCELERATION,
     BLEND,
@@ -58,7 +59,7 @@ from .rigid_layout import (
     X,
 )
 from .rigid_math import dvec3, dvec4, load3, load33, matrix_of, store3, store33, turned
-from .rigid_solver import SETTLED, SWEEPS, finish, prepare, sweep, warm
+from .rigid_solver import ALONE, SETTLED, SWEEPS, finish, prepare, sweep, warm
 
 ITERATIONS = 512
 """Loop iterations spent on one world: Taichi's CPU backend gives a thread at least so many at a time."""
@@ -179,6 +180,8 @@ def solve_and_move(w, dt, bodies: RigidArrays, contacts: RigidContacts):
     sweeps = 0
     while sweeps < SWEEPS and worst > settled:
         worst = 0
+        if sweeps == ALONE and bodies.spans[w * SPANS + 5] >= 0:
+            solve_together(w, settled, bodies, contacts)
         for p in range(first_pair, end_pair):
             worst = ti.max(worst, sweep(p, bodies, contacts))
         sweeps += 1

@@ -3,7 +3,8 @@
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
-"""Contact impulses between rigid bodies: projected Gauss-Seidel, warm-started from the last substep.
+"""Contact impulses between rigid bodies: projected Gauss-Seidel, warm-started from the last substep, and a common
+solution (``rigid_direct``) where that takes long.
 
 For each contact with gap phi, normal n from b to a, relative velocity u = u_n n + u_t (a's less b's, after it):
 
@@ -19,6 +20,7 @@ import taichi as ti
 
 from ..kernels.kernel_arrays import RigidArrays, RigidContacts
 from ..kernels.kernel_bundles import func
+from .rigid_direct import kick, tangent
 from .rigid_layout import (
     ADHESION,
     ADHESION_REACH,
@@ -75,7 +77,10 @@ from .rigid_layout import (
 from .rigid_math import dvec3, load3, load33, store3
 
 SWEEPS = 80
-"""Gauss-Seidel sweeps at most; they end when nothing changes any more. With 40 a tower of five boxes kept rocking."""
+"""Gauss-Seidel sweeps at most; they end when nothing changes any more."""
+
+ALONE = 8
+"""Sweeps after which all contacts are solved together."""
 
 SETTLED = 1e-3
 """Share of the speed that gravity gives in a substep below which a change counts as converged."""
@@ -94,16 +99,6 @@ SHARE = 0.2
 def cross_product_matrix_column(arm, inverse_inertia, axis):
     """Velocity at ``arm`` along all axes from an impulse of 1 along ``axis`` there, by turning alone."""
     return (inverse_inertia @ arm.cross(axis)).cross(arm)
-
-
-@func
-def kick(i, row_v, row_w, impulse, moment, bodies: RigidArrays):
-    """Add an impulse and an angular impulse to the velocities at ``row_v`` and ``row_w`` of body ``i``."""
-    for c in ti.static(range(3)):
-        bodies.state[i * STATE + row_v + c] += bodies.numbers[i * NUMBERS + INVERSE_MASS] * impulse[c]
-    turn = load33(bodies.state, i * STATE + J) @ moment
-    for c in ti.static(range(3)):
-        bodies.state[i * STATE + row_w + c] += turn[c]
 
 
 @func
@@ -136,8 +131,7 @@ def prepare(w, dt, p, bodies: RigidArrays, contacts: RigidContacts):
     for s in range(contacts.counts[p]):
         c = (p * SLOTS + s) * ROW
         ra, rb, n = load3(contacts.rows, c + ARM_A), load3(contacts.rows, c + ARM_B), load3(contacts.rows, c + NORMAL)
-        t1 = n.cross(ti.select(ti.abs(n[0]) < 0.6, dvec3(1.0, 0.0, 0.0), dvec3(0.0, 1.0, 0.0)))
-        t1 /= t1.norm()
+        t1 = tangent(n)
         t2 = n.cross(t1)
         K = inverse * dvec3(1.0)
         k12 = ti.cast(0.0, ti.f64)
