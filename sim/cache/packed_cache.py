@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Packed point caches: quantised positions, predicted from the two samples before, deflated.
+"""Packed point caches: quantised positions, predicted from the two samples before, folded, deflated.
 
 Little-endian: char[12] "PHYSGENPACK1", int32 vertices, int32 samples, float32 start, float64[3] origin, float64 step;
 then for every sample uint8 kind, uint32 length, and so many bytes of zlib. Sample 0 is float32 and exact; of the others
-the whole numbers round((x - origin) / step) less their prediction, low bytes of all before high bytes.
+the whole numbers round((x - origin) / step) less their prediction, low bytes of all before high bytes. Folded numbers
+0, -1, 1, -2, 2 ... are written as 0, 1, 2, 3, 4 ...: a high byte that says the sign again would cost a bit a number.
 """
 
 from __future__ import annotations
@@ -32,7 +33,12 @@ _EXACT, _PLAIN, _ALONG = 0, 2, 4
 """Kinds of samples; the width in bytes, 2 or 4, less 2, is added to the last two: 2, 4; along the vertices 6, 8."""
 _AFFINE = 16
 """Added where the prediction is the affine map of the sample before, whose 12 float64 precede the numbers."""
-_MAP_BYTES = 96
+_FOLDED = 32
+"""Added where the numbers are folded, as all that are written are; files of earlier versions have others."""
+_TWO = 64
+"""Added where the prediction is the affine map of both samples before, whose 21 float64 precede the numbers: it takes
+of the speed what outlasts the rounding of the places."""
+_MAP_ROWS = {0: 0, _AFFINE: 4, _TWO: 7}
 
 
 def pack_cache(source: Pc2Reader, target: Path, samples: int) -> None:
@@ -50,37 +56,48 @@ def pack_cache(source: Pc2Reader, target: Path, samples: int) -> None:
         file.write(_PART.pack(_EXACT, len(data)) + data)
         for index in range(1, samples):
             now = _whole(source.sample(index), origin, step, source.path)
-            found = [(kind, zlib.compress(_bytes(rest), LEVEL)) for kind, rest in _residuals(now - (2 * last - before))]
-            affine = _fit(last, now)
-            for kind, rest in _residuals(now - _mapped(last, affine)):
-                found.append((kind + _AFFINE, zlib.compress(affine.astype("<f8").tobytes() + _bytes(rest), LEVEL)))
+            both = np.column_stack([last, before])
+            found = []
+            for use, places in ((0, None), (_AFFINE, last), (_TWO, both)):
+                if places is None:
+                    head, expected = b"", 2 * last - before
+                else:
+                    affine = _fit(places, now)
+                    head, expected = affine.astype("<f8").tobytes(), _mapped(places, affine)
+                for kind, rest in _residuals(now - expected):
+                    found.append((kind + use + _FOLDED, zlib.compress(head + _bytes(rest), LEVEL)))
             kind, data = min(found, key=lambda each: len(each[1]))
             file.write(_PART.pack(kind, len(data)) + data)
             before, last = last, now
 
 
-def _residuals(rest: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.signedinteger]]]:
+def _residuals(rest: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.unsignedinteger]]]:
     along = np.diff(rest, axis=0, prepend=0)
     for kind, values in ((_PLAIN, rest), (_ALONG + 2, along)):
-        width = 2 if np.abs(values).max(initial=0) < 2**15 else 4
-        yield kind + width - 2, values.astype(f"<i{width}")
+        folded = (values << 1) ^ (values >> 63)
+        width = 2 if folded.max(initial=0) < 2**16 else 4
+        yield kind + width - 2, folded.astype(f"<u{width}")
 
 
-def _fit(last: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(4, 3) affine map from ``last`` to ``now`` in least squares."""
-    return np.asarray(
-        np.linalg.lstsq(np.column_stack([last, np.ones(len(last))]), now.astype(np.float64), rcond=None)[0]
-    )
+def _fit(places: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(K + 1, 3) affine map from ``places`` (V, K) to ``now`` (V, 3) in least squares."""
+    rows = np.column_stack([places, np.ones(len(places))])
+    return np.asarray(np.linalg.lstsq(rows, now.astype(np.float64), rcond=None)[0])
 
 
-def _mapped(last: NDArray[np.int64], affine: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The map of ``last``, number by number, so that every machine rounds alike."""
-    x, y, z = last.T.astype(np.float64)
-    rows = [np.rint(x * a + y * b + z * c + d) for a, b, c, d in affine.T]
+def _mapped(places: NDArray[np.int64], affine: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The map of ``places`` (V, K), number by number, so that every machine rounds alike."""
+    columns = places.T.astype(np.float64)
+    rows = []
+    for *factors, shift in affine.T:
+        total = columns[0] * factors[0]
+        for column, factor in zip(columns[1:], factors[1:], strict=True):
+            total = total + column * factor
+        rows.append(np.rint(total + shift))
     return np.stack(rows, axis=1).clip(-(2.0**40), 2.0**40).astype(np.int64)
 
 
-def _bytes(values: NDArray[np.signedinteger]) -> bytes:
+def _bytes(values: NDArray[np.unsignedinteger]) -> bytes:
     return values.T.copy().view(np.uint8).reshape(-1, values.dtype.itemsize).T.tobytes()
 
 
@@ -117,14 +134,16 @@ class PackedCache:
             for index in range(self.sample_count):
                 head = file.read(_PART.size)
                 kind, length = _PART.unpack(head) if len(head) == _PART.size else (-1, 0)
-                affine = kind >= _AFFINE
-                kind -= _AFFINE if affine else 0
+                use, folded = max(kind, 0) & (_AFFINE | _TWO), kind > 0 and kind & _FOLDED != 0
+                kind -= use + (_FOLDED if folded else 0)
                 width = 4 if kind in (_EXACT, 4, 8) else 2
-                count = 3 * self.vertex_count * width + (_MAP_BYTES if affine else 0)
+                rows = _MAP_ROWS.get(use, -1)
+                count = 3 * self.vertex_count * width + 24 * max(rows, 0)
                 if (
                     (kind == _EXACT) != (index == 0)
                     or kind not in (0, 2, 4, 6, 8)
-                    or (affine and index == 0)
+                    or rows < 0
+                    or (index == 0 and (use or folded))
                     or length > count + 2**16
                 ):
                     raise InputError(f"{self.path}: sample {index} is damaged; copy the folder again")
@@ -143,13 +162,17 @@ class PackedCache:
                     yield first
                     continue
                 expected = 2 * last - before
-                if affine:
-                    matrix = np.frombuffer(data[:_MAP_BYTES], "<f8").reshape(4, 3)
+                if use:
+                    matrix = np.frombuffer(data[: 24 * rows], "<f8").reshape(rows, 3)
                     if not (np.isfinite(matrix).all() and np.abs(matrix).max() < 1e15):
                         raise InputError(f"{self.path}: sample {index} is damaged; copy the folder again")
-                    expected, data = _mapped(last, matrix), data[_MAP_BYTES:]
+                    places = last if use == _AFFINE else np.column_stack([last, before])
+                    expected, data = _mapped(places, matrix), data[24 * rows :]
                 planes = np.frombuffer(data, np.uint8).reshape(width, -1)
-                rest = np.ascontiguousarray(planes.T).view(f"<i{width}").reshape(3, -1).T.astype(np.int64)
+                sort = "u" if folded else "i"
+                rest = np.ascontiguousarray(planes.T).view(f"<{sort}{width}").reshape(3, -1).T.astype(np.int64)
+                if folded:
+                    rest = (rest >> 1) ^ -(rest & 1)
                 now = expected + (np.cumsum(rest, axis=0) if kind >= _ALONG + 2 else rest)
                 if np.abs(now).max() > 2**29:
                     raise InputError(f"{self.path}: sample {index} is damaged; copy the folder again")
