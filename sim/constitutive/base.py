@@ -64,9 +64,9 @@ class DeviceFunctions(NamedTuple):
     """(stretch, memory, two_mu, lam, own) → elastic principal stretches, memory, principal Kirchhoff stress, stiffness,
     for trial principal stretches (3). The map changes F <- U diag(s_new / s) U^T F and keeps everything else."""
 
-    hencky_return_map: Any = None
-    """(strain, memory, own) → elastic principal Hencky strains ln s, memory, whether they changed. The stress is
-    2 mu e + lambda tr e."""
+    radial_return: Any = None
+    """(volume, shear, memory, own) → elastic volume, share of the deviator that is kept, memory: of the Hencky strain
+    ln V, with its trace and the norm of its deviator. The stress is 2 mu e + lambda tr e."""
 
     advance_volume: Any = None
     """(memory, dt, C) → memory, the ln of the volume ratio after dt; of fluids, whose F stays the identity."""

@@ -55,23 +55,15 @@ class SandMaterial(DeformableMaterial):
         """Return to the cone, or to its tip in tension."""
         import taichi as ti
 
-        from .tensors import vec3
-
         @ti.func
-        def hencky_return_map(strain, memory, own):
-            mapped = strain + memory / 3.0
-            remembered = memory
-            volumetric = mapped.sum()
-            if volumetric >= 0.0:
-                mapped = vec3(0.0)
-                remembered = volumetric
-            else:
-                remembered = 0.0
-                shear = mapped - volumetric / 3.0
-                norm = shear.norm()
-                beyond = norm + volumetric * own[0]
-                if beyond > 0.0:
-                    mapped -= (beyond / norm) * shear
-            return mapped, remembered, (mapped != strain).any()
+        def radial_return(volume, shear, memory, own):
+            kept = 1.0
+            elastic = volume + memory
+            remembered = 0.0
+            if elastic >= 0.0:
+                remembered, elastic, kept = elastic, 0.0, 0.0
+            elif shear + elastic * own[0] > 0.0:
+                kept = -elastic * own[0] / shear
+            return elastic, kept, remembered
 
-        return DeviceFunctions(hencky_return_map=hencky_return_map)
+        return DeviceFunctions(radial_return=radial_return)

@@ -52,13 +52,10 @@ class VonMisesMaterial(DeformableMaterial):
         import taichi as ti
 
         @ti.func
-        def hencky_return_map(strain, memory, own):
-            mapped = strain
-            shear = strain - strain.sum() / 3.0
-            norm = shear.norm()
-            yields = norm > own[0]
-            if yields:
-                mapped -= (1.0 - own[0] / norm) * shear
-            return mapped, memory, yields
+        def radial_return(volume, shear, memory, own):
+            kept = 1.0
+            if shear > own[0]:
+                kept = own[0] / shear
+            return volume, kept, memory
 
-        return DeviceFunctions(hencky_return_map=hencky_return_map)
+        return DeviceFunctions(radial_return=radial_return)

@@ -13,7 +13,9 @@ Besides the models' own stress:
                  per particle (``conformation``), I at rest, positive definite whatever the step
 
 D is the symmetric part of the velocity gradient. Plastic models map the trial principal stretches s back onto the yield
-surface: F <- U diag(s_new / s) U^T F, which keeps everything else, so no right singular vectors are needed.
+surface: F <- U diag(s_new / s) U^T F, which keeps everything else, so no right singular vectors are needed. Maps of the
+Hencky strain that keep its axes and scale its deviator need no U either while the strain is moderate: ln b and the
+powers of b are series in its deviator.
 """
 
 import functools
@@ -32,7 +34,18 @@ from ...constitutive import (
     ElasticMaterial,
     models,
 )
-from ...constitutive.tensors import LEAST_STRETCH, eigen_symmetric, hencky_stress, isotropic, mat3, vec3, vec4
+from ...constitutive.tensors import (
+    LEAST_STRETCH,
+    MOST_SERIES,
+    eigen_symmetric,
+    hencky_stress,
+    isotropic,
+    log_series,
+    mat3,
+    power_series,
+    vec3,
+    vec4,
+)
 from .kernel_arrays import ParticleArrays, WorldArrays
 from .kernel_bundles import func
 
@@ -43,7 +56,7 @@ class DeviceModel(NamedTuple):
     number: int
     stress: Any
     return_map: Any
-    hencky_return_map: Any
+    radial_return: Any
     advance_volume: Any
 
 
@@ -57,7 +70,7 @@ class LawSet(NamedTuple):
     """Models with a return map of principal stretches."""
 
     hencky_plastic: tuple[DeviceModel, ...]
-    """Models with a return map of Hencky strains."""
+    """Models with a return map of the Hencky strain."""
 
     volumetric: tuple[DeviceModel, ...]
     """Models that advance a volume ratio in place of F: fluids."""
@@ -67,6 +80,9 @@ class LawSet(NamedTuple):
 
     flowing: bool
     """Whether there are granular materials or fluids."""
+
+    only_flowing: bool
+    """Whether there is nothing else."""
 
     damped: bool
     """Whether some solid has a damping time."""
@@ -84,7 +100,7 @@ class LawSet(NamedTuple):
 FLOWING = (GRANULAR, FLUID)
 FLOWING_BITS = sum(1 << model.number for model in models() if model.cohesion in FLOWING)
 FLUIDS = tuple(model.number for model in models() if model.device().advance_volume is not None)
-HENCKY = tuple(model.number for model in models() if model.device().hencky_return_map is not None)
+HENCKY = tuple(model.number for model in models() if model.device().radial_return is not None)
 PLASTIC = (*HENCKY, *(model.number for model in models() if model.device().return_map is not None))
 LOG_VOLUMES = tuple(model.number for model in models() if model.memory_is_log_volume)
 """Numbers of models by property."""
@@ -104,10 +120,11 @@ def law_set(laws: int) -> LawSet:
     return LawSet(
         solid=tuple(model for model in device if model.stress is not None and model.advance_volume is None),
         stretch_plastic=tuple(model for model in device if model.return_map is not None),
-        hencky_plastic=tuple(model for model in device if model.hencky_return_map is not None),
+        hencky_plastic=tuple(model for model in device if model.radial_return is not None),
         volumetric=tuple(model for model in device if model.advance_volume is not None),
         log_volume=any(model.memory_is_log_volume for model in present),
         flowing=any(model.cohesion in FLOWING for model in present),
+        only_flowing=bool(present) and all(model.cohesion in FLOWING for model in present),
         damped=bool(laws & DAMPED),
         fibred=bool(laws & FIBRED),
         relaxing=bool(laws & RELAXING),
@@ -153,32 +170,118 @@ def own_numbers(row: ti.i32, worlds: WorldArrays):
 @ti.func
 def map_back(law: ti.i32, laws: ti.template(), F: mat3, memory: ti.f32, two_mu: ti.f32, lam: ti.f32, own: vec4):
     """Return mapping of the plastic models: F, memory, Kirchhoff stress, stiffness."""
-    squares, axes = eigen_symmetric(F @ F.transpose())
-    stretch = ti.sqrt(ti.max(squares, LEAST_STRETCH**2))
-    kept = stretch
+    mapped = F
+    remembered = memory
     tau = mat3(0.0)
     stiffness = 0.0
-    remembered = memory
-    for model in ti.static(laws.stretch_plastic):
-        if law == model.number:
-            kept, remembered, principal, stiffness = model.return_map(stretch, memory, two_mu, lam, own)
-            tau = isotropic(principal, axes)
+    b = F @ F.transpose()
+    # b = mean (1 + Y): where Y is small, as in all that flows slowly, series in it need no principal axes.
+    mean = ti.max(b.trace() / 3.0, 1e-30)
+    Y = b / mean
+    for i in ti.static(range(3)):
+        Y[i, i] -= 1.0
+    square = Y @ Y
+    p = 0.5 * square.trace()
     if ti.static(len(laws.hencky_plastic) > 0):
         if is_one_of(law, HENCKY):
-            strain = ti.log(stretch)
-            for model in ti.static(laws.hencky_plastic):
+            if p < MOST_SERIES and mean > LEAST_STRETCH**2:
+                mapped, remembered, tau, stiffness = return_in_series(
+                    law, laws, F, mean, Y, square, memory, two_mu, lam, own
+                )
+            else:
+                mapped, remembered, tau, stiffness = return_along_axes(law, laws, F, b, memory, two_mu, lam, own)
+    if ti.static(len(laws.stretch_plastic) > 0):
+        if not is_one_of(law, HENCKY):
+            squares, axes = eigen_symmetric(b)
+            stretch = ti.sqrt(ti.max(squares, LEAST_STRETCH**2))
+            kept = stretch
+            for model in ti.static(laws.stretch_plastic):
                 if law == model.number:
-                    strain, remembered, yields = model.hencky_return_map(strain, memory, own)
-                    if yields:
-                        kept = ti.exp(strain)
-            principal, stiffness = hencky_stress(strain, two_mu, lam)
-            tau = isotropic(principal, axes)
+                    kept, remembered, principal, stiffness = model.return_map(stretch, memory, two_mu, lam, own)
+                    tau = isotropic(principal, axes)
+            mapped = scaled(F, squares, axes, stretch, kept)
+    return mapped, remembered, tau, stiffness
+
+
+@ti.func
+def return_in_series(
+    law: ti.i32,
+    laws: ti.template(),
+    F: mat3,
+    mean: ti.f32,
+    Y: mat3,
+    square: mat3,
+    memory: ti.f32,
+    two_mu: ti.f32,
+    lam: ti.f32,
+    own: vec4,
+):
+    """``map_back`` in Hencky strain ln b / 2 for b = mean (1 + Y), with ``square`` Y², by series in Y."""
+    p, q = 0.5 * square.trace(), Y.determinant()
+    log = log_series(p, q)
+    skewed = 3.0 * log[0] + 2.0 * p * log[2]  # tr ln(1 + Y)
+    volume = 0.5 * (3.0 * ti.log(mean) + skewed)
+    norm2 = 2.0 * p * log[1] * log[1] + 6.0 * q * log[1] * log[2] + (2.0 / 3.0) * p * p * log[2] * log[2]
+    shear = 0.5 * ti.sqrt(ti.max(norm2, 0.0))
+    elastic, kept, remembered = volume, 1.0, memory
+    for model in ti.static(laws.hencky_plastic):
+        if law == model.number:
+            elastic, kept, remembered = model.radial_return(volume, shear, memory, own)
+    mapped = F
+    if elastic != volume or kept != 1.0:
+        # exp((elastic - volume) / 3 - (1 - kept) dev e) with dev e = (ln(1 + Y) - skewed / 3) / 2
+        power = power_series(0.5 * (kept - 1.0), p, q)
+        scale = ti.exp((elastic - volume) / 3.0 + (1.0 - kept) * skewed / 6.0)
+        change = (scale * power[1]) * Y + (scale * power[2]) * square
+        for i in ti.static(range(3)):
+            change[i, i] += scale * power[0]
+        mapped = change @ F
+    deviator = (0.5 * kept * log[1]) * Y + (0.5 * kept * log[2]) * square
+    for i in ti.static(range(3)):
+        deviator[i, i] -= kept * log[2] * p / 3.0
+    tau, stiffness = hencky_stress(elastic, deviator, kept * shear, two_mu, lam)
+    return mapped, remembered, tau, stiffness
+
+
+@ti.func
+def return_along_axes(
+    law: ti.i32,
+    laws: ti.template(),
+    F: mat3,
+    b: mat3,
+    memory: ti.f32,
+    two_mu: ti.f32,
+    lam: ti.f32,
+    own: vec4,
+):
+    """The same by the principal axes, for whatever F."""
+    squares, axes = eigen_symmetric(b)
+    stretch = ti.sqrt(ti.max(squares, LEAST_STRETCH**2))
+    strain = ti.log(stretch)
+    volume = strain.sum()
+    deviator = strain - volume / 3.0
+    shear = deviator.norm()
+    elastic, kept, remembered = volume, 1.0, memory
+    for model in ti.static(laws.hencky_plastic):
+        if law == model.number:
+            elastic, kept, remembered = model.radial_return(volume, shear, memory, own)
+    left = stretch
+    if elastic != volume or kept != 1.0:
+        left = ti.exp(elastic / 3.0 + kept * deviator)
+    mapped = scaled(F, squares, axes, stretch, left)
+    tau, stiffness = hencky_stress(elastic, isotropic(kept * deviator, axes), kept * shear, two_mu, lam)
+    return mapped, remembered, tau, stiffness
+
+
+@ti.func
+def scaled(F: mat3, squares: vec3, axes: mat3, stretch: vec3, kept: vec3):
+    """F with its principal stretches ``stretch`` (roots of ``squares`` along ``axes``) replaced by ``kept``."""
     mapped = F
     if (kept != stretch).any() or squares.min() < LEAST_STRETCH**2:
         mapped = isotropic(kept / stretch, axes) @ F
         if squares.min() < LEAST_STRETCH**2:
             mapped = isotropic(kept, axes)
-    return mapped, remembered, tau, stiffness
+    return mapped
 
 
 @func

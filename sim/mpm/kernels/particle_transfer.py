@@ -286,6 +286,41 @@ def spread_curved(
 
 
 @ti.func
+def spread_kept(
+    first: ti.i32,
+    fx: vec3,
+    mass: ti.f32,
+    b4: vec4,
+    c0: vec4,
+    c1: vec4,
+    c2: vec4,
+    E01: vec4,
+    E02: vec4,
+    E12: vec4,
+    D0: vec4,
+    D1: vec4,
+    D2: vec4,
+    window: Vectors4,
+):
+    """As ``spread``, with what a particle of ``mass`` keeps of the second derivatives that ``interpolate_curved``
+    gave."""
+    keep = CURVED * vec4(mass, mass, mass, 0.0)
+    e01 = 16.0 * keep * E01
+    e02 = 16.0 * keep * E02
+    e12 = 16.0 * keep * E12
+    # i j e01 stands for (i - x) (j - y) e01, and so on.
+    b4c = b4 + (fx[0] * fx[1]) * e01 + (fx[0] * fx[2]) * e02 + (fx[1] * fx[2]) * e12
+    c0c = c0 - fx[1] * e01 - fx[2] * e02
+    c1c = c1 - fx[0] * e01 - fx[2] * e12
+    c2c = c2 - fx[0] * e02 - fx[1] * e12
+    w3 = weights(fx)
+    # Factor from a second derivative to the mode that is orthogonal to 1 and x under the weights.
+    h = w3[0] * w3[1] * w3[2] / (w3[1] * w3[2] + 4.0 * w3[0] * w3[2] + w3[0] * w3[1])
+    d0, d1, d2 = h[0] * keep * D0, h[1] * keep * D1, h[2] * keep * D2
+    spread_curved(first, fx, b4c, c0c, c1c, c2c, e01, e02, e12, d0, d1, d2, window)
+
+
+@ti.func
 def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: Vectors4):
     """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
     w = weights(fx)
@@ -391,13 +426,10 @@ def advance_particles(
             dt_gather = ti.cast(worlds.control[c + STEP], ti.f32)
             dt_scatter = ti.cast(worlds.control[c + NEXT_STEP], ti.f32)
             flows = False
-            curved = CURVED
             law = 0
             if ti.static(laws.flowing):
                 law = law_of(blocks.starts[k], worlds, particles)
                 flows = material_flows(law)
-                if flows:
-                    curved = 0.0
             if gather:
                 load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
                 if ti.static(laws.flowing):
@@ -445,7 +477,14 @@ def advance_particles(
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
-                    A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
+                    A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
+                    if ti.static(laws.only_flowing):
+                        A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                    else:
+                        if flows:
+                            A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                        else:
+                            A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
                     for r in ti.static(range(3)):
                         vp[r] = A[r]
                         Cp[r, 0] = 4.0 * B0[r]
@@ -531,23 +570,13 @@ def advance_particles(
                     c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
                     c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
                     c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
-                    if curved > 0.0:
-                        keep = curved * vec4(mass, mass, mass, 0.0)
-                        e01 = 16.0 * keep * E01
-                        e02 = 16.0 * keep * E02
-                        e12 = 16.0 * keep * E12
-                        # i j e01 stands for (i - x) (j - y) e01, and so on.
-                        b4 += (fx[0] * fx[1]) * e01 + (fx[0] * fx[2]) * e02 + (fx[1] * fx[2]) * e12
-                        c0 -= fx[1] * e01 + fx[2] * e02
-                        c1 -= fx[0] * e01 + fx[2] * e12
-                        c2 -= fx[0] * e02 + fx[1] * e12
-                        w3 = weights(fx)
-                        # Factor from a second derivative to the mode that is orthogonal to 1 and x under the weights.
-                        h = w3[0] * w3[1] * w3[2] / (w3[1] * w3[2] + 4.0 * w3[0] * w3[2] + w3[0] * w3[1])
-                        d0, d1, d2 = h[0] * keep * D0, h[1] * keep * D1, h[2] * keep * D2
-                        spread_curved(first, fx, b4, c0, c1, c2, e01, e02, e12, d0, d1, d2, nodes.scattered)
-                    else:
+                    if ti.static(laws.only_flowing):
                         spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                    else:
+                        if flows:
+                            spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                        else:
+                            spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, nodes.scattered)
                     if ti.static(laws.flowing):
                         if flows:
                             packing = 0.0
