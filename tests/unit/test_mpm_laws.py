@@ -110,6 +110,35 @@ def test_sand_stays_in_its_cone_and_remembers_expansion(evaluate):
     assert (memory > 0).any() and (memory == 0).any()
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.93, 1.05), (0.5, 1.8)])
+def test_hencky_returns_are_those_of_the_principal_axes(evaluate, low, high):
+    """Stress and F of sand and of von Mises' solid against principal axes in float64, for strains that the kernels take
+    by series and for larger ones; 2e-6 of the modulus times 1 + the largest strain: float32."""
+    F = deformations(2000, low, high).astype(np.float32).astype(float)
+    U, stretch, Vt = np.linalg.svd(F)
+    strain = np.log(stretch)
+    volume = strain.sum(axis=1)
+    shear = strain - volume[:, None] / 3
+    norm = np.linalg.norm(shear, axis=1)
+    scale = 1 + np.abs(strain).max()
+
+    slope, memory = 0.9, 0.01
+    elastic = np.minimum(volume + np.float32(memory), 0.0)
+    inside = np.minimum(1.0, -slope * elastic / norm)
+    limit = 0.04
+    cases = (
+        (SAND, (slope, 0.0, 0.0), memory, elastic, inside),
+        (VON_MISES, (limit, 0.0, 0.0), 0.0, volume, np.minimum(1.0, limit / norm)),
+    )
+    for law, own, before, kept_volume, kept in cases:
+        tau, mapped, _ = evaluate(law, F, own, before)
+        left = kept_volume[:, None] / 3 + kept[:, None] * shear
+        principal = TWO_MU * left + LAM * kept_volume[:, None]
+        assert (kept < 1).mean() > 0.3 and (kept > 0).any()
+        assert np.abs(tau - (U * principal[:, None, :]) @ U.transpose(0, 2, 1)).max() < 2e-6 * TWO_MU * scale
+        assert np.abs(mapped - (U * np.exp(left)[:, None, :]) @ Vt).max() < 2e-6 * scale**2
+
+
 def test_snow_clamps_its_stretches(evaluate):
     F = deformations(2000, 0.9, 1.1)
     _, mapped, memory = evaluate(SNOW, F, (0.025, 0.0075, 10.0))

@@ -478,7 +478,9 @@ def advance_particles(
                     fx = gp - ti.cast(base, ti.f32)
                     first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
                     A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
-                    if ti.static(laws.only_flowing):
+                    if ti.static(not laws.flowing):
+                        A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
+                    elif ti.static(laws.only_flowing):
                         A, B0, B1, B2 = interpolate(first, fx, nodes.window)
                     else:
                         if flows:
@@ -570,7 +572,9 @@ def advance_particles(
                     c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
                     c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
                     c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
-                    if ti.static(laws.only_flowing):
+                    if ti.static(not laws.flowing):
+                        spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, nodes.scattered)
+                    elif ti.static(laws.only_flowing):
                         spread(first, fx, b4, c0, c1, c2, nodes.scattered)
                     else:
                         if flows:
