@@ -143,6 +143,14 @@ def resident_memory() -> int | None:
     return None
 
 
+def return_freed_memory() -> None:
+    """Give the system back what this process has freed: the C library of Linux keeps it in pieces between what is still
+    in use, after large temporary arrays a third of all. Does nothing elsewhere."""
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def available_memory(reserved: int = 0) -> int | None:
     """Return the bytes of main memory that this process may still take without swapping; None where that is not known.
 

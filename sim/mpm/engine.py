@@ -254,7 +254,11 @@ class Engine:
         keys = np.concatenate(all_keys)
         # Fields one after the other, whenever they started.
         order = np.argsort(keys >> 48, kind="stable")
-        self._upload({name: np.concatenate(parts[name])[order] for name in self._names}, keys[order])
+        # One after the other: all at once would take as much again as the particles.
+        del state
+        for name in self._names:
+            self._put(name, np.concatenate(parts.pop(name))[order])
+        self._begin(keys[order])
 
     def expect(self, world: int, *, speed: float = 0.0, wave_speed: float = 0.0) -> None:
         """Let the next substep of ``world`` be stable for particles and waves of these speeds, cells/s."""
@@ -281,16 +285,23 @@ class Engine:
         return state
 
     def _upload(self, state: Mapping[str, NDArray[np.generic]], keys: NDArray[np.int64]) -> None:
-        n = len(keys)
         for name in self._names:
-            array = self._particles[0][name]
-            host = array.to_numpy()
-            host[:n] = state[name]
-            array.from_numpy(host)
+            self._put(name, state[name])
+        self._begin(keys)
+
+    def _put(self, name: str, values: NDArray[np.generic]) -> None:
+        """Let the first particles have these ``values`` in the array ``name``."""
+        array = self._particles[0][name]
+        host = array.to_numpy()
+        host[: len(values)] = values
+        array.from_numpy(host)
+
+    def _begin(self, keys: NDArray[np.int64]) -> None:
+        """Go on with the particles that were put, whose blocks these ``keys`` name."""
         host = self._keys.to_numpy()
-        host[:n] = keys
+        host[: len(keys)] = keys
         self._keys.from_numpy(host)
-        self.count = n
+        self.count = len(keys)
         self._group()
 
     def state(self) -> State:

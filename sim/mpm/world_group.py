@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..constitutive import DeformableMaterial
 from ..errors import Cancelled, InputError, SimulationError
 from ..events import IsCancelled, never
+from ..memory import return_freed_memory
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import packing
 from .colliders import SAME_TIME, Track
@@ -251,9 +252,15 @@ class WorldGroup:
                         fresh.append(packing.particles(place, i, int(self._offsets[first + i]), choice))
             until[world] = now + max(rest, LEAST_WATCH)
         if fresh:
-            self._engine.add(fresh)
-            self._host = None
+            self._add(fresh)
         return until
+
+    def _add(self, fresh: list[tuple[packing.NewParticles, float]]) -> None:
+        """Let the engine have these particles, see ``packing.particles``; takes them out of the list."""
+        self._engine.add(fresh)
+        self._host = None
+        fresh.clear()
+        return_freed_memory()
 
     def _moving_matter(self, place: packing.WorldSlot, speed: float) -> tuple[dict[int, Array], float]:
         """Particles (N, 3) in world metres of the world's bodies that have started, by index, and the speed in m/s of
@@ -297,8 +304,7 @@ class WorldGroup:
                         choice = self._material_choice(place, i, now)
                         fresh.append(packing.particles(place, i, int(self._offsets[number]), choice))
         if fresh:
-            self._engine.add(fresh)
-            self._host = None
+            self._add(fresh)
         for place in moved:
             now, then = float(self._times[place.world]) + SAME_TIME, float(before[place.world]) + SAME_TIME
             for i, body in enumerate(place.setup.bodies):

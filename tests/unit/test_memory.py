@@ -2,6 +2,7 @@
 """Memory: what there is, on each system; estimates that refuse before a stage begins; what its lack leaves behind."""
 
 import contextlib
+import ctypes
 import os
 import re
 import resource
@@ -27,6 +28,33 @@ MIB = 2**20
 def test_available_memory_is_plausible_here():
     found = available_memory()
     assert found is None or 2**26 < found < 2**46
+
+
+KEPT = """
+import numpy as np
+from physgen.sim.memory import return_freed_memory
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1])
+
+before = resident()
+pieces = [np.ones(8000) for _ in range(2000)]
+last = np.ones(8000)  # in use, and behind all of them
+taken = resident()
+del pieces
+freed = resident()
+return_freed_memory()
+print(*(round((now - before) / (taken - before), 3) for now in (freed, resident())))
+"""
+
+
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux") or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="glibc"
+)
+def test_what_was_freed_between_pieces_in_use_goes_back_to_the_system():
+    done = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
+    kept, left = map(float, done.stdout.split())
+    assert kept > 0.9 and left < 0.1, (kept, left)
 
 
 def test_memory_on_linux_is_what_the_system_calls_available(tmp_path):
