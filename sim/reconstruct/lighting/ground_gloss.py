@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite import floor_reflection
-from ...composite.pull_push import spread_values
 from ...composite.srgb import bytes_to_linear, linear_to_bytes
 from ...scene.model import Camera, Ground
-from ..mesh_raster import Paint, colours, visible_pixels
 from ..shape.body_texture import TexturedSurface
+from .ground_roughness import DARKEST, LEVEL, VARNISH, MirrorImage, fitted_roughness, mirror_image, open_ground
 
 Mask = NDArray[np.bool_]
 Image = NDArray[np.float32]
@@ -31,16 +30,12 @@ Values = NDArray[np.float64]
 
 OBJECT_SIDE = 110
 """Largest size in pixels of the largest object in the picture that is compared."""
-ROUGHNESSES = (0.0, 0.05, 0.08, 0.11, 0.14, 0.18, 0.22)
-"""Candidates; beyond the last a mirror image is a haze."""
-VARNISH = 0.04
-"""Reflectivity of the candidates; the share that is found is measured in this one's."""
+ROUGHNESSES = (0.0, 0.06, 0.1, 0.14, 0.19, 0.25, 0.32)
+"""Roughnesses with which mirror images are looked for; ``ground_roughness`` then tells it finer."""
 WIDTHS = (0.5, 0.75, 1.0, 1.5, 2.0)
 """Widths of the mirror image by which it is moved aside, both ways, as controls."""
 SLACK = (-0.05, 0.0, 0.05)
 """Heights of the mirror image by which it may lie off: horizon and bodies are estimates."""
-LEVEL = 0.5
-"""Blur that tells the ground's level, over the smaller side of the mirror images."""
 LEAST_CORRELATION, MARGIN, FACTOR = 0.25, 0.15, 2.0
 """Correlation that a mirror image needs, by how much it exceeds the controls', and how many times these it is. Chosen
 with one glossy table in sight (0.56 against 0.19)."""
@@ -50,8 +45,6 @@ FEWEST = 150
 """Fewest pixels of an image that are compared."""
 MOST_DEVIATING = 3.0
 """Standard deviations beyond which a pixel counts as that far: glints and scratches."""
-DARKEST = 4e-3
-"""Linear light below which ratios are unreliable."""
 VISIBLE = 0.1
 """Coverage above which a pixel belongs to the mirror image."""
 
@@ -70,25 +63,6 @@ class GroundGloss:
     pixels: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, eq=False)
-class _Mirrored:
-    """One body in the ground, sharp: colour (h, w, 3) linear, alpha (h, w), sigma (h, w) pixels of blur at roughness 1,
-    slant of the view."""
-
-    colour: Image
-    alpha: Image
-    sigma: Image
-    slant: float
-
-    def blurred(self, roughness: float) -> Image:
-        """Colour and coverage (h, w, 4) in a ground of ``roughness``."""
-        one = np.ones_like(self.alpha)
-        layer = floor_reflection.mirrored_layer(
-            self.colour, self.alpha, self.sigma * np.float32(roughness**2), one, self.slant
-        )
-        return np.dstack([layer.colour, layer.alpha])
-
-
 def estimate_gloss(
     pixels: NDArray[np.uint8], covered: Mask, camera: Camera, surfaces: Sequence[TexturedSurface]
 ) -> GroundGloss:
@@ -99,7 +73,7 @@ def estimate_gloss(
     none = GroundGloss(0.0, Ground().reflection_roughness, 0.0, 0.0, (np.zeros_like(covered),) * len(surfaces), pixels)
     extents = [np.ptp(camera.project(s.vertices)[:, :2], axis=0).max() for s in surfaces]
     scale = min(1.0, OBJECT_SIDE / max(float(max(extents)), 1.0))
-    mirrored = [_mirror_image(camera, surface, scale) for surface in surfaces]
+    mirrored = [mirror_image(camera, surface, scale) for surface in surfaces]
     if not any(m.alpha.sum() >= FEWEST for m in mirrored):
         return none
     comparison = _Comparison(pixels, covered, camera, mirrored)
@@ -109,32 +83,16 @@ def estimate_gloss(
     by_chance = max(0.0, *(fit.correlation for fit in controls))
     enough = max(LEAST_CORRELATION, by_chance + MARGIN, FACTOR * by_chance)
     grazing = comparison.grazing
-    # A view taken for flatter than it is leaves less than Fresnel's share at that angle; far less is something else.
-    reflectivity = max((found.share - grazing) / max(1.0 - grazing, 1e-6), LEAST)
     if found.correlation < enough or found.share < MOST_OFF * grazing:
         return GroundGloss(0.0, none.roughness, found.correlation, by_chance, none.images, pixels)
-    gloss = Ground(reflectivity=min(reflectivity, 1.0), reflection_roughness=found.roughness)
-    images, bare = _without(pixels, covered, camera, gloss, [_mirror_image(camera, s, 1.0) for s in surfaces])
-    return GroundGloss(gloss.reflectivity, found.roughness, found.correlation, by_chance, images, bare)
-
-
-def _mirror_image(camera: Camera, surface: TexturedSurface, scale: float) -> _Mirrored:
-    ground = Ground(reflection_roughness=1.0)
-    below = floor_reflection.mirrored_camera(camera, ground)
-    width, height = size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    shown = visible_pixels(below, surface.vertices, surface.faces, scale)
-    at = below.project(surface.vertices)
-    at[:, :2] *= (width / camera.width, height / camera.height)
-    paint = Paint(texture=surface.picture, uv=surface.uv)
-    light = np.rint(colours(shown, at, surface.faces, paint)).clip(0, 255).astype(np.uint8)
-    colour, alpha = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
-    colour[shown.rows, shown.columns], alpha[shown.rows, shown.columns] = bytes_to_linear(light), 1.0
-    blur = floor_reflection.blur_sigma(below, ground, surface.vertices) * (height / camera.height)
-    sigma = spread_values(at[:, :2], at[:, 2], blur, size)
-    flipped = [np.ascontiguousarray(np.fliplr(image), dtype=np.float32) for image in (colour, alpha, sigma)]
-    _, cosine = floor_reflection.fresnel(camera, ground, size)
-    seen = flipped[1] > 0
-    return _Mirrored(flipped[0], flipped[1], flipped[2], float(cosine[seen].mean()) if seen.any() else 1.0)
+    # So small a picture hardly tells how sharp a mirror image is.
+    roughness = fitted_roughness(pixels, covered, camera, surfaces, found.roughness)
+    # A view taken for flatter than it is leaves less than Fresnel's share at that angle; far less is something else.
+    share = comparison.fit(roughness).share
+    reflectivity = min(max((share - grazing) / max(1.0 - grazing, 1e-6), LEAST), 1.0)
+    gloss = Ground(reflectivity=reflectivity, reflection_roughness=roughness)
+    images, bare = _without(pixels, covered, camera, gloss, [mirror_image(camera, s, 1.0) for s in surfaces])
+    return GroundGloss(reflectivity, roughness, found.correlation, by_chance, images, bare)
 
 
 @dataclass(frozen=True)
@@ -149,17 +107,13 @@ class _Fit:
 class _Comparison:
     """The photo's ground beside mirror images."""
 
-    def __init__(self, pixels: NDArray[np.uint8], covered: Mask, camera: Camera, mirrored: Sequence[_Mirrored]) -> None:
+    def __init__(
+        self, pixels: NDArray[np.uint8], covered: Mask, camera: Camera, mirrored: Sequence[MirrorImage]
+    ) -> None:
         height, width = mirrored[0].alpha.shape
         size = (width, height)
         light = cv2.resize(bytes_to_linear(pixels), size, interpolation=cv2.INTER_AREA)
-        # Pixels along an outline mix object and ground.
-        seam = max(1, round(0.7 * camera.width / width))
-        closed = cv2.dilate(covered.astype(np.uint8), np.ones((2 * seam + 1,) * 2, np.uint8)).astype(np.float32)
-        shares, cosine = floor_reflection.fresnel(camera, Ground(reflectivity=VARNISH), size)
-        self._known = ((cv2.resize(closed, size, interpolation=cv2.INTER_AREA) < 0.02) & (cosine > 0)).astype(
-            np.float32
-        )
+        self._known, shares = open_ground(covered, camera, size)
         self._boxes = [_extent(m.alpha) for m in mirrored]
         sides = [min(box) for box in self._boxes if min(box) > 1]
         self._sigma = max(3.0, LEVEL * min(sides, default=6))
@@ -172,7 +126,7 @@ class _Comparison:
         self._shares, self._mirrored = shares, mirrored
         inside = np.maximum.reduce([m.alpha for m in mirrored]) > 0
         self._mean_share = float(shares[inside].mean())
-        self.grazing = float(((1.0 - cosine[inside]) ** 5).mean())
+        self.grazing = max((self._mean_share - VARNISH) / (1.0 - VARNISH), 0.0)
         self._blurred: dict[float, list[Image]] = {}
 
     def fit(self, roughness: float, *, aside: float = 0.0, turned: bool = False) -> _Fit:
@@ -229,7 +183,7 @@ def _extent(alpha: Image) -> tuple[int, int]:
 
 
 def _without(
-    pixels: NDArray[np.uint8], covered: Mask, camera: Camera, ground: Ground, mirrored: Sequence[_Mirrored]
+    pixels: NDArray[np.uint8], covered: Mask, camera: Camera, ground: Ground, mirrored: Sequence[MirrorImage]
 ) -> tuple[tuple[Mask, ...], NDArray[np.uint8]]:
     """Where each mirror image is seen, and the photo without them."""
     height, width = pixels.shape[:2]
