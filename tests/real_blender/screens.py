@@ -140,10 +140,10 @@ def widen(area: bpy.types.Area, width: int) -> Generator[float, None, None]:
     if shutil.which("xdotool") is None:
         return
     lost = 0
-    for _ in range(3):
+    for attempt in range(3):
         yield from _drag_edge(area, width + lost)
         missing = width - region(area, "UI").width
-        if abs(missing) <= 1:
+        if abs(missing) <= 2 or attempt == 2:
             return
         # What the mouse moves before Blender takes it for a drag is lost; so is a short drag, as a whole.
         lost += missing
