@@ -215,7 +215,12 @@ def _cast(
     """The objects' shadows, the same with their penumbras and where one may have been missed, and unboxed things."""
     things = unboxed_things(pixels, seen, view)
     if things.count:
-        notice(f"{things.count} things on the ground near the objects have no box: they stay in the photo")
+        what = (
+            "1 thing on the ground near the objects has no box: it stays"
+            if things.count == 1
+            else (f"{things.count} things on the ground near the objects have no box: they stay")
+        )
+        notice(f"{what} in the photo")
     rest = {"stay": things.stay, "whole": things.whole}
     if threshold is not None:
         shadows = np.stack(threshold_shadows(pixels, seen, threshold)) & ~things.stay

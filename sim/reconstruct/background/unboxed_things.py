@@ -30,7 +30,9 @@ OBJECT_SIDE, MOST_PIXELS = 48.0, 250_000
 """Size in pixels of the object in the copy in which things are looked for; largest size of that copy."""
 AROUND, FARTHER = 1.8, 3.2
 """Range in which they are looked for, over the object's longer side; and where something reaches its border."""
-NECK = 0.75
+LONGEST_FAR = 2.5
+"""Length over width of a thing that reaches beyond ``AROUND``."""
+NECK = 0.5
 """Width of a neck between two things that touch, over that of the narrower, below which they are two."""
 APART = 3.5
 """Difference from the ground's smooth colour, over the spread of the ground."""
@@ -92,11 +94,17 @@ def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: C
         farther = _look(pixels, mask, objects, camera, FARTHER)
         near = np.zeros_like(mask)
         near[found.window] = True
-        found.things += [item for item in farther.things if (item[0] & near).any()]
+        found.things += [item for item in farther.things if (item[0] & near).any() and _is_compact(item[0])]
     for thing, behind in found.things:
         stay |= thing
         if not behind:
             whole |= thing
+
+
+def _is_compact(thing: Mask) -> bool:
+    """Whether ``thing`` (H, W) is no strip, such as a streak of light on a table, which goes on behind an object."""
+    _, sides, _ = cv2.minAreaRect(np.argwhere(thing)[:, ::-1].astype(np.int32))
+    return max(sides) <= LONGEST_FAR * max(min(sides), 1.0)
 
 
 @dataclass
