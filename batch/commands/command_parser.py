@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parser of ``physgen``: commands in groups, one short usage line, an error in two lines."""
+"""The parser of ``physgen``: commands in groups, one short usage line, errors without the list of flags."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class CommandParser(argparse.ArgumentParser):
             self.usage = given
 
     def error(self, message: str) -> NoReturn:
-        """Exit with code 2: the usage, what is wrong, and where the flags are listed."""
-        text = f"{self.format_usage()}{self.prog}: error: {message}\nall options: {self.prog} --help\n"
+        """Exit with code 2: the usage, where flags are listed, and last what is wrong: farms record the last line."""
+        text = f"{self.format_usage()}all options: {self.prog} --help\n{self.prog}: error: {message}\n"
         self.exit(2, text)
 
 

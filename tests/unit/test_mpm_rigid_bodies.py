@@ -88,7 +88,7 @@ def test_colliders_do_not_meet_each_other_and_worlds_have_their_own_pairs():
     one = WorldSetup(bodies=(cube(),), ground=Ground(), colliders=(collider("a"), collider("b")))
     world = rigid_bodies(one, one)
     spans = world.arrays["world_spans"].to_numpy().reshape(-1, at.SPANS)
-    assert spans.tolist() == [[0, 3, 0, 5], [3, 6, 5, 10]]
+    assert spans.tolist() == [[0, 3, 0, 5, 1, -1], [3, 6, 5, 10, 4, -1]]
     pairs = world.arrays["pairs"].to_numpy().reshape(-1, at.PAIRS)
     assert pairs[5:, :2].tolist() == [[3, -1], [3, 4], [4, 3], [3, 5], [5, 3]]
 

@@ -65,9 +65,7 @@ POINT = 12
 """Stride: ``collision_shapes.PATCH`` numbers and 1 where the surface is smooth, 0 at edges and corners."""
 
 # ---- per world: ``world_spans`` i32, ``world_numbers`` f64, ``world_report`` f64 ------------------------------------
-SPANS = (
-    6  # first body, end of bodies, first pair, end of pairs, end of what is no collider, its place in ``systems`` or -1
-)
+SPANS = 6  # first body, end of bodies, first pair, end of pairs, first collider, start in ``systems`` or -1
 WORLD = 16
 GRAVITY = 0  # (3)
 PLANE = 3  # two tangents and the normal of the plane (9)

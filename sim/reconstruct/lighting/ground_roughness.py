@@ -36,7 +36,7 @@ DARKEST = 4e-3
 LEVEL = 0.5
 """Blur that tells the ground's level, over the smaller side of the mirror images."""
 FIT_SIDE = 240
-"""Largest size in pixels of the largest object in the picture in which blur is told."""
+"""Size in pixels of the largest object in the picture on which blur is measured, at most."""
 SMOOTHEST, ROUGHEST, CANDIDATES = 0.02, 0.4, 9
 """Range of roughness, and how many are tried before the best is refined. Below, the blur is less than a pixel of most
 photos; beyond, a mirror image is a haze."""
