@@ -11,6 +11,7 @@ from ..preview.live_preview import PHYSGEN_OT_toggle_preview
 from ..props.body_props import is_body
 from ..props.preferences import PIE
 from ..text import count
+from .asset_ops import PHYSGEN_OT_open_sample
 from .bake_ops import PHYSGEN_OT_bake, PHYSGEN_OT_free_bake
 from .body_ops import (
     OfSelected,
@@ -23,7 +24,6 @@ from .body_ops import (
 )
 from .compose_ops import PHYSGEN_OT_compose_objects
 from .photo_ops import PHYSGEN_OT_open_photo
-from .sample_ops import PHYSGEN_OT_open_sample
 
 KEY = {"type": "P", "value": "PRESS", "shift": True}
 """Of the pie menu, in Object Mode, where Blender uses it for nothing."""

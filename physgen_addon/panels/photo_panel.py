@@ -14,8 +14,8 @@ from ...sim.reconstruct.models.model_folder import model_status
 from .. import text
 from ..context import TAB
 from ..interpreter import photo_check
+from ..operators.install_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
 from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
-from ..operators.model_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
 from ..operators.photo_object_ops import (
     PHYSGEN_OT_clear_strokes,
     PHYSGEN_OT_draw_strokes,

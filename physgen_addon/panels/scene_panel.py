@@ -9,12 +9,12 @@ import bpy
 
 from .. import bake_state, blend_trust, text
 from ..background_jobs import PHYSGEN_OT_cancel_job, running
+from ..operators.asset_ops import PHYSGEN_OT_open_sample
 from ..operators.bake_ops import PHYSGEN_OT_pause_bake
 from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
 from ..operators.photo_object_ops import PHYSGEN_OT_show_cutouts
 from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, image_here
-from ..operators.sample_ops import PHYSGEN_OT_open_sample
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo

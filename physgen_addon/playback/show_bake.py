@@ -16,7 +16,7 @@ from ...sim.errors import InputError
 from .. import paths
 from ..props.body_props import bodies
 from ..scene_io.export_animation import export_names
-from . import particles, point_caches, splats, torn_skins
+from . import particles, point_caches, splats
 from .bake_record import GRAINS, MESH, SURFACE, BakeRecord, Look, manifest_of, playable, spacing
 
 
@@ -161,7 +161,7 @@ def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObj
         seen = record.path / baked.splats_file
         splats.play(item, Pc2Reader(seen), paths.stored(seen), record.frame_start)
     if baked.torn_file is not None and splats.find(item) is None:
-        torn_skins.show(scene, item, baked, record)
+        particles.show_torn_skin(scene, item, baked, record)
         return
     # Splats show granular and fluid objects themselves.
     if look.shape == MESH or baked.points_file is None or splats.find(item) is not None:

@@ -28,8 +28,7 @@ from .clean_plate import CameraMotion, CleanPlate, PlateView, make_relief
 from .image_finish import ImageFinish
 from .lighting import GroundShadow, reflections
 from .motion_blur import Moment
-from .photo_grains import FADING_S, GROWN_S, PhotoGrains
-from .photo_torn import add_torn_skin
+from .photo_grains import FADING_S, GROWN_S, PhotoGrains, add_torn_skin
 from .render_options import RenderOptions
 from .render_regions import Box, ground_depth, object_box
 from .render_scene import BlenderScene, aim, build, everything, remove

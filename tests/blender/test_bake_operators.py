@@ -15,7 +15,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from mathutils import Matrix
-from physgen.physgen_addon import background_jobs, bake_state, cache_bar, paths
+from physgen.physgen_addon import background_jobs, bake_state, overlays, paths
 from physgen.physgen_addon import bake_state as unsaved
 from physgen.physgen_addon.bake_state import BakeState
 from physgen.physgen_addon.operators.bake_ops import Bake
@@ -298,14 +298,14 @@ def test_each_bake_is_listed_and_freed_by_itself(file):
 
 
 def test_the_timeline_shows_which_frames_are_cached(file):
-    (span,) = cache_bar.spans(bake_state.state(scene()))
-    assert span[:2] == (START - 0.5, START + FRAMES - 0.5) and span[2] == cache_bar.COLOURS["baked"]
+    (span,) = overlays.cached_spans(bake_state.state(scene()))
+    assert span[:2] == (START - 0.5, START + FRAMES - 0.5) and span[2] == overlays.BAR_COLOURS["baked"]
     bpy.data.objects["Cube"].physgen.material.density *= 2
-    (span,) = cache_bar.spans(bake_state.observe(scene()))
-    assert span[2] == cache_bar.COLOURS["stale"]
+    (span,) = overlays.cached_spans(bake_state.observe(scene()))
+    assert span[2] == overlays.BAR_COLOURS["stale"]
     half = BakeState("paused", 2, 6, frame_start=10)
-    assert [part[:2] for part in cache_bar.spans(half)] == [(9.5, 11.5), (11.5, 15.5)]
-    assert cache_bar.spans(None) == [] == cache_bar.spans(BakeState("none", 0, 6))
+    assert [part[:2] for part in overlays.cached_spans(half)] == [(9.5, 11.5), (11.5, 15.5)]
+    assert overlays.cached_spans(None) == [] == overlays.cached_spans(BakeState("none", 0, 6))
 
 
 def test_a_first_bake_ends_playback_unless_an_animation_goes_on(baked, file):

@@ -9,7 +9,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import paths
-from physgen.physgen_addon.operators import photo_ops, quick_ops, sample_ops
+from physgen.physgen_addon.operators import asset_ops, photo_ops, quick_ops
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
@@ -69,7 +69,7 @@ def test_the_photo_sample_needs_nothing_but_reconstruct(tmp_path):
     assert bpy.ops.physgen.reconstruct.poll()
     assert [box.preset for box in state.boxes] == ["jelly"]
     # A copy that the user has changed is the user's.
-    assert (tmp_path / "samples" / "coffee.jpg").read_bytes() == (sample_ops.DEMO / "coffee.jpg").read_bytes()
+    assert (tmp_path / "samples" / "coffee.jpg").read_bytes() == (asset_ops.DEMO / "coffee.jpg").read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import dataclasses
 import bpy
 import numpy as np
 import pytest
-from physgen.physgen_addon.playback import particles, torn_skins
+from physgen.physgen_addon.playback import particles
 from physgen.physgen_addon.playback.bake_record import BakeRecord
 from physgen.physgen_addon.playback.point_caches import open_bake
 from physgen.physgen_addon.render.render_options import RenderOptions
@@ -70,14 +70,14 @@ def torn_bake(ball_scene, tmp_path):
 
 def test_the_torn_skin_plays_by_native_modifiers_alone(torn_bake):
     _, bake, mesh = torn_bake
-    data = torn_skins.new_mesh("ball0", mesh.vertices, mesh.faces)
+    data = particles.new_mesh("ball0", mesh.vertices, mesh.faces)
     flat = mesh.vertices[mesh.faces].reshape(-1, 3)[:, :2].astype(np.float32)
     data.uv_layers.new(name="UV").data.foreach_set("uv", flat.ravel())
     body = bpy.data.objects.new("ball0", data)
     bpy.context.collection.objects.link(body)
     baked = bake.manifest.objects[0]
     record = BakeRecord(folder=str(bake.root))
-    torn_skins.show(bpy.context.scene, body, baked, record)
+    particles.show_torn_skin(bpy.context.scene, body, baked, record)
     item = particles.find(bpy.context.scene, "ball0")
     uv = np.empty(2 * len(item.data.loops), dtype=np.float32)
     item.data.uv_layers["UV"].data.foreach_get("uv", uv)

@@ -339,7 +339,7 @@ def dropped():
     yield from home()
     folder = OUT / "to drop"
     folder.mkdir()
-    samples = Path(extension("physgen_addon.operators.sample_ops").DEMO)
+    samples = Path(extension("physgen_addon.operators.asset_ops").DEMO)
     shutil.copyfile(samples / "coffee.jpg", folder / "coffee.jpg")
     before = set(screens.window().screen.areas)
     view = screens.viewport()
