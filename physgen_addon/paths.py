@@ -14,7 +14,7 @@ import bpy
 
 from ..sim.cache.bake_folder import load_manifest
 from ..sim.errors import InputError
-from ..sim.scene.object_names import DEVICES
+from ..sim.validation import DEVICES
 from . import blend_trust
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Atomic writes: files and folders are written under a temporary name and take their place in one step at the end.
 
-A temporary name holds the mark of its process (``sim/process_identity.py``): ``.NAME.partial-MARK.SUFFIX`` of what is
+A temporary name holds the mark of its process (``sim/processes.py``): ``.NAME.partial-MARK.SUFFIX`` of what is
 being written, ``.NAME.old-MARK`` of a folder that is being replaced where it cannot be exchanged. ``recover`` puts back
 or removes what dead processes left, and nothing else.
 """
@@ -26,7 +26,7 @@ from typing import Any
 
 from .errors import InputError
 from .files import to_disk
-from .process_identity import MARK, Mark, own_mark, parse_mark
+from .processes import MARK, Mark, own_mark, parse_mark
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
 """Seconds between attempts: Windows refuses to replace a file that another process is reading."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Field checks, and JSON to dataclasses and back, with errors that name the field, value and remedy.
+"""Field checks, JSON to dataclasses and back, plain YAML, names, with errors that name the field, value and remedy.
 
 Only the types that the project's own formats use are supported: nested dataclasses, tuples, optional values, strings,
-paths, numbers and booleans. Unknown keys are rejected, so that a misspelt field is never silently ignored.
+paths, numbers and booleans. Unknown keys are rejected, so that a misspelt field is never silently ignored. YAML is that
+of other programs: plain values only, of bounded size. Names are those that scenes and every file system accept.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import json
 import math
 import types
 import typing
+import unicodedata
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -194,3 +197,110 @@ def to_json(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [to_json(item) for item in value]
     return value.as_posix() if isinstance(value, Path) else value
+
+
+MAX_YAML_BYTES = 64 * 2**10
+"""Larger files are refused unread: the settings of a simulation are a few kilobytes, and the parser is slow."""
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the content of the YAML file ``path``: dicts, lists, strings, numbers, booleans, None.
+
+    Aliases are refused, because a few lines of them can expand to billions of values; so are tags of Python objects.
+    Raises InputError, also where PyYAML is missing.
+    """
+    # Late: Blender's own Python, which lists folders with this package, lacks it.
+    try:
+        import yaml
+    except ModuleNotFoundError:
+        raise InputError(f"{path}: reading YAML needs the Python package PyYAML; run `make setup`") from None
+
+    class PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise InputError(f"{path}: has an alias (*{self.peek_event().anchor}); write out the value")
+            return super().compose_node(parent, index)
+
+    try:
+        text = read_bytes(path, MAX_YAML_BYTES, what="file of settings").decode("utf-8-sig")
+        return yaml.load(text, Loader=PlainLoader)  # noqa: S506 - a SafeLoader
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    # ValueError: impossible dates and numbers such as 2001-99-99; not UTF-8.
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, RecursionError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not readable as YAML ({words})") from None
+
+
+def checked_number(value: Any, where: str, low: float, high: float) -> float:
+    """Return ``value`` as a float from ``low`` to ``high``. Raises InputError, naming ``where``, for anything else.
+
+    Numeric strings are accepted, because PyYAML reads ``5.0e4``, whose exponent has no sign, as a string.
+    """
+    result = math.nan
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        try:
+            result = float(value)
+        except (ValueError, OverflowError):
+            result = math.nan
+    if not low <= result <= high:
+        raise InputError(f"{where} is {_brief(value)}: expected a number from {low:g} to {high:g}")
+    return result
+
+
+def checked_numbers(value: Any, count: int, where: str, limit: float = 1e9) -> tuple[float, ...]:
+    """Return ``value`` as ``count`` floats within ±``limit``. Raises InputError for anything else."""
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"{where} is {_brief(value)}: expected a list of {count} numbers")
+    return tuple(checked_number(entry, f"{where}[{i}]", -limit, limit) for i, entry in enumerate(value))
+
+
+GROUND = "ground"
+"""Name of the ground in ``contacts`` and overrides; no object may have it."""
+
+MAX_NAME_CHARACTERS = 64
+MAX_NAME_BYTES = 120
+"""In UTF-8; file names have at most 255 bytes, and suffixes are added."""
+
+DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+"""File names, in lower case, that Windows reserves for devices."""
+
+
+def valid_names(wanted: Sequence[str]) -> list[str]:
+    """Return unique valid object names in the order of ``wanted``, changed as little as possible.
+
+    A name that is valid and not taken by an earlier equal one stays unchanged.
+    """
+    cleaned = [_cleaned(name) for name in wanted]
+    order = sorted(range(len(wanted)), key=lambda i: (cleaned[i] != wanted[i], wanted[i]))
+    found = list(cleaned)
+    taken: set[str] = set()
+    for index in order:
+        found[index] = _unique(cleaned[index], taken)
+        taken.add(found[index].casefold())
+    return found
+
+
+def _cleaned(name: str) -> str:
+    composed = unicodedata.normalize("NFC", name)
+    allowed = "".join(c if c.isalnum() or c in "_- " else "_" for c in composed).strip()
+    cut = _cut(allowed, 0) or "object"
+    return f"{cut}_" if cut.casefold() in DEVICES | {GROUND} else cut
+
+
+def _cut(name: str, reserve: int) -> str:
+    """Return the longest prefix of ``name`` within the limits, with ``reserve`` characters to spare."""
+    name = name[: MAX_NAME_CHARACTERS - reserve]
+    while len(name.encode()) > MAX_NAME_BYTES - reserve:
+        name = name[:-1]
+    return name.strip()
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    result, number = name, 2
+    while result.casefold() in taken:
+        ending = f"_{number}"
+        result, number = _cut(name, len(ending)) + ending, number + 1
+    return result

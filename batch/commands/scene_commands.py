@@ -15,7 +15,7 @@ from ...sim.errors import InputError
 from ...sim.events import IsCancelled
 from ...sim.files import is_file
 from ...sim.scene.folder import SCENE_FILE, Scene, load_scene
-from ...sim.scene.scene_sums import check_scene
+from ...sim.scene.scene_output import check_scene
 from .. import stages
 from ..terminal import Terminal
 from .flags import add_anyway_flag, add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options

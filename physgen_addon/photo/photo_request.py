@@ -12,8 +12,7 @@ import bpy
 from ...sim.errors import InputError
 from ...sim.scene.folder import SCENE_FILE
 from ...sim.scene.model import Camera
-from ...sim.scene.object_names import valid_names
-from ...sim.validation import read_json
+from ...sim.validation import read_json, valid_names
 from .. import blend_trust
 from ..paths import folder_beside, require_folder
 from . import photo_maths

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ...sim.errors import InputError
 from ...sim.scene.camera_path import ZOOM_RANGE, CameraPath, PoseKey, camera_with_pose, is_still
 from ...sim.scene.model import Camera, Key, Keys, Motion
-from ...sim.scene.object_names import valid_names
 from ...sim.scene.scene_object import Matrix4
+from ...sim.validation import valid_names
 from ..props.body_props import bodies
 from ..text import decimal
 

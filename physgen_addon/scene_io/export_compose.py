@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ...sim.errors import InputError
 from ...sim.scene.folder import Scene, inside, load_scene, save_scene
 from ...sim.scene.model import Ground, SceneModel, SceneObject
-from ...sim.scene.object_names import valid_names
 from ...sim.scene.textured_mesh import read_textured_mesh, write_moved_mesh
+from ...sim.validation import valid_names
 from ..paths import require_folder
 from ..props.body_props import is_body
 from . import export_world

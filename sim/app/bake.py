@@ -36,7 +36,7 @@ from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError, Simulat
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..scene.folder import Scene, inside
 from ..scene.meshes import load_object_mesh
-from ..scene.scene_sums import changed_files
+from ..scene.scene_output import changed_files
 from ..version import VERSION
 from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
 from .bake_estimate import disk_bytes, require_disk_space

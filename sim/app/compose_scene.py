@@ -33,9 +33,9 @@ from ..gaussians.splats import Splats, joined, transform_splats
 from ..memory import COMPOSITION_RESERVED, available_memory, composition_bytes, require_memory
 from ..mpm.colliders import Surface
 from ..mpm.geometry.triangles import face_normals
-from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, inside, referenced_files, save_scene
 from ..scene.model import SceneModel, SceneObject
+from ..scene.scene_output import replacing_folder
 from ..scene.textured_mesh import moved_suffix, transformed, write_moved_mesh
 from ..version import VERSION
 from .compose_inputs import (

@@ -26,10 +26,10 @@ from ..gaussians.views.posed_images import BACKGROUND, FOREGROUND, View, mask_fo
 from ..gaussians.views.view_files import LAYOUTS, read_view_grid, read_views
 from ..gaussians.views.visual_hull import visual_hull
 from ..mpm.colliders import Surface
-from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, save_scene
 from ..scene.model import Ground, SceneModel, SceneObject
-from ..scene.object_names import valid_names
+from ..scene.scene_output import replacing_folder
+from ..validation import valid_names
 
 FOLDER_LAYOUT = "transforms"
 VIEW_LAYOUTS = (FOLDER_LAYOUT, *LAYOUTS)

@@ -23,12 +23,12 @@ from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.adapters.adapter_registry import chosen_segmenter, spec_files
 from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.reasoning.chat_client import ChatRequest
-from ..reconstruct.scene_output import PHYSICS_FILE
 from ..scene.environment import read_environment
 from ..scene.folder import Scene, file_hash, load_scene, parse_scene, save_scene, scene_to_json
 from ..scene.material import load_preset
 from ..scene.model import Ground, SceneModel, Vector
 from ..scene.overrides import PHYSICS_FIELDS, apply_overrides, without_physics
+from ..scene.scene_output import PHYSICS_FILE
 from ..trust import trusted_spec
 from ..validation import read_json, to_json
 from .reconstruct_record import STAMP_FILE, Request, read_stamp, require_stamp, stamp_to_json

@@ -19,10 +19,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import Empty, Queue
 
-from ..children import note_child
 from ..errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ..events import Event, IsCancelled, OnEvent
 from ..memory import how_it_was_killed, memory_kills
+from ..processes import note_child
 
 CANCEL_GRACE_S = 1.0
 """Time for a stage to clean up before it is killed: a command ends within two seconds of being asked to

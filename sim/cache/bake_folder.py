@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..errors import InputError
-from ..process_identity import is_running
+from ..processes import is_running
 from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 from ..version import VERSION

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..process_identity import UNKNOWN_START, Mark, own_mark, parse_mark
+from ..processes import UNKNOWN_START, Mark, own_mark, parse_mark
 
 LOCK_FILE = ".lock"
 MOST_BYTES = 4096

@@ -6,7 +6,7 @@ physgen3d_scene.py  the same as a scene folder
 physgen.py      folders of PhysGen, as they are and as a scene folder
 splat_scene.py  splat files as a scene folder
 masks.py        masks in any supported form; image_masks.py images and arrays (SAM), coco_masks.py JSON (COCO)
-yaml_fields.py  YAML of bounded size and checked numbers"""
+"""
 
 SPLAT_UP_AXES = ("x", "y", "z", "x-down", "y-down", "z-down")
 """Up axes of splat files; with ``-down``, their down axes. Here, because every command line names them."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..scene.object_names import valid_names
+from ..validation import valid_names
 from .coco_masks import masks_from_json
 from .image_masks import FileMask, masks_from_array_file, masks_from_folder, masks_from_image
 

@@ -35,15 +35,14 @@ from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.photo import load_photo
-from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, inside, load_scene, save_scene
 from ..scene.material import Material
 from ..scene.meshes import load_object_mesh
 from ..scene.model import SceneModel, SceneObject, Vector
-from ..scene.object_names import GROUND, valid_names
 from ..scene.scene_object import Contact
+from ..scene.scene_output import replacing_folder
+from ..validation import GROUND, checked_number, checked_numbers, read_yaml, valid_names
 from .image_masks import read_grey_image
-from .yaml_fields import number, numbers, read_yaml
 
 SETTINGS, MASKS, PHOTO, BACKGROUND = "sim.yaml", "mask.png", "original.png", "inpaint.png"
 MAX_OBJECTS = 256
@@ -136,7 +135,7 @@ def _object(ident: int, entry: Any, values: NDArray[Any], velocity: tuple[float,
     if area == 0:
         raise InputError(f"{where}: {MASKS} has no pixel of that number; remove the entry or restore the image")
     if entry.get("mass") is not None:
-        mass = number(entry["mass"], f"{where}.mass", 1e-9, 1e12)
+        mass = checked_number(entry["mass"], f"{where}.mass", 1e-9, 1e12)
     else:
         mass = area * _optional(entry, "density", 1.0, 1e-9, 1e9, where)
     label = entry.get("label")
@@ -155,7 +154,10 @@ def _by_number(data: dict[Any, Any], key: str, path: Path) -> dict[int, tuple[fl
     entries = data.get(key) or {}
     if not isinstance(entries, dict):
         raise InputError(f"{path}: {key}: expected [x, y] by the objects' numbers")
-    return {_object_number(i, f"{path}: {key}"): numbers(v, 2, f"{path}: {key}[{i}]", 1e6) for i, v in entries.items()}
+    return {
+        _object_number(i, f"{path}: {key}"): checked_numbers(v, 2, f"{path}: {key}[{i}]", 1e6)
+        for i, v in entries.items()
+    }
 
 
 def _object_number(key: Any, where: str) -> int:
@@ -168,7 +170,7 @@ def _object_number(key: Any, where: str) -> int:
 
 def _optional(data: dict[Any, Any], key: str, usual: float, low: float, high: float, where: str) -> float:
     value = data.get(key)
-    return usual if value is None else number(value, f"{where}: {key}", low, high)
+    return usual if value is None else checked_number(value, f"{where}: {key}", low, high)
 
 
 def _required(root: Path, name: str) -> Path:

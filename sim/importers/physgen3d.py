@@ -37,8 +37,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..scene.folder import inside
-from ..validation import read_json
-from .yaml_fields import number, numbers, read_yaml
+from ..validation import checked_number, checked_numbers, read_json, read_yaml
 
 TRANSFORM_FILE = "transform.json"
 PHOTO, BACKGROUND = "raw_image.jpg", "inpaint/inpainted_all.jpg"
@@ -309,7 +308,7 @@ def read_settings(path: Path) -> Physgen3dSettings:
     given = {key: value for key, value in data.items() if value is not None}
 
     def optional(key: str, low: float, high: float) -> float | None:
-        return number(given[key], f"{path}: {key}", low, high) if key in given else None
+        return checked_number(given[key], f"{path}: {key}", low, high) if key in given else None
 
     velocities, for_all = _velocities(given.get("velocities", []), path)
     pulled = given.get("pull_to_ground", True)
@@ -339,8 +338,8 @@ def _velocities(value: object, path: Path) -> tuple[tuple[tuple[float, ...], ...
     if not isinstance(value, list) or len(value) > MAX_OBJECTS:
         raise InputError(f"{where}: expected a list of [right, forward, down], one per object")
     if len(value) == 3 and not any(isinstance(entry, list) for entry in value):
-        return (numbers(value, 3, where, limit=1e4),), True
-    return tuple(numbers(entry, 3, f"{where}[{i}]", limit=1e4) for i, entry in enumerate(value)), False
+        return (checked_numbers(value, 3, where, limit=1e4),), True
+    return tuple(checked_numbers(entry, 3, f"{where}[{i}]", limit=1e4) for i, entry in enumerate(value)), False
 
 
 def camera_velocity(velocity: tuple[float, ...], normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,12 +23,12 @@ from trimesh.visual.material import PBRMaterial
 from ..errors import InputError
 from ..events import OnEvent, ignore
 from ..reconstruct.photo import load_photo
-from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, load_scene, save_scene
 from ..scene.material import Material, load_preset
 from ..scene.meshes import read_mesh
 from ..scene.model import Camera, Ground, Matrix4, SceneModel, SceneObject, Vector
-from ..scene.object_names import valid_names
+from ..scene.scene_output import replacing_folder
+from ..validation import valid_names
 from .image_masks import binary_mask, read_grey_image
 from .masks import resized_mask
 from .physgen3d import (

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..children import note_child
 from ..errors import InputError
 from ..files import open_file
 from ..npz import read_npz
+from ..processes import note_child
 from ..validation import read_json
 from .recording_worker import BYTES_A_SECOND, SPARE_S
 from .recordings import RecordedTable

@@ -25,10 +25,10 @@ from ..errors import InputError
 from ..events import OnEvent, ignore
 from ..gaussians.splat_ply import read_splat_file, write_splats
 from ..gaussians.splats import Splats
-from ..reconstruct.scene_output import replacing_folder
 from ..scene.folder import Scene, load_scene, save_scene
 from ..scene.model import Camera, Matrix4, SceneModel, SceneObject
-from ..scene.object_names import valid_names
+from ..scene.scene_output import replacing_folder
+from ..validation import valid_names
 from . import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 
 Array = NDArray[np.float64]

@@ -25,6 +25,7 @@ from ..scene.equirectangular import Radiance
 from ..scene.folder import Scene, save_scene
 from ..scene.material import load_preset
 from ..scene.model import Camera, Ground, Light, SceneModel, SceneObject
+from ..scene.scene_output import PHYSICS_FILE, replacing_folder
 from ..trust import trusted_spec
 from .adapters.resolve import resolve
 from .appearance.appearance_estimate import ObjectAppearance, estimate_appearances
@@ -51,7 +52,6 @@ from .reasoning.material_names import shipped_names
 from .reasoning.material_query import query_materials
 from .reconstruct_options import ObjectRequest, ReconstructOptions, object_names
 from .reconstruction_report import REPORT_FILE, ReportData, write_report
-from .scene_output import PHYSICS_FILE, replacing_folder
 from .segmentation.object_masks import segment_objects
 from .segmentation.object_proposals import propose_boxes
 from .shape.body_texture import glb_bytes, world_from_gltf

@@ -15,8 +15,7 @@ from ..atomic import replacing
 from ..constitutive import RIGID, models
 from ..errors import InputError
 from ..files import read_toml
-from ..validation import finite, parse, quantity, require, require_quantities
-from .object_names import DEVICES
+from ..validation import DEVICES, finite, parse, quantity, require, require_quantities
 
 LAWS = (*(model.law for model in models()), RIGID)
 """Constitutive models by name, and RIGID."""

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..validation import finite, quantity, require, require_quantities
+from ..validation import GROUND, finite, quantity, require, require_quantities
 from .material import LAWS, Material
-from .object_names import GROUND
 from .scene_object import (
     CONTACT_MODES,
     IDENTITY4,

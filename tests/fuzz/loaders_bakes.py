@@ -32,7 +32,7 @@ from physgen.sim.reconstruct import stage_cache
 from physgen.sim.reconstruct.stage_cache import StageCache
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import ObjectMesh
-from physgen.sim.scene.scene_sums import SUMS_FILE, check_scene, write_scene_sums
+from physgen.sim.scene.scene_output import SUMS_FILE, check_scene, write_scene_sums
 
 
 def _splat_bake(folder: Path) -> None:

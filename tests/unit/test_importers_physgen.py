@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from physgen.batch.cli import main
 from physgen.sim.errors import InputError
 from physgen.sim.importers.physgen import import_physgen, object_requests, read_physgen, with_motion
-from physgen.sim.importers.yaml_fields import MAX_YAML_BYTES, number, read_yaml
 from physgen.sim.reconstruct import ReconstructOptions
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.model import Camera, Ground, SceneModel, SceneObject
+from physgen.sim.validation import MAX_YAML_BYTES, checked_number, read_yaml
 from PIL import Image
 
 WIDTH, HEIGHT = 160, 120
@@ -242,10 +242,10 @@ def test_yaml_is_bounded(tmp_path):
 
 
 def test_numbers_as_people_write_them():
-    assert number("5.0e4", "x", 0, 1e6) == 5e4 and number(3, "x", 0, 9) == 3.0
+    assert checked_number("5.0e4", "x", 0, 1e6) == 5e4 and checked_number(3, "x", 0, 9) == 3.0
     for value in (True, None, "nan", float("nan"), "five", [], 10**400, "1e999"):
         with pytest.raises(InputError, match="x is"):
-            number(value, "x", 0, 9)
+            checked_number(value, "x", 0, 9)
 
 
 plain = st.recursive(

@@ -14,7 +14,7 @@ from physgen.batch.cli import main
 from physgen.sim import atomic
 from physgen.sim.cache.folder_lock import lock_beside
 from physgen.sim.errors import InputError
-from physgen.sim.process_identity import Mark, own_mark, parse_mark
+from physgen.sim.processes import Mark, own_mark, parse_mark
 from physgen.sim.scene.folder import load_scene
 
 HERE = Path(__file__).parent
@@ -80,7 +80,7 @@ def test_a_render_killed_at_any_call_goes_on_to_the_same_frames(tmp_path):
 @pytest.fixture
 def dead():
     """The mark of a process that has ended."""
-    command = "from physgen.sim.process_identity import own_mark; print(own_mark())"
+    command = "from physgen.sim.processes import own_mark; print(own_mark())"
     said = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True).stdout
     mark = parse_mark(said.strip())
     assert mark.is_here and mark.is_dead
@@ -90,7 +90,7 @@ def dead():
 @pytest.fixture
 def living():
     """The mark of a process that runs."""
-    command = "from physgen.sim.process_identity import own_mark; print(own_mark(), flush=True); input()"
+    command = "from physgen.sim.processes import own_mark; print(own_mark(), flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         mark = parse_mark(process.stdout.readline().decode().strip())
         assert mark.pid == process.pid and not mark.is_dead

@@ -16,8 +16,7 @@ from ....sim.effects.registry import effect
 from ....sim.errors import InputError
 from ....sim.scene.material import load_preset
 from ....sim.scene.model import Effect, Vector
-from ....sim.scene.object_names import DEVICES
-from ....sim.validation import parse
+from ....sim.validation import DEVICES, parse
 
 
 @dataclass(frozen=True, kw_only=True)

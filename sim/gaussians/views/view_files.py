@@ -26,8 +26,7 @@ from ...atomic import replacing
 from ...errors import InputError
 from ...scene.folder import inside
 from ...scene.model import Camera
-from ...scene.object_names import valid_names
-from ...validation import read_json
+from ...validation import read_json, valid_names
 from .posed_images import (
     Picture,
     PixelBudget,

@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ...atomic import scratch_prefix
-from ...children import note_child
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled
 from ...files import MAX_PICTURE_BYTES, open_file
 from ...memory import how_it_was_killed, memory_kills
 from ...npz import read_npy, read_npz
+from ...processes import note_child
 from ...scene.meshes import MAX_MESH_BYTES
 from .adapter_registry import CommandFile, program_python
 from .protocols import Depth, Mask, Pixels, checked_depth, checked_masks, checked_mesh, checked_pixels

@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Identity of a process: number, start and machine, so that a reused number does not match another process.
+"""Processes: the identity of one (number, start and machine), and those that this one has started.
 
-A ``Mark`` is written into names of temporary files and into locks. Whether its process still runs is known for this
-machine only; processes of another one never count as dead.
+A ``Mark`` is written into names of temporary files and into locks, so that a reused number does not match another
+process. Whether its process still runs is known for this machine only; processes of another one never count as dead.
+Started ones are noted for an exit that cannot wait for them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import re
+import signal
 import socket
+import subprocess
 import sys
+import weakref
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,3 +167,22 @@ def _started_on_windows(pid: int) -> str | None:
         return f"{times[0].value:x}" if good else UNKNOWN_START
     finally:
         kernel.CloseHandle(handle)
+
+
+_children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
+
+
+def note_child(process: subprocess.Popen[bytes]) -> None:
+    """Remember ``process``, the leader of its own session, until it has ended."""
+    _children.add(process)
+
+
+def kill_children() -> None:
+    """Kill all that run, with the processes that they started."""
+    for process in list(_children):
+        if process.returncode is None:
+            with contextlib.suppress(OSError):
+                if os.name == "nt":
+                    process.kill()
+                else:
+                    os.killpg(process.pid, signal.SIGKILL)
