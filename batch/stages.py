@@ -197,8 +197,8 @@ def _rehearse(
 
     What falls over in one only hops straight up in the next, and stays where it is if it falls over even so.
     """
+    from ..sim.app.clip_check import MOST_REHEARSALS, rehearsal_options, rehearsed
     from ..sim.app.default_motion import default_motion
-    from ..sim.app.rehearsal import MOST_REHEARSALS, rehearsal_options, rehearsed
 
     calm: set[str] = set()
     still: set[str] = set()

@@ -9,8 +9,7 @@ import bpy
 
 from ...sim.app.bake_options import BakeOptions, inputs_hash
 from ...sim.app.bake_worker import BakeJob, job_to_json
-from ...sim.app.stage_process import run_stage
-from ...sim.app.warm_stage import WarmStage
+from ...sim.app.stage_process import WarmStage, run_stage
 from ...sim.cache.bake_folder import free_bake, load_manifest
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent

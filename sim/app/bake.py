@@ -38,10 +38,19 @@ from ..scene.folder import Scene, inside
 from ..scene.meshes import load_object_mesh
 from ..scene.scene_output import changed_files
 from ..version import VERSION
-from .bake_checkpoint import Checkpoint, State, drop_checkpoint, resume, save_checkpoint
 from .bake_estimate import disk_bytes, require_disk_space
-from .bake_mending import BakeSums, Mendable, OtherSamples, find_mendable
 from .bake_options import BakeOptions, inputs_hash
+from .bake_resume import (
+    BakeSums,
+    Checkpoint,
+    Mendable,
+    OtherSamples,
+    State,
+    drop_checkpoint,
+    find_mendable,
+    resume,
+    save_checkpoint,
+)
 from .bake_samples import ObjectSampler, baked_objects, load_object_splats
 from .world_setup import prepare_world
 

@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Cost of a bake, without baking: the scene is sampled and checked as for the bake itself."""
+"""Before a bake, without running it: what it costs, and whether the scene's objects stay where they are.
+
+The scene is sampled and checked as for the bake itself; rest is judged by the engine's own rule.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..cache.bake_folder import BakedObject
 from ..errors import InputError
+from ..mpm.sleeping import Sleepers
+from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
+from ..scene.model import SceneModel
 from .bake_options import BakeOptions
 from .bake_samples import baked_objects, load_object_splats
 from .world_setup import PreparedWorld, prepare_world
@@ -90,3 +97,38 @@ def require_disk_space(out: Path, needed: int) -> None:
             f"{out}: the bake needs about {(needed + SPARE_BYTES) >> 20} MiB and {free >> 20} MiB are free; free "
             "space, bake fewer frames, or choose another disk"
         )
+
+
+STILL = (0.0, 0.0, 0.0)
+
+
+def at_rest(folder: Scene, notice: Callable[[str], None]) -> SceneModel:
+    """Return the model of ``folder`` in which whatever is said to be asleep stays where it is: what nothing carries is
+    held.
+
+    It is judged as a bake judges it (``sim/mpm/sleeping.py``), with the particles of the coarsest quality and before
+    anything is thrown: by what carries the object and where its centre of mass is. ``notice`` receives a sentence for
+    each object that is held. A scene that cannot be baked is returned as it is; the bake says why.
+    """
+    model = folder.model
+    calm = tuple(dataclasses.replace(item, velocity=STILL, spin=STILL) for item in model.objects)
+    scene = Scene(root=folder.root, model=dataclasses.replace(model, objects=calm))
+    try:
+        meshes = [load_object_mesh(scene, item) for item in calm]
+        prepared = prepare_world(scene, meshes, BakeOptions(frames=2, quality=COARSEST))
+    except InputError:
+        return model
+    sleepers = Sleepers(prepared.setup, prepared.solver.cell_size(prepared.similarity))
+    restless = {
+        body.name
+        for body, wants, sleeps in zip(prepared.setup.bodies, sleepers.wanting, sleepers.asleep, strict=True)
+        if wants and not sleeps
+    }
+    for name in sorted(restless):
+        notice(
+            f"{name}: nothing carries its centre of mass, as if it hung or leaned; it is held where the photo shows it "
+            f"until something touches it (--set {name}.held=false lets it go). If it stands by itself, check its mask "
+            "and the horizon, or give another shape or a larger thickness"
+        )
+    objects = tuple(dataclasses.replace(item, held=item.held or item.name in restless) for item in model.objects)
+    return dataclasses.replace(model, objects=objects)

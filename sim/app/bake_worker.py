@@ -5,8 +5,8 @@ The job file is ``{"format": "physgen-job/1", "use_case": "bake", "scene": …, 
 go to standard output as JSON lines; SIGTERM, or the parent's death, cancels.
 
 With ``--serve`` in place of the file it takes one job after the other as lines of standard input, so that imports and
-compiled kernels are there for the next one (``warm_stage.py``); the line ``cancel`` cancels. It ends when its input is
-closed, when it has had no job for some minutes, and after a job that has left it large.
+compiled kernels are there for the next one (``stage_process.py``); the line ``cancel`` cancels. It ends when its input
+is closed, when it has had no job for some minutes, and after a job that has left it large.
 """
 
 from __future__ import annotations

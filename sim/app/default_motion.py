@@ -4,7 +4,7 @@
 Reconstruction stays true to the photo, in which everything is at rest; this is asked for separately (``physgen run``
 does, without a velocity, spin, moving override or ``--still``). Paths are ballistic, as the engine's are until the
 first contact; what follows is bounded: bounces, and sliding by v² / (2 μ g) or rolling on. A coarse run of the engine
-(``rehearsal.py``) checks it where there is time for one. Nothing is drawn at random.
+(``clip_check.py``) checks it where there is time for one. Nothing is drawn at random.
 """
 
 from __future__ import annotations

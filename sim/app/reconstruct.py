@@ -140,7 +140,7 @@ def _reconstruct_cached(
     from ..reconstruct import reconstruct_photo
 
     # Imported here, because planning a farm's jobs must not pay for the engine's geometry.
-    from .rest_check import at_rest
+    from .bake_estimate import at_rest
 
     def stamped(folder: Scene) -> SceneModel:
         record = stamp_to_json(inputs_hash, request, scene_to_json(folder.model))

@@ -43,8 +43,7 @@ from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
 from .matter_maps import factors_of, nearest_on_surface
-from .world_separation import separate
-from .world_setup_checks import require_above_ground, resolve, surface_warnings, vertices_at
+from .world_setup_checks import require_above_ground, resolve, separate, surface_warnings, vertices_at
 
 
 def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:

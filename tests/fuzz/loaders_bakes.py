@@ -13,10 +13,10 @@ from loaders import BOX, PIXELS, RANDOM, add, put_bake, put_json, put_scene
 from physgen.physgen_addon.frames.frame_files import Part, read_layers, read_picture, write_exr, write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex, gather_frames
 from physgen.physgen_addon.playback.bake_record import read_record
-from physgen.sim.app import bake_checkpoint
-from physgen.sim.app.bake_mending import find_mendable
-from physgen.sim.app.bake_tearing import Tears
-from physgen.sim.app.pack_bake import pack_bake, unpack_bake
+from physgen.sim.app import bake_resume
+from physgen.sim.app.bake_resume import find_mendable
+from physgen.sim.app.bake_samples import Tears
+from physgen.sim.app.pack_bake import PackedCache, pack_bake, unpack_bake
 from physgen.sim.cache.bake_check import check_bake
 from physgen.sim.cache.bake_folder import (
     MATTER_FILES,
@@ -25,7 +25,6 @@ from physgen.sim.cache.bake_folder import (
     listed_files,
     load_bake,
 )
-from physgen.sim.cache.packed_cache import PackedCache
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.cache.torn_skins import TornSkin, read_torn_skin, write_torn_skin
 from physgen.sim.reconstruct import stage_cache
@@ -56,8 +55,8 @@ def _checkpoint(folder: Path) -> None:
     put_bake(folder)
     (folder / "checkpoints").mkdir(exist_ok=True)
     state = {"times": np.zeros(2), "positions": RANDOM.random((5, 3)), "flags": np.ones(5, bool)}
-    found = bake_checkpoint.Checkpoint(frames_done=2, metrics=[{"frame": 1}, {"frame": 2}], state=state)
-    bake_checkpoint.save_checkpoint(folder, "0" * 64, found)
+    found = bake_resume.Checkpoint(frames_done=2, metrics=[{"frame": 1}, {"frame": 2}], state=state)
+    bake_resume.save_checkpoint(folder, "0" * 64, found)
 
 
 class _World:
@@ -73,7 +72,7 @@ class _World:
 def _read_checkpoint(folder: Path) -> None:
     item = BakedObject(name="box", file="box.pc2", vertices=8)
     manifest = dataclasses.replace(load_bake(folder).manifest, objects=(item,))
-    bake_checkpoint.resume(folder, manifest, _World())
+    bake_resume.resume(folder, manifest, _World())
 
 
 def _stages(folder: Path) -> None:

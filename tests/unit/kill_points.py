@@ -33,7 +33,7 @@ from physgen.batch.farm.task_execution import execute_task
 from physgen.physgen_addon.frames.frame_files import write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex
 from physgen.sim import atomic
-from physgen.sim.app import rest_check  # noqa: F401 - before the fork
+from physgen.sim.app import bake_estimate  # noqa: F401 - before the fork
 from physgen.sim.app.diagnose import diagnose
 from physgen.sim.app.explain import explain
 from physgen.sim.app.pack_bake import pack_bake, unpack_bake

@@ -19,8 +19,8 @@ from physgen.physgen_addon.frames.frame_index import FrameIndex
 from physgen.physgen_addon.playback import bake_record
 from physgen.sim.app import bake as bake_module
 from physgen.sim.app.bake import bake
-from physgen.sim.app.bake_checkpoint import Checkpoint, resume, save_checkpoint
 from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.app.bake_resume import Checkpoint, resume, save_checkpoint
 from physgen.sim.cache.bake_check import check_bake, damage_of, require_intact
 from physgen.sim.cache.bake_folder import (
     CHECKPOINT_FILE,

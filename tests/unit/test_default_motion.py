@@ -12,9 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.commands import photo_commands
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
-from physgen.sim.app.clip_check import Clip, clip_notices
+from physgen.sim.app.clip_check import Clip, clip_notices, rehearsal_options, rehearsed
 from physgen.sim.app.default_motion import default_motion, tells_motion
-from physgen.sim.app.rehearsal import rehearsal_options, rehearsed
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.material import load_preset

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.app.pack_bake import PACKED_FILE, pack_bake, unpack_bake
+from physgen.sim.app.pack_bake import PACKED_FILE, PackedCache, pack_bake, unpack_bake
 from physgen.sim.cache.bake_check import check_bake
 from physgen.sim.cache.bake_folder import Bake, BakedObject, load_bake, save_manifest
-from physgen.sim.cache.packed_cache import PackedCache
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.errors import InputError
 

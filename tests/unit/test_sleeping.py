@@ -8,8 +8,8 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.app.bake_estimate import at_rest
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.app.rest_check import at_rest
 from physgen.sim.app.simulation import start_world
 from physgen.sim.app.world_setup import prepare_world
 from physgen.sim.constitutive import ElasticMaterial, RigidMaterial

@@ -10,8 +10,7 @@ import pytest
 from physgen.sim.app import stage_process
 from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.app.bake_worker import SERVE, BakeJob, job_to_json
-from physgen.sim.app.stage_process import own_command
-from physgen.sim.app.warm_stage import WarmStage
+from physgen.sim.app.stage_process import WarmStage, own_command
 from physgen.sim.cache.bake_folder import load_manifest
 from physgen.sim.errors import Cancelled, InputError, SimulationError
 
