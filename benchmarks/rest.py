@@ -34,7 +34,7 @@ from physgen.sim.app.world_setup import prepare_world
 from physgen.sim.errors import PhysGenError
 from physgen.sim.importers.mesh_scene import scene_from_meshes
 from physgen.sim.reconstruct import ObjectRequest
-from physgen.sim.reconstruct.shape.support import support_of
+from physgen.sim.reconstruct.shape.stability import support_of
 from physgen.sim.scene.bake_quality import quality_names
 from physgen.sim.scene.folder import SCENE_FILE, Scene, load_scene
 from physgen.sim.scene.material import load_preset, preset_names

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..reconstruct.adapters.onnx_session import open_session
+from ..reconstruct.adapters.onnx_adapter import open_session
 from .footage import Frame
 
 Flow = NDArray[np.float32]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.adapters import resolve
-from physgen.sim.reconstruct.adapters.lama_adapter import square_around
+from physgen.sim.reconstruct.adapters.onnx_adapter import square_around
 
 from .onnx_models import FLOAT, FLOAT16, constant, model
 

@@ -8,7 +8,7 @@ import pytest
 import skimage.data
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.sim.reconstruct.camera.alike_sizes import pitch_from_alike_sizes
+from physgen.sim.reconstruct.camera.camera_estimate import pitch_from_alike_sizes
 from physgen.sim.reconstruct.camera.ground_camera import focal_of_fov
 from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
 

@@ -8,7 +8,7 @@ from physgen.sim.mpm.colliders import Surface
 from physgen.sim.mpm.geometry.interior_sampling import sample_interior
 from physgen.sim.mpm.geometry.signed_distance import overlap, signed_distance
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
-from physgen.sim.reconstruct.shape.separation import PlacedBody, separate
+from physgen.sim.reconstruct.shape.object_placement import PlacedBody, separate
 
 VIEW = camera_above_ground(400, 300, 350.0, np.radians(25.0))
 SPACING = 0.03

@@ -25,7 +25,7 @@ from physgen.sim.reconstruct.adapters import resolve
 from physgen.sim.reconstruct.adapters.adapter_registry import chosen_segmenter, list_adapters
 from physgen.sim.reconstruct.models import known_models, model_folder
 from physgen.sim.reconstruct.models.known_models import PackagedModel
-from physgen.sim.reconstruct.models.model_archive import ArchiveReader
+from physgen.sim.reconstruct.models.model_folder import ArchiveReader
 from physgen.sim.scene.folder import load_scene
 from PIL import Image
 

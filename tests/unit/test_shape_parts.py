@@ -18,7 +18,7 @@ from physgen.sim.reconstruct.shape.furniture import furniture_legs
 from physgen.sim.reconstruct.shape.inflate import crop_mask
 from physgen.sim.reconstruct.shape.legs import find_legs
 from physgen.sim.reconstruct.shape.object_bodies import build_body
-from physgen.sim.reconstruct.shape.support import support_of
+from physgen.sim.reconstruct.shape.stability import support_of
 from scipy import ndimage
 
 WIDTH, HEIGHT = shapes.WIDTH, shapes.HEIGHT

@@ -8,13 +8,12 @@ import trimesh
 from physgen.sim.mpm.geometry.triangles import area_normals
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.shape import inflated_mesh as meshes
-from physgen.sim.reconstruct.shape.footing import footed
 from physgen.sim.reconstruct.shape.inflate import inflate
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
 from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
 from physgen.sim.reconstruct.shape.primitive_mesh import primitive_mesh
 from physgen.sim.reconstruct.shape.primitives import Box
-from physgen.sim.reconstruct.shape.support import support_of
+from physgen.sim.reconstruct.shape.stability import footed, support_of
 from physgen.sim.scene.bake_quality import COARSEST, load_quality, quality_names
 
 

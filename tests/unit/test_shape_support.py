@@ -5,8 +5,14 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, declination
-from physgen.sim.reconstruct.shape.hanging import SEEN_FROM_DEG, hung, turned_view
-from physgen.sim.reconstruct.shape.object_supports import first_hit, place_on_supports, resting_on
+from physgen.sim.reconstruct.shape.object_placement import (
+    SEEN_FROM_DEG,
+    first_hit,
+    hung,
+    place_on_supports,
+    resting_on,
+    turned_view,
+)
 
 HEIGHT, WIDTH = 300, 400
 VIEW = camera_above_ground(WIDTH, HEIGHT, 350.0, np.radians(25.0))

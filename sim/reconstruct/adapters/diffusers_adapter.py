@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...gaussians.guidance.pretrained_models import import_library, library_errors, package_version, read_json
-from .lama_adapter import LEAST_SIDE, blended, filled_hole_by_hole, without_content
+from .onnx_adapter import LEAST_SIDE, blended, filled_hole_by_hole, without_content
 from .protocols import Mask, Pixels, checked_pixels
 
 INSTALL = "pip install 'physgen[models]'"

@@ -3,8 +3,8 @@
 
 python:MODULE:FUNCTION, python:FILE.py:FUNCTION a function as in ``protocols``
 command:FILE.toml a program (``command_adapter``)
-lama:FILE.onnx inpainting by LaMa through onnxruntime (``lama_adapter``)
-isnet:FILE.onnx segmentation by IS-Net through onnxruntime (``isnet_adapter``)
+lama:FILE.onnx inpainting by LaMa through onnxruntime (``onnx_adapter``)
+isnet:FILE.onnx segmentation by IS-Net through onnxruntime (``onnx_adapter``)
 sam:FOLDER, sam2:FOLDER, depth-anything:FOLDER, depth-pro:FOLDER through transformers (``transformers_adapter``)
 diffusers-inpaint:FOLDER inpainting through diffusers (``diffusers_adapter``)
 sam-3d-objects:FOLDER, trellis:FOLDER, hunyuan3d:FOLDER, triposg:FOLDER programs that make meshes
@@ -36,8 +36,7 @@ from .adapter_registry import (
     split_spec,
 )
 from .command_adapter import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
-from .isnet_adapter import load_isnet
-from .lama_adapter import load_lama
+from .onnx_adapter import load_isnet, load_lama
 from .picture_adapter import load_picture
 from .protocols import STAGES, DepthEstimator, Inpainter, Mesher, Segmenter
 from .python_adapter import (

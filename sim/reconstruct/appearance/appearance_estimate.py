@@ -21,7 +21,7 @@ from ..reasoning.material_decision import ObjectPhysics
 from ..reconstruct_options import ObjectRequest
 from ..shape.body_texture import TexturedSurface
 from ..shape.object_bodies import Body
-from ..shape.object_supports import TriangleMesh
+from ..shape.object_placement import TriangleMesh
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from .albedo import NEAR, CreasedSurface, compute_albedo, split_creases, texel_values
 from .object_shading import DIELECTRIC_F0, LocalLighting, Mesh, Shading, local_lighting, shade, sky_lobe, sun_lobe

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
-from .footing import footed, settled
 from .inflate import Silhouette
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
-from .support import support_of
+from .stability import footed, settled, support_of
 from .surface_mesh import RELAXATION_ROUNDS, Faces, Points, relax, surface_of_size
 
 STABLE = 0.25

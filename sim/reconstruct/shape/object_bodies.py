@@ -29,19 +29,15 @@ from ..segmentation.matting import foreground_colours, soft_alpha
 from ..stage_cache import Arrays, Notice, StageCache, Steps
 from ..user_mesh.fit_user_mesh import fit_mesh
 from .body_texture import TexturedSurface, colour_pixels, corner_pixels, crop_texture
-from .depth_front import front_of
-from .footing import footed
-from .furniture import furniture_boards
-from .furniture_mesh import furniture_mesh
-from .hanging import hung, turned_view
+from .furniture import furniture_boards, furniture_mesh
 from .inflate import Crop, crop_mask, inflate
 from .inflated_mesh import BodyMesh, inflated_mesh, shadow_mesh
-from .object_supports import TriangleMesh, place_on_supports
+from .object_placement import PlacedBody, TriangleMesh, hung, place_on_supports, separate, turned_view
 from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import Box, rasterize
-from .separation import PlacedBody, separate
-from .support import support_of
+from .reference_surfaces import front_of
+from .stability import footed, support_of
 from .surface_mesh import WORTH_SAYING
 from .texture_atlas import textured_body
 

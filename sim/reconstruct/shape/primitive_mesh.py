@@ -23,8 +23,7 @@ from ..camera.ground_camera import ground_depth
 from .inflate import Crop, limb_profile, signed_distance
 from .inflated_mesh import GROUND_TOLERANCE_PX, BodyMesh, standing_mesh
 from .primitives import FINER, Box, Primitive, Sphere, SurfaceOfRevolution, soft_min
-from .ray_field import RayField
-from .surface_mesh import relax, surface_of_size
+from .surface_mesh import RayField, relax, surface_of_size
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float64]

@@ -1,5 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Bodies that share space are separated along the camera's rays, which moves nothing in the photo.
+"""Place bodies along the camera's rays, which changes nothing in the photo: on supports, hanging, and apart.
+
+Where the photo shows another object right below an object's foot, the foot touches that object. Scaling a body about
+the camera moves nothing in the photo, so it is moved to the depth at which the ray through its foot meets its support.
+
+Objects whose foot lies above the horizon stand on no ground, and hang as far away as what does. Such an object is made
+in a view that is turned about its own centre until the foot lies below the horizon; turning about the centre of
+projection changes nothing in the photo either.
 
 Two bodies can overlap only where the photo shows one in front of the other: their silhouettes would be disjoint
 otherwise, and so would their cones of sight. Along each ray through both, the body in front should end where the one
@@ -10,18 +17,189 @@ everything visible stay.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
-from ..camera.ground_camera import ground_depth
+from ..camera.ground_camera import (
+    camera_above_ground,
+    declination,
+    ground_depth,
+    pitch_and_roll,
+    stands_below,
+    up_in_camera,
+)
 from ..mesh_raster import depth_range
 
+Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
+
+SEEN_FROM_DEG = 15.0
+"""How far below the horizontal the foot lies in the turned view: things that hang are seen nearly level."""
+ALONE = 3.0
+"""Distance of what hangs alone, in heights of the camera."""
+CLEAR = 0.05
+"""Least height of its lowest point, in heights of the camera."""
+
+
+def turned_view(view: Camera, mask: Mask) -> Camera | None:
+    """Return ``view`` turned until the foot of ``mask`` (H, W), not empty, lies below the horizon; None if it does."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask[rows[-1]])
+    foot = np.array([(columns[0] + columns[-1] + 1) / 2.0, rows[-1] + 1.0])
+    if stands_below(view, foot):
+        return None
+    pitch, roll = pitch_and_roll(up_in_camera(view))
+    turned = view
+    for _ in range(4):
+        # At the sides of a wide photo the angle grows more slowly than the pitch.
+        pitch = min(pitch + math.radians(SEEN_FROM_DEG) - float(declination(turned, foot)), math.radians(89.0))
+        pose = camera_above_ground(view.width, view.height, view.fx, pitch, roll).world_from_camera
+        turned = replace(view, world_from_camera=pose)
+    return turned
+
+
+def hung(view: Camera, turned: Camera, vertices: Points, standing: Sequence[Points]) -> Points:
+    """Return ``vertices`` (V, 3), made in the view ``turned``, in the world of ``view``, above the ground z = 0.
+
+    standing: (W, 3) vertices of the bodies on the ground; it hangs as far away as the nearest, or at a usual distance.
+    """
+    made = turned.project(vertices)
+    wanted = min((float(np.median(view.project(points)[:, 2])) for points in standing), default=ALONE)
+    rays = view.rays(made[:, :2]) * made[:, 2:]
+    factor = wanted / float(np.median(made[:, 2]))
+    drop = -float(rays[:, 2].min())
+    if drop > 0.0:
+        factor = min(factor, (1.0 - CLEAR) * view.position[2] / drop)
+    return np.asarray(view.position + factor * rays)
+
+
+TriangleMesh = tuple[Points, NDArray[np.int64]]
+
+BELOW = 0.012
+"""Height of the band below a foot, over the photo's longer side."""
+SHARE = 0.6
+"""Share of the foot's width that another object must cover below it."""
+FOOT = 0.06
+"""Lowest share of an object's height that is its foot."""
+NEAREST = 0.2
+"""Least distance of a moved body from the camera, over its distance on the ground."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """``upper`` stands on ``lower`` (indices); ``factor``: its distance from the camera over that where it was."""
+
+    upper: int
+    lower: int
+    factor: float
+
+
+def resting_on(seen: Sequence[Mask]) -> dict[int, int]:
+    """Return, by index of an object, the index of its support: the object that the photo shows below its foot.
+
+    seen: (H, W) visible pixels of each object. Objects on the ground, and cycles, are left out.
+    """
+    found: dict[int, int] = {}
+    for i, mask in enumerate(seen):
+        below = _below_foot(mask)
+        if not below.any():
+            continue
+        shares = [0.0 if j == i else float((below & other).sum() / below.sum()) for j, other in enumerate(seen)]
+        best = int(np.argmax(shares))
+        if shares[best] >= SHARE and not _stands_on(found, best, i):
+            found[i] = best
+    return found
+
+
+def _stands_on(found: dict[int, int], upper: int, lower: int) -> bool:
+    """Whether ``upper`` stands on ``lower``, directly or indirectly."""
+    while upper in found:
+        upper = found[upper]
+        if upper == lower:
+            return True
+    return False
+
+
+def _below_foot(mask: Mask) -> Mask:
+    """A band of pixels (H, W) right below the lowest part of ``mask``."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    band = max(2, round(BELOW * max(mask.shape)))
+    bottom = int(rows[-1]) + 1
+    foot = mask[bottom - max(1, round(FOOT * len(rows))) : bottom].any(axis=0)
+    result = np.zeros_like(mask)
+    # Skip the seam between two objects, which mixes both.
+    result[bottom + 1 : bottom + 1 + band] = foot
+    return np.asarray(result & ~mask)
+
+
+def place_on_supports(camera: Camera, seen: Sequence[Mask], meshes: Sequence[TriangleMesh]) -> list[Support]:
+    """Return how bodies must be scaled about ``camera`` to stand on the supports that the photo shows.
+
+    seen: (H, W); meshes: vertices (V, 3) and faces (T, 3) of all objects, standing on z = 0, or hanging where the foot
+    lies above the horizon, in the camera's unit. Lower ones come first. A body whose ray misses its support stays.
+    """
+    on = resting_on(seen)
+    factors = [1.0] * len(seen)
+    placed: list[Support] = []
+    for upper in sorted(on, key=lambda i: _height(on, i)):
+        lower = on[upper]
+        vertices = camera.position + factors[lower] * (meshes[lower][0] - camera.position)
+        pixel = _foot_pixel(seen[upper])
+        ray = camera.rays(pixel)
+        depth = first_hit(camera.position, ray, vertices, meshes[lower][1])
+        own = float(camera.project(meshes[upper][0])[:, 2].min())
+        if stands_below(camera, pixel):
+            factor = depth / (-camera.position[2] / ray[2])
+            placeable = NEAREST < factor < 0.999
+        else:
+            projected = camera.project(meshes[upper][0])
+            factor = depth / projected[np.linalg.norm(projected[:, :2] - pixel, axis=1).argmin(), 2]
+            placeable = bool(np.isfinite(factor))
+        if placeable and own > 0:
+            factors[upper] = float(factor)
+            placed.append(Support(upper, lower, float(factor)))
+    return placed
+
+
+def _height(on: dict[int, int], index: int) -> int:
+    steps = 0
+    while index in on:
+        index, steps = on[index], steps + 1
+    return steps
+
+
+def _foot_pixel(mask: Mask) -> Points:
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask[rows[-1]])
+    return np.array([(columns[0] + columns[-1] + 1) / 2.0, rows[-1] + 1.0])
+
+
+def first_hit(origin: Points, ray: Points, vertices: Points, faces: NDArray[np.int64]) -> float:
+    """Return the distance in lengths of ``ray`` (3,) from ``origin`` (3,) to the first triangle that it meets; inf for
+    none.
+
+    Möller & Trumbore, Journal of Graphics Tools 2(1), 1997.
+    """
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    edge, other = b - a, c - a
+    across = np.cross(ray, other)
+    determinant = np.einsum("ti,ti->t", edge, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        start = origin - a
+        u = np.einsum("ti,ti->t", start, across) / determinant
+        turned = np.cross(start, edge)
+        v = turned @ ray / determinant
+        distance = np.einsum("ti,ti->t", other, turned) / determinant
+        hit = (np.abs(determinant) > 1e-15) & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 1e-9)
+    return float(distance[hit].min()) if hit.any() else float("inf")
+
+
 Faces = NDArray[np.int64]
 
 CELLS = 160
