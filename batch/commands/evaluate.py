@@ -13,7 +13,7 @@ from ...sim.reconstruct.reasoning.chat_client import DEFAULT_KEY_VARIABLE, ChatR
 from ..terminal import Terminal
 
 if TYPE_CHECKING:
-    from ...sim.evaluate.judged_footage import JudgeRequest
+    from ...sim.app.evaluate import JudgeRequest
 
 REPETITIONS = 5
 
@@ -54,7 +54,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def judge_request(options: argparse.Namespace) -> JudgeRequest | None:
     """Return who is to judge, or None. Raises InputError for an incomplete request or missing consent."""
-    from ...sim.evaluate.judged_footage import JudgeRequest
+    from ...sim.app.evaluate import JudgeRequest
     from ...sim.evaluate.model_judge import JudgeOptions
 
     if options.judge is None:

@@ -1,25 +1,33 @@
 # SPDX-License-Identifier: MIT
-"""Video → evaluation folder: figures against recordings and by themselves, a page, JSON and tables."""
+"""Video → evaluation folder: figures against recordings and by themselves, a page, JSON and tables.
+
+Where a model judges, the frames of the videos are read, a video that stands still is added, and its scores become
+figures.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_bytes
 from ..cache.bake_folder import MANIFEST_FILE, Bake, load_bake
 from ..cache.folder_lock import lock_beside
+from ..composite.srgb import read_rgb
 from ..errors import Cancelled, InputError
-from ..evaluate.against import against as against_section
-from ..evaluate.alone import alone
 from ..evaluate.bake_physics import bake_physics
-from ..evaluate.evaluation import JSON_FILE, Evaluation, Section, table, write_evaluation
+from ..evaluate.evaluation import HIGHER, JSON_FILE, NEITHER, Evaluation, Measure, Section, table, write_evaluation
 from ..evaluate.flow import dis_flow, network_flow
 from ..evaluate.footage import MOST_FRAMES, Footage, Frame, open_footage
-from ..evaluate.judged_footage import JudgeRequest, judged
+from ..evaluate.model_judge import CRITERIA, TITLES, Judgement, JudgeOptions, evenly_sampled, judge_videos
+from ..evaluate.no_reference import without_reference
+from ..evaluate.physics_iq import against as against_section
 from ..evaluate.physics_iq_folder import (
     ViewRow,
     physics_iq_section,
@@ -31,8 +39,96 @@ from ..evaluate.physics_iq_folder import (
 from ..evaluate.report import strip_frames, write_page
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file
+from ..reconstruct.reasoning.chat_client import ChatRequest
 from ..scene.folder import SCENE_FILE, Scene, load_scene
 from ..validation import quantity, require_quantities
+
+STILL = "the first frame repeated"
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeRequest:
+    """Who judges, and what beside the video itself.
+
+    endpoint: the model; its ``consent`` is to sending the photo and the frames. prompt: what should happen in the
+    videos. photo: what they start from; None: the video's first frame. beside: videos of the same photo and prompt,
+    judged together with it.
+    """
+
+    endpoint: ChatRequest
+    prompt: str
+    photo: Path | None = None
+    beside: Sequence[Path] = ()
+    options: JudgeOptions = field(default_factory=JudgeOptions)
+
+
+def sampled_frames(footage: Footage, most: int, wanted: int) -> list[NDArray[np.uint8]]:
+    """Return ``wanted`` evenly spaced frames of the first ``most``, (H, W, 3) uint8 sRGB.
+
+    Raises InputError for fewer than two.
+    """
+    try:
+        numbers = set(evenly_sampled(footage.count(most), wanted).tolist())
+    except InputError as error:
+        raise InputError(f"{footage.name}: {error}") from None
+    return [frame[..., ::-1].copy() for i, frame in enumerate(footage.frames(max(numbers) + 1)) if i in numbers]
+
+
+def judged(
+    footage: Footage,
+    most: int,
+    judge: JudgeRequest,
+    *,
+    notice: Callable[[str], None] = lambda message: None,
+    cancelled: IsCancelled = never,
+) -> tuple[Section, Judgement]:
+    """Return the scores of the first ``most`` frames of ``footage`` as figures, and all that the model said.
+
+    Its first frame, repeated, is judged as one more video: what standing still would get. Raises what ``judge_videos``
+    raises, and InputError for two videos of one name.
+    """
+    wanted = judge.options.frames
+    videos: dict[str, Sequence[NDArray[np.uint8]]] = {footage.name: sampled_frames(footage, most, wanted)}
+    for path in judge.beside:
+        other = open_footage(path)
+        if other.name in videos:
+            raise InputError(f"{path}: another video that is judged has the same name; rename one")
+        videos[other.name] = sampled_frames(other, most, wanted)
+    first = videos[footage.name][0]
+    videos[STILL] = [first] * wanted
+    photo = first if judge.photo is None else read_rgb(judge.photo)
+    found = judge_videos(
+        videos, photo, judge.prompt, judge.endpoint, options=judge.options, notice=notice, cancelled=cancelled
+    )
+    return _section(found, footage.name), found
+
+
+def _section(found: Judgement, subject: str) -> Section:
+    measures = []
+    for name in CRITERIA:
+        still = found.scores[STILL][name]
+        for video, of in found.scores.items():
+            if video == STILL:
+                continue
+            score, own = of[name], video == subject
+            spread = f", standard deviation {score.spread:.2f}" if len(score.values) > 1 else ""
+            measures.append(
+                Measure(
+                    name=f"judge_{name}" if own else f"judge_{name}: {video}",
+                    title=f"{TITLES[name]}{'' if own else f' of {video}'}",
+                    value=score.mean if score.values else None,
+                    better=HIGHER if own else NEITHER,
+                    still=still.mean if own and still.values else None,
+                    note=f"{len(score.values)} of {found.options.repetitions} answers{spread}",
+                )
+            )
+    text = (
+        f"What {found.model} scores from 0 to 1, asked {found.options.repetitions} times about {found.options.frames} "
+        f"frames of each video, in another order each time. The text was: {found.prompt}"
+    )
+    notices = tuple(f"judge: {note}" for note in found.notes)
+    return Section(name="judge", title="Judged by a model", text=text, measures=tuple(measures), notices=notices)
+
 
 STAGE = "evaluate"
 JUDGE_FILE = "judge.json"
@@ -105,7 +201,7 @@ def evaluate(
         flow = dis_flow() if options.flow is None else network_flow(options.flow)
         named = "DIS" if options.flow is None else options.flow.name
         still = None if photo is None else Path(photo)
-        sections.append(alone(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled))
+        sections.append(without_reference(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled))
         strip = strip_frames(footage, most)
         if judge is not None:
             section, judgement = judged(footage, most, judge, notice=progress.notice, cancelled=cancelled)

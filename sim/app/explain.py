@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_json
 from ..cache.folder_lock import lock_beside
-from ..composite.side_by_side import cut_out, window_around, with_body, write_comparison
+from ..composite.side_by_side import (
+    BoxPose,
+    box_faces,
+    box_pose,
+    cut_out,
+    window_around,
+    with_body,
+    with_box,
+    write_comparison,
+)
 from ..diagnose import run_diagnosis
 from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
@@ -28,7 +37,6 @@ from ..events import IsCancelled, OnEvent, ignore, never
 from ..rigid_alignment import nearest_pose
 
 if TYPE_CHECKING:
-    from ..composite.textured_box import BoxPose
     from ..diagnose.track.moving_regions import Region
     from ..diagnose.track.plain_bodies import VideoMotion
 
@@ -236,7 +244,6 @@ def _drawn_cut_out(trial: VideoTrial, motion: VideoMotion, simulated: tuple[Arra
 
 def _drawn_box(trial: VideoTrial, motion: VideoMotion, simulated: tuple[Array, Array]) -> Drawing:
     """Return how to draw a box with the faces that the video shows, turned as simulated. simulated: two (T, N, 3) m."""
-    from ..composite.textured_box import box_faces, box_pose, with_box
     from ..diagnose.track.moving_regions import aligned_frames
 
     box, view, found = motion.box, motion.view, motion.found

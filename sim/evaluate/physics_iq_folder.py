@@ -20,10 +20,9 @@ import numpy as np
 
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
-from .against import TITLES
 from .evaluation import HIGHER, Measure, Section
 from .footage import Footage, at_rate, open_footage
-from .physics_iq import NAMES, compare, original_score, quarter, take, verified_scores
+from .physics_iq import NAMES, TITLES, compare, original_score, quarter, take, verified_scores
 
 VIEWS = 198
 RATES = (8, 16, 24, 30)

@@ -5,8 +5,7 @@ import cv2
 import numpy as np
 import physgen
 import pytest
-from physgen.sim.composite.side_by_side import window_around
-from physgen.sim.composite.textured_box import box_faces, box_pose, with_box
+from physgen.sim.composite.side_by_side import box_faces, box_pose, window_around, with_box
 from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.box_pose import GroundCamera, corners, follow_box, repeats_after, unwrapped
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body

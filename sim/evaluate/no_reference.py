@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A video by itself: flickering, smoothness, how much moves, and how well first frame and background are kept.
+"""Figures of a video without a reference: flickering, smoothness, how much moves, what of the first frame is kept.
 
 Flickering, smoothness and dynamic degree have the formulas of VBench (Huang et al., CVPR 2024; Vchitect/VBench,
 Apache-2.0); the networks in its smoothness and dynamic degree are replaced by classical flow, and the titles say so.
@@ -52,7 +52,7 @@ class _Pass:
     areas: list[float] = field(default_factory=list)
 
 
-def alone(
+def without_reference(
     video: Footage, most: int, *, photo: Path | None, flow: FlowEstimator, flow_name: str, cancelled: IsCancelled
 ) -> Section:
     """Return the section of the first ``most`` frames of ``video`` by itself.
