@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``physgen`` command: every stage alone, or all of them (docs/cli.md)."""
+"""The ``physgen`` command: every stage alone, or all of them (docs/cli.md).
+
+Its parser has commands in groups, one short usage line, and errors without the list of flags.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,10 @@ import os
 import re
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from . import early_stop  # noqa: F401 - before the modules that take long
 
@@ -30,17 +34,79 @@ from . import stages
 from .commands import (
     compose_commands,
     diagnosis_commands,
-    doctor,
-    evaluate,
-    model_commands,
+    evaluation_commands,
+    install_commands,
     photo_commands,
-    questionnaire,
     render_commands,
     scene_commands,
 )
-from .commands.command_parser import CommandParser, command_list
 from .farm import batch_command as farm_command
 from .terminal import Terminal, stop_signals
+
+HELP_WIDTH = 100
+"""Widest line of a help text, in characters."""
+MOST_USAGE_FLAGS = 6
+"""A command with more optional flags shows ``[options]`` in their place."""
+COMMAND_COLUMN = 16
+"""Column at which the commands' texts begin."""
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Argparse's own, no wider than ``HELP_WIDTH``; descriptions keep their lines."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28)
+        self._width = min(self._width, HELP_WIDTH)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose usage is one line, and whose errors leave the list of all flags to ``--help``."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, **settings)
+
+    def format_usage(self) -> str:
+        """Return the usage; with many flags only what has to be given, and ``[options]``."""
+        actions = self._actions
+        if self.usage is not None:
+            return super().format_usage()
+        optional = [item for item in actions if item.option_strings and not item.required]
+        if len(optional) <= MOST_USAGE_FLAGS:
+            return super().format_usage()
+        formatter = self._get_formatter()
+        formatter.add_usage(None, [item for item in actions if item not in optional], [], prefix="")
+        needed = formatter.format_help().strip().removeprefix(self.prog).strip()
+        return f"usage: {self.prog} {needed} [options]\n"
+
+    def format_help(self) -> str:
+        """Return the help with the usage of ``format_usage``."""
+        given = self.usage
+        self.usage = self.format_usage().removeprefix("usage: ").strip().replace("%", "%%")
+        try:
+            return super().format_help()
+        finally:
+            self.usage = given
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2: the usage, where flags are listed, and last what is wrong: farms record the last line."""
+        text = f"{self.format_usage()}all options: {self.prog} --help\n{self.prog}: error: {message}\n"
+        self.exit(2, text)
+
+
+def command_list(groups: dict[str, list[tuple[str, str]]]) -> str:
+    """Return the commands with their texts, a heading a group, no line wider than ``HELP_WIDTH`` characters."""
+    lines = []
+    for title, commands in groups.items():
+        lines += ["", f"{title}:"]
+        for name, text in commands:
+            lines += textwrap.wrap(
+                text,
+                width=HELP_WIDTH,
+                initial_indent=f"  {name:<{COMMAND_COLUMN - 2}}",
+                subsequent_indent=" " * COMMAND_COLUMN,
+            )
+    return "\n".join(lines)
+
 
 ABOUT = """\
 One photo becomes a small physical world: reconstruct, simulate, render.
@@ -125,15 +191,15 @@ def build_parser() -> CommandParser:
 
     groups["How real a video is"] = []
     real = "figures of a video against recordings, or by itself; a page, JSON and tables"
-    evaluate.add_evaluate(command("evaluate", evaluate.run_evaluate, real))
+    evaluation_commands.add_evaluate(command("evaluate", evaluation_commands.run_evaluate, real))
     asked = "photos and videos → pages on which people judge them; with --collect: answers → results"
-    questionnaire.add_questionnaire(command("questionnaire", questionnaire.run_questionnaire, asked))
+    evaluation_commands.add_questionnaire(command("questionnaire", evaluation_commands.run_questionnaire, asked))
 
     groups["This installation"] = []
     listing = command("effects", _effects, "list physical effects with their equations and parameters")
     listing.add_argument("name", nargs="*", metavar="NAME", help="only these (default: all)")
     kept = "list, install or remove models that improve the reconstruction"
-    model_commands.add_models(command("models", model_commands.run_models, kept))
+    install_commands.add_models(command("models", install_commands.run_models, kept))
     command("doctor", _doctor, "check the installation and name what is missing")
     parser.description = ABOUT + command_list(groups)
     return parser
@@ -156,7 +222,7 @@ def _effect_text(item: Effect) -> str:
 
 
 def _doctor(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
-    report = doctor.examine()
+    report = install_commands.examine()
     terminal({"event": "done", "report": report})
     terminal.line("\n".join(f"{'ok     ' if ok else 'MISSING'} {name}: {text}" for name, ok, text in report))
     return 0 if all(ok for _, ok, _ in report) else InputError.exit_code

@@ -29,7 +29,7 @@ from physgen.benchmarks.compose_assets.results import Line, Row, contact_sheet, 
 from physgen.benchmarks.compose_assets.standing import SECONDS, Standing, drop, standing_json, standing_text
 from physgen.benchmarks.compose_assets.trial import SMALL, TINY, Budget, composed, judged, picture_of, start
 from physgen.sim.gaussians.compose.compose_options import METHODS, ComposeOptions
-from physgen.sim.gaussians.guidance.clip_scores import ClipScores
+from physgen.sim.gaussians.guidance.pretrained_models import ClipScores
 from physgen.sim.gaussians.splat_ply import write_splats
 from physgen.sim.mpm.colliders import Surface
 

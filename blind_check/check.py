@@ -24,11 +24,10 @@ from ..sim.effects.registry import effect
 from ..sim.errors import Cancelled, InputError, PhysGenError, SimulationError
 from ..sim.events import IsCancelled, OnEvent, StageProgress
 from . import rigid_causes, soft_cases
-from .case import BlindCase
+from .case import BlindCase, Seal, break_seal, keep_memory_private, publish, seal
 from .mujoco_world import load_mujoco
 from .rigid_cases import rigid_case
 from .scoring import Arrays, BlindScore, score_report, total_score
-from .seal import Seal, break_seal, keep_memory_private, publish, seal
 from .soft_cases import soft_case
 
 LEAST_CASES = 4

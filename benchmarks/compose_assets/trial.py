@@ -27,8 +27,8 @@ from physgen.sim.gaussians.compose.composition_parts import (
 )
 from physgen.sim.gaussians.compose.pair_stability import StabilityOptions, check_stability
 from physgen.sim.gaussians.compose.penetration import Penetration, penetration_of_meshes
-from physgen.sim.gaussians.guidance.clip_scores import ClipScores
 from physgen.sim.gaussians.guidance.ideal_denoiser import IdealDenoiser
+from physgen.sim.gaussians.guidance.pretrained_models import ClipScores
 from physgen.sim.gaussians.image_loss import view_target
 from physgen.sim.gaussians.pair_fit import initial_splats, pixel_size
 from physgen.sim.gaussians.raster.rasteriser import Rasteriser

@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 
 from ..cache.torn_skins import TornSkin
 from ..skinning import Binding, bind, deform
-from .blocks import NEVER, Blocks
-from .refinement import Refined, refine, touched_near
+from .blocks import NEVER, Blocks, Refined, refine, touched_near
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

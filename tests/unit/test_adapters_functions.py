@@ -13,7 +13,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from physgen.batch.commands.doctor import adapter_findings
+from physgen.batch.commands.install_commands import adapter_findings
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.adapters import Depth, object_crop, resolve
 from physgen.sim.reconstruct.adapters.adapter_registry import spec_files

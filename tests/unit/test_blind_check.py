@@ -15,10 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.commands.diagnosis_commands import add_blind_check, run_blind_check
 from physgen.blind_check import BlindCheckOptions, blind_check, score_table
-from physgen.blind_check.case import BlindCase, TrialTruth, Truth
+from physgen.blind_check.case import BlindCase, TrialTruth, Truth, break_seal, publish, seal, verify
 from physgen.blind_check.check import LEAST_CASES, plan_cases
 from physgen.blind_check.scoring import calibration_error, rank_auc, score_report, total_score
-from physgen.blind_check.seal import break_seal, publish, seal, verify
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.errors import InputError
 from physgen.sim.events import never

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.batch.commands.doctor import diffusion_finding
+from physgen.batch.commands.install_commands import diffusion_finding
 from physgen.sim.errors import InputError, SimulationError
-from physgen.sim.gaussians.guidance.clip_scores import ClipScores
 from physgen.sim.gaussians.guidance.diffusers_guidance import DiffusersGuidance, DiffusersOptions
 from physgen.sim.gaussians.guidance.ideal_denoiser import IdealDenoiser
+from physgen.sim.gaussians.guidance.pretrained_models import ClipScores
 from physgen.sim.gaussians.guidance.score_distillation import (
     CheckedGuidance,
     NoiseSchedule,

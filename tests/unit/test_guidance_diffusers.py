@@ -11,8 +11,8 @@ import socket
 import numpy as np
 import pytest
 from physgen.sim.errors import InputError
-from physgen.sim.gaussians.guidance.clip_scores import CLIP_MEAN, CLIP_STD, ClipScores
 from physgen.sim.gaussians.guidance.diffusers_guidance import DiffusersGuidance, DiffusersOptions
+from physgen.sim.gaussians.guidance.pretrained_models import CLIP_MEAN, CLIP_STD, ClipScores
 from physgen.sim.gaussians.guidance.score_distillation import RenderedView
 from physgen.sim.scene.model import IDENTITY4, Camera
 

@@ -5,4 +5,4 @@ score_distillation.py  the Guidance protocol, noise schedules, the loss term, ch
 ideal_denoiser.py      the exact denoiser of a finite set of images
 diffusers_guidance.py  a local diffusion model (optional extra)
 pretrained_models.py   loading local weights safely, text encoders
-clip_scores.py         CLIP scores"""
+pretrained_models.py         CLIP scores"""
