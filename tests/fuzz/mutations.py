@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import random
 import re
+from typing import Any
 
 NUMBERS = (0, -1, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 10**30, 10**400, 1e308, -1e308, 1e-320, 0.5)
 VALUES = (
@@ -117,7 +118,7 @@ _WAYS = (_flip, _flip, _cut, _splice, _splice, _word, _number, _line)
 def _json(content: bytes, choose: random.Random) -> bytes:
     tree = json.loads(content)
     for _ in range(choose.choice((1, 1, 2))):
-        holder, key = choose.choice(list(_slots(tree)) or [([tree], 0)])
+        holder, key = choose.choice(_slots(tree) or [([tree], 0)])
         way = choose.randrange(10)
         if way == 0:
             del holder[key]
@@ -156,10 +157,18 @@ def _deep(choose: random.Random) -> object:
     return value
 
 
-def _slots(tree: object, depth: int = 0):
-    """Yield (holder, key) of every value in ``tree``."""
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    for key, value in list(items):
-        yield tree, key
-        if depth < 12:
-            yield from _slots(value, depth + 1)
+def _slots(tree: object) -> list[tuple[Any, Any]]:
+    """Return (holder, key) of every value in ``tree``, to a depth of 13."""
+    found: list[tuple[Any, Any]] = []
+    level = [tree]
+    for _ in range(13):
+        below = []
+        for holder in level:
+            if isinstance(holder, dict):
+                found += [(holder, key) for key in holder]
+                below += [value for value in holder.values() if isinstance(value, dict | list)]
+            elif isinstance(holder, list):
+                found += [(holder, index) for index in range(len(holder))]
+                below += [value for value in holder if isinstance(value, dict | list)]
+        level = below
+    return found
