@@ -41,7 +41,7 @@ from .commands import (
     scene_commands,
 )
 from .farm import batch_command as farm_command
-from .terminal import Terminal, stop_signals
+from .terminal import Terminal, stop_signals, tolerant
 
 HELP_WIDTH = 100
 """Widest line of a help text, in characters."""
@@ -273,6 +273,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
+    # Help, too, has arrows and quotes that not every encoding has.
+    tolerant(sys.stdout)
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
     expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
     terminal = Terminal(as_json=options.json, expected_s=expected)

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -102,13 +104,37 @@ class RemainingTime:
         return sum(self._left.values()) + waiting * self._slowness
 
 
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that a terminal obeys instead of showing them: escape sequences set its title, hide or move what it shows,
+and some answer as if the user had typed; bidirectional controls reorder a line. Lone halves of characters cannot be
+written at all. Line feeds and tabs are ours."""
+
+
+def printable(text: str) -> str:
+    """Return ``text`` for a terminal: what names from a stranger's folder may hold besides text is replaced."""
+    return _UNSEEN.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def tolerant(stream: TextIO) -> TextIO:
+    """Have ``stream`` write what its encoding lacks (ASCII, a code page of Windows) as ``\\u2192``; return it."""
+    if isinstance(stream, io.TextIOWrapper):
+        stream.reconfigure(errors="backslashreplace")
+    return stream
+
+
+def json_line(value: Event, encoding: str) -> str:
+    """Return ``value`` as one line of JSON in ``encoding``: the same value for a program, harmless on a terminal."""
+    text = json.dumps(value, ensure_ascii=not encoding.lower().startswith("utf"))
+    return _UNSEEN.sub(lambda at: f"\\u{ord(at[0]):04x}", text) + "\n"
+
+
 class Terminal:
     """Print events: one updating line on a terminal, occasional lines in a log, or JSON lines."""
 
     def __init__(self, *, as_json: bool, expected_s: dict[str, float] | None = None, out: TextIO | None = None) -> None:
         """expected_s: initial guess for each stage; out: stream to write to, standard output by default."""
         self._json = as_json
-        self._out: TextIO = out or sys.stdout
+        self._out: TextIO = tolerant(out or sys.stdout)
         self._live = not as_json and self._out.isatty()
         self._started = time.monotonic()
         self._remaining = RemainingTime(expected_s or {})
@@ -122,11 +148,14 @@ class Terminal:
         if kind == "progress":
             event = {**event, "job_eta_s": round(self._remaining.update(event), 1)}
         if self._json:
-            self._write(json.dumps(event, ensure_ascii=False) + "\n")
+            self._write_json(event)
         elif kind == "progress":
             self._progress(event, stage)
         elif "message" in event:
             self.line(f"{stage + ': ' if stage else ''}{event['message']}")
+
+    def _write_json(self, event: Event) -> None:
+        self._write(json_line(event, self._out.encoding or "utf-8"))
 
     def _write(self, text: str) -> None:
         try:
@@ -149,6 +178,7 @@ class Terminal:
         text = (
             f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed, about {left} left"
         )
+        text = printable(text).replace("\n", " ")
         if self._live:
             self._write("\r\x1b[K" + text + ("\n" if finished else ""))
             self._open_line = not finished
@@ -159,15 +189,15 @@ class Terminal:
         """Print one line of text, below a progress line that is being updated."""
         if self._json:
             return
-        self._write(("\n" if self._open_line else "") + text + "\n")
+        self._write(("\n" if self._open_line else "") + printable(text) + "\n")
         self._open_line = False
 
     def error(self, kind: str, message: str) -> None:
         """Report the error that ends the run."""
         if self._json:
-            self._write(json.dumps({"event": "error", "kind": kind, "message": message}, ensure_ascii=False) + "\n")
+            self._write_json({"event": "error", "kind": kind, "message": message})
         else:
-            sys.stderr.write(("\n" if self._open_line else "") + f"error: {message}\n")
+            tolerant(sys.stderr).write(("\n" if self._open_line else "") + f"error: {printable(message)}\n")
 
 
 def _clock(seconds: float) -> str:

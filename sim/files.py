@@ -26,6 +26,15 @@ PICTURE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "TGA")
 """Pillow's names of what it may decode, whatever the file is called; JPEG includes MPO. PostScript is not among them:
 for it, Pillow starts Ghostscript, which runs what the file says."""
 
+VIDEO_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+VIDEO_FORMATS = (
+    "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "h264", "hevc", "ogg", "flv", "asf", "gif", "ivf",
+    "mxf", "dv", "yuv4mpegpipe",
+)  # fmt: skip
+"""FFmpeg's names of what a video may be: files that hold their pictures themselves. Playlists (HLS, concat, DASH, SDP)
+are not among them: whatever such a file is called, FFmpeg opens what it names, anywhere, and waits for it."""
+_VIDEO_BOUNDS = f"format_whitelist;{','.join(VIDEO_FORMATS)}|protocol_whitelist;file"
+
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOCTTY", 0)
 
 
@@ -39,7 +48,7 @@ def open_file(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | N
     """
     try:
         if folder is not None and not path.resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{path}: leads out of {folder}; put the file itself there")
+            raise InputError(f"{shown(path)}: leads out of {shown(folder)}; put the file itself there")
         number = os.open(path, _FLAGS)
     except FileNotFoundError:
         raise
@@ -51,9 +60,9 @@ def open_file(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | N
     try:
         found = os.fstat(number)
         if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"{path}: is {_kind(found.st_mode)}, not a file; name a regular file")
+            raise InputError(f"{shown(path)}: is {_kind(found.st_mode)}, not a file; name a regular file")
         if found.st_size > most:
-            raise InputError(f"{path}: larger than {_size(most)}, so it is no {what}")
+            raise InputError(f"{shown(path)}: larger than {_size(most)}, so it is no {what}")
         if hasattr(os, "set_blocking"):
             os.set_blocking(number, True)
         return io.BufferedReader(io.FileIO(number, "rb"))
@@ -68,12 +77,12 @@ def read_bytes(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | 
         try:
             content = stream.read(most + 1)
         except OSError as error:
-            raise InputError(f"{path}: {_reason(error)}") from None
+            raise InputError(f"{shown(path)}: {_reason(error)}") from None
         except MemoryError:
-            raise InputError(f"{path}: does not fit in memory; close other programs") from None
+            raise InputError(f"{shown(path)}: does not fit in memory; close other programs") from None
     # Files that grow meanwhile, and those of /proc, are longer than they say.
     if len(content) > most:
-        raise InputError(f"{path}: larger than {_size(most)}, so it is no {what}")
+        raise InputError(f"{shown(path)}: larger than {_size(most)}, so it is no {what}")
     return content
 
 
@@ -82,7 +91,7 @@ def read_text(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | N
     try:
         return read_bytes(path, most, what=what, folder=folder).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not readable as UTF-8 ({error}); save it as UTF-8") from None
+        raise InputError(f"{shown(path)}: not readable as UTF-8 ({error}); save it as UTF-8") from None
 
 
 def read_toml(path: Path, most: int, *, what: str = "TOML file") -> dict[str, Any]:
@@ -91,12 +100,24 @@ def read_toml(path: Path, most: int, *, what: str = "TOML file") -> dict[str, An
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
+        raise InputError(f"{shown(path)}: not readable as TOML ({error})") from None
 
 
 def require_file(path: Path, most: int, *, what: str = OF_PHYSGEN) -> None:
     """Raise as ``open_file`` does, for libraries that open ``path`` themselves, by its name."""
     open_file(path, most, what=what).close()
+
+
+def name_for_ffmpeg(path: Path) -> str:
+    """Return the name by which OpenCV's FFmpeg opens the video ``path``, which it then does within our bounds: the file
+    alone, of a format in ``VIDEO_FORMATS``. Other options in ``VIDEO_VARIABLE`` stay.
+
+    The name is absolute, as a relative one such as ``data:x/video`` would be taken for a protocol.
+    """
+    given = os.environ.get(VIDEO_VARIABLE, "")
+    if not given.endswith(_VIDEO_BOUNDS):
+        os.environ[VIDEO_VARIABLE] = f"{given}|{_VIDEO_BOUNDS}" if given else _VIDEO_BOUNDS
+    return str(path.absolute())
 
 
 def to_disk(path: Path) -> None:
@@ -127,8 +148,8 @@ def is_file(path: Path) -> bool:
 
 
 def shown(path: Path | str) -> str:
-    """Return ``path`` for a message: at most 200 characters, printable."""
-    text = str(path).encode("utf-8", "replace").decode("utf-8")
+    """Return ``path`` for a message: at most 200 characters, printable, so that no name forges another line."""
+    text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(path))
     return text if len(text) <= 200 else f"{text[:100]}…{text[-60:]}"
 
 

@@ -22,6 +22,7 @@ from ...physgen_addon.frames.frame_files import read_picture
 from ...sim.atomic import replacing, write_bytes, write_json
 from ...sim.errors import InputError
 from ...sim.events import Event, OnEvent, StageProgress
+from ...sim.files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 from ...sim.html import render
 from .planning.plan import STAGES, Outcome, Plan, Task
 from .task_execution import log_end, log_path
@@ -271,10 +272,13 @@ def _fingerprint(paths: Sequence[Path]) -> bytes:
 
 def _stored_fingerprint(path: Path) -> bytes | None:
     try:
-        with Image.open(path) as image:
+        with (
+            open_file(path, MAX_PICTURE_BYTES, what="picture") as file,
+            Image.open(file, formats=PICTURE_FORMATS) as image,
+        ):
             comment = image.info.get("comment")
             return comment if isinstance(comment, bytes) else None
-    except (OSError, ValueError, SyntaxError):
+    except (OSError, ValueError, SyntaxError, InputError):
         return None
 
 

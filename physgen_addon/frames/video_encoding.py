@@ -18,6 +18,7 @@ from PIL import Image
 from ...sim.atomic import replacing, scratch_prefix
 from ...sim.errors import Cancelled, InputError, RenderError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ...sim.files import name_for_ffmpeg
 from .. import compat
 from ..render.render_options import VIDEO_CODECS, exact_rate, require_video_name
 from .frame_files import read_picture
@@ -57,7 +58,7 @@ def encode_video(
 
 def _count(video: Path) -> int:
     """Return the number of frames readable from ``video``, 0 if it is no video."""
-    capture = cv2.VideoCapture(str(video))
+    capture = cv2.VideoCapture(name_for_ffmpeg(video), cv2.CAP_FFMPEG)
     try:
         count = 0
         while capture.grab():

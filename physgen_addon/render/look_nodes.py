@@ -18,6 +18,7 @@ from typing import Any
 import bpy
 
 from ...sim.errors import InputError
+from ...sim.files import MOST_HASHED, open_file
 
 LAYERS, LOOK, TREE = "PhysGen Layers", "PhysGen Look", "PhysGen Compositing"
 OURS = "physgen_look"
@@ -72,7 +73,7 @@ def add_look_nodes(scene: bpy.types.Scene, frames: list[Path], *, first_frame: i
 def _header(path: Path) -> bytes:
     """Return the beginning of an EXR file. Raises InputError for a file that is none."""
     try:
-        with path.open("rb") as stream:
+        with open_file(path, MOST_HASHED, what="frame") as stream:
             head = stream.read(MOST_HEADER)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); render the frames again") from error

@@ -220,13 +220,18 @@ def is_held(folder: Path) -> bool:
     return is_locked(folder) or (owner is not None and not owner.is_here)
 
 
+def _text(path: Path) -> Any:
+    """Return what the lock file says; of a longer file, which is none of ours, its beginning."""
+    with path.open("rb") as file:
+        return json.loads(file.read(MOST_BYTES))
+
+
 def _owner(path: Path) -> Mark | None:
     """Return who the text at ``path`` names; None for none, or no such text."""
     try:
         if not path.is_file():
             return None
-        with path.open("rb") as file:
-            data = json.loads(file.read(MOST_BYTES))
+        data = _text(path)
         mark = parse_mark(str(data.get("mark", "")))
         if mark is not None:
             return mark
@@ -243,7 +248,7 @@ def _in_use(folder: Path, path: Path, owner: Mark | None) -> str:
     if owner.is_here:
         return f"{folder}: in use by process {owner.pid}; wait for it, stop it, or choose another folder"
     try:
-        host = str(json.loads(path.read_bytes())["host"])[:100]
+        host = str(_text(path)["host"])[:100]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         host = "another machine"
     return f"{folder}: in use by process {owner.pid} on {host}; if that run is gone, delete {path}"

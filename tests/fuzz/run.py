@@ -29,7 +29,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -42,6 +42,7 @@ import loaders_evaluate  # noqa: F401
 import loaders_jobs  # noqa: F401
 import loaders_pictures  # noqa: F401
 import loaders_scenes  # noqa: F401
+from hostile import INSTEAD
 from loaders import LOADERS, Loader
 from mutations import mutated
 from physgen.sim.errors import PhysGenError
@@ -52,7 +53,6 @@ CPU_S, WALL_S = 5.0, 20.0
 ADDRESS_SPACE = 3 * 2**29
 """Bytes beyond those of the process with all libraries loaded, before it reads anything."""
 MOST_CRASHES = 5
-OUTSIDE = "/etc/passwd"
 
 
 class TooSlow(BaseException):
@@ -131,51 +131,26 @@ class Guard:
 guard = Guard()
 
 
-def _pipe(path: Path) -> None:
-    os.mkfifo(path)
+def chosen(loader: Loader, index: int) -> tuple[str, Callable[[Path], object] | None]:
+    """Return which file input ``index`` is about, and what is put in its place; None: it is damaged.
 
-
-def _endless(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def _circle(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def _outside(path: Path) -> None:
-    path.symlink_to(OUTSIDE)
-
-
-def _sparse(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(2**42)
-
-
-def _postscript(path: Path) -> None:
-    """For which Pillow starts Ghostscript, whatever the file is called."""
-    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n")
-
-
-INSTEAD = (_pipe, _endless, _circle, _outside, _postscript, Path.mkdir, Path.touch, _sparse, lambda path: None)
-"""What is put in the place of a file: the first inputs of every loader. The last one is nothing."""
+    Every other input is one of ``INSTEAD`` until each file had them all.
+    """
+    number, files = index // 2, loader.files
+    special = index % 2 == 0 and number < len(INSTEAD) * len(files)
+    return files[number % len(files)], INSTEAD[number // len(files)] if special else None
 
 
 def place_input(name: str, loader: Loader, folder: Path, seed: int, index: int, content: bytes) -> None:
-    """Write over the file of ``loader`` in ``folder`` that input ``index`` is about: ``content``, damaged."""
-    choose = random.Random(f"{name}:{seed}:{index}")
-    path = folder / file_of(loader, index)
-    special = index // len(loader.files)
-    if special < len(INSTEAD):
+    """Write over the file of ``loader`` in ``folder`` that input ``index`` is about. content: what it holds."""
+    file, instead = chosen(loader, index)
+    path = folder / file
+    if instead is not None:
         path.unlink()
-        INSTEAD[special](path)
+        instead(path)
         return
+    choose = random.Random(f"{name}:{seed}:{index}")
     path.write_bytes(mutated(content, choose, as_json=path.suffix in (".json", ".gltf")))
-
-
-def file_of(loader: Loader, index: int) -> str:
-    """Return which file input ``index`` damages."""
-    return loader.files[index % len(loader.files)]
 
 
 @contextlib.contextmanager
@@ -214,17 +189,16 @@ class Inputs:
 
     def place(self, index: int) -> None:
         """Have the files undamaged but for the one that input ``index`` damages."""
-        file = file_of(self.loader, index)
-        if self.used >= self.ANEW:
+        file, instead = chosen(self.loader, index)
+        # What was no file may have brought another one with it.
+        if self.used >= self.ANEW or self.special:
             shutil.rmtree(self.folder, ignore_errors=True)
             shutil.copytree(self.template, self.folder)
             self.used = 0
-        elif self.special or self.damaged != file:
-            path = self.folder / self.damaged
-            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
-            path.write_bytes(self.contents[self.damaged])
+        elif self.damaged != file:
+            (self.folder / self.damaged).write_bytes(self.contents[self.damaged])
         self.used += 1
-        self.damaged, self.special = file, index // len(self.loader.files) < len(INSTEAD)
+        self.damaged, self.special = file, instead is not None
         place_input(self.name, self.loader, self.folder, self.seed, index, self.contents[file])
 
     def attempt(self, index: int) -> BaseException | None:
@@ -341,7 +315,7 @@ def again(name: str, seed: int, index: int) -> None:
     (place / "input").mkdir()
     loader.write(place / "input")
     if index >= 0:
-        content = (place / "input" / file_of(loader, index)).read_bytes()
+        content = (place / "input" / chosen(loader, index)[0]).read_bytes()
         place_input(name, loader, place / "input", seed, index, content)
     print(f"{name}, seed {seed}, input {index}: {place / 'input'}")  # noqa: T201
     _limit_memory()

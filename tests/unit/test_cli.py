@@ -2,6 +2,7 @@
 """The command line as a user types it: arguments, exit codes, what is on the disk afterwards."""
 
 import argparse
+import io
 import json
 import re
 import signal
@@ -103,6 +104,16 @@ def test_help_has_every_command_in_a_group_and_every_flag_of_one(capsys):
         commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
         wanted = commands if not name else {f for a in commands[name]._actions for f in a.option_strings}
         assert not [word for word in wanted if not re.search(rf"(^|[ ,]){re.escape(word)}\b", text, re.M)]
+
+
+def test_help_is_written_in_any_encoding(monkeypatch):
+    """A code page of Windows has no arrows."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    stream.flush()
+    assert ended.value.code == 0 and b"photo \\u2192 video" in stream.buffer.getvalue()
 
 
 def test_the_video_takes_the_photos_name(tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 """The summary of a job: what it says, and that nothing that a job says becomes a part of the page's own language."""
 
 import json
+import os
 import re
 from html.parser import HTMLParser
 
@@ -112,4 +113,8 @@ def test_a_strip_is_made_again_only_for_other_frames(tmp_path):
     cv2.imwrite(str(frames[0]), np.full((60, 80, 3), 255, np.uint8))
     assert make_strip(frames, out) and cv2.imread(str(out))[5, 5].min() > 200
     assert not make_strip([tmp_path / "none.png"], tmp_path / "b.jpg")
+    # Somebody else's job may have a pipe there, which nobody writes to.
+    out.unlink()
+    os.mkfifo(out)
+    assert make_strip(frames, out) and out.is_file()
     assert [format_duration(s) for s in (0.04, 12.4, 200, 18123)] == ["0.0 s", "12 s", "3:20 min", "5:02 h"]

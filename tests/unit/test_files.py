@@ -7,14 +7,16 @@ import signal
 import stat
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
 from physgen.sim.cache.bake_folder import disk_usage, load_bake
 from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.diagnose.track.track_videos import Video
 from physgen.sim.errors import InputError
-from physgen.sim.files import open_file, read_bytes, read_text, read_toml
+from physgen.sim.files import VIDEO_VARIABLE, name_for_ffmpeg, open_file, read_bytes, read_text, read_toml
 from physgen.sim.html import page_head, require_harmless
 from physgen.sim.npz import read_npy, read_npz
 from physgen.sim.scene.folder import load_scene
@@ -331,6 +333,7 @@ def test_a_gltf_reads_no_buffer_outside_its_folder(tmp_path):
         ('<!DOCTYPE html>\n<html lang="en" onload="alert(1)">{head}<body></body></html>', False),
         ('<!DOCTYPE html>\n<html lang="en">{runs}<body></body></html>', False),
         ("<!DOCTYPE html>\n<html lang=\"en\">{head}<META HTTP-EQUIV=refresh content='0;url=//evil'></html>", False),
+        ('<!DOCTYPE html>\n<html lang="en">{head}<LINK rel="preconnect" href="https://evil"></html>', False),
         ("<html><body>a</body></html>", False),
         ("", False),
     ],
@@ -354,3 +357,42 @@ def test_every_page_that_is_written_forbids_scripts_or_names_its_own():
     for path in templates:
         text = path.read_text(encoding="utf-8")
         assert "{{ head }}" in text or "default-src 'none'" in text or "<head" not in text, path
+
+
+def short_video(path):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 24, (64, 48))
+    for level in range(3):
+        writer.write(np.full((48, 64, 3), 90 * level, np.uint8))
+    writer.release()
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.m3u8", "a.ffconcat"])
+@pytest.mark.parametrize("kind", ["ffconcat version 1.0\nfile 'real.avi'\n", "#EXTM3U\n#EXTINF:1.0,\n{real}\n"])
+def test_a_playlist_is_no_video_whatever_it_is_called(tmp_path, name, kind):
+    """FFmpeg would read the files that it names, wherever they are."""
+    short_video(tmp_path / "real.avi")
+    (tmp_path / name).write_text(kind.format(real=(tmp_path / "real.avi").as_uri()))
+    with pytest.raises(InputError, match="not a readable video"):
+        Video(tmp_path / name)
+    with Video(tmp_path / "real.avi") as video:
+        assert len(list(video.frames(0, None))) == 3
+
+
+def test_a_video_in_a_folder_called_as_a_protocol_is_that_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(VIDEO_VARIABLE, "threads;1")
+    for folder in (Path("http:"), Path("data:text")):
+        folder.mkdir()
+        short_video(folder / "a.avi")
+        with Video(folder / "a.avi") as video:
+            assert video.info.width == 64
+    assert name_for_ffmpeg(Path("a")) == str(tmp_path / "a")
+    assert os.environ[VIDEO_VARIABLE].startswith("threads;1|format_whitelist;mov,")
+    assert os.environ[VIDEO_VARIABLE].count("whitelist") == 2
+
+
+def test_no_name_of_a_file_forges_a_line(tmp_path):
+    with pytest.raises(InputError) as refused:
+        (tmp_path / "a\nerror: \x1b[2Jb").mkdir()
+        read_bytes(tmp_path / "a\nerror: \x1b[2Jb", 9)
+    assert str(refused.value).isprintable()

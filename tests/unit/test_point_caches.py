@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from physgen.sim.cache import folder_lock as folder_lock_module
 from physgen.sim.cache.bake_folder import BakedObject, load_manifest, save_manifest
-from physgen.sim.cache.folder_lock import LOCK_FILE, folder_lock, is_held, is_locked
+from physgen.sim.cache.folder_lock import LOCK_FILE, MOST_BYTES, folder_lock, is_held, is_locked
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
 
@@ -169,6 +169,13 @@ def test_another_machines_run_is_respected(tmp_path):
     with pytest.raises(InputError, match=words), folder_lock(tmp_path):
         pass
     assert (tmp_path / LOCK_FILE).exists() and is_held(tmp_path) and not is_locked(tmp_path)
+    # Somebody else's folder may have one that goes on for a terabyte.
+    with (tmp_path / LOCK_FILE).open("r+") as file:
+        file.seek(0, 2)
+        file.write(" " * (MOST_BYTES - file.tell()))
+        file.truncate(2**40)
+    with pytest.raises(InputError, match=words), folder_lock(tmp_path):
+        pass
 
 
 def test_looking_at_a_lock_takes_nothing(tmp_path, holder):

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The remaining time that a command shows."""
+"""The remaining time that a command shows, and what its terminal gets to see."""
+
+import io
+import json
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from physgen.batch.terminal import RemainingTime
+from physgen.batch.terminal import RemainingTime, Terminal
 
 
 class Clock:
@@ -71,3 +74,47 @@ def test_it_is_never_negative_nor_endless(steps):
     for stage, done, total, eta, passed in steps:
         clock.now += passed
         assert 0 <= left.update(event(stage, done, total, eta)) < 1e9
+
+
+HOSTILE = "ball\x1b]0;t\x07\x9b2J\u202e\ud800 é→\ttab"
+SHOWN = "ball�]0;t��2J�� é→\ttab"
+
+
+def out(encoding="utf-8"):
+    return io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+
+
+def written(stream):
+    stream.flush()
+    return stream.buffer.getvalue()
+
+
+def test_names_from_a_strangers_folder_give_a_terminal_no_orders(capsys):
+    stream = out()
+    terminal = Terminal(as_json=False, out=stream)
+    terminal.line(HOSTILE)
+    terminal({"event": "notice", "stage": "track", "message": HOSTILE})
+    terminal({"event": "progress", "stage": "bake", "done": 1, "total": 1, "message": f"{HOSTILE}\nerror: no"})
+    terminal.error("InputError", HOSTILE)
+    lines = written(stream).decode().splitlines()
+    assert lines[:2] == [SHOWN, f"track: {SHOWN}"]
+    assert len(lines) == 3 and lines[2].startswith("bake") and f"{SHOWN} error: no" in lines[2]
+    assert capsys.readouterr().err == f"error: {SHOWN}\n"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii", "cp1252"])
+def test_json_lines_say_the_same_and_hold_no_orders(encoding):
+    stream = out(encoding)
+    terminal = Terminal(as_json=True, out=stream)
+    event = {"event": "notice", "message": HOSTILE + "\u2028\N{GRINNING FACE}"}
+    terminal(event)
+    terminal.error("InputError", HOSTILE)
+    first, second = written(stream).decode(encoding).splitlines()
+    assert json.loads(first) == event and json.loads(second)["message"] == HOSTILE
+    assert all(c.isprintable() for c in first + second)
+
+
+def test_a_terminal_that_lacks_a_character_gets_its_number():
+    stream = out("ascii")
+    Terminal(as_json=False, out=stream).line("photo → video")
+    assert written(stream) == b"photo \\u2192 video\n"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
-from ...files import open_file
+from ...files import name_for_ffmpeg, open_file
 from ...scene.folder import Scene
 from ..capture import Camera, Capture, Trial
 from ..capture_checks import check_capture
@@ -75,7 +75,7 @@ class Video:
         if empty:
             raise InputError(f"{path}: is empty; copy the video again")
         self._path = path
-        self._source = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        self._source = cv2.VideoCapture(name_for_ffmpeg(path), cv2.CAP_FFMPEG)
         if not self._source.isOpened():
             raise InputError(f"{path}: not a readable video; convert it to MP4 (H.264) or AVI (MJPEG)")
         get = self._source.get
