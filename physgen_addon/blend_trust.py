@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import bpy
@@ -113,6 +113,25 @@ def agree(scene: bpy.types.Scene) -> None:
 def is_pending(text: str) -> bool:
     """Return whether the path ``text`` of a property waits for the user's word."""
     return bool(_came) and bool(text.strip()) and _outside(text) in {claim.text for claim in _came}
+
+
+PROGRAMS = (
+    ".app", ".action", ".appex", ".bundle", ".kext", ".mpkg", ".pkg", ".plugin", ".prefpane", ".saver", ".service",
+    ".workflow", ".xpc",
+)  # fmt: skip
+"""Suffixes of folders that macOS runs or installs when they are opened, whatever is in them."""
+
+
+def may_open(path: Path, suffixes: Collection[str] = ()) -> bool:
+    """Return whether ``path``, which a file from elsewhere may have set, can be handed to the operating system: a file
+    with one of ``suffixes`` that is there, or, without any, a folder. A program would run."""
+    try:
+        if suffixes:
+            return path.suffix in suffixes and path.is_file()
+        # What is not there may be found with another ending, as on Windows.
+        return path.is_dir() and path.resolve().suffix.lower() not in PROGRAMS and path.suffix.lower() not in PROGRAMS
+    except (OSError, ValueError, RuntimeError):
+        return False
 
 
 def require(text: str) -> None:

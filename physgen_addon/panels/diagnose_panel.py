@@ -115,7 +115,7 @@ class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
             row.operator(PHYSGEN_OT_explain_video.bl_idname, icon="VIEWZOOM")
         path = Path(bpy.path.abspath(video.comparison))
         # A .blend from elsewhere may set any path here, and the operating system opens it: a program would run.
-        if video.comparison and not blend_trust.is_pending(video.comparison) and path.suffix == ".mp4":
+        if video.comparison and not blend_trust.is_pending(video.comparison) and blend_trust.may_open(path, (".mp4",)):
             layout.operator("wm.path_open", text="Play Comparison", icon="PLAY").filepath = str(path)
 
 

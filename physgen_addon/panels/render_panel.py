@@ -77,12 +77,13 @@ def _draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup)
         return
     path = Path(bpy.path.abspath(rendering.result))
     # A .blend from elsewhere may set any path here, and Open passes it to the operating system.
-    if path.suffix not in RESULTS or not path.is_file():
+    if not blend_trust.may_open(path, RESULTS):
         return
     row = layout.row(align=True)
     row.label(text=path.name, icon="CHECKMARK")
     row.operator("wm.path_open", text="Open").filepath = str(path)
-    row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
+    if blend_trust.may_open(path.parent):
+        row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
 
 
 def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

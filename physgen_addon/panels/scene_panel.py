@@ -101,8 +101,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: 
     row.prop(state, "folder", text="")
     row.operator(PHYSGEN_OT_import_scene.bl_idname, text="", icon="IMPORT")
     there = not blend_trust.is_pending(state.folder) and folder.is_dir()
-    # On macOS a folder may be a program, which opening starts.
-    if there and folder.suffix.lower() != ".app":
+    if there and blend_trust.may_open(folder):
         row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
     if not there:
         row.alert = True

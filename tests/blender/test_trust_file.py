@@ -16,6 +16,8 @@ from physgen.sim.errors import InputError
 from physgen.sim.trust import NotTrusted
 from physgen.sim.version import VERSION
 
+from . import checked_layout
+
 pytestmark = pytest.mark.usefixtures("addon")
 
 
@@ -195,3 +197,30 @@ def test_a_link_that_leads_out_of_the_folder_counts_as_outside(tmp_path, monkeyp
     with pytest.raises(InputError, match="outside its folder"):
         paths.scene_cache(bpy.context.scene)
     assert [claim.text for claim in blend_trust.pending(bpy.context.scene)] == [str(tmp_path / "secret")]
+
+
+def buttons(panel):
+    """How many buttons of ``panel`` hand something to the operating system."""
+    return checked_layout.draw(panel).names.count("wm.path_open")
+
+
+def test_no_button_opens_what_the_system_would_run(tmp_path):
+    """On macOS a folder may be a program; elsewhere a missing file may be found with the ending of one."""
+    scene = bpy.context.scene
+    rendering, video = scene.physgen.rendering, scene.physgen_diagnose.video
+    for folder, expected in (("frames", 2), ("Frames.APP", 1), ("frames.workflow", 1), ("shot.v2", 2)):
+        frame = tmp_path / folder / "0001.png"
+        frame.parent.mkdir()
+        frame.write_bytes(b"a picture")
+        rendering.result = str(frame)
+        scene.physgen.folder = str(frame.parent)
+        assert buttons(bpy.types.PHYSGEN_PT_render) == expected, folder
+        assert buttons(bpy.types.PHYSGEN_PT_scene) == expected - 1, folder
+    (tmp_path / "linked").symlink_to(tmp_path / "Frames.APP")
+    scene.physgen.folder = str(tmp_path / "linked")
+    assert buttons(bpy.types.PHYSGEN_PT_scene) == 0
+    for name, there, expected in (("a.mp4", True, 1), ("b.mp4", False, 0), ("c.exe", True, 0)):
+        if there:
+            (tmp_path / name).write_bytes(b"a video")
+        video.comparison = str(tmp_path / name)
+        assert buttons(bpy.types.PHYSGEN_PT_diagnose_video) == expected, name
