@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A command that is asked to stop while its modules are still imported ends with the same code as later.
+"""What a command does before its modules are imported: heed signals, and have somebody who says how it was killed.
 
 Importing NumPy and the rest takes a second, on a busy machine many. Nothing is written before ``cli.main`` takes
 the signals over (``terminal.stop_signals``), so ending at once loses nothing. Imported first, and light; what has
 to be set before NumPy is imported is set here, too.
+
+On Linux the command then works in a child. A process that the kernel kills, as memory ran out, cannot say so itself:
+its parent, which has imported nothing, waits, passes signals on, and says it. Both end together, whichever is killed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import json
 import os
 import signal
 import sys
@@ -17,6 +23,11 @@ from ..sim.app.launch import ONE_BLAS_THREAD
 
 CANCELLED = 130
 """Exit code of ``Cancelled`` in sim/errors.py."""
+KILLED = 128 + 9
+"""Exit code of a command that SIGKILL has ended, as shells give it."""
+
+_PR_SET_PDEATHSIG = 1
+_PASSED_ON = (signal.SIGINT, signal.SIGTERM)
 
 
 def _is_own_process() -> bool:
@@ -26,12 +37,72 @@ def _is_own_process() -> bool:
     return module.endswith((".batch.cli", "physgen.__main__")) or PurePath(sys.argv[0]).stem == "physgen"
 
 
+def _is_typed() -> bool:
+    """Return whether it was started as people start it; other programs start ``batch.cli``, and wait for it."""
+    started = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return PurePath(sys.argv[0]).stem == "physgen" or (
+        started is not None and started.name.endswith("physgen.__main__")
+    )
+
+
 def heed() -> None:
     """End this process at once, with the code for cancelled, when it gets SIGINT or SIGTERM."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _PASSED_ON:
         signal.signal(number, lambda *_: os._exit(CANCELLED))
+
+
+def work_in_child() -> None:
+    """Return in a child of this process, which ends with it; this process waits for it and ends as it did.
+
+    Returns in this process where there can be no such child: elsewhere than on Linux, or where no process can start.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    # Imported here: signals have to be heeded before.
+    from ..sim.memory import how_it_was_killed, memory_kills
+
+    kills, parent = memory_kills(), os.getpid()
+    try:
+        child = os.fork()
+    except OSError:
+        return
+    if child == 0:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != parent:
+            os._exit(KILLED)
+        return
+    for number in _PASSED_ON:
+        signal.signal(number, lambda number, _: _pass_on(number, child))
+    _, status = os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(status)
+    if code >= 0:
+        os._exit(code)
+    if code == -signal.SIGKILL:
+        _say(f"{' '.join(sys.argv[1:2]) or 'physgen'}: {how_it_was_killed(kills)}; run it again to go on")
+        os._exit(KILLED)
+    # Of a fault: as if there were no child, for whoever asks how this process ended.
+    signal.signal(-code, signal.SIG_DFL)
+    os.kill(parent, -code)
+    os._exit(128 - code)
+
+
+def _pass_on(number: int, child: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, number)
+
+
+def _say(message: str) -> None:
+    """Print the error as ``Terminal`` does, which is not imported here."""
+    if "--json" in sys.argv:
+        text, to = json.dumps({"event": "error", "kind": "Killed", "message": message}), 1
+    else:
+        text, to = f"\nerror: {message}", 2
+    with contextlib.suppress(OSError):
+        os.write(to, f"{text}\n".encode())
 
 
 if _is_own_process():
     heed()
     os.environ.setdefault(*ONE_BLAS_THREAD)
+    if _is_typed():
+        work_in_child()

@@ -16,6 +16,7 @@ from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.cache.checksums import span_for
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.processes import is_running
 from PIL import Image
 
 from ..conftest import complete_manifest
@@ -57,6 +58,55 @@ def test_while_its_modules_are_imported_the_code_is_the_same(number, started, mo
     """)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def typed(tmp_path, *words, then):
+    """The command ``words`` as a person starts it, whose worker does ``then`` when it imports NumPy: its process."""
+    code = textwrap.dedent(f"""
+        import os, runpy, signal, sys, time
+        def hook(event, arguments):
+            if event == "import" and arguments[0] == "numpy":
+                with open({str(tmp_path / "worker")!r}, "w") as file:
+                    file.write(str(os.getpid()))
+                {then}
+        sys.addaudithook(hook)
+        sys.argv = {["physgen", *words]!r}
+        runpy.run_module("physgen.__main__", run_name="__main__", alter_sys=True)
+    """)
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the shell says it")
+def test_a_command_that_was_killed_says_so(tmp_path):
+    """The kernel kills it as memory runs out: it cannot say anything itself."""
+    then = "os.kill(os.getpid(), signal.SIGKILL)"
+    with typed(tmp_path, "doctor", then=then) as process:
+        out, said = process.communicate(timeout=60)
+    assert (process.returncode, out) == (137, "")
+    (line,) = said.split("\n")[1:-1]
+    assert line.startswith("error: doctor: it was killed") and "MiB are available now" in line
+    with typed(tmp_path, "doctor", "--json", then=then) as process:
+        out, said = process.communicate(timeout=60)
+    assert process.returncode == 137 and said == "" and json.loads(out)["kind"] == "Killed"
+    with typed(tmp_path, "doctor", then="os.kill(os.getpid(), signal.SIGSEGV)") as process:
+        process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGSEGV
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 130), (signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
+    with typed(tmp_path, "doctor", then="time.sleep(120)") as process:
+        while not (tmp_path / "worker").exists() or not (worker := (tmp_path / "worker").read_text()):
+            time.sleep(0.02)
+        assert int(worker) != process.pid
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    assert process.returncode == code
+    end = time.monotonic() + 60
+    while is_running(int(worker)):
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
