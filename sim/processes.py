@@ -71,12 +71,6 @@ def _own_mark(pid: int) -> Mark:
     return Mark(pid, _started(pid) or UNKNOWN_START, _machine())
 
 
-def mark_of(pid: int) -> Mark | None:
-    """Return the mark of the process ``pid`` of this machine; None if there is none."""
-    started = _started(pid)
-    return None if started is None else Mark(pid, started, _machine())
-
-
 def parse_mark(text: str) -> Mark | None:
     """Return the mark that ``text`` is, if it is one."""
     found = _MARK.fullmatch(text)

@@ -352,18 +352,3 @@ def _scaled(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
         return picture
     width, height = (max(1, round(side * share)) for side in (picture.shape[1], picture.shape[0]))
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def judgement_lines(judgement: Judgement) -> list[str]:
-    """Return the scores as lines of text: mean ± spread of each criterion."""
-    lines = [
-        f"judged by {judgement.model}, {judgement.options.repetitions} repetitions (mean ± standard deviation, 0 to 1):"
-    ]
-    for video, of in judgement.scores.items():
-        parts = []
-        for name, score in of.items():
-            told = "none" if not score.values else f"{score.mean:.2f}"
-            told += f" ± {score.spread:.2f}" if len(score.values) > 1 else ""
-            parts.append(f"{TITLES[name].lower()} {told} (n = {len(score.values)})")
-        lines.append(f"  {video}: " + ", ".join(parts))
-    return lines

@@ -20,10 +20,9 @@ from skimage.draw import polygon
 
 from ..errors import InputError
 from ..validation import read_json
-from .image_masks import FileMask
+from .image_masks import MAX_BYTES, MAX_PIXELS, FileMask
 
 Mask = NDArray[np.bool_]
-MAX_PIXELS = 100_000_000
 MAX_RUNS = 20_000_000
 MAX_POLYGONS = 10_000
 _MAX_CHARACTERS = 13
@@ -97,7 +96,6 @@ def mask_from_polygons(value: list[Any], width: int, height: int, where: str) ->
 
 
 MAX_ANNOTATIONS = 4096
-MAX_BYTES = 2**30
 
 
 def masks_from_json(path: Path, width: int, height: int, photo_name: str) -> list[FileMask]:

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..validation import valid_names
 from .coco_masks import masks_from_json
-from .image_masks import FileMask, masks_from_array_file, masks_from_folder, masks_from_image
+from .image_masks import MAX_BYTES, FileMask, masks_from_array_file, masks_from_folder, masks_from_image
 
 Mask = NDArray[np.bool_]
 MAX_MASKS = 256
-MAX_BYTES = 2**30
-"""Of all imported masks."""
 ASPECT_TOLERANCE = 0.01
 """Relative difference allowed between the aspect ratios of a mask and its photo: one pixel in a hundred."""
 

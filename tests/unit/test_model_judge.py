@@ -19,7 +19,6 @@ from physgen.sim.evaluate.model_judge import (
     JudgeOptions,
     evenly_sampled,
     judge_videos,
-    judgement_lines,
     question,
     read_scores,
 )
@@ -111,7 +110,6 @@ def test_all_videos_are_judged_together_in_another_order_each_time():
         assert found.scores[name]["photorealism"].spread == 0
     assert not found.notes and "60 frames" not in notices[0] and "30 frames of 3 videos" in notices[0]
     assert KEY not in json.dumps(found.to_json()) + "".join(notices)
-    assert any("clip_dark: physical realism" in text for text in judgement_lines(found))
     again = dict.fromkeys(found.orders)
     with Judge(honest) as server:
         assert dict.fromkeys(judge(server.url, repetitions=6).orders) == again, "orders follow from the seed"
@@ -158,9 +156,7 @@ def test_what_stays_unreadable_has_no_score_and_is_said():
     assert sum("has one value less" in note for note in found.notes) == 2
     with Judge(lambda h, n: send(h, completion("no"))) as server:
         nothing = judge(server.url, repetitions=1, attempts=1)
-    assert (
-        math.isnan(nothing.scores["clip_dark"]["photorealism"].mean) and "none (n = 0)" in judgement_lines(nothing)[1]
-    )
+    assert math.isnan(nothing.scores["clip_dark"]["photorealism"].mean)
     assert nothing.to_json()["videos"]["clip_dark"]["photorealism"] == {"mean": None, "spread": None, "values": []}
 
 

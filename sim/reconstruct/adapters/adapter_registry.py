@@ -446,10 +446,11 @@ def _problem(stage: str, kind: str, target: str) -> str | None:
             return str(error)
         return None
     if kind in FOLDERS:
+        from ...gaussians.guidance import pretrained_models
         from . import diffusers_adapter, transformers_adapter
 
         if kind == DIFFUSERS:
-            found, lacking = diffusers_adapter.pipeline_problem(path), diffusers_adapter.missing_packages()
+            found, lacking = diffusers_adapter.pipeline_problem(path), pretrained_models.missing_packages()
         else:
             found, lacking = transformers_adapter.folder_problem(kind, path), transformers_adapter.missing_packages()
         return found or (f"needs {', '.join(lacking)}; install physgen[models]" if lacking else None)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...gaussians.guidance.pretrained_models import import_library, library_errors, package_version, read_json
+from ...gaussians.guidance.pretrained_models import import_library, library_errors, read_json
 from .onnx_adapter import LEAST_SIDE, blended, filled_hole_by_hole, without_content
 from .protocols import Mask, Pixels, checked_pixels
 
@@ -26,7 +26,6 @@ LIBRARIES = ("diffusers", "transformers")
 """Where the parts of a pipeline may come from."""
 NOT_LOADED = ("safety_checker", "feature_extractor", "image_encoder")
 """Parts that inpainting does without."""
-PACKAGES = ("torch", "diffusers", "transformers", "safetensors")
 REMEDY = "give the folder that save_pretrained wrote (model_index.json, unet, vae, …)"
 PROMPT, AVOID = "empty background, nothing on it", "object, person, text, shadow"
 STEPS, GUIDANCE, SEED = 30, 5.0, 0
@@ -124,8 +123,3 @@ def pipeline_problem(folder: Path) -> str | None:
         if given is not None and given not in LIBRARIES:
             return f"{folder}: its part {name[:40]} is of {str(given)[:60]!r}, which is not opened: {REMEDY}"
     return None
-
-
-def missing_packages() -> list[str]:
-    """Return the packages that are not installed, without importing any."""
-    return [name for name in PACKAGES if package_version(name) is None]
