@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.gaussians.compose.composition_parts import CompositionPart, part_distances
-from physgen.sim.gaussians.compose.seating import seated_parts
+from physgen.sim.gaussians.compose.composition_parts import CompositionPart, part_distances, seated_parts
 from physgen.sim.gaussians.mesh_to_splats import splats_on_mesh
 from physgen.sim.mpm.colliders import Surface
 from physgen.sim.scene.model import Ground

@@ -2,7 +2,7 @@
 """Composition: several objects brought to fit each other (Algorithm 1 of PhyCAGE and its ablations).
 
 compose_options.py    options and request; no heavy imports
-composition_parts.py  parts, reference image, result; a part as a simulated body with its mesh (Taichi)
+composition_parts.py  parts, reference image, result; a part as a simulated body with its mesh (Taichi), seated
 composition.py        the loss and its optimisation (Taichi)
 physical_body.py      the simulator as an optimiser's step: velocities in, positions out (Taichi)
 body_distances.py     signed distances to a body's inside and to obstacles

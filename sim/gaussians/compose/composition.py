@@ -41,9 +41,9 @@ from .composition_parts import (
     StepRecord,
     fraction_inside,
     part_distances,
+    seated_parts,
 )
 from .physical_body import StepOptions
-from .seating import seated_parts
 
 Array = NDArray[np.float64]
 

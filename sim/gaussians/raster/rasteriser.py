@@ -15,7 +15,6 @@ from ...mpm.kernels.runtime import ensure_started
 from ...mpm.solver_options import SolverOptions
 from ...scene.model import Camera
 from ..splats import Splats
-from .blending import LIGHT, MEAN_DEPTH, STATE, BackwardArrays, PairArrays, PictureArrays, blend, blend_back
 from .splat_projection import (
     ELLIPSE,
     FURTHEST,
@@ -29,7 +28,18 @@ from .splat_projection import (
     project,
     project_back,
 )
-from .tiles import TilePairs, pairs_of
+from .tile_blending import (
+    LIGHT,
+    MEAN_DEPTH,
+    STATE,
+    BackwardArrays,
+    PairArrays,
+    PictureArrays,
+    TilePairs,
+    blend,
+    blend_back,
+    pairs_of,
+)
 
 MAX_PIXELS = 2**26
 """Bounds memory: a pixel takes about 60 bytes."""
