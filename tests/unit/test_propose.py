@@ -15,12 +15,15 @@ from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, cho
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.object_proposals import proposals_from_alpha, with_model
+from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width
 from PIL import Image
 from scipy import ndimage
 
 WIDTH, HEIGHT = 256, 192
 THINGS = {(60, 110, 26): (190, 60, 40), (180, 90, 34): (40, 70, 150)}
 """Discs x, y, radius, and their colours."""
+BEHIND = (100, 30, 20)
+"""A coloured disc that is out of focus."""
 
 
 def floor(seed=0):
@@ -37,6 +40,9 @@ def saved(image, path):
 def drawn(path):
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = floor()
+    x, y, radius = BEHIND
+    image[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = (40, 120, 60)
+    image[:75] = ndimage.gaussian_filter(image[:75], (4, 4, 0))
     for (x, y, radius), colour in THINGS.items():
         image[(((columns - x) / (1.2 * radius)) ** 2 + ((rows - y - radius) / (0.3 * radius)) ** 2) < 1] *= 0.6
         image[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = colour
@@ -69,14 +75,45 @@ def iou(box, other):
     return common / (sum((b[2] - b[0]) * (b[3] - b[1]) for b in (box, other)) - common)
 
 
-def test_both_things_are_found_and_come_first(photo, tmp_path):
+def test_both_things_are_found_and_come_first_and_what_is_out_of_focus_is_not(photo, tmp_path):
     found = propose(photo, out=tmp_path / "list")
+    x, y, radius = BEHIND
+    assert all(iou(item.box, (x - radius, y - radius, x + radius, y + radius)) < 0.3 for item in found)
     for x, y, radius in THINGS:
         assert max(iou(item.box, (x - radius, y - radius, x + radius, y + radius)) for item in found[:2]) > 0.5
     record = json.loads((tmp_path / "list" / LIST_FILE).read_text())
     assert (record["format"], record["width"], record["height"]) == ("physgen-proposals/1", WIDTH, HEIGHT)
     assert [tuple(item["box"]) for item in record["proposals"]] == [item.box for item in found]
     assert Image.open(tmp_path / "list" / PICTURE_FILE).size == (WIDTH, HEIGHT)
+
+
+def blurred_behind(sharp):
+    """A ball that is sharp or not before two coloured things that are out of focus, and the masks of all three."""
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    image = np.full((120, 160, 3), 170.0) + np.random.default_rng(1).normal(scale=2, size=(120, 160, 1))
+    masks = [(columns - x) ** 2 + (rows - y) ** 2 < r**2 for x, y, r in ((50, 32, 16), (112, 34, 18), (80, 84, 20))]
+    for mask, colour in zip(masks, ((200, 40, 30), (30, 30, 40), (220, 180, 30)), strict=True):
+        if mask is masks[-1]:
+            image = ndimage.gaussian_filter(image, (4, 4, 0))
+        image[mask] = colour
+    image = ndimage.gaussian_filter(image, (0.7, 0.7, 0) if sharp else (4, 4, 0))
+    return np.clip(image, 0, 255).astype(np.uint8), masks
+
+
+def test_things_are_in_focus_as_sharp_as_the_sharpest_one():
+    image, masks = blurred_behind(sharp=True)
+    assert in_focus(masks, image) == [False, False, True]
+    assert in_focus(masks, blurred_behind(sharp=False)[0]) == [True, True, True]
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_the_width_of_an_edge_is_that_of_its_blur(sigma):
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    mask = (columns - 80) ** 2 + (rows - 60) ** 2 < 35**2
+    lab = np.repeat(ndimage.gaussian_filter(100.0 * mask, sigma)[..., None], 3, axis=-1).astype(np.float32)
+    # The step over the greatest slope of a step blurred by a Gaussian; a curved outline and 8 pixels' reach narrow it.
+    assert outline_width(mask, lab) == pytest.approx(sigma * np.sqrt(2 * np.pi), rel=0.12)
+    assert outline_width(np.zeros_like(mask), lab) is None
 
 
 def test_an_equal_photo_is_searched_once_and_another_one_again(photo, tmp_path, monkeypatch):

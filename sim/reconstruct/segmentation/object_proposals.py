@@ -23,6 +23,7 @@ from .mask_cleanup import largest_component
 from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
+from .outline_sharpness import in_focus
 
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
@@ -55,7 +56,8 @@ class Examined:
 def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
 
-    Of two that overlap the better one is returned. The list is empty where nothing stands out.
+    Of two that overlap the better one is returned, and none that is out of focus where another is sharp. The list is
+    empty where nothing stands out.
     """
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
@@ -63,6 +65,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     found = [(item, _score(item.features)) for item in examined_candidates(small)]
     # A whole goes before its parts, which often have the clearer outline.
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
+    sharp = in_focus([item.mask for item, _ in found], small)
+    found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
     found.sort(key=lambda pair: -(pair[1] + WHOLE * float(np.log(pair[0].mask.mean()))))
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
