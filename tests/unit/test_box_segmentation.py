@@ -112,6 +112,31 @@ def test_contact_shadow_is_not_part_of_the_object():
     assert (drop_ground_shadow(paint([(truth, (40, 80, 190))]), truth) == truth).all()
 
 
+def test_brown_legs_under_a_seat_on_white_are_no_shadow():
+    seat, front = (
+        drawn([(90, 20), (230, 20), (230, 158), (90, 158)]),
+        drawn([(92, 150), (106, 150), (104, 220), (94, 220)]),
+    )
+    behind = drawn([(120, 150), (136, 150), (126, 204), (114, 204)])
+    truth = seat | front | front[:, ::-1] | behind
+    photo = np.full((HEIGHT, WIDTH, 3), 253.0)
+    # The crease between the seat and its legs is dark.
+    photo[truth] = (120, 80, 62)
+    photo[152:159, 90:230] = (30, 19, 15)
+    photo = np.clip(ndimage.gaussian_filter(photo, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    assert overlap(drop_ground_shadow(photo, truth), truth) > 0.995
+
+
+def test_granite_around_a_smooth_top_is_no_shadow_on_ice():
+    rng = np.random.default_rng(5)
+    image = 232.0 + rng.normal(scale=2, size=(HEIGHT, WIDTH, 1)) + np.zeros(3)
+    stone, top = disc(160, 120, 60), disc(160, 120, 44)
+    image[stone] = np.clip(105.0 + 45 * rng.normal(size=(HEIGHT, WIDTH, 1)), 20, 220)[stone]
+    image[top] = (225, 185, 30)
+    photo = np.clip(ndimage.gaussian_filter(image, (0.6, 0.6, 0)), 0, 255).astype(np.uint8)
+    assert overlap(segment(photo, (90, 50, 230, 190), "stone"), stone) > 0.95
+
+
 def test_outline_settles_where_the_colours_mix_half_and_half():
     truth = disc(150, 120, 45)
     photo = paint([(truth, (40, 80, 190))])
@@ -298,6 +323,22 @@ def test_a_box_around_object_and_shadow_yields_the_object(box, seed):
     found = segment(pixels, box, "toy")
     assert (found & ball).sum() / (found | ball).sum() > 0.95
     assert (found & shadow).sum() < 0.02 * shadow.sum()
+
+
+def test_black_wheels_with_pale_hubs_are_no_shadow_of_the_car():
+    body = drawn([(80, 110), (130, 85), (200, 85), (240, 112), (240, 150), (80, 150)])
+    wheels, hubs = (disc(115, 150, r) | disc(205, 150, r) for r in (20, 9))
+    cast = drawn([(72, 156), (245, 156), (245, 171), (72, 171)])
+    image = np.array([105.0, 120, 135]) + (ground(3) - ground(3).mean(axis=(0, 1)))
+    image[cast] *= 0.12
+    image[body] = (225, 170, 20)
+    image[wheels] = (12, 15, 19)
+    image[hubs] = (150, 160, 170)
+    photo = np.clip(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    mask = segment(photo, (60, 70, 260, 185), "car")
+    assert mask[wheels].mean() > 0.95 and mask[body].mean() > 0.97
+    # The shadow that joins them may stay, the ground beyond it may not.
+    assert mask[~(body | wheels | cast)].sum() < 0.03 * mask.sum()
 
 
 def test_a_brown_thing_on_brown_wood_is_not_given_back_to_the_ground():

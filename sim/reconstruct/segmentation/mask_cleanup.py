@@ -14,6 +14,9 @@ Mask = NDArray[np.bool_]
 SHADE = (0.28, 0.9)
 """Range of a contact shadow's brightness over that of the lit ground: below is the crease itself or a black object."""
 
+COLOURED = 60.0
+"""Saturation, of 255, that a contact shadow may have over that of the lit ground, at least."""
+
 BOX_CORNERS, CORNER_CUT, BOX_OVERLAP = 6, 0.015, 0.96
 """A box' outline: most corners, how far off they may be over its length, and the least overlap with them."""
 BESIDE = 8.0
@@ -215,7 +218,9 @@ def drop_ground_shadow(pixels: NDArray[np.uint8], mask: Mask, *, most: float = 0
     apart = np.abs((hue.astype(np.float32) - lit_hue + 90.0) % 180.0 - 90.0)
     brightness = value.astype(np.float32) / max(lit, 1.0)
     # Light reflected into a shadow by the ground takes on its colour: darker is also redder on wood.
+    # White ground has no hue to compare; its shadow has hardly any colour either, as dark wood before it has.
     similar = (apart < 4.0 + 12.0 * (1.0 - brightness)) & (saturation > lit_saturation - 15)
+    similar &= saturation < lit_saturation + max(COLOURED, 2.0 * lit_saturation)
     # Under the object, the crease lies above its shadow in the photo.
     height = max(3, round(0.12 * np.sqrt(area)))
     above = cv2.erode(value, np.ones((height, 1), np.uint8), anchor=(0, height - 1))
