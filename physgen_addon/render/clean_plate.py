@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...sim.composite import backdrop, disocclusion, srgb
 from ...sim.composite.backdrop import Backdrop, Proxy, Warp, borders_of, make_proxy
-from ...sim.composite.compositing import SOFT, ObjectLayer, behind, shadow_exponents
+from ...sim.composite.compositing import SOFT, ObjectLayer, behind, shadow_exponents, shows_shadow
 from ...sim.composite.outpaint import Borders, inpaint_hole, outpaint
 from ...sim.composite.srgb import Linear
 from ...sim.errors import InputError
@@ -84,12 +84,16 @@ class PlateView:
 
 @dataclass(frozen=True)
 class Seen:
-    """The plate seen by a view: photo and background (H, W, 3), the weight w (H, W), masks (H, W)."""
+    """The plate seen by a view: photo and background (H, W, 3), the weight w (H, W), masks (H, W).
+
+    contacts: (H, W) the weight of the objects' contacts with the ground alone, as smooth as these.
+    """
 
     photo: srgb.Linear
     background: srgb.Linear
     at_rest: NDArray[np.float32]
     masks: NDArray[np.bool_]
+    contacts: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,11 +158,12 @@ class CleanPlate:
 
     def seen(self, view: PlateView, now: Sequence[NDArray[np.float32]]) -> Seen:
         """Return the plate as seen by ``view`` with the objects' vertices at ``now`` (V, 3)."""
-        at_rest = self._contacts_at_rest(now)
+        contacts = self._contacts_at_rest(now)
         if view.relief is None:
+            at_rest = contacts.copy()
             for rim, positions in zip(self._rims, now, strict=True):
                 rim.apply(at_rest, self._pixels(positions))
-            return Seen(self._behind, self.background, at_rest, self._cores)
+            return Seen(self._behind, self.background, at_rest, self._cores, contacts)
         extended = self.extended(view.relief.borders)
         keep = np.where(self.masks, np.float32(0.0), np.float32(1.0))
         for halo, positions in zip(extended.halos, now, strict=True):
@@ -169,18 +174,29 @@ class CleanPlate:
         return Seen(
             photo=view.colours(photo),
             background=view.colours(extended.background),
-            at_rest=view.warp(at_rest),
+            at_rest=view.warp(contacts),
             masks=np.zeros(self.masks.shape, dtype=bool),
+            contacts=view.warp(contacts),
         )
 
     def shadow_exponents(self, rest_shadow: srgb.Linear) -> NDArray[np.float32]:
         """Return the exponents (3,) that give rendered shadows the photo's colour and depth; ``rest_shadow`` (H, W, 3)
         is that at rest."""
+        shaded, known = self._shaded_and_known()
+        return shadow_exponents(self.photo, self.background, rest_shadow, shaded=shaded, known=known)
+
+    def shows_shadow(self, rest_shadow: srgb.Linear) -> bool:
+        """Return whether the photo shows shadows of its objects, where the scene says anything about that;
+        ``rest_shadow`` as of ``shadow_exponents``."""
+        if any(item.shadow is None for item in self._scene.objects):
+            return True
+        shaded, known = self._shaded_and_known()
+        return shows_shadow(self.photo, self.background, rest_shadow, shaded=shaded, known=known)
+
+    def _shaded_and_known(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         shaded = np.logical_or.reduce([self._mask(item.shadow) for item in self._scene.objects])
         rims = np.maximum.reduce([disocclusion.rim_strength(mask, self.masks) for mask in self.object_masks])
-        return shadow_exponents(
-            self.photo, self.background, rest_shadow, shaded=shaded, known=~self.masks & (rims == 0.0)
-        )
+        return shaded, ~self.masks & (rims == 0.0)
 
     def extended(self, borders: Borders) -> Extended:
         """Return the background extended to a canvas with ``borders``, for a moving camera; computed once."""

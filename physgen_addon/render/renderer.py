@@ -209,6 +209,7 @@ class Renderer:
             self._shadows = GroundShadow(self._scene, self._built, options, self._scratch)
             bare = self._shadows.ratio(rest, self._scene.camera, self._size)
             self._shade = self._plate.shadow_exponents(bare)
+            self._shows_shadow = self._plate.shows_shadow(bare)
             self._rest_shadow = self._tinted(bare)
             self._reflections = reflections(self._scene, self._built, options, self._objects)
             self._rest_reflection = (
@@ -240,6 +241,8 @@ class Renderer:
         shadow = rest_shadow
         if sample > 0:
             shadow = self._tinted(self._shadows.ratio(moment, view.camera, self._size))
+        if not self._shows_shadow:
+            shadow, rest_shadow = compositing.appearing(shadow, seen.contacts), np.ones_like(shadow)
         ground = compositing.ground_layer(
             photo=seen.photo,
             background=seen.background,

@@ -235,19 +235,52 @@ def shadow_exponents(
     if shaded.sum() < FEWEST_SHADED:
         return ones
 
-    def darkening(lit: Linear, dark: Linear) -> NDArray[np.float64]:
-        values = np.log(np.maximum(lit, BLACK)) - np.log(np.maximum(dark, BLACK))
-        return np.asarray(values.astype(np.float64).sum(axis=0))
-
     luminance = np.asarray(LUMINANCE, dtype=np.float32)
-    total = float(darkening(background[shaded] @ luminance, photo[shaded] @ luminance))
+    total = float(_darkening(background[shaded] @ luminance, photo[shaded] @ luminance))
     if total < FAINT * shaded.sum():
         return ones
-    levels = rest_shadow[known] @ luminance
-    rendered = float(-np.log(np.maximum(levels[levels < OUTSKIRTS], MIN_SHADOW)).astype(np.float64).sum())
-    depth = float(np.clip(total / max(rendered, 1e-6), *DEPTHS))
-    tint = np.clip(darkening(background[shaded], photo[shaded]) / total, *TINTS)
+    depth = float(np.clip(total / max(_rendered_depth(rest_shadow, known), 1e-6), *DEPTHS))
+    tint = np.clip(_darkening(background[shaded], photo[shaded]) / total, *TINTS)
     return np.asarray(depth * tint, dtype=np.float32)
+
+
+def _darkening(lit: Linear, dark: Linear) -> NDArray[np.float64]:
+    """Sum of how much darker (N, …) ``dark`` is than ``lit``, as natural logarithms."""
+    values = np.log(np.maximum(lit, BLACK)) - np.log(np.maximum(dark, BLACK))
+    return np.asarray(values.astype(np.float64).sum(axis=0))
+
+
+def _rendered_depth(rest_shadow: Linear, known: NDArray[np.bool_]) -> float:
+    levels = rest_shadow[known] @ np.asarray(LUMINANCE, dtype=np.float32)
+    return float(-np.log(np.maximum(levels[levels < OUTSKIRTS], MIN_SHADOW)).astype(np.float64).sum())
+
+
+LEAST_SHOWN = 0.1
+"""Share of a rendered shadow's depth, in total, below which the photo shows none."""
+
+
+def shows_shadow(
+    photo: Linear, background: Linear, rest_shadow: Linear, *, shaded: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> bool:
+    """Return whether the ``photo`` shows the shadow that is rendered at rest, or at least some of it.
+
+    It does not where a thing was cut out and put on white, or stands in a light that leaves no shadow. Arguments as of
+    ``shadow_exponents``.
+    """
+    shaded = shaded & known
+    luminance = np.asarray(LUMINANCE, dtype=np.float32)
+    total = float(_darkening(background[shaded] @ luminance, photo[shaded] @ luminance))
+    return total >= LEAST_SHOWN * _rendered_depth(rest_shadow, known)
+
+
+def appearing(shadow: Linear, at_rest: NDArray[np.float32]) -> Linear:
+    """Return the rendered ``shadow`` (H, W, 3) of things without one in the photo: none at rest; it comes as they move.
+
+    ``ground_layer`` would divide the photo by a shadow that is not in it. Beside things that have landed where they
+    stood, the clean plate would then be in a shadow that ends where the photo begins. at_rest: (H, W), weight of their
+    contacts alone, without an edge around their outlines.
+    """
+    return np.asarray(1.0 + (shadow - 1.0) * (1.0 - at_rest[..., None]), dtype=np.float32)
 
 
 UMBRA = (0.1, 0.5)

@@ -249,3 +249,33 @@ def test_what_turns_to_a_lamp_is_no_brighter_than_the_brightest_of_the_photo():
     assert lit[0, :, 0] == pytest.approx([0.2 * (2.5 + 1.5 * -np.expm1(-3.5 / 1.5)), 0.525, 0.9, 0.3], abs=0.001)
     assert lit[0, 0, 0] < 0.8
     assert (compositing.rolled_off(layer, np.full((1, 4), np.inf, np.float32)).light == light).all()
+
+
+def test_beside_what_landed_where_it_stood_a_cut_out_on_white_has_no_shadow_with_an_edge():
+    """The photo shows none, so none may show within the clean plate around the outline either."""
+    white = np.ones((30, 40, 3), np.float32)
+    rows, columns = np.mgrid[:30, :40]
+    away = np.hypot(rows - 15.0, columns - 20.0)
+    mask, rim = away < 8, (away >= 8) & (away < 12)
+    rendered = np.repeat((1.0 - 0.7 * np.exp(-away / 8.0))[..., None], 3, axis=2).astype(np.float32)
+    nothing = np.zeros_like(mask)
+    assert not compositing.shows_shadow(white, white, rendered, shaded=nothing, known=~mask & ~rim)
+    shaded = ~mask & (rendered[..., 0] < 0.9)
+    assert compositing.shows_shadow(white * rendered, white, rendered, shaded=shaded, known=~mask)
+    assert compositing.shows_shadow(white, white, np.ones_like(white), shaded=nothing, known=~mask)
+
+    def shown(contacts):
+        shadow = compositing.appearing(rendered, np.full(mask.shape, contacts, np.float32))
+        return compositing.ground_layer(
+            photo=white,
+            background=white,
+            shadow=shadow,
+            rest_shadow=np.ones_like(shadow),
+            at_rest=np.where(rim, np.float32(0.0), np.float32(contacts)),
+            masks=mask,
+        )
+
+    assert (shown(1.0) == 1.0).all()
+    landed = shown(0.95)[15, :, 0]
+    assert np.abs(np.diff(landed)).max() < 0.01
+    assert shown(0.0) == pytest.approx(rendered)
