@@ -42,7 +42,7 @@ from .reasoning.material_decision import (
     DEFAULT_PRESET,
     ObjectPhysics,
     decide_materials,
-    decided_by_shape,
+    decided_by_shapes,
     describe_decision,
     ground_friction,
     physics_record,
@@ -240,7 +240,7 @@ def reconstruct_photo(
             store=store,
             steps=steps,
         )
-        physics = tuple(decided_by_shape(item, body.shape) for item, body in zip(physics, bodies, strict=True))
+        physics = decided_by_shapes(physics, [body.shape for body in bodies], [body.size for body in bodies])
         for name, decided in zip(names, physics, strict=True):
             steps.notice(describe_decision(name, decided))
         (folder / "light").mkdir()

@@ -15,6 +15,7 @@ from physgen.sim.reconstruct.reasoning.chat_client import ChatRequest
 from physgen.sim.reconstruct.reasoning.material_decision import (
     decide_materials,
     decided_by_shape,
+    decided_by_shapes,
     describe_decision,
     ground_friction,
     physics_record,
@@ -221,3 +222,20 @@ def test_the_user_is_told_who_decided():
     assert "'mug'" in describe_decision("cup 1", decided(ObjectRequest(box=BOX, kind="mug")))
     assert "as you chose" in describe_decision("x", decided(ObjectRequest(box=BOX, preset="sand")))
     assert "model's answer" in describe_decision("x", decided(answer="1, thing, 700, hard, 0.3, yes"))
+
+
+def test_things_that_are_alike_are_of_the_same_matter():
+    (unknown,) = decide_materials([ObjectRequest(box=BOX)], [None], None, shipped_names())
+    (chosen,) = decide_materials([ObjectRequest(box=BOX, preset="jelly")], [None], None, shipped_names())
+
+    def presets(shapes, sizes, physics=None):
+        return [item.preset for item in decided_by_shapes(physics or [unknown] * len(shapes), shapes, sizes)]
+
+    alike = [(1.0, 0.5), (1.1, 0.46), (0.95, 0.53)]
+    assert presets(["inflated", "sphere", "inflated"], alike) == ["wood"] * 3
+    assert presets(["inflated", "sphere", "sphere"], alike) == ["medium"] * 3
+    # One of two: what is as large as a ball is nearly one.
+    assert presets(["inflated", "sphere"], alike[:2]) == ["medium"] * 2
+    # A ball and a box that is twice as large keep their own, and nothing is changed that was decided.
+    assert presets(["box", "sphere"], [(2.0, 0.5), (1.0, 0.5)]) == ["wood", "medium"]
+    assert presets(["inflated", "sphere"], alike[:2], [chosen, unknown]) == ["jelly", "medium"]

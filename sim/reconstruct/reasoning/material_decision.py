@@ -29,6 +29,9 @@ that stands on a table or a floor keeps its shape in a small fall, and a camera 
 believed.
 """
 
+ALIKE = 1.2
+"""Largest ratio of widths, and of heights, of unidentified things that are taken to be of the same matter."""
+
 LEAST_MODULUS = {"hard": 1e9, "medium": 1e6}
 """Least Young's modulus of each class in Pa, for real materials. Thresholds lie between foams and cloth, rubber and
 soft plastics, and hard plastics, wood, metal (Ashby, Materials Selection in Mechanical Design, chart of modulus and
@@ -135,6 +138,32 @@ def decided_by_shape(physics: ObjectPhysics, shape: str) -> ObjectPhysics:
     preset = UNIDENTIFIED.get(shape, RIGID_PRESET)
     material = load_preset(preset)
     return replace(physics, preset=preset, density=material.density, youngs_modulus=material.youngs_modulus)
+
+
+def decided_by_shapes(
+    physics: Sequence[ObjectPhysics], shapes: Sequence[str], sizes: Sequence[tuple[float, float]]
+) -> tuple[ObjectPhysics, ...]:
+    """Return ``physics`` by ``decided_by_shape``, with one preset for things that are alike.
+
+    A candy seen at its edge or in part is not recognised as round, and would be of wood among others of rubber. Of
+    things alike in width and height (``sizes``), those count that nothing else decided; the shape of most of them is
+    that of all, round ones first.
+    """
+    unknown = [item.source == "default" for item in physics]
+    decided = []
+    for index, (item, shape) in enumerate(zip(physics, shapes, strict=True)):
+        like = [n for n, free in enumerate(unknown) if free and _alike(sizes[index], sizes[n])]
+        counts = {each: sum(shapes[n] == each for n in like) for each in sorted({shapes[n] for n in like})}
+        rounds = sum(count for each, count in counts.items() if each in UNIDENTIFIED)
+        if counts and 0 < rounds < len(like):
+            found = [each for each in counts if (each in UNIDENTIFIED) == (2 * rounds >= len(like))]
+            shape = max(found, key=lambda each: counts[each])
+        decided.append(decided_by_shape(item, shape))
+    return tuple(decided)
+
+
+def _alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
+    return all(max(a, b) <= ALIKE * min(a, b) for a, b in zip(first, second, strict=True))
 
 
 def to_material(physics: ObjectPhysics) -> Material:

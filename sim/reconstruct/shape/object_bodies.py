@@ -256,6 +256,12 @@ class Body:
         """Largest extent along the world's axes, in the camera's unit."""
         return float(np.ptp(self.surface.vertices, axis=0).max())
 
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width, the mean of both directions, and height, in the camera's unit."""
+        x, y, z = (float(v) for v in np.ptp(self.surface.vertices, axis=0))
+        return (x * y) ** 0.5, z
+
 
 def make_bodies(
     layers: Layers,
