@@ -21,6 +21,7 @@ from . import early_stop  # noqa: F401 - before the modules that take long
 # isort: split
 from ..sim import atomic
 from ..sim.app.bake_options import BakeOptions
+from ..sim.app.launch import STOP_SIGNALS
 from ..sim.cache.folder_lock import LOCK_FILE, release_all, remove_dead_lock
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import ANYWAY, OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
@@ -268,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         if arguments is None:
             # Python ends next and puts the system's own handlers back: a signal would be the exit code of work done.
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in STOP_SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
 
 

@@ -19,7 +19,7 @@ import signal
 import sys
 from pathlib import PurePath
 
-from ..sim.app.launch import ONE_BLAS_THREAD
+from ..sim.app.launch import ONE_BLAS_THREAD, STOP_SIGNALS
 
 CANCELLED = 130
 """Exit code of ``Cancelled`` in sim/errors.py."""
@@ -27,7 +27,6 @@ KILLED = 128 + 9
 """Exit code of a command that SIGKILL has ended, as shells give it."""
 
 _PR_SET_PDEATHSIG = 1
-_PASSED_ON = (signal.SIGINT, signal.SIGTERM)
 
 
 def _is_own_process() -> bool:
@@ -46,8 +45,8 @@ def _is_typed() -> bool:
 
 
 def heed() -> None:
-    """End this process at once, with the code for cancelled, when it gets SIGINT or SIGTERM."""
-    for number in _PASSED_ON:
+    """End this process at once, with the code for cancelled, when it is asked to stop."""
+    for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: os._exit(CANCELLED))
 
 
@@ -71,7 +70,7 @@ def work_in_child() -> None:
         if os.getppid() != parent:
             os._exit(KILLED)
         return
-    for number in _PASSED_ON:
+    for number in STOP_SIGNALS:
         signal.signal(number, lambda number, _: _pass_on(number, child))
     _, status = os.waitpid(child, 0)
     code = os.waitstatus_to_exitcode(status)

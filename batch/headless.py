@@ -22,7 +22,7 @@ from typing import Any, NoReturn, TextIO
 
 from ..physgen_addon.interpreter import find_python, wheels_for
 from ..sim.app import requirements
-from ..sim.app.launch import PACKAGES_VARIABLE
+from ..sim.app.launch import PACKAGES_VARIABLE, STOP_SIGNALS
 from ..sim.app.stage_process import child_environment, own_command
 from ..sim.atomic import scratch_prefix
 from ..sim.errors import Cancelled, InputError, PhysGenError
@@ -116,7 +116,7 @@ class Stop:
         if os.name != "nt":
             os.set_blocking(writing, False)
         signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)):
+        for number in STOP_SIGNALS:
             signal.signal(number, lambda *_: self._asked.set())
         threading.Thread(target=self._hear, args=(reading,), daemon=True).start()
         threading.Thread(target=self._end_at_last, args=(at_last,), daemon=True).start()

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from ..sim.app.launch import STOP_SIGNALS
 from ..sim.events import Event, IsCancelled
 
 STOP_S = 1.3
@@ -24,13 +25,13 @@ STOP_S = 1.3
 
 @contextmanager
 def stop_signals(at_last: Callable[[], object] | None = None) -> Iterator[IsCancelled]:
-    """Yield a function that returns whether SIGINT or SIGTERM arrived since; the former handlers return at the end.
+    """Yield a function that returns whether one of ``STOP_SIGNALS`` has arrived; the former handlers return at the end.
 
     at_last: called by another thread, ``STOP_S`` after the signal, if the work has not ended by then; it ends the
     process. For the main thread: only there Python allows handlers.
     """
     stop, done = threading.Event(), threading.Event()
-    former = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    former = {number: signal.signal(number, lambda *_: stop.set()) for number in STOP_SIGNALS}
     # Python's handlers wait until the main thread's present call into a library is over; the pipe is written at once.
     reading, writing = os.pipe()
     if os.name != "nt":

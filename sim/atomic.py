@@ -29,7 +29,8 @@ from .files import to_disk
 from .processes import MARK, Mark, own_mark, parse_mark
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
-"""Seconds between attempts: Windows refuses to replace a file that another process is reading."""
+"""Seconds between attempts: Windows refuses to replace a file that another process is reading, or a folder with one."""
+_PATIENT = os.name == "nt"
 
 _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK})(?P<suffix>(?:\.[^/]*)?)", re.DOTALL)
 _SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
@@ -86,7 +87,7 @@ def replacing_tree(out: Path) -> Iterator[Path]:
             _move_aside(partial, out, old)
         elif not out.exists():
             _replace(partial, out)
-        _sync(out.parent)
+        _sync_names(out.parent)
     finally:
         # After an exchange this is the earlier folder.
         _remove(partial)
@@ -96,12 +97,12 @@ def replacing_tree(out: Path) -> Iterator[Path]:
 
 
 def _move_aside(partial: Path, out: Path, old: Path) -> None:
-    out.rename(old)
-    _sync(out.parent)
+    _replace(out, old)
+    _sync_names(out.parent)
     try:
-        partial.rename(out)
+        _replace(partial, out)
     except OSError:
-        old.rename(out)
+        _replace(old, out)
         raise
 
 
@@ -128,23 +129,17 @@ def _exchange(first: Path, second: Path) -> bool:
     raise OSError(number, os.strerror(number), str(second))
 
 
-def _sync(path: Path) -> None:
-    """Have the system write ``path``, a file or the names in a folder, to the disk."""
-    if os.name == "nt" and path.is_dir():
-        return
+def _sync_names(folder: Path) -> None:
+    """Have the system write the names in ``folder`` to the disk, as far as it can: what they name is in place."""
     with contextlib.suppress(OSError):
-        file = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(file)
-        finally:
-            os.close(file)
+        to_disk(folder)
 
 
 def _sync_tree(folder: Path) -> None:
     for root, _, names in os.walk(folder):
         for name in names:
-            _sync(Path(root) / name)
-        _sync(Path(root))
+            to_disk(Path(root) / name)
+        to_disk(Path(root))
 
 
 def _remove(path: Path) -> None:
@@ -168,7 +163,7 @@ def _replace(partial: Path, path: Path) -> None:
             partial.replace(path)
             return
         except PermissionError:
-            if os.name != "nt":
+            if not _PATIENT:
                 raise
             time.sleep(pause)
     partial.replace(path)

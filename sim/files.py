@@ -120,13 +120,18 @@ def name_for_ffmpeg(path: Path) -> str:
     return str(path.absolute())
 
 
+_SYNC_FLAGS = os.O_RDWR if os.name == "nt" else _FLAGS
+"""Windows writes out only what was opened for writing."""
+
+
 def to_disk(path: Path) -> None:
     """Wait until the content of the file or folder ``path`` is on the disk, so that a rename after it can count.
 
-    Does nothing where the system cannot do it, such as for folders on Windows.
+    Does nothing where the system cannot do it, such as for folders on Windows. Raises OSError for a full or failing
+    disk.
     """
     try:
-        number = os.open(path, os.O_RDONLY)
+        number = os.open(path, _SYNC_FLAGS)
     except OSError:
         return
     try:

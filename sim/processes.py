@@ -79,12 +79,26 @@ def parse_mark(text: str) -> Mark | None:
 
 @functools.cache
 def _machine() -> str:
-    # Containers may share a name and a disk, but not the numbers of their processes.
+    # Containers may share a name and a disk, but not the numbers of their processes; machines of a cluster may all have
+    # the name that they were installed with.
     try:
         numbers = str(Path("/proc/self/ns/pid").readlink())
     except OSError:
         numbers = ""
-    return hashlib.sha256(f"{socket.gethostname()} {numbers}".encode()).hexdigest()[:8]
+    own = next((found for path in MACHINE_IDS if (found := _word(path))), "")
+    return hashlib.sha256(f"{socket.gethostname()} {numbers} {own}".encode()).hexdigest()[:8]
+
+
+MACHINE_IDS = (Path("/etc/machine-id"), Path("/var/lib/dbus/machine-id"))
+"""Files with a number of this installation of Linux."""
+
+
+def _word(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(64).decode("ascii", "replace").strip()
+    except OSError:
+        return ""
 
 
 def _started(pid: int) -> str | None:

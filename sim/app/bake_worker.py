@@ -31,6 +31,7 @@ from ..memory import ran_out, resident_memory
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json
 from .bake_options import BakeOptions, inputs_hash
+from .launch import STOP_SIGNALS
 
 JOB_FORMAT = "physgen-job/1"
 SERVE = "--serve"
@@ -111,7 +112,7 @@ class _Wish:
         if os.name != "nt":
             os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-        for number in (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGTERM)):
+        for number in STOP_SIGNALS:
             signal.signal(number, lambda *_: self.asked.set())
         threading.Thread(target=self._await_signal, args=(read,), daemon=True).start()
 
@@ -162,7 +163,7 @@ _CANCEL = b"cancel"
 def _serve(emit: OnEvent) -> None:
     """Take jobs from standard input until it is closed, or for IDLE_S there is none."""
     inbox = _Inbox()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: inbox.close())
     threading.Thread(target=inbox.read, daemon=True).start()
     # What every job needs, while the first one is not there yet.

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..memory import memory_kills
+from .launch import STOP_SIGNALS
 from .requirements import RENDERER, REQUIREMENTS
 from .stage_process import how_it_ended
 
@@ -127,7 +128,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         installation.stop()
         sys.exit(130)
 
-    signal.signal(signal.SIGTERM, stopped)
+    for number in STOP_SIGNALS:
+        signal.signal(number, stopped)
     try:
         python = installation.run()
     except (OSError, RuntimeError) as error:

@@ -25,6 +25,8 @@ PACKAGES_VARIABLE = "PHYSGEN_PACKAGES"
 OLDEST = (3, 11)
 ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
 """Matrices here are small: more threads wait on each other, and sums would depend on how many cores there are."""
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name))
+"""Signals that ask to stop; on Windows a process asks another by Ctrl-Break, which would end it at once."""
 ORPHAN_GRACE_S = 20.0
 """Time for an orphaned process to clean up."""
 
@@ -33,7 +35,7 @@ def main(arguments: "list[str]") -> None:
     """Parse the options in ``arguments`` and run the module as ``__main__``."""
     if sys.version_info[:2] < OLDEST:
         sys.exit("Python {}.{} is too old: 3.11 to 3.13 are needed".format(*sys.version_info[:2]))
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOP_SIGNALS:
         # Until the module takes them over: imports take seconds, and nothing has been written yet.
         signal.signal(number, lambda *_: os._exit(130))
     # Python puts the script's folder first in its search path, where ours could shadow modules of the same names.

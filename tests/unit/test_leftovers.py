@@ -3,7 +3,10 @@
 
 import ctypes
 import errno
+import fcntl
 import json
+import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -11,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from physgen.batch.cli import main
-from physgen.sim import atomic
+from physgen.sim import atomic, files, processes
 from physgen.sim.cache.folder_lock import lock_beside
 from physgen.sim.errors import InputError
 from physgen.sim.processes import Mark, own_mark, parse_mark
@@ -210,7 +213,7 @@ def test_a_replaced_folder_is_whole_at_every_moment(tmp_path, monkeypatch):
     out.mkdir()
     (out / "old").touch()
     seen = []
-    monkeypatch.setattr(atomic, "_sync", lambda path: seen.append((out / "old").exists() or (out / "new").exists()))
+    monkeypatch.setattr(atomic, "to_disk", lambda path: seen.append((out / "old").exists() or (out / "new").exists()))
     with atomic.replacing_tree(out) as partial:
         (partial / "new").touch()
     assert all(seen) and [path.name for path in out.iterdir()] == ["new"]
@@ -238,6 +241,82 @@ def test_where_the_system_has_no_exchange_the_earlier_folder_is_moved_aside(tmp_
         (partial / "new").touch()
     assert [path.name for path in out.iterdir()] == ["new"]
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_a_folder_that_windows_holds_for_a_moment_is_replaced_all_the_same(tmp_path, monkeypatch):
+    """There, nothing that another program is reading can be renamed, nor a folder with such a file."""
+    refused = []
+
+    def replace(path, target, former=Path.replace):
+        if refused.count((path, target)) < 2:
+            refused.append((path, target))
+            raise PermissionError(errno.EACCES, "in use", str(path))
+        return former(path, target)
+
+    monkeypatch.setattr(atomic, "_exchange", lambda first, second: False)
+    monkeypatch.setattr(atomic, "WINDOWS_PAUSES", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(Path, "replace", replace)
+    out = tmp_path / "scene"
+    out.mkdir()
+    (out / "old").touch()
+    with pytest.raises(PermissionError), atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert [path.name for path in out.iterdir()] == ["old"], "other systems refuse for good"
+    refused.clear()
+    monkeypatch.setattr(atomic, "_PATIENT", True)
+    with atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert [path.name for path in out.iterdir()] == ["new"] and len(refused) == 4
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_what_counts_is_on_the_disk_before_on_windows_too(tmp_path, monkeypatch):
+    """Windows writes out no file that was opened for reading, and opens no folder."""
+    synced = []
+
+    def opened(path, flags, *given, former=os.open):
+        if Path(path).is_dir() and not flags & os.O_CREAT:
+            raise PermissionError(errno.EACCES, "a folder", str(path))
+        return former(path, flags, *given)
+
+    def fsync(file):
+        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, "not open for writing")
+        synced.append(Path(f"/proc/self/fd/{file}").readlink().name)
+
+    monkeypatch.setattr(files, "_SYNC_FLAGS", os.O_RDWR)
+    monkeypatch.setattr(files.os, "open", opened)
+    monkeypatch.setattr(files.os, "fsync", fsync)
+    with atomic.replacing_tree(tmp_path / "scene") as partial:
+        (partial / "a.json").write_text("a")
+    atomic.write_bytes(tmp_path / "b.json", b"b")
+    assert synced[0] == "a.json" and synced[1].startswith(".b.partial-") and len(synced) == 2
+
+
+def test_a_disk_that_fails_at_the_end_leaves_the_earlier_folder(tmp_path, monkeypatch):
+    def fsync(file):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(files.os, "fsync", fsync)
+    out = tmp_path / "scene"
+    out.mkdir()
+    (out / "old").touch()
+    with pytest.raises(OSError, match="Input/output error"), atomic.replacing_tree(out) as partial:
+        (partial / "new").touch()
+    assert [path.name for path in out.iterdir()] == ["old"] and len(list(tmp_path.iterdir())) == 1
+
+
+def test_two_machines_of_one_name_are_two(tmp_path, monkeypatch):
+    """On a disk that they share, each would take the other's living processes for dead ones of its own."""
+    marks = []
+    for number in ("1f", "2e", ""):
+        place = tmp_path / f"machine-id-{number}"
+        place.write_text(f"{number}\n")
+        monkeypatch.setattr(processes, "MACHINE_IDS", (tmp_path / "none", place))
+        processes._machine.cache_clear()
+        marks.append(processes._machine())
+    processes._machine.cache_clear()
+    assert len(set(marks)) == 3 and all(re.fullmatch("[0-9a-f]{8}", mark) for mark in marks)
 
 
 def test_an_exchange_that_fails_for_another_reason_leaves_the_earlier_folder(tmp_path, monkeypatch):

@@ -109,6 +109,25 @@ def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
         time.sleep(0.02)
 
 
+def test_what_windows_asks_by_is_heeded_like_the_others():
+    """By Ctrl-Break, which ends a process at once otherwise; here another signal stands in for it."""
+    code = textwrap.dedent("""
+        import os, signal, sys
+        signal.SIGBREAK = signal.SIGUSR1
+        from physgen.batch import terminal
+        from physgen.sim.app import launch
+        with terminal.stop_signals() as stopped:
+            os.kill(os.getpid(), signal.SIGUSR1)
+            assert stopped() or not __import__("time").sleep(1) and stopped()
+        def load(root):
+            os.kill(os.getpid(), signal.SIGUSR1)
+        launch.load_tree = load
+        launch.main(["batch.cli"])
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_after_the_work_is_done_does_not_become_its_exit_code(number):
     """While Python ends, it puts the system's own handlers back."""
