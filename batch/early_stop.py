@@ -7,6 +7,7 @@ to be set before NumPy is imported is set here, too.
 
 On Linux the command then works in a child. A process that the kernel kills, as memory ran out, cannot say so itself:
 its parent, which has imported nothing, waits, passes signals on, and says it. Both end together, whichever is killed.
+A worker that hears nothing, in a long call of a library that lets no other thread run, is ended by it, too.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from ..sim.app.launch import ONE_BLAS_THREAD, STOP_SIGNALS
 
 CANCELLED = 130
 """Exit code of ``Cancelled`` in sim/errors.py."""
+LAST_S = 1.9
+"""A command that was asked to stop has ended so long afterwards, whatever it is doing. By itself it does at
+``terminal.STOP_S``, and then leaves nothing for the next command to sweep."""
 KILLED = 128 + 9
 """Exit code of a command that SIGKILL has ended, as shells give it."""
 
@@ -70,14 +74,29 @@ def work_in_child() -> None:
         if os.getppid() != parent:
             os._exit(KILLED)
         return
+    late: list[int] = []
+
+    def ask(number: int, frame: object) -> None:
+        _send(child, number)
+        if not any(signal.getitimer(signal.ITIMER_REAL)):
+            signal.setitimer(signal.ITIMER_REAL, LAST_S)
+
+    def end(number: int, frame: object) -> None:
+        late.append(number)
+        _send(child, signal.SIGKILL)
+
+    signal.signal(signal.SIGALRM, end)
     for number in STOP_SIGNALS:
-        signal.signal(number, lambda number, _: _pass_on(number, child))
+        signal.signal(number, ask)
     _, status = os.waitpid(child, 0)
     code = os.waitstatus_to_exitcode(status)
     if code >= 0:
         os._exit(code)
+    if late:
+        _say("Cancelled", "cancelled in the middle of a long step; run it again to continue")
+        os._exit(CANCELLED)
     if code == -signal.SIGKILL:
-        _say(f"{' '.join(sys.argv[1:2]) or 'physgen'}: {how_it_was_killed(kills)}; run it again to go on")
+        _say("Killed", f"{' '.join(sys.argv[1:2]) or 'physgen'}: {how_it_was_killed(kills)}; run it again to go on")
         os._exit(KILLED)
     # Of a fault: as if there were no child, for whoever asks how this process ended.
     signal.signal(-code, signal.SIG_DFL)
@@ -85,15 +104,15 @@ def work_in_child() -> None:
     os._exit(128 - code)
 
 
-def _pass_on(number: int, child: int) -> None:
+def _send(child: int, number: int) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.kill(child, number)
 
 
-def _say(message: str) -> None:
+def _say(kind: str, message: str) -> None:
     """Print the error as ``Terminal`` does, which is not imported here."""
     if "--json" in sys.argv:
-        text, to = json.dumps({"event": "error", "kind": "Killed", "message": message}), 1
+        text, to = json.dumps({"event": "error", "kind": kind, "message": message}), 1
     else:
         text, to = f"\nerror: {message}", 2
     with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Kill commands at random moments and run them again: is the result that of an undisturbed run, and is all else gone?
 
-    python -m physgen.benchmarks.kills [--kills 300] [--seed S] [--cpu SECONDS] [--only STEP …] [--quick]
+    python -m physgen.benchmarks.kills [--kills 300] [--seed S] [--cpu SECONDS] [--only STEP …] [--signals] [--quick]
 
 A chain of small commands runs once undisturbed: reconstruct, variant, light, correct, bake, pack, evaluate, render,
 encode, propose, import of a capture, diagnose, track, explain, compose, questionnaire, batch. Then, for every kill, a
@@ -9,6 +9,9 @@ command begins from the same folder as then, is killed (SIGKILL) at a random mom
 kills hit the command alone, three all of its processes at once, two any one of them. Everything in the folder, hidden
 files, locks and the list of trusted folders included, has to have the bytes of the undisturbed run then, and the
 temporary folder has to be empty. Kill N follows from the seed and N, its moment from how long the undisturbed run took.
+
+With --signals the command is asked to stop instead, by SIGINT or SIGTERM in turn: it has to end with 130 (or 0, where
+its work was done), to have left nothing in the temporary folder by then, and the seconds that it took are reported.
 
 Commands are forked from one process that has imported the libraries, so that moments are spent in the work and not in
 imports; the processes that a command starts are those that it always starts.
@@ -69,6 +72,9 @@ LONGEST_S = 900.0
 """No command takes longer, on however busy a machine."""
 END_CODES = (0, 3, 4, 5)
 """Of a command of whose processes another one was killed (docs/cli.md)."""
+
+ASKED = 130
+"""Of a command that was asked to stop."""
 
 REFUSED = re.compile(r"already exists; choose another|is there already; name a new")
 """What commands that never replace anything say."""
@@ -283,8 +289,36 @@ def kill(place: Place, step: Step, after_s: float, victim: str, choose: Callable
     return happened, f"{len(left)} of its processes ran on" if left else ""
 
 
-def measure(root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Step, ...]) -> dict[str, object]:
-    """Run the chain and the kills in ``root``; return counts, CPU seconds and all that was wrong."""
+def ask(place: Place, step: Step, after_s: float, number: int, taken: list[float]) -> tuple[str, str]:
+    """Start ``step``, send the signal ``number`` after ``after_s``; return what happened and what is wrong.
+
+    taken: gets the seconds from the signal to the command's end.
+    """
+    pid = place.start(step)
+    code, _ = wait(pid, time.monotonic() + after_s)
+    if code is not None:
+        return "ended before", "" if code == 0 else f"ended with code {code} undisturbed"
+    asked = time.monotonic()
+    os.kill(pid, number)
+    code, _ = wait(pid, asked + LONGEST_S)
+    taken.append(time.monotonic() - asked)
+    end = time.monotonic() + ORPHANS_S
+    while (left := place.others(pid)) and time.monotonic() < end:
+        time.sleep(0.05)
+    words = f"{len(left)} of its processes ran on" if left else ""
+    if code not in (0, ASKED):
+        words = f"ended with code {code}: {place.log.read_text(errors='replace')[-600:]}"
+    names = sorted(path.name for path in place.scratch.iterdir())
+    return "asked", words or (f"left in the temporary folder: {', '.join(names[:4])}" if names else "")
+
+
+def measure(
+    root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Step, ...], signals: bool = False
+) -> dict[str, object]:
+    """Run the chain and the kills in ``root``; return counts, CPU seconds and all that was wrong.
+
+    signals: commands are asked to stop, and not killed; the longest seconds of each are among the results.
+    """
     place = Place(root)
     place.work.mkdir()
     draw_inputs(place.work)
@@ -300,7 +334,8 @@ def measure(root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Ste
         print(f"{step.name}: {durations[step.name]:.1f} s, {cpu:.1f} CPU s", file=sys.stderr, flush=True)
         if problem is not None:
             return {"kills": 0, "wrong": [f"{step.name}, undisturbed: {problem}"]}
-    counts = {"command": 0, "all": 0, "one of its processes": 0, "ended before": 0}
+    counts: dict[str, float] = {"command": 0, "all": 0, "one of its processes": 0, "asked": 0, "ended before": 0}
+    taken: dict[str, list[float]] = {step.name: [] for step in steps}
     each = dict.fromkeys((step.name for step in steps), 0)
     began, number = _cpu(), -1
     while sum(each.values()) < kills and _cpu() - began < cpu_s:
@@ -310,7 +345,11 @@ def measure(root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Ste
         victim = rng.choice(["command"] * 3 + ["all"] * 3 + ["one"] * 2)
         moment = rng.random() * durations[step.name]
         place.begin(step.name)
-        happened, problem = kill(place, step, moment, victim, rng.choice)
+        if signals:
+            asking = (signal.SIGINT, signal.SIGTERM)[number % 2]
+            happened, problem = ask(place, step, moment, asking, taken[step.name])
+        else:
+            happened, problem = kill(place, step, moment, victim, rng.choice)
         counts[happened] += 1
         each[step.name] += happened != "ended before"
         if not problem:
@@ -329,6 +368,9 @@ def measure(root: Path, *, kills: int, seed: int, cpu_s: float, steps: tuple[Ste
         if problem:
             wrong.append(f"{step.name}, kill {number} ({happened}, after {moment:.2f} s): {problem}")
             print(wrong[-1], file=sys.stderr, flush=True)
+    for name, seconds in taken.items():
+        if seconds:
+            counts[f"seconds of {name}"] = round(max(seconds), 2)
     done = {"kills": sum(each.values()), **counts, "cpu_s": round(_cpu() - began, 1), "seed": seed}
     return {**done, **{f"kills of {name}": count for name, count in each.items()}, "wrong": wrong}
 
@@ -353,11 +395,14 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cpu", type=float, default=1e9, metavar="S", help="CPU seconds after which no kill begins")
+    parser.add_argument("--signals", action="store_true", help="ask commands to stop, and say how long they took")
     parser.add_argument("--only", nargs="+", default=[s.name for s in STEPS], choices=[s.name for s in STEPS])
     options = parser.parse_args()
     steps = tuple(step for step in STEPS if step.name in options.only)
     with tempfile.TemporaryDirectory(prefix="physgen-kills-") as root:
-        found = measure(Path(root), kills=options.kills, seed=options.seed, cpu_s=options.cpu, steps=steps)
+        found = measure(
+            Path(root), kills=options.kills, seed=options.seed, cpu_s=options.cpu, steps=steps, signals=options.signals
+        )
     print_result(found, as_json=options.json)
     return int(bool(found["wrong"]))
 

@@ -109,6 +109,24 @@ def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
         time.sleep(0.02)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_worker_that_hears_nothing_is_ended_in_time(tmp_path, number):
+    """As in a library's call that lets no other thread run: neither handlers nor the watching thread get their turn."""
+    deaf = "signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])"
+    then = f"{deaf}; os.mkdir({str(tmp_path / 'deaf')!r}); time.sleep(120)"
+    with typed(tmp_path, "doctor", "--json", then=then) as process:
+        while not (tmp_path / "deaf").exists():
+            time.sleep(0.02)
+        worker = (tmp_path / "worker").read_text()
+        asked = time.monotonic()
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=60)
+    # Two seconds are the promise; the rest is for a machine that does twenty other things.
+    assert process.returncode == 130 and 1.0 < time.monotonic() - asked < 6.0
+    assert json.loads(out)["kind"] == "Cancelled" and not is_running(int(worker))
+
+
 def test_what_windows_asks_by_is_heeded_like_the_others():
     """By Ctrl-Break, which ends a process at once otherwise; here another signal stands in for it."""
     code = textwrap.dedent("""
