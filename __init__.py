@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from .sim.diagnose.capture import Capture, load_capture
     from .sim.diagnose.diagnosis import Diagnosis
     from .sim.diagnose.run_diagnosis import DiagnoseOptions
-    from .sim.diagnose.track.body_request import BodyRequest
     from .sim.diagnose.track.track_command import track
-    from .sim.diagnose.track.track_input import TrackOptions, VideoTrial
+    from .sim.diagnose.track.track_input import BodyRequest, TrackOptions, VideoTrial
     from .sim.errors import PhysGenError
     from .sim.evaluate.evaluation import Evaluation
     from .sim.evaluate.questionnaire import QuestionnaireOptions, make_questionnaire
@@ -104,7 +103,7 @@ __all__ = [
 _HOMES = {
     "Bake": ".sim.cache.bake_folder",
     "BakeOptions": ".sim.app.bake_options",
-    "BodyRequest": ".sim.diagnose.track.body_request",
+    "BodyRequest": ".sim.diagnose.track.track_input",
     "Capture": ".sim.diagnose.capture",
     "ChatRequest": ".sim.reconstruct.reasoning.chat_client",
     "CollectOptions": ".sim.evaluate.questionnaire_answers",

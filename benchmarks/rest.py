@@ -29,8 +29,8 @@ import trimesh
 from physgen.benchmarks.common import benchmark_parser
 from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.app.reconstruct import reconstruct
+from physgen.sim.app.scene_to_world import prepare_world
 from physgen.sim.app.simulation import start_world
-from physgen.sim.app.world_setup import prepare_world
 from physgen.sim.errors import PhysGenError
 from physgen.sim.importers.mesh_scene import scene_from_meshes
 from physgen.sim.reconstruct import ObjectRequest

@@ -110,7 +110,7 @@ def run_estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     """Run ``physgen estimate``; the exit code."""
     # What prepares worlds, and below what bakes, takes a second to import, which the other commands need not pay.
     from ...sim.app.bake_estimate import bake_cost
-    from ...sim.app.world_setup import cost_text
+    from ...sim.app.scene_to_world import cost_text
 
     folder = load_scene(options.scene)
     scene = with_physics(folder.model, physics_options(options))

@@ -24,7 +24,7 @@ from ..operators.body_ops import (
     PHYSGEN_OT_select_bodies,
 )
 from ..operators.compose_ops import Compose, PHYSGEN_OT_compose_objects, chosen_meshes
-from ..playback import splats
+from ..playback import splat_clouds
 from ..props import material_props
 from ..props.body_props import bodies, is_body
 from ..props.material_props import ADVANCED, LAW_FIELDS, WITH_UNITS, is_modified, shown_as
@@ -129,7 +129,7 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
             text.sentences(layout, context, text.brief(why), icon="ERROR")
         column = settings(layout, context, why=True)
         column.row().prop(item.physgen, "role", expand=True)
-        if splats.find(item) is not None:
+        if splat_clouds.find(item) is not None:
             column.row().prop(item.physgen, "splats_as", expand=True)
         if item.physgen.role == "dynamic":
             draw_preset(column, context, item.physgen.material)

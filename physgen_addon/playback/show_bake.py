@@ -16,7 +16,7 @@ from ...sim.errors import InputError
 from .. import paths
 from ..props.body_props import bodies
 from ..scene_io.export_animation import export_names
-from . import particles, point_caches, splats
+from . import particles, point_caches, splat_clouds
 from .bake_record import GRAINS, MESH, SURFACE, BakeRecord, Look, manifest_of, playable, spacing
 
 
@@ -159,12 +159,12 @@ def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObj
     point_caches.attach_as_first(item, Pc2Reader(file), paths.stored(file), record.frame_start)
     if baked.splats_file is not None:
         seen = record.path / baked.splats_file
-        splats.play(item, Pc2Reader(seen), paths.stored(seen), record.frame_start)
-    if baked.torn_file is not None and splats.find(item) is None:
+        splat_clouds.play(item, Pc2Reader(seen), paths.stored(seen), record.frame_start)
+    if baked.torn_file is not None and splat_clouds.find(item) is None:
         particles.show_torn_skin(scene, item, baked, record)
         return
     # Splats show granular and fluid objects themselves.
-    if look.shape == MESH or baked.points_file is None or splats.find(item) is not None:
+    if look.shape == MESH or baked.points_file is None or splat_clouds.find(item) is not None:
         _hide_points(scene, item, baked.name)
         return
     file = record.path / baked.points_file
@@ -183,7 +183,7 @@ def _show_object(scene: bpy.types.Scene, item: bpy.types.Object, baked: BakedObj
 
 def _hide_object(scene: bpy.types.Scene, item: bpy.types.Object, name: str) -> None:
     point_caches.detach(item)
-    splats.rest(item)
+    splat_clouds.rest(item)
     _hide_points(scene, item, name)
 
 
@@ -203,7 +203,7 @@ def strip_extension_data() -> list[str]:
         modifier.filepath = paths.stored(paths.absolute(modifier.filepath))
     for item in bpy.data.objects:
         item.pop(particles.POINTS_OF, None)
-        item.pop(splats.SPLATS, None)
+        item.pop(splat_clouds.SPLATS, None)
         item.property_unset("physgen")
     for scene in bpy.data.scenes:
         scene.property_unset("physgen")

@@ -14,7 +14,7 @@ from bpy.props import (
 from mathutils import Vector
 
 from ...sim.scene.model import FactorMap, Ground, SceneObject
-from ..playback import splats
+from ..playback import splat_clouds
 from .generated_properties import from_field, switch
 from .material_props import PHYSGEN_PG_material
 
@@ -82,7 +82,7 @@ def _set_speed(self: "PHYSGEN_PG_body", speed: float) -> None:
 
 
 def _show_splats(self: "PHYSGEN_PG_body", context: bpy.types.Context) -> None:
-    splats.show_as(self.id_data, self.splats_as)
+    splat_clouds.show_as(self.id_data, self.splats_as)
 
 
 SURFACES = [

@@ -23,7 +23,7 @@ from ...sim.gaussians.splat_ply import write_splats
 from ...sim.scene.folder import SCENE_FILE, Scene, parse_scene, referenced_files, save_scene
 from ...sim.scene.model import FactorMap, Ground, SceneModel, SceneObject
 from ...sim.validation import read_json
-from ..playback import splats
+from ..playback import splat_clouds
 from ..props.body_props import bodies
 from ..text import decimal
 from . import export_world
@@ -196,11 +196,11 @@ class _Export:
 
     def _splats(self, item: bpy.types.Object) -> str | None:
         """Return the file of the splats of ``item``, in object space; None without splats."""
-        found = splats.find(item)
+        found = splat_clouds.find(item)
         if found is None or not len(found.data.vertices):
             return None
         file = f"splats/{self._names[item.name]}.ply"
-        write_splats(self._root / file, splats.read(found))
+        write_splats(self._root / file, splat_clouds.read(found))
         return file
 
     def _collider(self, collider: Collider) -> SceneObject:

@@ -19,7 +19,7 @@ from ...sim.scene.folder import SCENE_FILE, Scene, load_scene
 from ...sim.scene.model import Ground, SceneObject
 from ...sim.scene.textured_mesh import TexturedMesh, read_textured_mesh
 from .. import compat
-from ..playback import splats
+from ..playback import splat_clouds
 from . import import_physics, photo_view
 from .photo_view import MARK, Made, load_picture, photo_uv
 
@@ -137,7 +137,7 @@ def read_object_splats(folder: Scene, source: SceneObject) -> Splats | None:
 def add_splats(item: bpy.types.Object, source: SceneObject, seen: Splats) -> bpy.types.Object:
     """Add the splats ``seen`` of ``source``, in mesh coordinates, to the imported ``item``."""
     matrix = np.array(item.matrix_world.inverted()) @ np.asarray(source.world_from_mesh)
-    return splats.add(item, transform_splats(seen, matrix))
+    return splat_clouds.add(item, transform_splats(seen, matrix))
 
 
 def import_splats(scene: bpy.types.Scene, root: Path) -> list[bpy.types.Object]:
@@ -164,7 +164,7 @@ def import_splats(scene: bpy.types.Scene, root: Path) -> list[bpy.types.Object]:
         add_splats(item, source, seen)
         item.matrix_world = Matrix.Translation(scene.cursor.location) @ item.matrix_world
         items.append(item)
-    splats.allow_transparency(scene)
+    splat_clouds.allow_transparency(scene)
     return items
 
 
@@ -251,7 +251,7 @@ def import_scene(scene: bpy.types.Scene, root: Path) -> bpy.types.Collection:
     scene.collection.children.link(collection)
     photo_view.show(scene, collection, view, read.folder.model.camera)
     if any(seen is not None for seen in read.splats):
-        splats.allow_transparency(scene)
+        splat_clouds.allow_transparency(scene)
     notes = import_physics.apply_physics(scene, collection, read.folder.model, items, view.ground)
     for item in collection.all_objects:
         item[MARK] = True

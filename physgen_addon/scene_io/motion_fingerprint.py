@@ -19,7 +19,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...sim.errors import InputError
-from ..playback import splats
+from ..playback import splat_clouds
 from ..props.body_props import bodies
 from .export_animation import (
     PLACING,
@@ -133,7 +133,7 @@ class _Digest:
         self._seen.discard((item.as_pointer(), True))
         dynamic = item.physgen.role == "dynamic"
         self._object(item, shape=True, as_seen=not dynamic)
-        seen = splats.find(item)
+        seen = splat_clouds.find(item)
         if seen is not None:
             # These do not affect the motion, but the bake depends on them.
             self.hash.update(read_points(seen.data))

@@ -52,7 +52,7 @@ from .bake_resume import (
     save_checkpoint,
 )
 from .bake_samples import ObjectSampler, baked_objects, load_object_splats
-from .world_setup import prepare_world
+from .scene_to_world import prepare_world
 
 __all__ = ["CHECKPOINT_FILE", "BakeOptions", "bake", "is_up_to_date"]
 

@@ -22,7 +22,7 @@ from ..scene.meshes import load_object_mesh
 from ..scene.model import SceneModel
 from .bake_options import BakeOptions
 from .bake_samples import baked_objects, load_object_splats
-from .world_setup import PreparedWorld, prepare_world
+from .scene_to_world import PreparedWorld, prepare_world
 
 STATE_BYTES = 190
 """Of a checkpoint, a particle, with all that any law keeps."""
@@ -66,7 +66,7 @@ class BakeCost:
 def estimate_bake(folder: Scene, options: BakeOptions) -> PreparedWorld:
     """Return the world that a bake of ``folder`` starts from; its ``cost`` is time and memory.
 
-    Raises InputError as ``world_setup.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
+    Raises InputError as ``scene_to_world.prepare_world`` does; ``require_affordable`` says what the bake would refuse.
     """
     return bake_cost(folder, options).prepared
 

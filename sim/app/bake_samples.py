@@ -42,7 +42,7 @@ from ..skinning import bind, deform
 from ..tearing.blocks import OPENING, Blocks, make_blocks, opening_times, regrouped, stretches
 from ..tearing.torn_skin import TornMotion, tear
 from .bake_options import BakeOptions
-from .world_setup import PreparedWorld
+from .scene_to_world import PreparedWorld
 
 if TYPE_CHECKING:
     from .simulation import Simulation

@@ -30,8 +30,7 @@ from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
 from ..diagnose.report.wording import found_effects
 from ..diagnose.run_diagnosis import DiagnoseOptions
-from ..diagnose.track.body_request import BodyRequest, parse_body
-from ..diagnose.track.track_input import VideoTrial
+from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..rigid_alignment import nearest_pose

@@ -29,7 +29,7 @@ from ..scene.folder import SCENE_FILE, Scene
 from ..scene.scene_object import SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh
 from .export_patch import prim_name
-from .world_setup import surface
+from .scene_to_world import surface
 
 Array = NDArray[np.float64]
 ENDINGS = (".usda", ".usdc")

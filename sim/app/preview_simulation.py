@@ -34,9 +34,9 @@ from ..scene.overrides import apply_overrides
 from ..skinning import Binding, bind, deform
 from .bake_options import BakeOptions
 from .preview_server import PreviewRequest
+from .scene_to_world import PreparedWorld, prepare_world
+from .scene_to_world_checks import cell_size, mesh_volume, moves, vertices_at
 from .simulation import Simulation, start_world
-from .world_setup import PreparedWorld, prepare_world
-from .world_setup_checks import cell_size, mesh_volume, moves, vertices_at
 
 MAX_VERTICES = 20_000
 

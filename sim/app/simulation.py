@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..events import StageProgress
 from ..mpm.world import World
-from .world_setup import PreparedWorld, cost_text, engine_material
-from .world_setup_checks import moves, vertices_at
+from .scene_to_world import PreparedWorld, cost_text, engine_material
+from .scene_to_world_checks import moves, vertices_at
 
 __all__ = ["ENGINE_NAME", "Simulation", "build_world", "engine_material"]
 

@@ -7,7 +7,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.app.world_setup import prepare_world
+from physgen.sim.app.scene_to_world import prepare_world
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh

@@ -12,7 +12,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.scene_io.export_animation import export_names
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
-from physgen.sim.app.world_setup_checks import vertices_at
+from physgen.sim.app.scene_to_world_checks import vertices_at
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.errors import InputError
 from physgen.sim.scene.meshes import load_object_mesh, read_mesh

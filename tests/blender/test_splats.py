@@ -13,12 +13,7 @@ import trimesh
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import compat
-from physgen.physgen_addon.playback import (
-    bake_record,
-    point_caches,
-    show_bake,
-    splats,
-)
+from physgen.physgen_addon.playback import bake_record, point_caches, show_bake, splat_clouds
 from physgen.physgen_addon.scene_io import import_scene as import_splats
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.physgen_addon.scene_io.import_scene import import_scene, remove_import
@@ -75,7 +70,7 @@ def seen(body, frame=1):
     """What geometry nodes make of the splats at ``frame``: their matrices [a b c | centre] (N, 4, 4) in the world."""
     bpy.context.scene.frame_set(frame)
     graph = bpy.context.evaluated_depsgraph_get()
-    name = splats.find(body).name
+    name = splat_clouds.find(body).name
     found = [
         np.array(instance.matrix_world)
         for instance in graph.object_instances
@@ -90,7 +85,7 @@ def assert_shows(matrices, wanted):
     """Centres and ellipsoids, to float32: half axes may differ, what they span may not."""
     assert len(matrices) == len(wanted)
     np.testing.assert_allclose(matrices[:, :3, 3], wanted.centres, atol=2e-6)
-    spread = matrices[:, :3, :3] @ matrices[:, :3, :3].transpose(0, 2, 1) / splats.SIGMAS**2
+    spread = matrices[:, :3, :3] @ matrices[:, :3, :3].transpose(0, 2, 1) / splat_clouds.SIGMAS**2
     size = np.linalg.norm(wanted.covariances(), axis=(1, 2))[:, None, None]
     np.testing.assert_allclose(spread / size, wanted.covariances() / size, atol=2e-3)
 
@@ -108,7 +103,7 @@ def test_a_splat_object_is_seen_as_its_ellipsoids(a_folder):
 
 def test_the_choice_is_ellipsoids_points_or_the_mesh(a_folder):
     (item,) = import_splats.import_splats(bpy.context.scene, a_folder.root)
-    cloud = splats.find(item)
+    cloud = splat_clouds.find(item)
     item.physgen.splats_as = "POINTS"
     assert len(seen(item)) == 0
     graph = bpy.context.evaluated_depsgraph_get()
@@ -116,7 +111,7 @@ def test_the_choice_is_ellipsoids_points_or_the_mesh(a_folder):
     radii = np.array([point.radius for point in geometry.pointcloud.points])
     assert len(radii) == COUNT
     # Through the matrix of the body nothing is scaled: it is in the mesh.
-    wanted = transform_splats(some(), np.array(TURNED)).scales.mean(axis=1) * splats.DOT
+    wanted = transform_splats(some(), np.array(TURNED)).scales.mean(axis=1) * splat_clouds.DOT
     np.testing.assert_allclose(radii, wanted, rtol=1e-3)
     item.physgen.splats_as = "MESH"
     assert cloud.hide_render and not item.hide_render
@@ -136,7 +131,7 @@ def test_splats_go_out_as_they_came_in(a_folder, tmp_path):
     np.testing.assert_allclose(back.opacities, wanted.opacities, atol=1e-5)
     size = np.linalg.norm(wanted.covariances(), axis=(1, 2))[:, None, None]
     np.testing.assert_allclose(back.covariances() / size, wanted.covariances() / size, atol=1e-4)
-    bpy.data.objects.remove(splats.find(item))
+    bpy.data.objects.remove(splat_clouds.find(item))
     assert fingerprint(bpy.context.scene) != before
     assert export_scene(bpy.context.scene, tmp_path / "out").model.objects[0].splats is None
     assert not (tmp_path / "out" / source.splats).exists()
@@ -159,7 +154,7 @@ def test_a_bake_plays_on_the_splats_also_without_the_add_on(a_folder, tmp_path):
     fallen = seen(item, 6)[:, 2, 3].mean() - seen(item, 3)[:, 2, 3].mean()
     assert fallen < -0.05
     show_bake.hide(scene)
-    assert point_caches.MODIFIER not in splats.find(item).modifiers
+    assert point_caches.MODIFIER not in splat_clouds.find(item).modifiers
     assert bpy.ops.physgen.bake() == {"FINISHED"}
     last = seen(item, 6)
     bpy.ops.wm.save_mainfile()
@@ -180,9 +175,9 @@ def test_a_photos_scene_brings_its_splats(a_folder):
     collection = import_scene(bpy.context.scene, a_folder.root)
     item = next(item for item in collection.all_objects if item.physgen.enabled)
     assert_shows(seen(item), transform_splats(some(), np.array(TURNED)))
-    assert bpy.context.scene.cycles.transparent_max_bounces >= splats.BOUNCES
+    assert bpy.context.scene.cycles.transparent_max_bounces >= splat_clouds.BOUNCES
     remove_import(bpy.context.scene, collection)
-    assert not [item for item in bpy.data.objects if splats.SPLATS in item]
+    assert not [item for item in bpy.data.objects if splat_clouds.SPLATS in item]
 
 
 def test_one_splat_renders_as_a_gaussian():
@@ -196,7 +191,7 @@ def test_one_splat_renders_as_a_gaussian():
     one = Splats(
         centres=[[0, 0, 0]], scales=[[0.2, 0.1, 0.4]], rotations=[[1, 0, 0, 0]], opacities=[0.6], colours=[[1, 1, 1]]
     )
-    splats.add(body, one)
+    splat_clouds.add(body, one)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.type, camera.data.ortho_scale, camera.location = "ORTHO", 1.0, (0, 0, 5)
     scene.collection.objects.link(camera)
@@ -206,7 +201,7 @@ def test_one_splat_renders_as_a_gaussian():
     scene.render.film_transparent = False
     scene.view_settings.view_transform = "Raw"
     alpha = rendered(scene)
-    end = np.exp(-0.5 * splats.SIGMAS**2)
+    end = np.exp(-0.5 * splat_clouds.SIGMAS**2)
     for across, b in ((0.0, 0.0), (0.2, 1.0), (0.3, 1.5), (0.45, 99.0)):
         wanted = 0.6 * max(np.exp(-0.5 * b**2) - end, 0) / (1 - end)
         # A pixel is 0.02 wide; its middle lies half of that aside.
@@ -233,14 +228,14 @@ def test_a_file_of_splats_becomes_an_object(tmp_path):
     path = str(tmp_path / "a ball.ply")
     assert bpy.ops.physgen.import_splats(filepath=path, size_m=0.3, up="z") == {"FINISHED"}
     item = bpy.context.view_layer.objects.active
-    assert item.name == "a ball" and splats.find(item) is not None
+    assert item.name == "a ball" and splat_clouds.find(item) is not None
     assert max(item.dimensions) == pytest.approx(0.3, rel=1e-3)
     matrices = seen(item)
     assert len(matrices) == 3000
     middle = (matrices[:, :3, 3].min(axis=0) + matrices[:, :3, 3].max(axis=0)) / 2
     assert middle == pytest.approx([1.0, 0.0, 0.15], abs=0.01)
     # Read from the file, coloured by it.
-    assert half_axes(splats.read(splats.find(item))).shape == (3000, 3, 3)
+    assert half_axes(splat_clouds.read(splat_clouds.find(item))).shape == (3000, 3, 3)
     with pytest.raises(RuntimeError, match="no such file"):
         bpy.ops.physgen.import_splats(filepath=str(tmp_path / "none.ply"))
     trimesh.creation.box().export(tmp_path / "mesh.ply")

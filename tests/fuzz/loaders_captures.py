@@ -23,9 +23,8 @@ from physgen.sim.diagnose.capture import (
     save_capture,
 )
 from physgen.sim.diagnose.diagnosis import read_diagnosis
-from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
-from physgen.sim.diagnose.track.track_input import VideoTrial
+from physgen.sim.diagnose.track.track_input import VideoTrial, parse_body
 from physgen.sim.importers.recordings import read_recording
 from physgen.sim.scene.folder import load_scene
 

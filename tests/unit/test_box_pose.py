@@ -6,9 +6,9 @@ import numpy as np
 import physgen
 import pytest
 from physgen.sim.composite.side_by_side import box_faces, box_pose, window_around, with_box
-from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.box_pose import GroundCamera, corners, follow_box, repeats_after, unwrapped
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
+from physgen.sim.diagnose.track.track_input import parse_body
 
 CAMERA = GroundCamera(focal=620.0, middle=(320.0, 180.0), pitch=np.radians(42), roll=np.radians(1.5), height=0.24)
 FPS, BRAKING = 120.0, 1.8

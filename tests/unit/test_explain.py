@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.diagnose.track.body_request import parse_body
 from physgen.sim.diagnose.track.motion_view import understand_motion
 from physgen.sim.diagnose.track.moving_regions import Region, find_moving_regions
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
 from physgen.sim.diagnose.track.region_track import RegionPath, true_times, with_missing_frames
+from physgen.sim.diagnose.track.track_input import parse_body
 from physgen.sim.errors import InputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "video_to_cause.py"

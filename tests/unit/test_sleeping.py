@@ -10,8 +10,8 @@ import pytest
 import trimesh
 from physgen.sim.app.bake_estimate import at_rest
 from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.app.scene_to_world import prepare_world
 from physgen.sim.app.simulation import start_world
-from physgen.sim.app.world_setup import prepare_world
 from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
 from physgen.sim.effects.registry import apply_effects
 from physgen.sim.mpm.bodies import BodyForces, BodyParticles

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.app.bake_options import BakeOptions
-from physgen.sim.app.world_setup import prepare_world
+from physgen.sim.app.scene_to_world import prepare_world
 from physgen.sim.constitutive import ElasticMaterial, FluidMaterial, RigidMaterial
 from physgen.sim.effects.registry import apply_effects
 from physgen.sim.errors import InputError

@@ -14,13 +14,12 @@ from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, CaptureObject, Ground, Trial
 from ..capture_checks import check_capture
-from .body_request import BodyRequest
 from .box_pose import BoxMotion, follow_box
 from .motion_view import MotionView, noise_px, stopped_at, understand_motion, wobble_px
 from .moving_regions import MovingRegions, Region, find_moving_regions
 from .pose_estimation import Array
 from .region_track import link_regions, true_times, with_missing_frames
-from .track_input import VideoTrial
+from .track_input import BodyRequest, VideoTrial
 from .track_videos import Video
 
 STAGE = "track"

@@ -17,8 +17,7 @@ from ...errors import InputError
 from ...events import Event, IsCancelled, OnEvent, ignore, never
 from ...scene.folder import Scene, load_scene
 from ..capture import Capture, Trial, load_capture, save_capture
-from .body_request import BodyRequest, parse_body
-from .track_input import TrackOptions, VideoTrial
+from .track_input import BodyRequest, TrackOptions, VideoTrial, parse_body
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""From a scene's material to the engine's.
+"""From a scene and its meshes to the engine's world: bodies, colliders, contacts, tracks, effects. No Taichi.
 
-Hollow bodies: of the particles that fill a mesh, those near its surface.
+Everything that can be wrong with a scene is found here, before the engine starts, and named by object and field.
 
-How the surfaces of a scene meet, pair by pair, from the numbers of each surface and of named pairs.
-
-Where a pair is not named, friction is the geometric mean of the two coefficients, so that anything slides on ice, and
-restitution the larger of the two, so that a ball that bounces well does so on anything: the rules of Box2D
-(b2MixFriction and b2MixRestitution, E. Catto, box2d.org). No law of physics gives a pair's numbers from two surfaces.
-
-From a scene and its meshes to the engine's world: bodies, colliders, contacts, tracks, effects. No Taichi.
-
-Everything that can be wrong with a scene is found here, before the engine starts, and named by object and field."""
+Materials become the engine's. Of the particles that fill a mesh, a hollow body has those near its surface. How the
+surfaces of a scene meet, pair by pair, follows from the numbers of each surface and of named pairs. Where a pair is not
+named, friction is the geometric mean of the two coefficients, so that anything slides on ice, and restitution the
+larger of the two, so that a ball that bounces well does so on anything: the rules of Box2D (b2MixFriction and
+b2MixRestitution, E. Catto, box2d.org). No law of physics gives a pair's numbers from two surfaces.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
 from .matter_maps import factors_of, nearest_on_surface
-from .world_setup_checks import require_above_ground, resolve, separate, surface_warnings, vertices_at
+from .scene_to_world_checks import require_above_ground, resolve, separate, surface_warnings, vertices_at
 
 
 def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:
