@@ -171,7 +171,7 @@ def _advanced(particles: int, arch: str) -> Any:
 
 def tests(arch: str, quick: bool) -> dict[str, Any]:
     """The validation of the engine on ``arch``: how pytest ended."""
-    chosen = QUICK_TESTS if quick else ("tests/validation", "-m", "not long and not slow")
+    chosen = QUICK_TESTS if quick else ("-n", "auto", "tests/validation", "-m", "not long and not slow")
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", *chosen],

@@ -12,7 +12,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..events import IsCancelled
-from .kernels import broad_phase, layout, runtime, sorting
+from .kernels import broad_phase, layout, parallel_sorting, runtime, sorting
 from .kernels.collider_distance import PUSH
 from .kernels.constitutive_response import law_set
 from .kernels.grid import SUMS
@@ -31,6 +31,7 @@ from .kernels.kernel_arrays import (
     WorldArrays,
 )
 from .kernels.kernel_bundles import Launcher
+from .kernels.lanes import Lanes
 from .kernels.layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
 from .kernels.substep import substep_launcher
 from .kernels.time_stepping import prime_worlds
@@ -49,6 +50,9 @@ MATTER = ("memory", "material")
 
 MOST_RETRIES = 6
 """Times that a stretch of substeps is repeated with half the step before the run fails."""
+
+MOST_LAUNCHES = 64
+"""Launches at most between two looks at whether the caller wants to stop, on a card that runs them meanwhile."""
 
 RECOVER = 1.25
 """Factor by which a shortened step grows again after each stretch that did not diverge."""
@@ -88,16 +92,20 @@ class Engine:
         cfl_velocity: float,
         numbers: PackedWorlds,
         rigid_bodies: RigidBodies,
+        lanes: Lanes,
     ) -> None:
+        """lanes: threads that share a block, ``lanes_of`` the architecture in use."""
+        self._lanes = lanes
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
         self.rigid_bodies = rigid_bodies
         self._most_rigid_bodies = int(numbers.world_integers[:, layout.RIGID_BODIES].max())
-        self._running = ti.ndarray(ti.i32, 1)
         self._touching = ti.ndarray(ti.f32, max(1, rigid_bodies.count))
         self.laws = numbers.laws
         models = law_set(self.laws)
         self._flowing = models.flowing
         self.world_count = len(numbers.worlds)
+        self._running = ti.ndarray(ti.i32, self.world_count if lanes.parallel else 1)
+        self._launches = 1
         self.field_count = len(numbers.fields)
         self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
         several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
@@ -326,35 +334,38 @@ class Engine:
 
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
-        sorting.rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks())
+        rebase = parallel_sorting.rebase_of(self._lanes) if self._lanes.parallel else sorting.rebase
+        rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks())
         self._group()
 
     def _group(self) -> None:
         """Lists, neighbours and permutation for the blocks named in ``_keys``."""
         while True:
             self._p_keys.fill(-1)
-            self._p_blocks = sorting.list_particle_blocks(
-                self.count, self._p_capacity, self._keys, self._p_table(), self._blocks()
-            )
+            self._p_blocks = self._list_particle_blocks()
             if self._p_blocks <= self._p_capacity:
                 break
             self._allocate_blocks(int(GROWTH * self._p_blocks) + LEAST_BLOCKS, 0)
-        # The grid's list turns the counts of particles into offsets, once: they are put back for every new attempt.
+        if self._lanes.parallel:
+            parallel_sorting.turn_counts_into_offsets_of(self._lanes)(self._cursors, self._blocks())
+        # The serial list of the grid turns the counts of particles into offsets, once: they are put back for every new
+        # attempt.
         counts = None
         while True:
             self._g_keys.fill(-1)
-            if counts is None:
+            if self._lanes.parallel:
+                pass
+            elif counts is None:
                 counts = self._starts.to_numpy()
             else:
                 self._starts.from_numpy(counts)
-            self._g_blocks = sorting.list_grid_blocks(
-                self.field_count, self._g_capacity, self._cursors, self._g_table(), self._blocks(), self._grid()
-            )
+            self._g_blocks = self._list_grid_blocks()
             if self._g_blocks <= self._g_capacity:
                 break
             self._allocate_blocks(0, int(GROWTH * self._g_blocks) + LEAST_BLOCKS)
         sorting.link_blocks(self._blocks(), self._grid(), self._p_table(), self._g_table())
-        sorting.place(self.count, self._keys, self._cursors, self._targets, self._p_table())
+        place = parallel_sorting.place_in_parallel if self._lanes.parallel else sorting.place
+        place(self.count, self._keys, self._cursors, self._targets, self._p_table())
         old, new = self._particles
         sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
@@ -371,16 +382,48 @@ class Engine:
         self._particles.reverse()
         self._list_contacts()
 
+    def _list_particle_blocks(self) -> int:
+        if self._lanes.parallel:
+            return int(
+                parallel_sorting.list_particle_blocks_in_parallel(
+                    self.count,
+                    self._p_capacity,
+                    self.field_count,
+                    self._keys,
+                    self._g_starts,
+                    self._p_table(),
+                    self._blocks(),
+                )
+            )
+        return int(
+            sorting.list_particle_blocks(self.count, self._p_capacity, self._keys, self._p_table(), self._blocks())
+        )
+
+    def _list_grid_blocks(self) -> int:
+        if self._lanes.parallel:
+            return int(
+                parallel_sorting.list_grid_blocks_in_parallel(
+                    self.field_count, self._g_capacity, self._g_table(), self._blocks(), self._grid()
+                )
+            )
+        return int(
+            sorting.list_grid_blocks(
+                self.field_count, self._g_capacity, self._cursors, self._g_table(), self._blocks(), self._grid()
+            )
+        )
+
     def _list_contacts(self) -> None:
-        rigid = self.rigid_bodies
+        rigid, parallel = self.rigid_bodies, self._lanes.parallel
         near, blocks, grid = self._near_blocks(), self._blocks(), self._grid()
-        found = broad_phase.list_near_blocks(self._worlds(), blocks, grid, near, rigid.bodies, rigid.shapes)
+        list_near = broad_phase.list_near_blocks_in_parallel if parallel else broad_phase.list_near_blocks
+        found = list_near(self._worlds(), blocks, grid, near, rigid.bodies, rigid.shapes)
         self._touched.fill(0)
         self._slack.fill(0.0)
         self._near = (int(found[0]), int(found[1]))
         if self._several:
             overlap = self._overlap_blocks()
-            found = broad_phase.list_overlap_blocks(self._worlds(), blocks, grid, self._g_table(), overlap)
+            list_overlap = broad_phase.list_overlap_blocks_in_parallel if parallel else broad_phase.list_overlap_blocks
+            found = list_overlap(self._worlds(), blocks, grid, self._g_table(), overlap)
             self._overlap = (int(found[0]), int(found[1]), int(found[2]))
 
     # ---- time ---------------------------------------------------------------------------------------------------
@@ -420,12 +463,7 @@ class Engine:
             while True:
                 prime_worlds(self._limits(), self._worlds())
                 if self.count:
-                    launch = self._launcher().bind(self._arguments())
-                    self._running[0] = self.world_count
-                    while self._running[0] > 0:
-                        if stop():
-                            raise Stopped
-                        launch()
+                    self._run_substeps(stop)
                 elif stop():
                     raise Stopped
                 else:
@@ -456,6 +494,26 @@ class Engine:
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
         self._put_control(control)
 
+    def _run_substeps(self, stop: IsCancelled) -> None:
+        """Substeps until every world wants a sort, is done or has diverged."""
+        launch = self._launcher().bind(self._arguments())
+        if not self._lanes.parallel:
+            self._running[0] = self.world_count
+            while self._running[0] > 0:
+                if stop():
+                    raise Stopped
+                launch()
+            return
+        # A card goes on while the host prepares the next launch, unless the host waits to read: it does so when about
+        # as many substeps as last time are under way.
+        launches = 0
+        while launches < self._launches or self._running.to_numpy().any():
+            if stop():
+                raise Stopped
+            launch()
+            launches += 1
+        self._launches = max(1, min(launches - 1, MOST_LAUNCHES))
+
     def _advance_rigid_bodies(self) -> None:
         """All substeps of all worlds, none of which holds particles."""
         rigid = self.rigid_bodies
@@ -464,7 +522,13 @@ class Engine:
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""
         return substep_launcher(
-            runtime.generation(), self.laws, self._overlap[2] > 0, self.rigid_bodies.count > 0, self._near[0] > 0
+            runtime.generation(),
+            self.laws,
+            self._lanes,
+            self._mean_fields > 0,
+            self._overlap[2] > 0,
+            self.rigid_bodies.count > 0,
+            self._near[0] > 0,
         )
 
     # ---- bundles ------------------------------------------------------------------------------------------------

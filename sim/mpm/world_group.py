@@ -20,6 +20,7 @@ from .colliders import SAME_TIME, Track
 from .diagnostics import FittedGradients
 from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, upload_new
 from .kernels import layout, runtime
+from .kernels.lanes import lanes_of
 from .kernels.time_stepping import RIGID_LOST
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
@@ -111,6 +112,7 @@ class WorldGroup:
             cfl_velocity=self.options.cfl_velocity,
             numbers=packing.pack(self._places),
             rigid_bodies=self._rigid_bodies,
+            lanes=lanes_of(self.arch),
         )
 
     def __len__(self) -> int:

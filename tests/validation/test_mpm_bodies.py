@@ -137,6 +137,7 @@ def _variants(box, cell) -> list[WorldSetup]:
     return setups
 
 
+@pytest.mark.usefixtures("repeatable")
 def test_worlds_together_are_worlds_alone(box, options, similarity, cell):
     """Every world among others: the same bytes as alone, though each takes its own substeps."""
     setups = _variants(box, cell)

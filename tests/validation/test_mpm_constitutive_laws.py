@@ -412,6 +412,7 @@ def mixed_bytes(world: World) -> bytes:
     return b"".join(f(i).tobytes() for i in range(len(MIXED)) for f in calls)
 
 
+@pytest.mark.usefixtures("repeatable")
 def test_all_laws_in_one_world_are_deterministic_and_resume_exactly(options, similarity, cell):
     first = mixed_world(options, similarity, cell)
     first.advance(0.05)

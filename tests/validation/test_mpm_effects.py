@@ -504,6 +504,7 @@ def seen(worlds: Worlds, world: int) -> bytes:
     return b"".join(f(0).tobytes() for f in (view.positions, view.velocities, view.deformation_gradients))
 
 
+@pytest.mark.usefixtures("repeatable")
 def test_worlds_with_different_effects_advance_as_alone(box, options, similarity):
     """Byte for byte, and after a restart in the middle too."""
     setups = different_worlds(box)

@@ -198,6 +198,7 @@ def test_jelly_in_a_corner_goes_through_neither_wall(box, options, similarity, c
         assert points[:, 2].min() > -0.1 * cell
 
 
+@pytest.mark.usefixtures("repeatable")
 def test_worlds_with_and_without_matter_are_worlds_alone(box, options, similarity, cell):
     """Solids only, matter only and both in one launch: each the same bytes as alone."""
     jelly = box(cells=(3, 3, 3), bottom=(0.0, 0.0, 4.2 * cell), youngs_modulus=1e5, name="jelly")
@@ -220,6 +221,7 @@ def test_worlds_with_and_without_matter_are_worlds_alone(box, options, similarit
             assert np.array_equal(alone[0].positions(body), together[i].positions(body)), (i, body)
 
 
+@pytest.mark.usefixtures("repeatable")
 def test_rigid_bodies_and_colliders_resume_exactly(box, options, similarity, cell):
     """A checkpoint of jelly, a rigid body and a turning collider continues with equal bytes."""
     jelly = box(cells=(3, 3, 3), bottom=(0.0, 0.0, 4.2 * cell), youngs_modulus=1e5, name="jelly")

@@ -165,6 +165,30 @@ def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, bodies: RigidArra
 
 
 @func
+def gather_pushes_in_parallel(
+    worlds: WorldArrays, blocks: ParticleBlocks, near: NearBlocks, bodies: RigidArrays, coupling: CouplingArrays
+):
+    """As ``gather_pushes``, a thread a block of particles."""
+    for w in range(worlds.count):
+        if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+            for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+                coupling.touching[i] = 0.0
+                for n in range(6):
+                    bodies.impulses[6 * i + n] = 0.0
+    for s in range(near.particle_count):
+        w = worlds.field_integers[blocks.field[near.particle_blocks[s]] * FIELD_INTEGERS + WORLD]
+        if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+            for o in range(worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+                row = (s * coupling.most_bodies + o) * PUSH
+                if coupling.pushes[row + 6] > 0.0:
+                    for n in range(6):
+                        bodies.impulses[6 * (first + o) + n] += coupling.pushes[row + n]
+                    coupling.touching[first + o] += coupling.pushes[row + 6]
+
+
+@func
 def gather_pushes(
     worlds: WorldArrays, blocks: ParticleBlocks, near: NearBlocks, bodies: RigidArrays, coupling: CouplingArrays
 ):

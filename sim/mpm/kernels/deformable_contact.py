@@ -26,6 +26,7 @@ import taichi as ti
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
 from .kernel_arrays import GridBlocks, NodeArrays, OverlapBlocks, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
+from .lanes import add_to, clear_window, gathered, meet, pads_of, store_window
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -78,6 +79,7 @@ def distance_of_share(share: ti.f32):
 @func
 def scatter_shares(
     laws: ti.template(),
+    lanes: ti.template(),
     worlds: WorldArrays,
     blocks: ParticleBlocks,
     overlap: OverlapBlocks,
@@ -85,14 +87,20 @@ def scatter_shares(
     nodes: NodeArrays,
 ):
     """Scatter the particles' present volumes (cells^3) and the gradient of their spread to the blocks' windows."""
-    for ss in range(overlap.particle_count * SPREAD):
-        if ss % SPREAD == 0:
-            k = overlap.particle_blocks[ss // SPREAD]
+    if ti.static(lanes.shared):
+        ti.loop_config(block_dim=ti.static(lanes.threads))
+    for ss in range(overlap.particle_count * ti.static(lanes.span)):
+        lane = ss % ti.static(lanes.span)
+        if lane < ti.static(lanes.threads):
+            k = overlap.particle_blocks[ss // ti.static(lanes.span)]
+            pads = ti.static(pads_of(lanes, nodes))
+            offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
             w = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD]
             if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-                for i in range(WINDOW_NODES):
-                    nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
-                for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                clear_window(lanes, lane, offset, pads.scattered)
+                meet(lanes)
+                p = blocks.starts[k] + lane
+                while p < blocks.starts[k + 1]:
                     volume = particles.volumes[p]
                     law = 0
                     if ti.static(laws.log_volume):
@@ -108,62 +116,86 @@ def scatter_shares(
                     w3 = weights(fx)
                     # Derivatives of the weights by the node's place.
                     s3 = [1.5 - fx, 2.0 * (fx - 1.0), 0.5 - fx]
-                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
                     for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
                         n = first + (i * 64 + j * 8 + m)
-                        nodes.scattered[n] = nodes.scattered[n] + volume * vec4(
+                        share = volume * vec4(
                             s3[i][0] * w3[j][1] * w3[m][2],
                             w3[i][0] * s3[j][1] * w3[m][2],
                             w3[i][0] * w3[j][1] * s3[m][2],
                             w3[i][0] * w3[j][1] * w3[m][2],
                         )
+                        add_to(pads.scattered, n, share)
+                    p += ti.static(lanes.threads)
+                meet(lanes)
+                store_window(lanes, lane, k, pads.scattered, nodes.scattered)
+                meet(lanes)
 
 
 @func
-def gather_shares(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
+def gather_shares(
+    lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays
+):
     """Sum the windows: gradient (1/cell) and share of the field at each node of the meeting blocks, in ``sums``."""
-    for ss in range(overlap.grid_count * SPREAD):
-        if ss % SPREAD == 0:
-            s = ss // SPREAD
-            g = overlap.grid_blocks[s]
+    if ti.static(lanes.parallel):
+        for n in range(overlap.grid_count * BLOCK_NODES):
+            g = overlap.grid_blocks[n // BLOCK_NODES]
             w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
             if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-                sum_chosen_windows(g, s, grid.neighbours, overlap.chosen, nodes.scattered, nodes.sums)
+                nodes.sums[n] = gathered(g, n % BLOCK_NODES, grid.neighbours, overlap.chosen, nodes.scattered)
+    else:
+        for ss in range(overlap.grid_count * SPREAD):
+            if ss % SPREAD == 0:
+                s = ss // SPREAD
+                g = overlap.grid_blocks[s]
+                w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+                if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                    sum_chosen_windows(g, s, grid.neighbours, overlap.chosen, nodes.scattered, nodes.sums)
 
 
 @func
-def separate(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
+def separate(lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
     """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``."""
-    for ss in range(overlap.lead_count * SPREAD):
-        if ss % SPREAD == 0:
-            lead = overlap.leads[ss // SPREAD]
-            f = grid.field[lead]
-            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
-            c = w * CONTROL_ROW
-            if worlds.control[c + PHASE] == FULL:
-                dt = ti.cast(worlds.control[c + STEP], ti.f32)
-                recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
-                first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
-                count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
-                a = lead
-                while overlap.mate[a] >= 0:
-                    b = overlap.mate[a]
-                    while b >= 0:
-                        pair = (
-                            worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
-                            + (grid.field[a] - first) * count
-                            + (grid.field[b] - first)
-                        ) * TOUCH_ROW
-                        for i in range(BLOCK_NODES):
-                            na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
-                            if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
-                                sa, sb = (
-                                    nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
-                                    nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
-                                )
-                                exchange(na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
-                        b = overlap.mate[b]
-                    a = overlap.mate[a]
+    share = ti.static(BLOCK_NODES if lanes.parallel else SPREAD)
+    for ss in range(overlap.lead_count * share):
+        if ti.static(lanes.parallel):
+            separate_node(overlap.leads[ss // share], ss % share, worlds, grid, overlap, nodes)
+        elif ss % share == 0:
+            for i in range(BLOCK_NODES):
+                separate_node(overlap.leads[ss // share], i, worlds, grid, overlap, nodes)
+
+
+@func
+def separate_node(
+    lead: ti.i32, i: ti.i32, worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays
+):
+    """The same at node ``i`` of the fields' blocks in the place of the block ``lead``."""
+    f = grid.field[lead]
+    w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+    c = w * CONTROL_ROW
+    if worlds.control[c + PHASE] == FULL:
+        dt = ti.cast(worlds.control[c + STEP], ti.f32)
+        recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
+        first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
+        count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
+        a = lead
+        while overlap.mate[a] >= 0:
+            b = overlap.mate[a]
+            while b >= 0:
+                pair = (
+                    worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
+                    + (grid.field[a] - first) * count
+                    + (grid.field[b] - first)
+                ) * TOUCH_ROW
+                na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
+                if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
+                    sa, sb = (
+                        nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
+                        nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
+                    )
+                    exchange(na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
+                b = overlap.mate[b]
+            a = overlap.mate[a]
 
 
 @func

@@ -11,6 +11,7 @@ import taichi as ti
 
 from .kernel_arrays import FlowArrays, GridBlocks, NodeArrays, WorldArrays
 from .kernel_bundles import func
+from .lanes import gathered
 from .layout import (
     ACCELERATION,
     ACCELERATION_RATE,
@@ -92,6 +93,58 @@ def steady_acceleration(f: ti.i32, w: ti.i32, dt: ti.f32, worlds: WorldArrays):
 
 
 @func
+def drive(q: vec4, push: vec3, dt: ti.f32, drag: ti.f32, wind: vec3):
+    """Velocity of a node of momentum and mass ``q`` after the forces of a substep; 0 as its fourth number."""
+    inverse = 1.0 / q[3]
+    u = vec3(q[0], q[1], q[2]) * inverse
+    slower = vec3(0.0)
+    if drag > 0.0:
+        # Exact for drag alone, so that none can turn a body back; with half of the other forces
+        # before and half after, the terminal velocity is right to the second order too.
+        through = u + 0.5 * push - wind
+        slower = through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
+    u += push - slower
+    return vec4(u[0], u[1], u[2], 0.0)
+
+
+@func
+def advance_nodes_in_parallel(
+    flowing: ti.template(),
+    means: ti.template(),
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+):
+    """As ``advance_nodes``, a thread a node; ``means``: whether some fields' means are wanted."""
+    for n in range(grid.count * BLOCK_NODES):
+        g = n // BLOCK_NODES
+        f = grid.field[g]
+        w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+        c = w * CONTROL_ROW
+        if worlds.control[c + PHASE] == FULL:
+            dt = ti.cast(worlds.control[c + STEP], ti.f32)
+            push = dt * steady_acceleration(f, w, dt, worlds)
+            wind = triple(worlds.field_numbers, f * FIELD_ROW + WIND)
+            q = gathered(g, n % BLOCK_NODES, grid.neighbours, None, nodes.scattered)
+            nodes.mass[n] = q[3]
+            if q[3] > 0.0:
+                if ti.static(flowing):
+                    flow.velocity[n] = gathered(g, n % BLOCK_NODES, grid.neighbours, None, flow.scattered) / q[3]
+                q = drive(q, push, dt, worlds.field_numbers[f * FIELD_ROW + DRAG], wind)
+            elif ti.static(flowing):
+                flow.velocity[n] = vec4(0.0)
+            nodes.velocity[n] = q
+    if ti.static(means):
+        for g in range(grid.count):
+            f = grid.field[g]
+            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            wanted = worlds.field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1
+            if wanted and worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                add_sums(g, triple(worlds.means, f * MEAN_ROW + MEAN_PLACE), grid, nodes)
+
+
+@func
 def advance_nodes(flowing: ti.template(), worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays):
     """Nodes of all grid blocks: sum of the windows, velocity = momentum / mass, forces.
 
@@ -114,16 +167,7 @@ def advance_nodes(flowing: ti.template(), worlds: WorldArrays, grid: GridBlocks,
                     q = nodes.velocity[g * BLOCK_NODES + i]
                     nodes.mass[g * BLOCK_NODES + i] = q[3]
                     if q[3] > 0.0:
-                        inverse = 1.0 / q[3]
-                        u = vec3(q[0], q[1], q[2]) * inverse
-                        slower = vec3(0.0)
-                        if drag > 0.0:
-                            # Exact for drag alone, so that none can turn a body back; with half of the other forces
-                            # before and half after, the terminal velocity is right to the second order too.
-                            through = u + 0.5 * push - wind
-                            slower = through * (1.0 - 1.0 / (1.0 + dt * drag * through.norm()))
-                        u += push - slower
-                        nodes.velocity[g * BLOCK_NODES + i] = vec4(u[0], u[1], u[2], 0.0)
+                        nodes.velocity[g * BLOCK_NODES + i] = drive(q, push, dt, drag, wind)
                 if ti.static(flowing):
                     sum_windows(g, grid.neighbours, flow.scattered, flow.velocity)
                     for i in range(BLOCK_NODES):

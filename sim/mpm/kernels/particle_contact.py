@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201
+# ruff: noqa: ANN201, SIM102
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """Coulomb contact of particles with the ground plane, rigid bodies and colliders, and pins; resolved at the particles.
@@ -39,6 +39,7 @@ from .kernel_arrays import (
     WorldArrays,
 )
 from .kernel_bundles import func
+from .lanes import add_to, clear_window, fetch_window, gathered, lane_maxima, meet, node_of, pads_of, store_window
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -149,6 +150,7 @@ def press(
 
 @func
 def solve_contact(
+    lanes: ti.template(),
     worlds: WorldArrays,
     blocks: ParticleBlocks,
     near: NearBlocks,
@@ -159,21 +161,30 @@ def solve_contact(
     coupling: CouplingArrays,
 ):
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass."""
-    for ss in range(near.particle_count * SPREAD):
-        if ss % SPREAD == 0:
-            s = ss // SPREAD
+    if ti.static(lanes.shared):
+        ti.loop_config(block_dim=ti.static(lanes.threads))
+    for ss in range(near.particle_count * ti.static(lanes.span)):
+        lane = ss % ti.static(lanes.span)
+        if lane < ti.static(lanes.threads):
+            s = ss // ti.static(lanes.span)
             k = near.particle_blocks[s]
+            pads = ti.static(pads_of(lanes, nodes))
+            offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
             f = blocks.field[k]
             w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
             c = w * CONTROL_ROW
-            near.touched[k] = 0
-            for n in range(coupling.most_bodies * PUSH):
-                coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
             dt = ti.cast(worlds.control[c + STEP], ti.f32)
             fastest = ti.cast(ti.max(worlds.control[c + SPEED], worlds.control[c + RIGID_SPEED]), ti.f32)
+            slack = near.slack[k]
             if worlds.control[c + PHASE] == FULL:
-                near.slack[k] -= 2.0 * REACH_FACTOR * fastest * dt
-            if worlds.control[c + PHASE] == FULL and near.slack[k] <= 0.0:
+                slack -= 2.0 * REACH_FACTOR * fastest * dt
+            meet(lanes)
+            if lane == 0:
+                near.touched[k] = 0
+                near.slack[k] = slack
+                for n in range(coupling.most_bodies * PUSH):
+                    coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
+            if worlds.control[c + PHASE] == FULL and slack <= 0.0:
                 # Particles farther away cannot touch in this substep.
                 reach = REACH_FACTOR * fastest * dt + LEAST_REACH
                 least = MOST_SLACK
@@ -187,7 +198,13 @@ def solve_contact(
                 first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
                 level = plane.dot(first_node) - worlds.numbers[w * WORLD_ROW + PLANE_OFFSET]
                 time = ti.cast(worlds.control[c + ELAPSED], ti.f32) + dt
-                for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                touched = 0.0
+                if ti.static(lanes.parallel):
+                    fetch_window(lanes, lane, k, blocks.neighbours, nodes.velocity, pads.window)
+                    clear_window(lanes, lane, offset, pads.scattered)
+                meet(lanes)
+                p = blocks.starts[k] + lane
+                while p < blocks.starts[k + 1]:
                     gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
                     fixed = particles.constants[p]
                     past = particles.reaction[p]
@@ -217,18 +234,18 @@ def solve_contact(
                     least = ti.min(least, phi)
                     if phi < reach or old.norm_sqr() > 0.0 or pinned:
                         least = 0.0
-                        if near.touched[k] == 0:
-                            near.touched[k] = 1
-                            load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
-                            for i in range(WINDOW_NODES):
-                                nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                        if ti.static(not lanes.parallel):
+                            if touched == 0.0:
+                                load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
+                                clear_window(lanes, lane, offset, pads.scattered)
+                        touched = 1.0
                         base = ti.cast(gp - 0.5, ti.i32)
                         fx = gp - ti.cast(base, ti.f32)
                         w3 = weights(fx)
-                        first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                        first = offset + base[0] * 64 + base[1] * 8 + base[2]
                         u = vec4(0.0)
                         for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                            u += (w3[i][0] * w3[j][1] * w3[m][2]) * nodes.window[first + (i * 64 + j * 8 + m)]
+                            u += (w3[i][0] * w3[j][1] * w3[m][2]) * node_of(pads.window, first + (i * 64 + j * 8 + m))
                         share = 1.0
                         if old.norm_sqr() > 0.0 and past[3] > 0.0:
                             share = ti.max(past[3], 0.02)
@@ -273,8 +290,9 @@ def solve_contact(
                             mass = ti.select((new + beside).norm_sqr() > 0.0, fixed[0], 0.0)
                             q = vec4(change[0], change[1], change[2], mass)
                             for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                                n = first + (i * 64 + j * 8 + m)
-                                nodes.scattered[n] = nodes.scattered[n] + (w3[i][0] * w3[j][1] * w3[m][2]) * q
+                                add_to(
+                                    pads.scattered, first + (i * 64 + j * 8 + m), (w3[i][0] * w3[j][1] * w3[m][2]) * q
+                                )
                             if obstacle > 0 and not pinned:
                                 row = (s * coupling.most_bodies + obstacle - 1) * PUSH
                                 add_push(first_body + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
@@ -282,28 +300,46 @@ def solve_contact(
                                 row = (s * coupling.most_bodies + second_obstacle - 1) * PUSH
                                 given = -fixed[0] * beside
                                 add_push(first_body + second_obstacle - 1, row, here, given, bodies, coupling)
-                near.slack[k] = least - AHEAD * reach
+                    p += ti.static(lanes.threads)
+                meet(lanes)
+                most = lane_maxima(lanes, lane, vec4(touched, -least, 0.0, 0.0), pads)
+                if most[0] > 0.0:
+                    store_window(lanes, lane, k, pads.scattered, nodes.scattered)
+                if lane == 0:
+                    near.touched[k] = ti.cast(most[0], ti.i32)
+                    near.slack[k] = -most[1] - AHEAD * reach
+                meet(lanes)
 
 
 @func
-def apply_contact(worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
+def apply_contact(lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
     """Add the change of impulse to the nodes' velocity; leave the share of contacting mass in their fourth number."""
-    for ss in range(near.grid_count * SPREAD):
-        if ss % SPREAD == 0:
-            s = ss // SPREAD
-            g = near.grid_blocks[s]
+    if ti.static(lanes.parallel):
+        for t in range(near.grid_count * BLOCK_NODES):
+            g = near.grid_blocks[t // BLOCK_NODES]
+            n = g * BLOCK_NODES + t % BLOCK_NODES
             w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
-            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-                any_touched = 0
-                for d in range(27):
-                    if grid.neighbours[g * 27 + d] >= 0:
-                        any_touched += near.touched[grid.neighbours[g * 27 + d]]
-                if any_touched == 0:
-                    continue
-                sum_chosen_windows(g, s, grid.neighbours, near.touched, nodes.scattered, nodes.sums)
-                for i in range(BLOCK_NODES):
-                    n = g * BLOCK_NODES + i
-                    if nodes.mass[n] > 0.0:
-                        q = nodes.sums[s * BLOCK_NODES + i] / nodes.mass[n]
-                        u = nodes.velocity[n]
-                        nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL and nodes.mass[n] > 0.0:
+                q = gathered(g, t % BLOCK_NODES, grid.neighbours, near.touched, nodes.scattered) / nodes.mass[n]
+                u = nodes.velocity[n]
+                nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+    else:
+        for ss in range(near.grid_count * SPREAD):
+            if ss % SPREAD == 0:
+                s = ss // SPREAD
+                g = near.grid_blocks[s]
+                w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+                if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                    any_touched = 0
+                    for d in range(27):
+                        if grid.neighbours[g * 27 + d] >= 0:
+                            any_touched += near.touched[grid.neighbours[g * 27 + d]]
+                    if any_touched == 0:
+                        continue
+                    sum_chosen_windows(g, s, grid.neighbours, near.touched, nodes.scattered, nodes.sums)
+                    for i in range(BLOCK_NODES):
+                        n = g * BLOCK_NODES + i
+                        if nodes.mass[n] > 0.0:
+                            q = nodes.sums[s * BLOCK_NODES + i] / nodes.mass[n]
+                            u = nodes.velocity[n]
+                            nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])

@@ -10,7 +10,7 @@ kilograms. A substep is
 
     advance_nodes      gather the windows, momentum -> velocity, forces: ``grid``
     contact            of deformable bodies: ``deformable_contact``; with plane, bodies, colliders: ``particle_contact``
-    advance_particles  grid -> particles -> grid in one pass over the particles, without atomics
+    advance_particles  grid -> particles -> grid in one pass over the particles, on the CPU without atomics
 """
 
 import taichi as ti
@@ -19,6 +19,17 @@ from .constitutive_response import deform, is_fluid, law_of, respond
 from .constitutive_response import flows as material_flows
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
+from .lanes import (
+    add_to,
+    clear_window,
+    fetch_window,
+    lane_maxima,
+    lane_sum,
+    meet,
+    node_of,
+    pads_of,
+    store_window,
+)
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -45,7 +56,6 @@ from .layout import (
     PLANE_OFFSET,
     SCALARS_PER_BLOCK,
     SCATTER,
-    SPREAD,
     STEP,
     STORE,
     SUBSTEPS,
@@ -148,7 +158,7 @@ def sum_chosen_windows(g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integ
 
 
 @ti.func
-def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
+def interpolate(first: ti.i32, fx: vec3, window: ti.template()):
     """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis."""
     w = weights(fx)
     A = vec4(0.0)
@@ -163,7 +173,7 @@ def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
             Aj = vec4(0.0)
             B2j = vec4(0.0)
             for m in ti.static(range(3)):
-                u = window[first + (i * 64 + j * 8 + m)] * w[m][2]
+                u = node_of(window, first + (i * 64 + j * 8 + m)) * w[m][2]
                 Aj += u
                 if ti.static(m > 0):
                     B2j += float(m) * u
@@ -180,7 +190,7 @@ def interpolate(first: ti.i32, fx: vec3, window: Vectors4):
 
 
 @ti.func
-def interpolate_curved(first: ti.i32, fx: vec3, window: Vectors4):
+def interpolate_curved(first: ti.i32, fx: vec3, window: ti.template()):
     """As ``interpolate``, and second derivatives per cell²: a sixteenth of those along two axes (01, 02, 12), and
     those along one (0, 1, 2)."""
     w = weights(fx)
@@ -202,9 +212,9 @@ def interpolate_curved(first: ti.i32, fx: vec3, window: Vectors4):
         D1i = vec4(0.0)
         D2i = vec4(0.0)
         for j in ti.static(range(3)):
-            u0 = window[first + (i * 64 + j * 8)]
-            u1 = window[first + (i * 64 + j * 8 + 1)]
-            u2 = window[first + (i * 64 + j * 8 + 2)]
+            u0 = node_of(window, first + (i * 64 + j * 8))
+            u1 = node_of(window, first + (i * 64 + j * 8 + 1))
+            u2 = node_of(window, first + (i * 64 + j * 8 + 2))
             v1 = w[1][2] * u1
             v2 = w[2][2] * u2
             Aj = w[0][2] * u0 + v1 + v2
@@ -257,7 +267,7 @@ def spread_curved(
     d0: vec4,
     d1: vec4,
     d2: vec4,
-    window: Vectors4,
+    window: ti.template(),
 ):
     """As ``spread``, with ij e01 + im e02 + jm e12 more, and along each axis a mode (1, -2, 1) d that carries neither
     momentum nor angular momentum."""
@@ -280,9 +290,9 @@ def spread_curved(
             cj = wij * (c2i + float(j) * e12)
             dj = wij * d2
             n = first + (i * 64 + j * 8)
-            window[n] = window[n] + (w[0][2] * bj + dj)
-            window[n + 1] = window[n + 1] + (w[1][2] * (bj + cj) - 2.0 * dj)
-            window[n + 2] = window[n + 2] + (w[2][2] * (bj + 2.0 * cj) + dj)
+            add_to(window, n, w[0][2] * bj + dj)
+            add_to(window, n + 1, w[1][2] * (bj + cj) - 2.0 * dj)
+            add_to(window, n + 2, w[2][2] * (bj + 2.0 * cj) + dj)
 
 
 @ti.func
@@ -300,7 +310,7 @@ def spread_kept(
     D0: vec4,
     D1: vec4,
     D2: vec4,
-    window: Vectors4,
+    window: ti.template(),
 ):
     """As ``spread``, with what a particle of ``mass`` keeps of the second derivatives that ``interpolate_curved``
     gave."""
@@ -321,7 +331,7 @@ def spread_kept(
 
 
 @ti.func
-def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: Vectors4):
+def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: ti.template()):
     """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
     w = weights(fx)
     for i in ti.static(range(3)):
@@ -331,8 +341,7 @@ def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, wind
             bj = wij * (bi + float(j) * c1)
             cj = wij * c2
             for m in ti.static(range(3)):
-                n = first + (i * 64 + j * 8 + m)
-                window[n] = window[n] + w[m][2] * (bj + float(m) * cj)
+                add_to(window, first + (i * 64 + j * 8 + m), w[m][2] * (bj + float(m) * cj))
 
 
 @func
@@ -382,7 +391,7 @@ def scatter_past(
     C: mat3,
     packing: ti.f32,
     slope: vec3,
-    past_scattered: Vectors4,
+    past_scattered: ti.template(),
 ):
     """Momentum without any force, and mass times ln J (``packing``), to the window."""
     q = mass * (velocity - C @ fx)
@@ -396,6 +405,7 @@ def scatter_past(
 @func
 def advance_particles(
     laws: ti.template(),
+    lanes: ti.template(),
     worlds: WorldArrays,
     blocks: ParticleBlocks,
     near: NearBlocks,
@@ -406,6 +416,7 @@ def advance_particles(
     """Grid to particles over ``STEP``, then particles to grid with the stress impulse of ``NEXT_STEP``.
 
     laws: the models that occur, a ``LawSet``; of ``only_elastic`` ones neither ``material`` nor ``memory`` is read.
+    lanes: threads that share a block, a ``Lanes``.
     The world's phase leaves the first half out (after a sort), its SCATTER the second (before one); STORE writes ``v``
     and ``C``, which are otherwise recomputed before they are read.
 
@@ -413,9 +424,14 @@ def advance_particles(
     move with the grid's velocity, so contacts hold as for all materials. Solids carry second derivatives of the
     velocity instead, in registers: they are dropped at a sort, and take no memory.
     """
-    for kk in range(blocks.count * SPREAD):
-        if kk % SPREAD == 0:
-            k = kk // SPREAD
+    if ti.static(lanes.shared):
+        ti.loop_config(block_dim=ti.static(lanes.threads))
+    for kk in range(blocks.count * ti.static(lanes.span)):
+        lane = kk % ti.static(lanes.span)
+        if lane < ti.static(lanes.threads):
+            k = kk // ti.static(lanes.span)
+            pads = ti.static(pads_of(lanes, nodes, flow if laws.flowing else None))
+            offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
             f = blocks.field[k]
             world = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
             c = world * CONTROL_ROW
@@ -431,17 +447,22 @@ def advance_particles(
                 law = law_of(blocks.starts[k], worlds, particles)
                 flows = material_flows(law)
             if gather:
-                load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
+                if ti.static(lanes.parallel):
+                    fetch_window(lanes, lane, k, blocks.neighbours, nodes.velocity, pads.window)
+                else:
+                    load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
                 if ti.static(laws.flowing):
                     if flows:
-                        load_window(k, blocks.neighbours, flow.window, flow.velocity)
+                        if ti.static(lanes.parallel):
+                            fetch_window(lanes, lane, k, blocks.neighbours, flow.velocity, pads.past_window)
+                        else:
+                            load_window(k, blocks.neighbours, flow.window, flow.velocity)
             if scatter:
-                for i in range(WINDOW_NODES):
-                    nodes.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                clear_window(lanes, lane, offset, pads.scattered)
                 if ti.static(laws.flowing):
                     if flows:
-                        for i in range(WINDOW_NODES):
-                            flow.scattered[k * WINDOW_NODES + i] = vec4(0.0)
+                        clear_window(lanes, lane, offset, pads.past_scattered)
+            meet(lanes)
             touching = near.slot[k] >= 0
             on_plane = touching and worlds.numbers[world * WORLD_ROW + HAS_PLANE] > 0.5
             normal = triple(worlds.numbers, world * WORLD_ROW + PLANE_NORMAL)
@@ -460,7 +481,8 @@ def advance_particles(
             first_p, last_p = blocks.starts[k], blocks.starts[k + 1]
             if phase == IDLE:
                 last_p = first_p
-            for p in range(first_p, last_p):
+            p = first_p + lane
+            while p < last_p:
                 xi = particles.x[p]
                 fixed = particles.constants[p]
                 vp = vec3(0.0)
@@ -476,17 +498,17 @@ def advance_particles(
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
-                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
                     A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
                     if ti.static(not laws.flowing):
-                        A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
+                        A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
                     elif ti.static(laws.only_flowing):
-                        A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                        A, B0, B1, B2 = interpolate(first, fx, pads.window)
                     else:
                         if flows:
-                            A, B0, B1, B2 = interpolate(first, fx, nodes.window)
+                            A, B0, B1, B2 = interpolate(first, fx, pads.window)
                         else:
-                            A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, nodes.window)
+                            A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
                     for r in ti.static(range(3)):
                         vp[r] = A[r]
                         Cp[r, 0] = 4.0 * B0[r]
@@ -502,7 +524,7 @@ def advance_particles(
                         if flows:
                             speed2 = ti.max(speed2, vp.dot(vp))
                             # Part of the particle's velocity that the grid, before the forces, does not carry.
-                            past, past0, past1, past2 = interpolate(first, fx, flow.window)
+                            past, past0, past1, past2 = interpolate(first, fx, pads.past_window)
                             vp += KEPT * (particles.v[p] - vec3(past[0], past[1], past[2]))
                             # Only the spin of C: angular momentum needs it, and no stress feels it.
                             kept = particles.C[p]
@@ -562,7 +584,7 @@ def advance_particles(
                     gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
-                    first = k * WINDOW_NODES + base[0] * 64 + base[1] * 8 + base[2]
+                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
                     if touching:
                         # Start the contact solve from the forces of the last substep.
                         a = particles.reaction[p]
@@ -573,31 +595,43 @@ def advance_particles(
                     c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
                     c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
                     if ti.static(not laws.flowing):
-                        spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, nodes.scattered)
+                        spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
                     elif ti.static(laws.only_flowing):
-                        spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                        spread(first, fx, b4, c0, c1, c2, pads.scattered)
                     else:
                         if flows:
-                            spread(first, fx, b4, c0, c1, c2, nodes.scattered)
+                            spread(first, fx, b4, c0, c1, c2, pads.scattered)
                         else:
-                            spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, nodes.scattered)
+                            spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
                     if ti.static(laws.flowing):
                         if flows:
                             packing = 0.0
                             if is_fluid(law):
                                 packing = particles.memory[p]
-                            scatter_past(first, fx, mass, own_v, Cp, packing, slope, flow.scattered)
-            if adheres and phase != IDLE:
+                            scatter_past(first, fx, mass, own_v, Cp, packing, slope, pads.past_scattered)
+                p += ti.static(lanes.threads)
+            meet(lanes)
+            if scatter:
+                store_window(lanes, lane, k, pads.scattered, nodes.scattered)
+                if ti.static(laws.flowing):
+                    if flows:
+                        store_window(lanes, lane, k, pads.past_scattered, flow.scattered)
+            margin = ti.cast(ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest), ti.f32) * (1.0 / FIXED_ONE)
+            if ti.static(lanes.shared):
+                sum2 = lane_sum(lanes, lane, sum2, pads)
+                most = lane_maxima(lanes, lane, vec4(speed2, stiffness, -gap, -margin), pads)
+                speed2, stiffness, gap, margin = most[0], most[1], -most[2], -most[3]
+            if adheres and phase != IDLE and lane == 0:
                 # The next whole substep reads this; the number that the present one has read waits for the one after.
                 now = ti.cast(worlds.control[c + SUBSTEPS], ti.i32) & 1
                 following = ti.select(gather, 1 - now, now)
                 worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + 1 - following] = FAR
                 ti.atomic_min(worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + following], gap)
-            margin = ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest)
             r = k * SCALARS_PER_BLOCK
-            if gather:
-                blocks.report[r] = speed2
-                blocks.report[r + 2] = ti.cast(margin, ti.f32) * (1.0 / FIXED_ONE)
-                blocks.report[r + 4] = sum2
-            if scatter:
-                blocks.report[r + 1] = stiffness
+            if lane == 0:
+                if gather:
+                    blocks.report[r] = speed2
+                    blocks.report[r + 2] = margin
+                    blocks.report[r + 4] = sum2
+                if scatter:
+                    blocks.report[r + 1] = stiffness

@@ -6,7 +6,8 @@
 
 A block's key packs its field and its three coordinates in 64 bits. Two hash tables map keys to slots in the list of
 particle blocks and of grid blocks (blocks that particles can reach), so time and memory follow the occupied blocks and
-a body may go anywhere. Everything that decides an order is serial, hence deterministic.
+a body may go anywhere. On the CPU everything that decides an order is serial, hence deterministic; ``parallel_sorting``
+makes the same lists with all threads of a graphics card.
 """
 
 import taichi as ti
@@ -63,11 +64,17 @@ def key_block(key: ti.i64):
 
 
 @func
-def place_in_table(key: ti.i64, table: BlockTable):
-    """Index of ``key`` in the table, or of the free entry where it would go (linear probing)."""
+def home(key: ti.i64, table: BlockTable):
+    """Index at which the search for ``key`` begins."""
     b = key_block(key)
     h = (b[0] * 73856093) ^ (b[1] * 19349663) ^ (b[2] * 83492791) ^ (key_field(key) * 25165843)
-    h = (h ^ (h >> 15)) & table.mask
+    return (h ^ (h >> 15)) & table.mask
+
+
+@func
+def place_in_table(key: ti.i64, table: BlockTable):
+    """Index of ``key`` in the table, or of the free entry where it would go (linear probing)."""
+    h = home(key, table)
     while table.keys[h] != key and table.keys[h] != -1:
         h = (h + 1) & table.mask
     return h
@@ -89,6 +96,28 @@ def neighbour_offset(d: ti.i32):
     return ivec3(d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1)
 
 
+@func
+def rebase_particle(p: ti.i32, k: ti.i32, moves: ti.i32, x: Cells, keys: Keys, blocks: ParticleBlocks):
+    """Find the new block of particle ``p`` of block ``k`` and express its position in that block's window; where it
+    does not move, ``keys`` gets the block that it has."""
+    old = blocks.cells[k]
+    new = old
+    if moves:
+        xi = x[p]
+        for c in ti.static(range(3)):
+            base = old[c] * 4 - 1 + ((xi[c] - FIXED_LOW) >> FIXED_BITS)
+            new[c] = ti.min(ti.max(base >> 2, -FARTHEST_BLOCK), FARTHEST_BLOCK)
+        x[p] = xi + (old - new) * (4 * FIXED_ONE)
+    keys[p] = block_key(blocks.field[k], new)
+
+
+@func
+def wants_sort(k: ti.i32, worlds: WorldArrays, blocks: ParticleBlocks):
+    """Whether the world of particle block ``k`` waits for a sort."""
+    w = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD]
+    return worlds.control[w * CONTROL_ROW + STATUS] == WANTS_SORT
+
+
 @kernel
 def rebase(x: Cells, keys: Keys, worlds: WorldArrays, blocks: ParticleBlocks):
     """Find each particle's new block and express its position in that block's window. Exact: integers are shifted.
@@ -96,18 +125,9 @@ def rebase(x: Cells, keys: Keys, worlds: WorldArrays, blocks: ParticleBlocks):
     Particles of worlds that want no sort stay in their blocks: moving them would change the order of sums.
     """
     for k in range(blocks.count):
-        f = blocks.field[k]
-        old = blocks.cells[k]
-        moves = worlds.control[worlds.field_integers[f * FIELD_INTEGERS + WORLD] * CONTROL_ROW + STATUS] == WANTS_SORT
+        moves = wants_sort(k, worlds, blocks)
         for p in range(blocks.starts[k], blocks.starts[k + 1]):
-            new = old
-            if moves:
-                xi = x[p]
-                for c in ti.static(range(3)):
-                    base = old[c] * 4 - 1 + ((xi[c] - FIXED_LOW) >> FIXED_BITS)
-                    new[c] = ti.min(ti.max(base >> 2, -FARTHEST_BLOCK), FARTHEST_BLOCK)
-                x[p] = xi + (old - new) * (4 * FIXED_ONE)
-            keys[p] = block_key(f, new)
+            rebase_particle(p, k, moves, x, keys, blocks)
 
 
 @kernel
@@ -188,14 +208,12 @@ def list_grid_blocks(
 @kernel
 def link_blocks(blocks: ParticleBlocks, grid: GridBlocks, p_table: BlockTable, g_table: BlockTable):
     """Neighbour lists: 27 grid blocks around each particle block, 27 particle blocks around each grid block."""
-    for k in range(blocks.count):
-        for d in range(27):
-            key = block_key(blocks.field[k], blocks.cells[k] + neighbour_offset(d))
-            blocks.neighbours[k * 27 + d] = slot_of(key, g_table)
-    for g in range(grid.count):
-        for d in range(27):
-            key = block_key(grid.field[g], grid.cells[g] + neighbour_offset(d))
-            grid.neighbours[g * 27 + d] = slot_of(key, p_table)
+    for t in range(blocks.count * 27):
+        k = t // 27
+        blocks.neighbours[t] = slot_of(block_key(blocks.field[k], blocks.cells[k] + neighbour_offset(t % 27)), g_table)
+    for t in range(grid.count * 27):
+        g = t // 27
+        grid.neighbours[t] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(t % 27)), p_table)
 
 
 @kernel

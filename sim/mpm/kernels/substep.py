@@ -19,10 +19,10 @@ import functools
 import taichi as ti
 
 from ..rigid.rigid_motion import move_worlds, predict, search_worlds
-from .collider_distance import gather_pushes
+from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
 from .deformable_contact import gather_shares, scatter_shares, separate
-from .grid import advance_nodes, gather_means
+from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
     CouplingArrays,
     FlowArrays,
@@ -38,27 +38,33 @@ from .kernel_arrays import (
     WorldArrays,
 )
 from .kernel_bundles import BundledKernel, Launcher, kernel
+from .lanes import Lanes
 from .layout import CONTROL_ROW, FULL, PHASE, STEP, Integers
 from .particle_contact import apply_contact, solve_contact
 from .particle_transfer import advance_particles
-from .time_stepping import review
+from .time_stepping import review, review_in_parallel
 
 
 @functools.cache
-def advance_grid_of(flowing: bool) -> BundledKernel:
-    """Kernel of grid nodes; ``flowing``: some materials are granular or fluid."""
+def advance_grid_of(flowing: bool, parallel: bool, means: bool) -> BundledKernel:
+    """Kernel of grid nodes; ``flowing``: some materials are granular or fluid; ``parallel``: a thread a node;
+    ``means``: some fields' means are wanted."""
 
     @kernel
     def advance_grid(worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays):
         """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
-        advance_nodes(flowing, worlds, grid, nodes, flow)
-        gather_means(worlds, grid, nodes)
+        if ti.static(parallel):
+            advance_nodes_in_parallel(flowing, means, worlds, grid, nodes, flow)
+        else:
+            advance_nodes(flowing, worlds, grid, nodes, flow)
+        if ti.static(means or not parallel):
+            gather_means(worlds, grid, nodes)
 
     return advance_grid
 
 
 @functools.cache
-def part_bodies_of(laws: int) -> BundledKernel:
+def part_bodies_of(laws: int, lanes: Lanes) -> BundledKernel:
     """Kernel of contact between deformable bodies for the set ``laws`` of constitutive models."""
     models = law_set(laws)
 
@@ -72,9 +78,9 @@ def part_bodies_of(laws: int) -> BundledKernel:
         nodes: NodeArrays,
     ):
         """Impulses between coinciding nodes of different bodies."""
-        scatter_shares(models, worlds, blocks, overlap, particles, nodes)
-        gather_shares(worlds, grid, overlap, nodes)
-        separate(worlds, grid, overlap, nodes)
+        scatter_shares(models, lanes, worlds, blocks, overlap, particles, nodes)
+        gather_shares(lanes, worlds, grid, overlap, nodes)
+        separate(lanes, worlds, grid, overlap, nodes)
 
     return part_bodies
 
@@ -90,27 +96,37 @@ def plan_bodies(worlds: WorldArrays, bodies: RigidArrays):
             predict(w, bodies.steps[w], bodies)
 
 
-@kernel
-def resolve_contact(
-    worlds: WorldArrays,
-    blocks: ParticleBlocks,
-    grid: GridBlocks,
-    near: NearBlocks,
-    particles: ParticleArrays,
-    nodes: NodeArrays,
-    bodies: RigidArrays,
-    shapes: ShapeArrays,
-    coupling: CouplingArrays,
-):
-    """Contact impulses between particles and plane, rigid bodies, colliders and pins."""
-    solve_contact(worlds, blocks, near, particles, nodes, bodies, shapes, coupling)
-    apply_contact(worlds, grid, near, nodes)
-    if coupling.body_count > 0:
-        gather_pushes(worlds, blocks, near, bodies, coupling)
+@functools.cache
+def resolve_contact_of(lanes: Lanes, pushed: bool) -> BundledKernel:
+    """Kernel of contact with what is no deformable body; ``pushed``: there are rigid bodies or colliders."""
+
+    @kernel
+    def resolve_contact(
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        near: NearBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        bodies: RigidArrays,
+        shapes: ShapeArrays,
+        coupling: CouplingArrays,
+    ):
+        """Contact impulses between particles and plane, rigid bodies, colliders and pins."""
+        solve_contact(lanes, worlds, blocks, near, particles, nodes, bodies, shapes, coupling)
+        apply_contact(lanes, worlds, grid, near, nodes)
+        if ti.static(lanes.parallel and pushed):
+            gather_pushes_in_parallel(worlds, blocks, near, bodies, coupling)
+        elif ti.static(lanes.parallel):
+            pass
+        elif coupling.body_count > 0:
+            gather_pushes(worlds, blocks, near, bodies, coupling)
+
+    return resolve_contact
 
 
 @functools.cache
-def advance_matter_of(laws: int) -> BundledKernel:
+def advance_matter_of(laws: int, lanes: Lanes) -> BundledKernel:
     """Kernel of particles for the set ``laws`` of constitutive models; one is compiled for each set."""
     models = law_set(laws)
 
@@ -126,9 +142,13 @@ def advance_matter_of(laws: int) -> BundledKernel:
         flow: FlowArrays,
         bodies: RigidArrays,
     ):
-        """Particles over STEP, then onto the grid; plans the next substep. running[0]: worlds that continue."""
-        advance_particles(models, worlds, blocks, near, particles, nodes, flow)
-        running[0] = review(limits, worlds, blocks, bodies)
+        """Particles over STEP, then onto the grid; plans the next substep. running: [0] how many worlds continue, of
+        many threads [w] whether world w does."""
+        advance_particles(models, lanes, worlds, blocks, near, particles, nodes, flow)
+        if ti.static(lanes.parallel):
+            review_in_parallel(lanes, running, limits, worlds, blocks, bodies)
+        else:
+            running[0] = review(limits, worlds, blocks, bodies)
 
     return advance_matter
 
@@ -138,20 +158,24 @@ REPEATS = 4
 
 
 @functools.lru_cache(maxsize=32)
-def substep_launcher(generation: int, laws: int, overlap: bool, bodies: bool, near: bool) -> Launcher:
+def substep_launcher(
+    generation: int, laws: int, lanes: Lanes, means: bool, overlap: bool, bodies: bool, near: bool
+) -> Launcher:
     """Launcher of a substep for worlds of these ``laws``, with the kernels that they need.
 
-    generation: of the compute runtime; a launcher ends with it. overlap: several fields overlap; bodies: there are
-    rigid bodies or colliders; near: some particles are near the plane, a body or a collider, or are held.
+    generation: of the compute runtime; a launcher ends with it. means: some fields' means are wanted; overlap: several
+    fields overlap; bodies: there are rigid bodies or colliders; near: some particles are near the plane, a body or a
+    collider, or are held.
     """
-    kernels = [advance_grid_of(law_set(laws).flowing)]
+    # The serial kernels leave out by themselves what is not there; compiling them twice would cost more.
+    kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
     if overlap:
-        kernels.append(part_bodies_of(laws))
+        kernels.append(part_bodies_of(laws, lanes))
     if bodies:
         kernels.append(plan_bodies)
     if near:
-        kernels.append(resolve_contact)
+        kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel))
     if bodies:
         kernels += [search_worlds, move_worlds]
-    kernels.append(advance_matter_of(laws))
+    kernels.append(advance_matter_of(laws, lanes))
     return Launcher(kernels, repeats=REPEATS)

@@ -17,6 +17,7 @@ from ..rigid.rigid_layout import DYNAMIC, KIND, KINDS, KINEMATIC, NUMBERS, RADIU
 from ..rigid.rigid_math import load3
 from .kernel_arrays import ParticleBlocks, RigidArrays, StepLimits, WorldArrays
 from .kernel_bundles import func, kernel
+from .lanes import lane_maxima, meet, reduction_pads
 from .layout import (
     CFL_SCALE,
     CONTROL_ROW,
@@ -51,6 +52,8 @@ from .layout import (
     WAVE_SPEED,
     WORLD,
     WORLD_INTEGERS,
+    Integers,
+    vec4,
 )
 
 SAFETY = 1.5
@@ -215,6 +218,57 @@ def review(limits: StepLimits, worlds: WorldArrays, blocks: ParticleBlocks, bodi
     for w in range(worlds.count):
         running += settle(w, limits, worlds)
     return running
+
+
+@func
+def review_in_parallel(
+    lanes: ti.template(),
+    running: Integers,
+    limits: StepLimits,
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    bodies: RigidArrays,
+):
+    """As ``review``, with a group of threads for each world. Sets ``running[w]`` to whether world w needs another
+    substep."""
+    if ti.static(lanes.shared):
+        ti.loop_config(block_dim=ti.static(lanes.threads))
+    for t in range(worlds.count * ti.static(lanes.threads)):
+        w, lane = t // ti.static(lanes.threads), t % ti.static(lanes.threads)
+        pads = ti.static(reduction_pads(lanes))
+        c = w * CONTROL_ROW
+        if lane == 0:
+            forget_reports(w, worlds, bodies)
+        meet(lanes)
+        moved = worlds.control[c + PHASE] == FULL
+        scattered = worlds.control[c + PHASE] != IDLE and worlds.control[c + SCATTER] == 1.0
+        speed2, wave2, margin, fastest = -1.0, 0.0, 1e9, -1
+        k = lane
+        while k < blocks.count:
+            if worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD] == w:
+                r = k * SCALARS_PER_BLOCK
+                if moved:
+                    if blocks.report[r] > speed2:
+                        speed2, fastest = blocks.report[r], blocks.field[k]
+                    margin = ti.min(margin, blocks.report[r + 2])
+                    if not_finite(blocks.report[r + 4]):
+                        lose(c, blocks.field[k], worlds)
+                if scattered:
+                    wave2 = ti.max(wave2, blocks.report[r + 1])
+                    if not_finite(blocks.report[r + 1]):
+                        lose(c, blocks.field[k], worlds)
+            k += ti.static(lanes.threads)
+        most = lane_maxima(lanes, lane, vec4(speed2, wave2, -margin, 0.0), pads)
+        if moved and fastest >= 0 and speed2 == most[0]:
+            worlds.control[c + FASTEST_FIELD] = fastest
+        meet(lanes)
+        if lane == 0:
+            if moved:
+                worlds.control[c + SPEED] = ti.max(0.0, most[0])
+                worlds.control[c + MARGIN] = -most[2]
+            if scattered:
+                worlds.control[c + WAVE_SPEED] = most[1]
+            running[w] = settle(w, limits, worlds)
 
 
 @func
