@@ -124,3 +124,12 @@ def test_every_preset_says_where_its_numbers_come_from():
     for path in (ROOT / "presets" / "materials").glob("*.toml"):
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         assert data["source"] and data["description"], path
+
+
+LISTED = re.compile(r"\b(\w+)\.py\b")
+
+
+@pytest.mark.parametrize("folder", ["sim/app", "sim/reconstruct/shape", "physgen_addon/render"])
+def test_a_large_folder_lists_its_files(folder):
+    text = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
+    assert set(LISTED.findall(text)) == {path.stem for path in sources(folder)} - {"__init__"}
