@@ -80,6 +80,20 @@ def drawn(corners):
     return filled > 0
 
 
+def test_a_slot_between_back_and_seat_stays_open_and_a_printed_line_does_not():
+    chair = drawn([(100, 30), (220, 30), (220, 110), (100, 110)]) | drawn(
+        [(80, 110), (240, 110), (240, 190), (80, 190)]
+    )
+    slot = drawn([(115, 104), (205, 104), (205, 108), (115, 108)])
+    line = drawn([(115, 60), (205, 60), (205, 64), (115, 64)])
+    photo = np.full((HEIGHT, WIDTH, 3), 250.0) + np.random.default_rng(6).normal(scale=1, size=(HEIGHT, WIDTH, 1))
+    photo[chair & ~slot] = (95, 55, 40)
+    photo[line] = (228, 222, 205)
+    photo = np.clip(ndimage.gaussian_filter(photo, (0.5, 0.5, 0)), 0, 255).astype(np.uint8)
+    filled = fill_holes(photo, chair & ~slot & ~line)
+    assert filled[line].all() and not filled[slot].any()
+
+
 def test_nothing_shows_through_a_box_whatever_the_colour_of_its_label():
     box = drawn([(70, 60), (130, 40), (250, 62), (240, 180), (215, 200), (80, 170)])
     label = drawn([(90, 80), (150, 86), (150, 130), (92, 122)])

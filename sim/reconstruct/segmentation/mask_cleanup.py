@@ -14,6 +14,10 @@ Mask = NDArray[np.bool_]
 SHADE = (0.28, 0.9)
 """Range of a contact shadow's brightness over that of the lit ground: below is the crease itself or a black object."""
 
+HOLE, SLOT, LONG = 0.05, 0.02, 0.25
+"""Width of a hole over the object's size from which the background may show through it; of a slot, as between the back
+and the seat of a chair; and the least length of that. Letters on a cover are shorter."""
+
 COLOURED = 60.0
 """Saturation, of 255, that a contact shadow may have over that of the lit ground, at least."""
 
@@ -67,7 +71,7 @@ def fill_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     holes = enclosed_holes(mask)
     if not holes.any() or is_box_with_print(mask, holes):
         return mask | holes
-    return mask | (holes & ~see_through(pixels, mask, holes))
+    return mask | (holes & ~see_through(pixels, mask, holes, slots=True))
 
 
 def is_box_with_print(mask: Mask, holes: Mask) -> bool:
@@ -109,23 +113,34 @@ def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
 
 
 def see_through(
-    pixels: NDArray[np.uint8], mask: Mask, regions: Mask, *, likeness: float = 14.0, share: float = 0.85
+    pixels: NDArray[np.uint8],
+    mask: Mask,
+    regions: Mask,
+    *,
+    likeness: float = 14.0,
+    share: float = 0.85,
+    slots: bool = False,
 ) -> Mask:
     """Return the connected parts of ``regions`` through which the background shows.
 
     Most of their pixels (``share``, 0 to 1) look like the ground beside the object at about the same height, within
-    ``likeness`` (CIELAB delta E), and they are wider than a letter printed on a cover.
+    ``likeness`` (CIELAB delta E), and they are wider than a letter printed on a cover. slots: also narrow and long
+    ones, of half of that likeness.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(regions.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
     area = int(mask.sum())
+    size = float(np.sqrt(area))
     lab = _lab(pixels)
     ring = surrounding_ring(mask | regions, max(4, round(0.12 * np.sqrt(area))))
     for index in range(1, count):
         region = labels == index
         width = 2.0 * float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 3).max())
-        if stats[index, cv2.CC_STAT_AREA] < 0.004 * area or width < 0.05 * np.sqrt(area):
+        long = max(stats[index, cv2.CC_STAT_WIDTH], stats[index, cv2.CC_STAT_HEIGHT]) > LONG * size
+        narrow = width < HOLE * size
+        if stats[index, cv2.CC_STAT_AREA] < 0.004 * area or (narrow and not (slots and long and width > SLOT * size)):
             continue
+        like = 0.5 * likeness if narrow else likeness
         top, height = int(stats[index, cv2.CC_STAT_TOP]), int(stats[index, cv2.CC_STAT_HEIGHT])
         rows = slice(max(0, top - height), top + 2 * height)
         near = lab[rows][ring[rows]]
@@ -136,7 +151,7 @@ def see_through(
         near, inside = near[:: max(1, len(near) // 600)], inside[:: max(1, len(inside) // 600)]
         distances = cKDTree(near).query(inside)[0]
         apart = float(np.linalg.norm(np.median(near, axis=0) - np.median(inside, axis=0)))
-        if (distances < likeness).mean() > share and apart < 1.5 * likeness and _as_beside(lab, region, ring):
+        if (distances < like).mean() > share and apart < 1.5 * like and _as_beside(lab, region, ring):
             result |= region
     return result
 
