@@ -2,7 +2,8 @@
 """What a diagnosis found → a model for MuJoCo (MJCF), or a layer for USD Physics.
 
 The MJCF model is complete: ground and body as captured, with the found effects as MuJoCo's own parameters. USD Physics
-knows friction, restitution, gravity and the centre of mass; the rest is kept there as custom data, and said.
+knows friction, restitution, gravity, centre of mass and moments of inertia; the rest is kept there as custom data,
+and said.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,6 +19,9 @@ from numpy.typing import NDArray
 
 from ..diagnose.capture import Capture, CaptureObject
 from ..errors import InputError
+
+if TYPE_CHECKING:
+    from ..diagnose.rigid.rigid_simulator import RigidBody
 
 Array = NDArray[np.float64]
 FORMATS = {"mjcf": "found.xml", "usd": "found.usda"}
@@ -42,6 +47,7 @@ class _Settings:
     wind: Array = field(default_factory=lambda: np.zeros(3))
     weightless: float = 0.0
     pellet: tuple[float, Array] | None = None
+    inertia: float = 1.0
     tether: Mapping[str, float] | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -87,6 +93,8 @@ def _settings(capture: Capture, found: Mapping[str, Mapping[str, float]]) -> _Se
             out.gravity = size * (across - np.array([0.0, 0.0, math.cos(lean)]))
         elif name == "mass_offset":
             out.pellet = values["fraction"], np.array([values[f"offset_{axis}"] for axis in "xyz"])
+        elif name == "inertia":
+            out.inertia = values["factor"]
         elif name == "tether":
             out.tether = values
         elif name in RECORDING:
@@ -136,6 +144,11 @@ def _mjcf(capture: Capture, item: CaptureObject, settings: _Settings) -> str:
     if settings.weightless:
         placed.set("gravcomp", f"{settings.weightless:.9g}")
     ElementTree.SubElement(placed, "freejoint")
+    if settings.inertia != 1.0:
+        middle, tensor = _mass_of(body, settings)
+        six = [tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+        inertial = {"pos": _numbers(middle), "mass": f"{body.mass:.9g}", "fullinertia": _numbers(six)}
+        ElementTree.SubElement(placed, "inertial", inertial)
     mass, fluid = body.mass, {}
     if settings.drag or settings.lift:
         blunt = settings.drag * mass / (AIR * body.area)
@@ -163,6 +176,16 @@ def _mjcf(capture: Capture, item: CaptureObject, settings: _Settings) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
+def _mass_of(body: RigidBody, settings: _Settings) -> tuple[Array, Array]:
+    """Return centre (3,) m and tensor of inertia about it (3, 3) kg m², mesh axes, of the body with what was found."""
+    share, place = settings.pellet if settings.pellet else (0.0, np.zeros(3))
+    tensor, middle = settings.inertia * body.inertia, body.center + share * place
+    tensor = (1.0 - share) * tensor  # of what is not in the pellet
+    for part, arm in ((1.0 - share, -share * place), (share, (1.0 - share) * place)):
+        tensor = tensor + part * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return middle, body.mass * tensor
+
+
 def _start(capture: Capture) -> Array:
     """Return where the body begins (3,) m: at the points of the first frame that saw all of them, else at 0."""
     trial = capture.trials[0]
@@ -175,7 +198,7 @@ def _start(capture: Capture) -> Array:
 
 
 def _usd(item: CaptureObject, settings: _Settings, found: Mapping[str, Mapping[str, float]]) -> str:
-    said = ("friction", "restitution", "gravity_tilt", "mass_offset", *RECORDING)
+    said = ("friction", "restitution", "gravity_tilt", "mass_offset", "inertia", *RECORDING)
     data = {f"{name}:{key}": value for name in found if name not in said for key, value in found[name].items()}
     for name in found:
         if name not in said and not any(note.startswith(name) for note in settings.notes):
@@ -203,6 +226,18 @@ def _usd(item: CaptureObject, settings: _Settings, found: Mapping[str, Mapping[s
         share, place = settings.pellet
         middle = share * place
         lines.append(f"        point3f physics:centerOfMass = ({middle[0]:.9g}, {middle[1]:.9g}, {middle[2]:.9g})")
+    if settings.inertia != 1.0:
+        from scipy.spatial.transform import Rotation
+
+        from ..diagnose.rigid.rigid_simulator import rigid_body
+
+        _, tensor = _mass_of(rigid_body(item), settings)
+        moments, axes = np.linalg.eigh(tensor)
+        if np.linalg.det(axes) < 0:
+            axes[:, 0] *= -1
+        real, *rest = np.roll(Rotation.from_matrix(axes).as_quat(), 1)
+        lines.append(f"        float3 physics:diagonalInertia = ({', '.join(f'{m:.9g}' for m in moments)})")
+        lines.append(f"        quatf physics:principalAxes = ({real:.9g}, {', '.join(f'{r:.9g}' for r in rest)})")
     return "\n".join([*lines, "    }", "}", ""])
 
 

@@ -94,6 +94,13 @@ _PAIRS: Mapping[frozenset[str], str] = {
         "mass_offset+magnus": "Throw the object with much spin in two opposite senses: lift changes sign, an offset "
         "centre wobbles in both.",
         "mass_offset+friction": "Throw the object high with much spin: an offset centre shows in free flight.",
+        "inertia+friction": "Slide the object flat without rotation: only friction acts there.",
+        "inertia+restitution": "Drop the object straight down onto one face, or a ball without spin: its inertia plays "
+        "no part there.",
+        "inertia+rolling_resistance": "Roll the object up a slope: inertia decides how high it gets, resistance how "
+        "long it rolls on the level.",
+        "inertia+mass_offset": "Throw the object with much spin: an offset centre shows in free flight, a factor on "
+        "the inertia does not.",
         "camera_pose+gravity_tilt": "Film a plumb line in the same view, or a level board.",
         "camera_pose+time_scale": "Film a ruler and a running stopwatch in the same view.",
         "camera_pose+buoyancy": "Film a ruler lying and standing in the same view.",

@@ -19,6 +19,7 @@ from . import (
     camera_pose,
     friction,
     gravity_tilt,
+    inertia,
     internal_damping,
     magnus,
     mass_offset,
@@ -54,6 +55,7 @@ _MODULES = (
     stiffness_gradient,
     sandy,
     mass_offset,
+    inertia,
     time_scale,
     camera_pose,
 )

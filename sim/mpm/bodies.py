@@ -124,6 +124,9 @@ class BodyParticles:
     density_scale: NDArray[np.float64] | None = None
     """Factor (N,) on the density of each particle, above 0; None: 1."""
 
+    inertia_factor: float = 1.0
+    """Factor on the moments of inertia that its particles have, above 0. Of rigid bodies only."""
+
     stiffness_scale: NDArray[np.float64] | None = None
     """Factor (N,) on the moduli of each particle, above 0; None: 1."""
 
@@ -246,9 +249,13 @@ class BodyParticles:
         self._require(self.name != GROUND_NAME, "name", self.name, "choose another, this one is the ground's")
         if self.rigid:
             self._require(self.surface is not None, "surface", None, "give the mesh of a rigid body")
+            factor = self.inertia_factor
+            self._require(math.isfinite(factor) and factor > 0, "inertia_factor", factor, "give a number above 0")
             held = self.pins is not None or self.goal_stiffness > 0
             held = held or bool(self.materials or self.material_track or self.parameter_tracks)
             self._require(not held, "pins, goals and materials", "given", "leave them out of a rigid body")
+        else:
+            self._require(self.inertia_factor == 1.0, "inertia_factor", self.inertia_factor, "give 1: it deforms")
 
     def _check_material_track(self) -> None:
         times = [time for time, _ in self.material_track]

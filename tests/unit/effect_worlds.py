@@ -24,7 +24,7 @@ VOCABULARY = {
     "force": ("air_drag", "wind", "magnus", "buoyancy", "gravity_tilt", "tether"),
     "contact": ("friction", "restitution", "rolling_resistance", "adhesion"),
     "material": ("stiffness", "internal_damping", "plastic_yield", "anisotropy", "stiffness_gradient", "sandy"),
-    "mass": ("mass_offset",),
+    "mass": ("mass_offset", "inertia"),
     "observation": ("time_scale", "camera_pose"),
 }
 NAMES = [name for names in VOCABULARY.values() for name in names]

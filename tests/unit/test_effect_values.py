@@ -258,6 +258,16 @@ def test_uneven_bodies_take_pellets_too():
     np.testing.assert_allclose(after.center_of_mass, before.center_of_mass + np.array([0.003, 0, 0]), atol=1e-12)
 
 
+def test_factors_on_the_inertia_multiply():
+    setup = put(put(world(), "inertia", bodies=("die",), factor=1.5), "inertia", factor=0.8)
+    assert setup.bodies[1].inertia_factor == pytest.approx(1.2)
+    np.testing.assert_array_equal(setup.bodies[1].masses, die().masses)
+    with pytest.raises(InputError, match=r"inertia_factor.*deforms"):
+        body(inertia_factor=1.2)
+    with pytest.raises(InputError, match=r"inertia_factor.*above 0"):
+        die(inertia_factor=0.0)
+
+
 # ---- observation ----------------------------------------------------------------------------------------------------
 
 

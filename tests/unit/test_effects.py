@@ -233,6 +233,7 @@ def test_an_effect_for_all_needs_somebody_to_act_on():
         ("friction", []),
         ("adhesion", []),
         ("mass_offset", []),
+        ("inertia", ["elastic", "clay", "snow", "sand", "fluid"]),
         ("tether", []),
     ],
 )

@@ -89,6 +89,25 @@ def test_found_gravity_mass_offset_tether_and_rolling_reach_mujoco():
     assert model.geom_friction[:, 2] == pytest.approx([0.003, 0.003])
 
 
+def test_found_inertia_reaches_mujoco_beside_a_pellet_and_usd():
+    mujoco = pytest.importorskip("mujoco")
+    mass, uniform = 200 * 0.1 * 0.1 * 0.04, np.array([0.1**2 + 0.04**2, 0.1**2 + 0.04**2, 0.1**2 + 0.1**2]) / 12
+    found = {"inertia": {"factor": 1.5}}
+    model = mujoco.MjModel.from_xml_string(patch_text(box(), found, "mjcf")[0])
+    assert model.body_mass[1] == pytest.approx(mass)
+    assert np.sort(model.body_inertia[1]) == pytest.approx(1.5 * mass * uniform)
+    # A pellet of a quarter of the mass, 4 cm off the middle.
+    found["mass_offset"] = {"fraction": 0.25, "offset_x": 0.04, "offset_y": 0.0, "offset_z": 0.0}
+    model = mujoco.MjModel.from_xml_string(patch_text(box(), found, "mjcf")[0])
+    off = 0.75 * 1.5 * uniform + 0.75 * 0.25 * 0.04**2 * np.array([0, 1, 1])
+    assert model.body_ipos[1] == pytest.approx([0.01, 0, 0], abs=1e-9)
+    assert np.sort(model.body_inertia[1]) == pytest.approx(np.sort(mass * off))
+    text, notes = patch_text(box(), {"inertia": {"factor": 1.5}}, "usd")
+    line = next(line for line in text.splitlines() if "physics:diagonalInertia" in line)
+    moments = [float(n) for n in line.split("(")[1].rstrip(")").split(",")]
+    assert moments == pytest.approx(np.sort(1.5 * mass * uniform)) and not notes
+
+
 def test_what_has_no_counterpart_is_said():
     adhesion = {"adhesion": {"pull_per_mass": 30.0, "reach": 0.004}}
     text, notes = patch_text(ball(), adhesion, "mjcf")

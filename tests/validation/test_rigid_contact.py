@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -90,17 +92,20 @@ def test_static_friction_holds_what_kinetic_friction_does_not(box_body, rigid_bo
     assert (speed - 0.2) / 0.5 == pytest.approx(G * (np.sin(angle) - 0.3 * np.cos(angle)), rel=0.02)
 
 
-def test_ball_rolls_down_a_slope(ball_body, rigid_bodies):
-    """a = 5/7 g sin th within 2 %, and it rolls without sliding within 1 %."""
+@pytest.mark.parametrize("inertia", [1.0, 5 / 3])
+def test_ball_rolls_down_a_slope(ball_body, rigid_bodies, inertia):
+    """a = g sin th / (1 + 2/5 k) within 2 %, 5/7 for a solid ball and 3/5 for a shell; rolls without sliding to 1 %."""
     angle = np.radians(15.0)
     normal, downhill = tilt(angle)[:, 2], tilt(angle)[:, 0]
-    body = ball_body(center=tuple(0.1 * normal - 0.5 * downhill))
+    body = dataclasses.replace(ball_body(center=tuple(0.1 * normal - 0.5 * downhill)), inertia_factor=inertia)
     world = rigid_bodies(WorldSetup(bodies=(body,), ground=slope(angle, friction=0.6)))
     world.advance(1e-3, 100)
     first = world.pose(0, "ball").velocity @ downhill
     world.advance(1e-3, 600)
     second = world.pose(0, "ball")
-    assert (second.velocity @ downhill - first) / 0.6 == pytest.approx(5 / 7 * G * np.sin(angle), rel=0.02)
+    assert (second.velocity @ downhill - first) / 0.6 == pytest.approx(
+        G * np.sin(angle) / (1 + 0.4 * inertia), rel=0.02
+    )
     assert second.spin[1] * 0.1 == pytest.approx(second.velocity @ downhill, rel=0.01)
 
 

@@ -213,7 +213,7 @@ class RigidBodies:
 
     def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
         properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
-        inertia = np.asarray(properties.inertia) * scale**2
+        inertia = np.asarray(properties.inertia) * scale**2 * body.inertia_factor
         numbers[at.INVERSE_MASS], numbers[at.MASS] = 1 / properties.mass, properties.mass
         numbers[at.INERTIA : at.INERTIA + 9] = inertia.ravel()
         numbers[at.INVERSE_INERTIA : at.INVERSE_INERTIA + 9] = np.linalg.inv(inertia).ravel()
