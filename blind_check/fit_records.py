@@ -104,6 +104,7 @@ def _plain_fit(fit: CandidateFit) -> dict[str, Any]:
         "effects": list(fit.effects),
         "log_evidence": fit.log_evidence,
         "heldout_rms_m": fit.heldout_rms_m,
+        "heldout_chi": fit.heldout_chi,
         "misfit": fit.misfit,
         "heldout_log_score": [float(s) for s in fit.heldout_log_score],
         "parameters": {
@@ -118,6 +119,7 @@ def _read_fit(value: Mapping[str, Any]) -> CandidateFit:
         effects=tuple(value["effects"]),
         log_evidence=_number(value["log_evidence"]),
         heldout_rms_m=_number(value["heldout_rms_m"]),
+        heldout_chi=_number(value.get("heldout_chi")),
         misfit=_number(value["misfit"]),
         heldout_log_score=np.array([_number(s) for s in value["heldout_log_score"]]),
         parameters={

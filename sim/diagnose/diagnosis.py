@@ -48,6 +48,8 @@ class CandidateFit:
         parameters). Comparable between all candidates of one capture: same data, same noise.
     heldout_log_score: (trials,) log probability in nats of each fit trial when the parameters were fitted without it.
     heldout_rms_m: RMS distance in m between observed and predicted points on held-out data.
+    heldout_chi: the same, each trial's over what noise and contacts make of its prediction, RMS of the trials: one that
+        tumbled chaotically does not decide whether a model predicts better. NaN where that is not known.
     misfit: RMS residual over what noise and numerical error would leave; 1 is explained, far above 1 means that
         something is still missing.
     """
@@ -59,6 +61,7 @@ class CandidateFit:
     heldout_log_score: Array
     heldout_rms_m: float
     misfit: float
+    heldout_chi: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)

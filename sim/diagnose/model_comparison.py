@@ -72,7 +72,7 @@ class ComparisonSettings:
     alternative: float = 0.1
 
 
-VOCABULARY = 18
+VOCABULARY = 19
 """Number of effects that share the prior, whichever were tested."""
 
 TWINS: Mapping[str, tuple[str, ...]] = {
@@ -192,8 +192,9 @@ def _reason(
         return "its simulation failed"
     if abs(fit.heldout_rms_m - nominal.heldout_rms_m) <= 1e-6 * nominal.heldout_rms_m:
         return SAME
-    if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m:
-        return "predicts held-out trials no better than the nominal model"
+    if _left(fit, nominal) >= weighing.predicts:
+        which = "" if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m else "most "
+        return f"predicts {which}held-out trials no better than the nominal model"
     gain = fit.log_evidence - nominal.log_evidence
     if gain < weighing.fee:
         return "gains too little for its parameters"
@@ -230,7 +231,7 @@ def _second_fee(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing:
     singles = _singles(fit, candidates)
     if not singles:
         return 0.0
-    shown = fit.heldout_rms_m < weighing.predicts * min(c.heldout_rms_m for c in singles)
+    shown = all(_left(fit, c) < weighing.predicts for c in singles)
     return weighing.second_fee + (0.0 if shown else weighing.unseen_fee)
 
 
@@ -257,6 +258,19 @@ def _same_motion(fit: CandidateFit, other: CandidateFit) -> bool:
     return names == {"time_scale", "buoyancy"} and fit.log_evidence == other.log_evidence
 
 
+def _left(fit: CandidateFit, other: CandidateFit) -> float:
+    """Return the held-out error of ``fit`` over that of ``other``.
+
+    Each trial counts by what noise and contacts make of it, where that is known: of a body that may come to lie on
+    another face the distance says little, and the largest one would decide.
+    """
+    if math.isfinite(fit.heldout_chi) and math.isfinite(other.heldout_chi):
+        return fit.heldout_chi / max(other.heldout_chi, 1e-12)
+    if not math.isfinite(fit.heldout_rms_m):
+        return math.inf
+    return fit.heldout_rms_m / max(other.heldout_rms_m, 1e-12)
+
+
 def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings, grain: float) -> float:
     """Return the nats over the nominal model that count for ``fit``. grain: noise and grain together, m."""
     if fit is nominal:
@@ -264,7 +278,7 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
     gain = fit.log_evidence - nominal.log_evidence
     if math.isnan(gain) or not math.isfinite(fit.log_evidence):
         return -math.inf
-    if fit.heldout_rms_m >= weighing.predicts * nominal.heldout_rms_m:
+    if _left(fit, nominal) >= weighing.predicts:
         # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.
         gain = min(gain, max(gain - weighing.unseen_fee, 0.0) if nominal.heldout_rms_m < grain else 0.0)
     return gain - weighing.fee
@@ -272,10 +286,10 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
 
 def _shown(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings) -> float:
     """Return the most that ``fit`` may claim after its prediction of held-out trials: less where their error grows."""
-    before, after = nominal.heldout_rms_m, fit.heldout_rms_m
-    if not fit.effects or after < weighing.predicts * before or not math.isfinite(before):
+    left = _left(fit, nominal)
+    if not fit.effects or left < weighing.predicts or not math.isfinite(nominal.heldout_rms_m):
         return 1.0
-    return weighing.unshown * min(1.0, before / after) if math.isfinite(after) and after > 0 else 0.0
+    return weighing.unshown * min(1.0, 1.0 / left) if math.isfinite(left) else 0.0
 
 
 def _adequacy(misfit: float, nominal: float, weighing: ComparisonSettings) -> float:

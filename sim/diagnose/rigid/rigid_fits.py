@@ -32,11 +32,13 @@ from .rigid_prediction import (
     HeldOutScore,
     Points,
     believed_fit,
-    contact_spread_rms,
+    contact_spread,
     marginal_points,
     marginal_rms,
     noise_floor,
+    pooled_rms,
     predict_points,
+    prediction_spread,
     score_held_out,
     simulate_points,
     step_size_error,
@@ -205,14 +207,15 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     keys = _worth(bodies, [k for k in bodies[0].fits if all(k in b.fits for b in bodies)])
     shown = shown_keys(keys)
     made = {}
-    held = {k: [score_held_out(b.fits[k]) for b in bodies] for k in shown}
+    plain = [believed_fit(b.fits[()]) for b in bodies]
+    spreads = [prediction_spread(f) for f in plain]
+    held = {k: [score_held_out(b.fits[k], s) for b, s in zip(bodies, spreads, strict=True)] for k in shown}
     for k in shown:
         made[k] = _candidate(capture, bodies, k, held[k])
     _level_twins(made)
     top = max(made, key=lambda k: made[k].log_evidence)
     floors = [noise_floor(b.fits[top]) for b in bodies]
-    plain = [believed_fit(b.fits[()]) for b in bodies]
-    grains = [np.hypot(contact_spread_rms(f), step_size_error(f)) for f in plain]
+    grains = [np.hypot(pooled_rms(contact_spread(f)), step_size_error(f)) for f in plain]
     expects, gap = False, min(c.misfit for c in made.values())
     if gap > UNEXPLAINED and not any(b.problem.scene.body.round for b in bodies):
         expected = float(np.sqrt(np.mean([marginal_rms(f) ** 2 for f in plain])))
@@ -264,8 +267,9 @@ def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
     if abs(rate**2 - (1 - fraction)) < 0.1 * abs(fraction) + 1e-4:
         best = max(clock.log_evidence, weight.log_evidence)
         error = min(clock.heldout_rms_m, weight.heldout_rms_m)
-        made["time_scale",] = dataclasses.replace(clock, log_evidence=best, heldout_rms_m=error)
-        made["buoyancy",] = dataclasses.replace(weight, log_evidence=best, heldout_rms_m=error)
+        chi = min(clock.heldout_chi, weight.heldout_chi)
+        for twin in (clock, weight):
+            made[twin.effects] = dataclasses.replace(twin, log_evidence=best, heldout_rms_m=error, heldout_chi=chi)
 
 
 def _candidate(
@@ -303,6 +307,7 @@ def _candidate(
         log_evidence=float(evidence),
         heldout_log_score=np.sum([h.log_score for h in held], axis=0),
         heldout_rms_m=float(np.sqrt(np.mean([h.rms_m**2 for h in held]))),
+        heldout_chi=float(np.sqrt(np.mean([h.chi**2 for h in held]))),
         misfit=math.sqrt(square),
     )
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import Fit, solve
-from .observed_poses import as_matrix, fit_rotation, perturbed
+from .observed_poses import ObservedBody, as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
 from .shooting_problem import Model, Problem, SegmentedTrial
@@ -103,15 +104,24 @@ def first_states(fit: Fit, z: Array) -> list[tuple[int, Array]]:
     return [(t.nodes[-1], s[-1]) for t, s in zip(short.trials, found, strict=True)]
 
 
-def noise_spread(fit: Fit) -> float:
-    """Return the RMS distance in m by which noise in the first frames moves the prediction of fit trials."""
+def pooled_rms(squares: list[Array]) -> float:
+    """Return the RMS of all trials' squared distances in m; 0 without any."""
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if sum(map(len, squares)) else 0.0
+
+
+def noise_spread(fit: Fit) -> list[Array]:
+    """Return by trial the squared distances in m² by which noise in the first frames moves its prediction.
+
+    Empty for trials that are to be predicted, and where all frames are shown.
+    """
     short, states = _shortened(fit)
     states = fit_states(short, fit.model, fit.z, states, 3)
     if all(t.observations.hides_spin for t in short.trials):
         return _refitted_spread(fit, short, states)
     look = short.evaluate(fit.model, fit.z, states, fixed=True)
-    rng, squares = np.random.default_rng(0), []
-    for trial, part, state in zip(short.trials, look.linear, states, strict=True):
+    rng = np.random.default_rng(0)
+    found: list[list[Array]] = [[] for _ in short.trials]
+    for squares, trial, part, state in zip(found, short.trials, look.linear, states, strict=True):
         times = trial.observations.times[shown_frames(fit, trial) :]
         if trial.observations.trial.role != "fit" or not len(times):
             continue
@@ -123,12 +133,12 @@ def noise_spread(fit: Fit) -> float:
         for draw in draws:
             other = world_points(trial, extrapolate(fit, fit.z, perturbed(state[-1], draw), clock))
             squares.append(np.sum((other - middle) ** 2, axis=-1).ravel())
-    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+    return [np.concatenate(s) if s else np.empty(0) for s in found]
 
 
-def _refitted_spread(fit: Fit, short: Problem, states: list[Array]) -> float:
+def _refitted_spread(fit: Fit, short: Problem, states: list[Array]) -> list[Array]:
     """Return what ``noise_spread`` does for single points, part of whose noise is slow: a fit to added noise."""
-    rng, squares = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
     ways: list[list[Array | None]] = []
     for number in range(NOISE_DRAWS + 1):
         # The first draw has no noise.
@@ -136,13 +146,11 @@ def _refitted_spread(fit: Fit, short: Problem, states: list[Array]) -> float:
         own = [dataclasses.replace(t, observations=o) for t, o in zip(short.trials, seen, strict=True)]
         found = fit_states(dataclasses.replace(short, trials=own), fit.model, fit.z, states, 3)
         ways.append([_later(fit, trial, state[-1]) for trial, state in zip(short.trials, found, strict=True)])
-    for other in ways[1:]:
-        squares += [
-            np.sum((b - a) ** 2, axis=-1).ravel()
-            for a, b in zip(ways[0], other, strict=True)
-            if a is not None and b is not None
-        ]
-    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+    found = []
+    for first, *others in zip(*ways, strict=True):
+        known = [np.sum((b - first) ** 2, axis=-1).ravel() for b in others if first is not None and b is not None]
+        found.append(np.concatenate(known) if known else np.empty(0))
+    return found
 
 
 def _later(fit: Fit, trial: SegmentedTrial, state: Array) -> Array | None:
@@ -183,15 +191,17 @@ def step_size_error(fit: Fit) -> float:
     return float(np.sqrt(np.mean(np.concatenate(off))))
 
 
-def contact_spread_rms(fit: Fit) -> float:
-    """Return the RMS distance in m by which the contact uncertainty moves the prediction of fit trials.
+def contact_spread(fit: Fit) -> list[Array]:
+    """Return by trial the squared distances in m² by which the contact uncertainty moves its prediction.
 
-    At every node the state gets a defect drawn from its covariance, which then travels on through later contacts.
+    At every node the state gets a defect drawn from its covariance, which then travels on through later contacts. Empty
+    for trials that are to be predicted, and where nothing touches after the first frames.
     """
-    problem, rng, squares = fit.problem, np.random.default_rng(0), []
+    problem, rng = fit.problem, np.random.default_rng(0)
     row = problem.scene.numbers([fit.model.setting(problem.scene, fit.z)])
     rate = fit.model.setting(problem.scene, fit.z).rate
-    for trial, (begin, state) in zip(problem.trials, first_states(fit, fit.z), strict=True):
+    found: list[list[Array]] = [[] for _ in problem.trials]
+    for squares, trial, (begin, state) in zip(found, problem.trials, first_states(fit, fit.z), strict=True):
         times = trial.observations.times
         later = [(n, c) for n, c in zip(trial.nodes[1:], trial.covers, strict=False) if n > begin]
         if trial.observations.trial.role != "fit" or not later:
@@ -210,15 +220,31 @@ def contact_spread_rms(fit: Fit) -> float:
             squares += [np.sum((points - out[0]) ** 2, axis=-1).ravel() for points in out[1:]]
         shown = NOISE_DRAWS * (later[0][0] - shown_frames(fit, trial)) * len(trial.observations.places)
         squares.append(np.zeros(max(shown, 0)))
-    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+    return [np.concatenate(s) if s else np.empty(0) for s in found]
+
+
+def prediction_spread(fit: Fit) -> Array:
+    """Return (trials,) m what noise and contact uncertainty make of each trial's prediction; NaN if none follows."""
+    found = np.full(len(fit.problem.trials), np.nan)
+    for i, (trial, noise, contact) in enumerate(
+        zip(fit.problem.trials, noise_spread(fit), contact_spread(fit), strict=True)
+    ):
+        if len(noise):
+            own = _own_noise(trial.observations)
+            found[i] = np.sqrt(own + noise.mean() + (contact.mean() if len(contact) else 0.0))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutScore:
-    """Held-out scores. log_score: (fit trials,) nats. rms_m: RMS error predicted from the first frames."""
+    """Held-out scores. log_score: (fit trials,) nats. rms_m: RMS error predicted from the first frames.
+
+    chi: RMS over trials of each one's error over ``prediction_spread``; NaN without it.
+    """
 
     log_score: Array
     rms_m: float
+    chi: float = math.nan
 
 
 def leave_one_out(fit: Fit) -> Array:
@@ -261,8 +287,8 @@ def _from_first_half(fit: Fit, index: int) -> Array:
     return solve(half, fit.model, fit.z, states, rounds=6).z
 
 
-def score_held_out(fit: Fit) -> HeldOutScore:
-    """Return the held-out scores of ``fit``."""
+def score_held_out(fit: Fit, spread: Array | None = None) -> HeldOutScore:
+    """Return the held-out scores of ``fit``. spread: (trials,) m, ``prediction_spread`` of the nominal model."""
     problem = fit.problem
     numbers = leave_one_out(fit)
     alone = [i for i, t in enumerate(problem.trials) if t.observations.trial.role == "fit"]
@@ -276,6 +302,7 @@ def score_held_out(fit: Fit) -> HeldOutScore:
             scores.append(-0.5 * cost)
     starts = first_states(fit, numbers)
     squares: list[Array] = []
+    chis: list[float] = []
     for i, trial in enumerate(problem.trials):
         if trial.observations.trial.role != "fit" or len(trial.observations.times) < 5:
             continue
@@ -289,8 +316,17 @@ def score_held_out(fit: Fit) -> HeldOutScore:
         first = _middle(trial) if len(alone) == 1 else shown_frames(fit, trial)
         off = off[max(0, first - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
+        if spread is not None and np.isfinite(spread[i]) and np.isfinite(squares[-1]).any():
+            chis.append(float(mean_known(squares[-1])) / spread[i] ** 2)
     rms = float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("nan")
-    return HeldOutScore(log_score=np.array(scores), rms_m=rms)
+    chi = float(np.sqrt(np.mean(chis))) if chis else math.nan
+    return HeldOutScore(log_score=np.array(scores), rms_m=rms, chi=chi)
+
+
+def _own_noise(seen: ObservedBody) -> float:
+    """Return the mean squared noise in m² of a tracked point; 0 for pixels, which are compared with the fitted path."""
+    axes = float(seen.measured.sum()) if seen.hides_spin else 3.0
+    return 0.0 if seen.camera is not None else axes * (seen.white**2 + seen.slow**2)
 
 
 def noise_floor(fit: Fit) -> float:
@@ -298,11 +334,8 @@ def noise_floor(fit: Fit) -> float:
 
     Pixels are compared with the fitted path, which has almost no noise.
     """
-    trials = [t for t in fit.problem.trials if t.observations.trial.role == "fit"]
-    seen = [t.observations for t in trials]
-    axes = [float(o.measured.sum()) if o.hides_spin else 3.0 for o in seen]
-    own = [0.0 if o.camera is not None else a * (o.white**2 + o.slow**2) for o, a in zip(seen, axes, strict=True)]
-    return float(np.sqrt(np.mean(own) + noise_spread(fit) ** 2))
+    own = [_own_noise(t.observations) for t in fit.problem.trials if t.observations.trial.role == "fit"]
+    return float(np.sqrt(np.mean(own) + pooled_rms(noise_spread(fit)) ** 2))
 
 
 def _tracked_points(fit: Fit, index: int) -> Array:
