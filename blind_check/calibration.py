@@ -34,6 +34,7 @@ TRUE_VALUES: Mapping[str, tuple[str, str]] = {
     "restitution": ("restitution", "e"),
     "adhesion": ("pull_per_mass", "pull_per_mass"),
     "time_scale": ("rate", "rate"),
+    "inertia": ("factor", "factor"),
     "stiffness": ("youngs_modulus", "E"),
 }
 """Effect → (its main parameter, the generator's name for it)."""

@@ -75,7 +75,8 @@ class Body:
 class RigidWorld:
     """All parameters of a world with one body.
 
-    pellet: (extra mass over the body's, position in the body in m). rolling: m, arm of the rolling resistance.
+    pellet: (extra mass over the body's, position in the body in m). inertia: moments of the body over
+        those of uniform density. rolling: m, arm of the rolling resistance.
     adhesion: (pull per mass in m/s², reach in m): pull on a separating body, decreasing to zero at that distance.
     bump: (x, y, radius, height) in m of an unmodelled spherical cap on the ground.
     push: see ``Push``. ground_motion: see ``GroundMotion``.
@@ -86,6 +87,7 @@ class RigidWorld:
     restitution: float
     gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY)
     pellet: tuple[float, tuple[float, float, float]] | None = None
+    inertia: float = 1.0
     rolling: float = 0.0
     adhesion: tuple[float, float] | None = None
     bump: tuple[float, float, float, float] | None = None
@@ -174,8 +176,9 @@ def _model(mujoco: Any, world: RigidWorld) -> Any:
         ground = f'<body name="ground">{joints}<geom type="box" size="20 20 1" pos="0 0 -1" mass="1e9" {law}/></body>'
     inertial = ""
     density = f'density="{body.density!r}"'
-    if world.pellet is not None:
-        inertial, density = _loaded_inertia(body, *world.pellet), 'mass="0"'
+    if world.pellet is not None or world.inertia != 1.0:
+        pellet = (0.0, (0.0, 0.0, 0.0)) if world.pellet is None else world.pellet
+        inertial, density = _loaded_inertia(body, *pellet, world.inertia), 'mass="0"'
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="{STEP_S}" integrator="RK4" cone="elliptic" impratio="{_GRIP}" '
         f'gravity="{" ".join(map(repr, world.gravity))}"/><worldbody>{ground}{bump}'
@@ -184,8 +187,11 @@ def _model(mujoco: Any, world: RigidWorld) -> Any:
     )
 
 
-def _loaded_inertia(body: Body, fraction: float, at: tuple[float, float, float]) -> str:
-    """Return the ``inertial`` element of ``body`` with a pellet of ``fraction`` of its mass at ``at``."""
+def _loaded_inertia(body: Body, fraction: float, at: tuple[float, float, float], factor: float) -> str:
+    """Return the ``inertial`` element of ``body``, its moments times ``factor``, and a pellet at ``at``.
+
+    fraction: the pellet's mass over the body's.
+    """
     half, mass = np.array(body.half), body.mass
     share = 0.4 if body.shape == "sphere" else None
     if share is not None:
@@ -194,6 +200,7 @@ def _loaded_inertia(body: Body, fraction: float, at: tuple[float, float, float])
         tensor = (
             np.diag([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2]) * mass / 3
         )
+    tensor = factor * tensor
     place = np.array(at)
     centre = place * fraction / (1 + fraction)
     for part, where in ((mass, -centre), (mass * fraction, place - centre)):

@@ -307,6 +307,19 @@ def mass_offset(world: RigidWorld, rng: np.random.Generator) -> Cause:
     )
 
 
+def inertia(world: RigidWorld, rng: np.random.Generator) -> Cause:
+    """A hollow body; strength: what its moments of inertia have more, up to a thin shell's two thirds."""
+    return Cause(
+        effect="inertia",
+        low=0.04,
+        high=2 / 3,
+        styles=("toss", "toss", "slide") if world.body.shape == "sphere" else ("toss", "spun", "drop"),
+        active="touched",
+        change=lambda s, w: dataclasses.replace(w, inertia=1 + s),
+        parameters=lambda s: {"factor": 1 + s},
+    )
+
+
 def time_scale(world: RigidWorld, rng: np.random.Generator) -> Cause:
     """Wrong clock rate; strength: deviation from 1."""
     sign = either_sign(rng)
@@ -356,4 +369,5 @@ KNOWN_CAUSES: Mapping[str, Maker] = {
     "mass_offset": mass_offset,
     "time_scale": time_scale,
     "camera_pose": camera_pose,
+    "inertia": inertia,
 }

@@ -185,6 +185,19 @@ def test_a_sliding_ball_ends_up_rolling_at_five_sevenths():
     assert found[0, 11] == pytest.approx(5 / 7 / RADIUS, rel=0.01)
 
 
+@pytest.mark.parametrize("z", [-2.0, 2.0])
+def test_inertia_acts_in_contact_and_not_in_flight(z):
+    freedom, ball, brick = CANDIDATE_EFFECTS["inertia"], scene_of(sphere()), scene_of(box((0.06, 0.1, 0.2)))
+    setting = freedom.change(ball, ball.base, np.array([z]))
+    factor = freedom.values(ball, setting, np.array([z]))["factor"]
+    # What slides without spin ends up rolling at 1 / (1 + J / m r²) of its speed.
+    found = run(ball, state((0, 0, RADIUS), (1, 0, 0)), [0.6], friction=0.4, inertia=factor)
+    assert factor == pytest.approx(np.exp(0.25 * z)) and found[0, 7] == pytest.approx(1 / (1 + 0.4 * factor), rel=0.01)
+    thrown = state((0, 0, 50), (1, 0, 2), (0.1, 9.0, 0.1))
+    flown = [run(brick, thrown, [0.2, 0.5], inertia=k) for k in (1.0, factor)]
+    assert flown[1][:, :13] == pytest.approx(flown[0][:, :13], abs=1e-9)
+
+
 def test_rolling_resistance_takes_five_sevenths_b_g_over_r():
     lever, radius = 0.002, RADIUS
     start = state((0, 0, radius), (1, 0, 0), (0, 1 / radius, 0))
@@ -335,6 +348,53 @@ def test_lift_is_found_in_flights_and_predicted():
     assert best.misfit < 1.4 < 3 < fits.nominal.misfit
     after = np.abs(fits.predict(best)["take4"] - truth).max()
     assert after < 0.2 * np.abs(fits.predict(fits.nominal)["take4"] - truth).max()
+
+
+def skidding(factor, friction=0.3, sigma=2e-4):
+    """Balls that slide without spin until they roll, in closed form; the last one is shown while it slides."""
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(5)
+    rest = RADIUS * Rotation.random(12, random_state=0).as_matrix()[:, :, 0]
+    slow, share = friction * 9.81, 0.4 * factor
+    t, trials = np.arange(0, 0.5, 0.01), []
+    for n, (speed, heading) in enumerate([(1.0, 0.0), (0.8, 2.0), (1.2, 4.0), (1.1, 5.5)]):
+        slides = np.minimum(t, speed * share / (1 + share) / slow)
+        way = speed * t - slow * slides * (t - 0.5 * slides)
+        turn = slow / (share * RADIUS) * slides * (t - 0.5 * slides)
+        ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+        axis = np.array([-ahead[1], ahead[0], 0.0])
+        turned = np.einsum("tij,kj->tki", Rotation.from_rotvec(turn[:, None] * axis).as_matrix(), rest)
+        points = way[:, None, None] * ahead + (0, 0, RADIUS) + turned + sigma * rng.normal(size=(len(t), 12, 3))
+        shown = len(t) if n < 3 else 8
+        trials.append(
+            Trial(
+                name=f"take{n}",
+                role="fit" if n < 3 else "predict",
+                times=t[:shown],
+                points=points[:shown],
+                pixels=None,
+                object_index=np.zeros(12, dtype=np.int64),
+                rest_points=rest,
+                predict_times=t[shown:] if n == 3 else None,
+            )
+        )
+    return scene_of(sphere(), trials, friction=friction, sigma=sigma).capture
+
+
+def test_a_hollow_ball_is_told_by_the_speed_at_which_it_begins_to_roll():
+    fits = fit_rigid(skidding(5 / 3), ["friction", "inertia"])
+    best = max((fits.nominal, *fits.candidates), key=lambda f: f.log_evidence)
+    found = best.parameters["inertia"]["factor"]
+    assert best.effects == ("inertia",) and found.low < 5 / 3 < found.high
+    assert found.value == pytest.approx(5 / 3, rel=0.05)
+    # The held-out error counts by trial, in units of what noise and contacts make of it.
+    assert best.heldout_chi < 0.3 * fits.nominal.heldout_chi
+
+
+def test_a_solid_ball_is_not_called_hollow():
+    fits = fit_rigid(skidding(1.0), ["inertia"])
+    assert all(c.log_evidence < fits.nominal.log_evidence + 2 for c in fits.candidates)
 
 
 @given(st.lists(st.tuples(st.sampled_from(sorted(CANDIDATE_EFFECTS))), unique=True, max_size=8))

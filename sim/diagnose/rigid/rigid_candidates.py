@@ -47,8 +47,8 @@ UNKNOWN_RESTITUTION, UNKNOWN_RESTITUTION_SPREAD = 0.35, 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSettings:
-    """Settings of one world. rate: true over recorded time. camera: rotation (3, 3) and translation (3,) from true to
-    assumed camera; None if the camera is where it was assumed."""
+    """Settings of one world. inertia: over that of uniform density. rate: true over recorded time. camera: rotation
+    (3, 3) and translation (3,) from true to assumed camera; None if the camera is where it was assumed."""
 
     gravity: Array
     drag: float = 0.0
@@ -65,6 +65,7 @@ class WorldSettings:
     reach: float = 0.0
     center: Array = field(default_factory=lambda: np.zeros(3))
     fraction: float = 0.0
+    inertia: float = 1.0
     rate: float = 1.0
     camera: tuple[Array, Array] | None = None
 
@@ -111,7 +112,7 @@ class BodyScene:
             row[SLOTS["friction"]], row[SLOTS["rolling"]] = max(s.friction, 0.0), max(s.rolling, 0.0)
             row[SLOTS["pull"]], row[SLOTS["reach"]] = max(s.pull, 0.0), s.reach
             row[SLOTS["inset"]] = s.inset
-            inertia = body.inertia
+            inertia = s.inertia * body.inertia
             if s.fraction > 0:
                 pellet, turn = s.center / s.fraction, skew(s.center)
                 rest = skew(pellet - s.center)
@@ -282,6 +283,15 @@ def _offset_values(scene: BodyScene, s: WorldSettings, z: Array) -> Values:
     return {"fraction": fraction, **{f"offset_{a}": float(v) for a, v in zip("xyz", center / fraction, strict=True)}}
 
 
+INERTIA_SPREAD = 0.25
+"""Standard deviation of the logarithm of the inertia over that of uniform density; thin shells of balls and cubes have
+two of them more."""
+
+
+def _inertia(scene: BodyScene, s: WorldSettings, z: Array) -> WorldSettings:
+    return dataclasses.replace(s, inertia=s.inertia * float(np.exp(INERTIA_SPREAD * np.clip(z[0], -4, 4))))
+
+
 def _camera_numbers(scene: BodyScene, z: Array) -> tuple[Array, Array, Array]:
     assert scene.capture.camera is not None
     place = scene.capture.camera.matrix[:3, 3]
@@ -384,6 +394,14 @@ CANDIDATE_EFFECTS: Mapping[str, CandidateEffect] = {
             change=_offset,
             values=_offset_values,
             starts=((0.05, 0.05, 0.05, 0.0),),
+        ),
+        CandidateEffect(
+            name="inertia",
+            size=1,
+            change=_inertia,
+            values=lambda scene, s, z: {"factor": s.inertia},
+            starts=((0.0,),),
+            grid=tuple((0.25 * k,) for k in range(-10, 11)),
         ),
         CandidateEffect(
             name="time_scale",

@@ -97,8 +97,8 @@ def _remainder(
 
 ROUNDS = 10
 
-CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion")
-"""Effects that act in contact only."""
+CONTACTS = ("friction", "restitution", "rolling_resistance", "adhesion", "inertia")
+"""Effects that act in contact only: a free body turns alike whatever the factor on its moments of inertia."""
 
 FLIES = 6
 """Contact-free frames after a node that determine its state."""
