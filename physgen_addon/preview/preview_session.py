@@ -356,7 +356,7 @@ class Session:
         return (self.clip, self.frame, self.state, self.message) != before
 
     def scene(self) -> bpy.types.Scene | None:
-        """The scene, even if renamed; None if it is gone."""
+        """Return the scene, even if renamed; None if it is gone."""
         return scene_with(self.scene_uid)
 
     def _follow(self, scene: bpy.types.Scene, now: float) -> None:

@@ -28,7 +28,7 @@ ROUNDED = 1e-3
 
 
 def nearest_on_surface(mesh: ObjectMesh, places: Array, spacing: float) -> tuple[NDArray[np.int64], Array]:
-    """Triangle (N,) of ``mesh`` nearest to each of ``places`` (N, 3), and the nearest point (N, 3) on it.
+    """Return the triangle (N,) of ``mesh`` nearest to each of ``places`` (N, 3), and the nearest point (N, 3) on it.
 
     Pieces of the surface ``spacing`` across tell which triangle is nearest, so that it may be one about as near.
     """
@@ -42,9 +42,10 @@ def nearest_on_surface(mesh: ObjectMesh, places: Array, spacing: float) -> tuple
 def factors_of(
     folder: Scene, item: SceneObject, mesh: ObjectMesh, factors: FactorMap, places: Array, spacing: float
 ) -> Array:
-    """The factor (N,) of matter of ``item`` at ``places`` (N, 3), world metres; ``spacing`` of the particles in m.
+    """Return the factor (N,) of matter of ``item`` at ``places`` (N, 3), world metres.
 
-    Raises InputError, with object and file, where weights or texture coordinates are missing or do not fit the mesh.
+    spacing: of the particles, m. Raises InputError, with object and file, where weights or texture coordinates are
+    missing or do not fit the mesh.
     """
     triangles, points = nearest_on_surface(mesh, places, spacing)
     shares = points_to_barycentric(mesh.vertices[mesh.faces[triangles]], points)

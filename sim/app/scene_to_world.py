@@ -44,7 +44,7 @@ from .scene_to_world_checks import require_above_ground, resolve, separate, surf
 
 
 def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:
-    """The constitutive model of the material's law, with the parameters that it reads."""
+    """Return the constitutive model of the material's law, with the parameters that it reads."""
     if material.law == "rigid":
         return RigidMaterial(density=material.density)
     model = model_of(material.law)
@@ -56,7 +56,7 @@ SHELL_CELLS = 2.0
 
 
 def keep_shell(sample: InteriorSample, mesh: ObjectMesh, thickness: float, spacing: float) -> InteriorSample:
-    """The particles of ``sample`` whose middle is within ``thickness`` m of the surface of ``mesh``.
+    """Return the particles of ``sample`` whose middle is within ``thickness`` m of the surface of ``mesh``.
 
     The inside is empty: mass and inertia are the shell's, and nothing but the shell resists bending and pressure. The
     volume is right to about half a particle ``spacing`` of thickness. Raises InputError for a shell thinner than the
@@ -81,7 +81,7 @@ HOLDS = ("separate", "slip", "sticky")
 
 
 def contact_table(scene: SceneModel) -> ContactTable:
-    """The contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is.
+    """Return the contacts of ``scene``; surfaces without numbers of their own count as made of what the ground is.
 
     Where there is no ground, as made of what a new scene's ground is. Where neither ground nor object says how it
     bounces, a rigid object has its material's restitution against the ground, colliders and, the smaller of the two,
@@ -118,7 +118,7 @@ def _bounce(item: SceneObject, ground: SurfaceContact) -> float:
 
 
 def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:
-    """The surface of ``item``: its own numbers, its roughness, or what the ground has."""
+    """Return the surface of ``item``: its own numbers, its roughness, or what the ground has."""
     friction, static = item.friction, item.static_friction
     if friction is None and item.roughness is not None:
         friction = friction_from_roughness(item.roughness)
@@ -205,7 +205,7 @@ class PreparedWorld:
         refuse_excess(self.cost, self.particle_count, available_memory(ENGINE_RESERVED) if on_host else None)
 
     def on(self, arch: str) -> PreparedWorld:
-        """The same, with the cost on another architecture."""
+        """Return the same, with the cost on another architecture."""
         cost = estimate(self.particle_count, len(self.setup.bodies), self.stable_step, self.duration, arch)
         return dataclasses.replace(self, arch=arch, cost=cost)
 
@@ -213,7 +213,7 @@ class PreparedWorld:
 def prepare_world(
     folder: Scene, meshes: Sequence[ObjectMesh], options: BakeOptions, quality: Quality | None = None
 ) -> PreparedWorld:
-    """The world of the scene in ``folder``, whose objects have ``meshes``.
+    """Return the world of the scene in ``folder``, whose objects have ``meshes``.
 
     quality: in place of the preset that ``options`` name. What depends on a mesh alone is worked out once for each of
     ``meshes``, as long as the caller keeps it.

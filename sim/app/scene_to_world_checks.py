@@ -301,7 +301,7 @@ def _hollowed(surface: Surface, other: Surface, spacing: float) -> Surface | Non
 
 
 def body_overlap(a: BodyParticles, b: BodyParticles, spacing: float) -> float:
-    """About how deep in m two bodies are in each other, 0 when they are not.
+    """Return about how deep in m two bodies are in each other, 0 when they are not.
 
     A ball of the contact radius around a particle lies inside its body; where two of them meet, the bodies do.
     """

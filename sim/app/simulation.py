@@ -48,7 +48,7 @@ class Simulation:
         return f"{ENGINE_NAME}/{self.world.arch}"
 
     def collider_vertices(self, slot: int) -> NDArray[np.float64] | None:
-        """Vertices (V, 3) in world metres of the moving collider that object ``slot`` is; None for all others."""
+        """Return the vertices (V, 3) of the moving collider that object ``slot`` is, world metres; None for others."""
         index = self.prepared.collider_of_object[slot]
         if index is None or not moves(self.prepared.setup.colliders[index]):
             return None
@@ -71,7 +71,7 @@ class Simulation:
 
 
 def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> Simulation:
-    """The prepared world, ready to run on ``arch``, after saying what it will cost and what is odd about it.
+    """Return the prepared world, ready to run on ``arch``, after saying what it will cost and what is odd about it.
 
     Raises InputError for a bake that would take too long or too much memory.
     """
@@ -95,7 +95,7 @@ def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> 
 
 
 def start_world(prepared: PreparedWorld) -> Simulation:
-    """The world that ``prepared`` describes, ready to run."""
+    """Return the world that ``prepared`` describes, ready to run."""
     setup = prepared.setup
     world = World(
         bodies=setup.bodies,

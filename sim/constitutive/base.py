@@ -174,8 +174,10 @@ class DeformableMaterial:
         raise NotImplementedError
 
     def elastic_energy(self, volumes: Array, deformation: Array, memories: Array) -> float:
-        """Energy in J stored by particles of volumes (N,) m³ at rest, with elastic deformation gradients (N, 3, 3) and
-        history variables (N,)."""
+        """Return the energy in J stored by particles of volumes (N,) m³ at rest.
+
+        deformation: elastic gradients (N, 3, 3); memories: history variables (N,).
+        """
         raise NotImplementedError
 
     def own_numbers(self) -> tuple[float, ...]:
@@ -183,14 +185,14 @@ class DeformableMaterial:
         return ()
 
     def fibre_energy(self, volumes: Array, deformation: Array) -> float:
-        """Energy in J stored in the fibres."""
+        """Return the energy in J stored in the fibres."""
         if not self.fibre_modulus > 0:
             return 0.0
         along = np.linalg.norm(deformation @ np.asarray(self.fibre_axis), axis=1)
         return float(volumes @ (0.5 * self.fibre_modulus * (along - 1) ** 2))
 
     def relaxing_energy(self, volumes: Array, conformations: Array) -> float:
-        """Energy in J stored in the springs that relax, share mu/2 (tr B - 3 - ln det B), with B (N, 3, 3)."""
+        """Return the energy in J of the springs that relax, share mu/2 (tr B - 3 - ln det B), with B (N, 3, 3)."""
         determinants = np.maximum(np.linalg.det(conformations), 1e-12)
         stored = np.trace(conformations, axis1=1, axis2=2) - 3 - np.log(determinants)
         return float(volumes @ (0.5 * self.relaxing_share * self.shear_modulus * stored))
@@ -260,7 +262,7 @@ class RigidMaterial:
 
 
 def models() -> tuple[type[DeformableMaterial], ...]:
-    """All registered models by ``rank``."""
+    """Return all registered models by ``rank``."""
     return tuple(sorted(_MODELS.values(), key=lambda model: (model.rank, model.law)))
 
 
@@ -276,7 +278,7 @@ def number_models() -> None:
 
 
 def model_of(law: str) -> type[DeformableMaterial]:
-    """The model called ``law``. Raises InputError if there is none."""
+    """Return the model called ``law``. Raises InputError if there is none."""
     if law not in _MODELS:
         raise InputError(f"law is {law!r}: choose one of {', '.join(model.law for model in models())}")
     return _MODELS[law]
@@ -293,10 +295,10 @@ def bounding_speed(wave_speed: float, diffusivity: float) -> float:
 
 
 def principal_stretches(deformation: Array) -> tuple[Array, Array]:
-    """Singular values (N, 3) of deformation gradients (N, 3, 3), and their determinants (N,)."""
+    """Return the singular values (N, 3) of deformation gradients (N, 3, 3), and their determinants (N,)."""
     return np.linalg.svd(deformation, compute_uv=False), np.linalg.det(deformation)
 
 
 def hencky_strains(stretches: Array) -> Array:
-    """Logarithms (N, 3) of principal stretches; those below 1e-3 count as 1e-3."""
+    """Return the logarithms (N, 3) of principal stretches; those below 1e-3 count as 1e-3."""
     return np.log(np.maximum(stretches, 1e-3))

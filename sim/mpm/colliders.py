@@ -45,7 +45,7 @@ class Track:
         object.__setattr__(self, "values", values)
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """The value at ``time`` in s."""
+        """Return the value at ``time`` in s."""
         i = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, max(len(self.times) - 2, 0)))
         if len(self.times) == 1:
             return np.asarray(self.values[0])

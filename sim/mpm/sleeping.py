@@ -72,7 +72,7 @@ class Shape:
 
     @classmethod
     def of(cls, points: Array, radii: Array) -> Shape:
-        """The shape of particles at ``points`` (N, 3) with contact ``radii`` (N,)."""
+        """Return the shape of particles at ``points`` (N, 3) with contact ``radii`` (N,)."""
         reach = float(radii.max())
         return cls(points, radii, cKDTree(points), points.min(axis=0) - reach, points.max(axis=0) + reach)
 
@@ -243,7 +243,7 @@ class Sleepers:
     def touched(
         self, moving: dict[int, Array], asleep: NDArray[np.bool_], time: float, speed: float
     ) -> tuple[list[int], float]:
-        """The sleepers that wake now, and the seconds for which none of the others can be reached.
+        """Return the sleepers that wake now, and the seconds for which none of the others can be reached.
 
         moving: particles (N, 3) in world metres of the bodies that move, by index. asleep: (B,). time: now, in s.
         speed: m/s, of the fastest of all matter.

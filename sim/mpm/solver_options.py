@@ -73,7 +73,7 @@ class SolverOptions:
         return ENGINE_BOX_SIZE / (self.grid * similarity.scale)
 
     def particle_spacing(self, similarity: Similarity) -> float:
-        """Distance in metres between neighbouring particles, for ``sample_interior``."""
+        """Return the distance in metres between neighbouring particles, for ``sample_interior``."""
         return self.cell_size(similarity) / math.cbrt(self.particles_per_cell)
 
 
@@ -89,7 +89,7 @@ MIN_CELLS_ACROSS = 3.0
 def fit_similarity(
     bodies: Sequence[NDArray[np.floating]], *, cells_across: float = 32.0, options: SolverOptions | None = None
 ) -> Similarity:
-    """The map that gives the largest body ``cells_across`` cells along its longest side, the bodies amid the box.
+    """Return the map that gives the largest body ``cells_across`` cells along its longest side, bodies amid the box.
 
     bodies: points (N, 3) of each body in world metres: mesh vertices before sampling, or particles.
 
@@ -121,7 +121,7 @@ def fit_similarity(
 
 
 def centred(middle: NDArray[np.float64], cell: float, options: SolverOptions) -> Similarity:
-    """The map with cells of ``cell`` metres and the world point ``middle`` (3,) amid the box."""
+    """Return the map with cells of ``cell`` metres and the world point ``middle`` (3,) amid the box."""
     scale = ENGINE_BOX_SIZE / (options.grid * cell)
     origin = middle - 0.5 * ENGINE_BOX_SIZE / scale
     return Similarity(scale=scale, origin=(float(origin[0]), float(origin[1]), float(origin[2])))

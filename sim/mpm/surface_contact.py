@@ -90,7 +90,7 @@ class ContactTable:
     pairs: Mapping[tuple[str, str], SurfaceContact] = field(default_factory=lambda: MappingProxyType({}))
 
     def between(self, a: str, b: str) -> SurfaceContact:
-        """The contact of ``a`` with ``b``, in either order."""
+        """Return the contact of ``a`` with ``b``, in either order."""
         return self.pairs.get((min(a, b), max(a, b)), self.default)
 
     def with_pair(self, a: str, b: str, contact: SurfaceContact) -> ContactTable:

@@ -66,7 +66,7 @@ class WorldView:
         return self.group.cells.scale
 
     def asleep(self, index: int) -> bool:
-        """Whether body ``index`` sleeps: it is at rest until something touches it."""
+        """Return whether body ``index`` sleeps: it is at rest until something touches it."""
         return self.group.asleep(self._number(index))
 
     def positions(self, index: int) -> Array:
@@ -134,7 +134,7 @@ class WorldView:
         return [i for i in range(len(self.bodies)) if self.group.started(self._number(i))]
 
     def linear_momentum(self) -> Array:
-        """Momentum (3,) of all bodies, kg m/s."""
+        """Return the momentum (3,) of all bodies, kg m/s."""
         terms = [
             self.pose(self.bodies[i].name).momentum
             if self.bodies[i].rigid

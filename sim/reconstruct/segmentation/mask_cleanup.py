@@ -31,7 +31,7 @@ PRINT_SHARE = 0.25
 
 
 def largest_component(mask: Mask) -> Mask:
-    """The largest 8-connected part of ``mask``; an empty mask stays empty."""
+    """Return the largest 8-connected part of ``mask``; an empty mask stays empty."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count <= 1:
         return mask.copy()

@@ -194,7 +194,7 @@ class Box:
         return [self.corners()]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Distance from the nearest face, soft where two are equally near."""
+        """Return the distance from the nearest face, soft where two are equally near."""
         across, along = self.axes
         offset = points[:, :2] - np.array([self.x, self.y])
         sides = soft_min(
@@ -247,7 +247,7 @@ class Sphere:
         return [self.centre + self.axes * (ring * np.sqrt(1.0 - sine**2) - axis * sine)]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Distance from the surface; exact on it."""
+        """Return the distance from the surface; exact on it."""
         scaled = (points - self.centre) / self.axes
         length = np.linalg.norm(scaled, axis=1)
         slope = np.linalg.norm(scaled / self.axes, axis=1) / np.maximum(length, 1e-12)
@@ -283,7 +283,7 @@ class SurfaceOfRevolution:
         return min(self.height, 2.0 * max(self.radii))
 
     def circle(self, height: float, radius: float) -> Points:
-        """Points (CIRCLE, 3) around the axis."""
+        """Return points (CIRCLE, 3) around the axis."""
         # A polygon with the circle's area approximates it better than the inscribed one.
         wide = radius * np.sqrt(2.0 * np.pi / CIRCLE / np.sin(2.0 * np.pi / CIRCLE))
         points = np.empty((CIRCLE, 3))
@@ -296,7 +296,7 @@ class SurfaceOfRevolution:
         return [np.concatenate(pair) for pair in pairwise(rings)]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Distance from the mantle or the top, soft where both are equally near."""
+        """Return the distance from the mantle or the top, soft where both are equally near."""
         heights, radii = np.array(self.heights), np.array(self.radii)
         slopes = np.diff(radii) / np.maximum(np.diff(heights), 1e-12)
         z = points[:, 2]
