@@ -19,6 +19,7 @@ import os
 import signal
 import sys
 from pathlib import PurePath
+from types import TracebackType
 
 from ..sim.app.launch import ONE_BLAS_THREAD, STOP_SIGNALS
 
@@ -27,6 +28,8 @@ CANCELLED = 130
 LAST_S = 1.9
 """A command that was asked to stop has ended so long afterwards, whatever it is doing. By itself it does at
 ``terminal.STOP_S``, and then leaves nothing for the next command to sweep."""
+LACKING = 3
+"""Exit code of ``InputError`` there."""
 KILLED = 128 + 9
 """Exit code of a command that SIGKILL has ended, as shells give it."""
 
@@ -52,6 +55,23 @@ def heed() -> None:
     """End this process at once, with the code for cancelled, when it is asked to stop."""
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: os._exit(CANCELLED))
+
+
+def _ended_by(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Report what ``cli.main`` did not get to see: libraries that cannot be loaded for lack of memory, in one line."""
+    from ..sim.memory import ran_out
+
+    if ran_out(error):
+        _say(
+            "InputError",
+            f"{_command()}: memory ran out while it was starting: close other programs, or raise the limit",
+        )
+        os._exit(LACKING)
+    sys.__excepthook__(kind, error, trace)
+
+
+def _command() -> str:
+    return " ".join(sys.argv[1:2]) or "physgen"
 
 
 def work_in_child() -> None:
@@ -96,7 +116,7 @@ def work_in_child() -> None:
         _say("Cancelled", "cancelled in the middle of a long step; run it again to continue")
         os._exit(CANCELLED)
     if code == -signal.SIGKILL:
-        _say("Killed", f"{' '.join(sys.argv[1:2]) or 'physgen'}: {how_it_was_killed(kills)}; run it again to go on")
+        _say("Killed", f"{_command()}: {how_it_was_killed(kills)}; run it again to go on")
         os._exit(KILLED)
     # Of a fault: as if there were no child, for whoever asks how this process ended.
     signal.signal(-code, signal.SIG_DFL)
@@ -121,6 +141,7 @@ def _say(kind: str, message: str) -> None:
 
 if _is_own_process():
     heed()
+    sys.excepthook = _ended_by
     os.environ.setdefault(*ONE_BLAS_THREAD)
     if _is_typed():
         work_in_child()

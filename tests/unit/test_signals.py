@@ -93,6 +93,20 @@ def test_a_command_that_was_killed_says_so(tmp_path):
     assert process.returncode == -signal.SIGSEGV
 
 
+@pytest.mark.parametrize(
+    ("raised", "code", "words"),
+    [
+        ("ImportError('libX.so: failed to map segment from shared object')", 3, "error: doctor: memory ran out"),
+        ("ImportError('no module X')", 1, "Traceback"),
+    ],
+)
+def test_a_library_that_cannot_be_loaded_for_lack_of_memory_is_one_line(tmp_path, raised, code, words):
+    with typed(tmp_path, "doctor", then=f"raise {raised}") as process:
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == code and said.strip().startswith(words)
+    assert (said.strip().count("\n") == 0) == (code == 3)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 130), (signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
