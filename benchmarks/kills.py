@@ -41,7 +41,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 import trimesh
-from physgen.batch import cli
+from physgen.batch import cli, early_stop
 from physgen.benchmarks.common import benchmark_parser, print_result
 from physgen.sim.evaluate.model_judge import CRITERIA
 from physgen.sim.scene.folder import save_scene
@@ -200,7 +200,12 @@ class Place:
     def start(self, step: Step) -> int:
         """Start the command of ``step`` as a process forked from this one; return its number."""
         sys.stdout.flush()
+        # As in a process of its own, there is no moment without its first handlers.
+        signal.pthread_sigmask(signal.SIG_BLOCK, early_stop.STOP_SIGNALS)
         pid = os.fork()
+        if pid == 0:
+            early_stop.heed()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, early_stop.STOP_SIGNALS)
         if pid != 0:
             return pid
         code = 70

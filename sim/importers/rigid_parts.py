@@ -171,10 +171,13 @@ def shape_mesh(kind: str, size: Sequence[float] | Array) -> tuple[Array, NDArray
         mesh = creation.cylinder(size[0], 2 * size[1], sections=ROUND)
     elif kind == "capsule":
         mesh = creation.capsule(2 * size[1], size[0], count=[ROUND, ROUND])
+        if mesh.bounds is None:
+            # Numbers beyond all bounds, which whoever reads the file refuses.
+            return np.full((3, 3), np.nan), np.array([[0, 1, 2]])
         mesh.apply_translation((0, 0, -mesh.bounds.mean(axis=0)[2]))
     else:
         mesh = creation.icosphere(subdivisions=3, radius=1.0)
-        mesh.apply_scale(np.broadcast_to(size, 3) if kind == "sphere" else np.asarray(size[:3]))
+        mesh.apply_scale(np.full(3, size[0]) if kind == "sphere" else np.asarray(size[:3]))
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -195,6 +196,11 @@ class Photo:
         return self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(self.width, self.height)
 
 
+SMALL, MOST_A_BYTE = 2**24, 2000
+"""Pixels of a photo that are decoded whatever the file says, and beyond them pixels a byte of the file: JPEG and PNG
+have at most some 1,000, photos less than 100. Others keep a decoder busy for long with nothing."""
+
+
 def load_photo(path: Path, max_size: int) -> Photo:
     """Read ``path`` and scale it down so that its longest side has at most ``max_size`` pixels.
 
@@ -205,6 +211,9 @@ def load_photo(path: Path, max_size: int) -> Photo:
             # Pillow only warns between its limit and twice that; our own check below has the better message.
             warnings.simplefilter("ignore")
             with open_file(path, MAX_PICTURE_BYTES, what="picture") as file, Image.open(file) as image:
+                width, height = image.size
+                if width * height > max(SMALL, MOST_A_BYTE * os.fstat(file.fileno()).st_size):
+                    raise InputError(f"{path}: claims {width}x{height} pixels and is too short for them; save it again")
                 return _decode(path, image, max_size)
     except InputError:
         raise

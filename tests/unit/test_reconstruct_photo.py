@@ -179,6 +179,18 @@ def test_decompression_bomb_is_refused_before_it_is_decoded(tmp_path):
         load_photo(tmp_path / "bomb.png", 1920)
 
 
+def test_a_short_file_that_claims_a_large_photo_is_not_decoded(tmp_path):
+    """TIFF may leave out nearly all of its rows: the decoder was busy for 7 s with 9 kB."""
+    path = tmp_path / "photo.tif"
+    Image.fromarray(gradient()).save(path)
+    content = path.read_bytes()
+    rows = struct.pack("<HHII", 0x0101, 4, 1, 64)
+    assert content.count(rows) == 1
+    path.write_bytes(content.replace(rows, struct.pack("<HHII", 0x0101, 4, 1, 10**6)))
+    with pytest.raises(InputError, match="96x1000000 pixels and is too short"):
+        load_photo(path, 1920)
+
+
 def test_a_large_but_allowed_photo_does_not_warn(tmp_path):
     path = tmp_path / "wide.png"
     Image.new("L", (10000, 9500)).save(path)  # above Pillow's own warning limit

@@ -159,6 +159,10 @@ def test_the_command_makes_a_scene_of_the_right_masses(parts, capsys):
         ("<mujoco><worldbody><body><freejoint/><geom size='-1'/></body></worldbody></mujoco>", "above 0"),
         ("<mujoco><worldbody><body><freejoint/><geom size='x'/></body></worldbody></mujoco>", "give numbers"),
         ("<mujoco><worldbody><body><freejoint/><geom size='nan'/></body></worldbody></mujoco>", "finite"),
+        (
+            "<mujoco><worldbody><body><freejoint/><geom type='capsule' size='0.1 1e308'/></body></worldbody></mujoco>",
+            "finite",
+        ),
         ("<mujoco><worldbody><body><freejoint/><geom type='hfield'/></body></worldbody></mujoco>", "not read"),
         ("<mujoco><worldbody><body><freejoint/><geom size='1' mass='0'/></body></worldbody></mujoco>", "mass of 0"),
         (
@@ -175,6 +179,14 @@ def test_what_cannot_be_read_is_one_line(tmp_path, text, words):
     with pytest.raises(InputError, match=words):
         import_folder(path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_balls_radius_is_the_first_of_its_sizes(tmp_path):
+    """MuJoCo ignores the others; two of them ended in a traceback."""
+    path = tmp_path / "m.xml"
+    path.write_text("<mujoco><worldbody><body><freejoint/><geom size='0.1 0.2'/></body></worldbody></mujoco>")
+    (body,) = read_rigid_model(path).bodies
+    assert np.ptp(body.vertices, axis=0).max() == pytest.approx(0.2, rel=0.01)
 
 
 def test_deep_nesting_is_refused(tmp_path):

@@ -231,6 +231,8 @@ def _open_image(path: Path, budget: PixelBudget) -> Image.Image:
             return image
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
+    except MemoryError:
+        raise InputError(f"{path}: does not fit in memory; give smaller images") from None
     except _DECODER_ERRORS as error:
         raise InputError(f"{path}: not a readable image ({str(error)[:120]}): write it again as PNG") from None
 
