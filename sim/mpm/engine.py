@@ -103,6 +103,7 @@ class Engine:
         self.laws = numbers.laws
         models = law_set(self.laws)
         self._flowing = models.flowing
+        self._fluid = bool(models.volumetric)
         self.world_count = len(numbers.worlds)
         self._running = ti.ndarray(ti.i32, self.world_count if lanes.parallel else 1)
         self._launches = 1
@@ -177,6 +178,7 @@ class Engine:
             self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
             self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
             self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
+            self._crowding_window = ti.ndarray(ti.f32, p * WINDOW_NODES if self._fluid else 1)
             self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
             self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
@@ -188,6 +190,9 @@ class Engine:
             self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
             self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
             self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self._flowing else 1)
+            self._crowding = ti.ndarray(ti.f32, g * BLOCK_NODES if self._fluid else 1)
+            crowded = max(1, g * self._most_rigid_bodies * PUSH) if self._fluid else 1
+            self._crowd_pushes = ti.ndarray(ti.f32, crowded)
             self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
             self._block_sums = ti.ndarray(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
@@ -544,7 +549,14 @@ class Engine:
             "overlap": self._overlap_blocks(),
             "particles": self._particle_bundle(),
             "nodes": NodeArrays(self._window, self._scattered, self._nodes, self._sums, self._masses, self._block_sums),
-            "flow": FlowArrays(self._past_window, self._past_scattered, self._past_nodes),
+            "flow": FlowArrays(
+                self._past_window,
+                self._past_scattered,
+                self._past_nodes,
+                self._crowding,
+                self._crowding_window,
+                self._crowd_pushes,
+            ),
             "bodies": self.rigid_bodies.bodies,
             "shapes": self.rigid_bodies.shapes,
             "contacts": self.rigid_bodies.contacts,

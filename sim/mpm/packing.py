@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive import ROW, DeformableMaterial, ElasticMaterial
+from ..constitutive import FLUID, ROW, DeformableMaterial, ElasticMaterial
 from ..scene.units import Similarity
 from .bodies import BodyParticles
 from .kernels import layout
@@ -228,9 +228,20 @@ def field_row(place: WorldSlot, body_index: int, start: float, end: float) -> ND
         row[layout.PLANE_REACH] = contact.adhesion_reach * scale
     row[layout.PLANE_GAP : layout.PLANE_GAP + 2] = layout.FAR
     row[layout.SUNK_LIMIT] = DEEPEST_ELASTIC if contact.restitution > 0 else DEEPEST
+    row[layout.FULL_MASS] = full_mass(body) / scale**3
+    if row[layout.FULL_MASS] > 0:
+        row[layout.SOUND_SPEED_SQUARED] = (scale * body.material_at(start).wave_speed) ** 2
     row[layout.GOAL_STIFFNESS] = body.goal_stiffness
     row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
     return row.astype(np.float32)
+
+
+def full_mass(body: BodyParticles) -> float:
+    """Density in kg/m³ of a body that is a fluid, and equally dense, all over and at all times; 0 of others."""
+    if any(material.cohesion != FLUID for material in body.materials_over_time):
+        return 0.0
+    densities = body.masses / body.volumes
+    return float(densities.mean()) if np.ptp(densities) < 1e-3 * densities.mean() else 0.0
 
 
 def particles(

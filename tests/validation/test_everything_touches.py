@@ -57,6 +57,29 @@ def filled(name: str, material, places: np.ndarray, spacing: float, **fields) ->
     )
 
 
+@pytest.mark.long
+def test_a_pond_in_a_tub_holds_its_level_and_comes_to_rest(similarity, options, cell):
+    """Eight cells deep and wide, let go for 2 s: its level within 3 % of its depth, as the issue asks of its pressure,
+    and r.m.s. speed below 0.01 sqrt(g H), as for the thick pond. Without crowding, ln J stays where it was while
+    particles pile up on floor and walls: the level falls by 11 %, the speed is 0.019 of that."""
+    spacing, side, depth = cell / 2, 8 * cell, 8 * cell
+    places = lattice((-side / 2, -side / 2, 0), (side / 2, side / 2, depth), spacing)
+    world = World(
+        bodies=[filled("water", WATER, places, spacing)],
+        ground=Ground(friction=0.0),
+        colliders=walls((side, side), 14 * cell),
+        contacts=ContactTable(default=SurfaceContact(friction=0.0)),
+        similarity=similarity,
+        options=options,
+    )
+    world.advance(2.0)
+    at = world.positions(0)
+    away = np.abs(at[:, :2]).max(axis=1) < side / 2 - 1.5 * cell
+    level = np.quantile(at[away, 2], 0.985) + spacing / 2
+    assert level == pytest.approx(depth, rel=0.03)
+    assert np.sqrt((world.velocities(0) ** 2).mean()) < 0.01 * np.sqrt(9.81 * depth)
+
+
 @pytest.fixture
 def floating(box_body, similarity, options, cell):
     """Draught over height of a block of ``density`` that floats upright in a tub, and how much still moves.
@@ -96,7 +119,7 @@ def floating(box_body, similarity, options, cell):
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="draught of 0.468 of the height at 500 kg/m³ (6.4 % too little), 2 % wanted")
+@pytest.mark.xfail(strict=True, reason="draught of 0.478 of the height at 500 kg/m³ (4.4 % too little), 2 % wanted")
 @pytest.mark.parametrize("density", [500.0])
 def test_a_wooden_block_floats_at_its_archimedes_draught(floating, density):
     """Of its height by its density over the water's, within 2 % (the issue's)."""

@@ -247,6 +247,16 @@ class FlowArrays(NamedTuple):
     scattered: Vectors4
     velocity: Vectors4
 
+    crowding: Scalars
+    """(G, BLOCK_NODES) ln of what fluids fill over what their ln J says, see ``crowding``; length 1 without fluids."""
+
+    crowding_window: Scalars
+    """(P, WINDOW_NODES) copy of the crowding around a particle block."""
+
+    pushes: Scalars
+    """(G, most_bodies, PUSH) what crowding in a block does to a body, as in ``CouplingArrays``; last but one: whether
+    it does anything."""
+
 
 class RigidArrays(NamedTuple):
     """Rigid bodies and colliders; ``rigid_layout`` names the columns."""

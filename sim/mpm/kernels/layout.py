@@ -58,7 +58,10 @@ ACCELERATION, ACCELERATION_RATE, GOAL_STIFFNESS, GOAL_DAMPING, MOTION, MOTION_RA
 # kernels find where there is adhesion; substep n reads number n % 2 of two.
 PLANE_ADHESION, PLANE_REACH, PLANE_GAP = 26, 27, 28
 SUNK_LIMIT = 30
-FIELD_ROW = 31
+# Mass (kg) of a cell that is full of the fluid that the field consists of, 0 where it is no fluid of one density.
+# SOUND_SPEED_SQUARED: of that fluid, cells²/s².
+FULL_MASS, SOUND_SPEED_SQUARED = 31, 32
+FIELD_ROW = 33
 
 FAR = 1e9
 """Cells; a distance beyond the reach of all forces."""

@@ -17,6 +17,7 @@ import taichi as ti
 
 from .constitutive_response import deform, is_fluid, law_of, respond
 from .constitutive_response import flows as material_flows
+from .crowding import NOTHING, RELAXED, STIFFNESS
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
 from .lanes import (
@@ -41,6 +42,7 @@ from .layout import (
     FIXED_LOW,
     FIXED_ONE,
     FULL,
+    FULL_MASS,
     GOAL_DAMPING,
     GOAL_STIFFNESS,
     HAS_ANCHORS,
@@ -56,6 +58,7 @@ from .layout import (
     PLANE_OFFSET,
     SCALARS_PER_BLOCK,
     SCATTER,
+    SOUND_SPEED_SQUARED,
     STEP,
     STORE,
     SUBSTEPS,
@@ -64,6 +67,7 @@ from .layout import (
     WORLD,
     WORLD_ROW,
     Integers,
+    Scalars,
     Vectors4,
     ivec3,
     mat3,
@@ -383,6 +387,42 @@ def goal_step(
 
 
 @ti.func
+def load_crowding(lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, window: Scalars, nodes: Scalars):
+    """Copy the crowding of the nodes around particle block ``k`` into its window, as ``lanes.fetch_window`` does."""
+    n = lane
+    while n < WINDOW_NODES:
+        i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
+        g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
+        window[k * WINDOW_NODES + n] = nodes[g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)]
+        n += ti.static(lanes.threads)
+
+
+@ti.func
+def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window: Scalars, scattered: ti.template()):
+    """Mean crowding at ``fx`` from the window's node ``known``, and the impulse on the particle there; the nodes take
+    the opposite, along the line to the particle, so both momenta stay. Nodes that are no measure count as the mean of
+    the others. strength: impulse at a slope of 1 per cell."""
+    w = weights(fx)
+    total, part = 0.0, 0.0
+    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+        crowding = window[known + (i * 64 + j * 8 + m)]
+        if crowding < NOTHING:
+            weight = w[i][0] * w[j][1] * w[m][2]
+            part += weight
+            total += weight * crowding
+    mean = total / ti.max(part, 0.1)
+    given = vec3(0.0)
+    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+        crowding = window[known + (i * 64 + j * 8 + m)]
+        if crowding >= NOTHING:
+            crowding = mean
+        push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * crowding) * (vec3(i, j, m) - fx)
+        given -= push
+        add_to(scattered, first + (i * 64 + j * 8 + m), vec4(push[0], push[1], push[2], 0.0))
+    return mean, given
+
+
+@ti.func
 def scatter_past(
     first: ti.i32,
     fx: vec3,
@@ -446,6 +486,8 @@ def advance_particles(
             if ti.static(laws.flowing):
                 law = law_of(blocks.starts[k], worlds, particles)
                 flows = material_flows(law)
+            crowds = worlds.field_numbers[f * FIELD_ROW + FULL_MASS] > 0.0
+            sound2 = worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
             if gather:
                 if ti.static(lanes.parallel):
                     fetch_window(lanes, lane, k, blocks.neighbours, nodes.velocity, pads.window)
@@ -457,6 +499,9 @@ def advance_particles(
                             fetch_window(lanes, lane, k, blocks.neighbours, flow.velocity, pads.past_window)
                         else:
                             load_window(k, blocks.neighbours, flow.window, flow.velocity)
+                if ti.static(len(laws.volumetric) > 0):
+                    if crowds:
+                        load_crowding(lanes, lane, k, blocks.neighbours, flow.crowding_window, flow.crowding)
             if scatter:
                 clear_window(lanes, lane, offset, pads.scattered)
                 if ti.static(laws.flowing):
@@ -532,6 +577,15 @@ def advance_particles(
                             a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
                             a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
                             Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
+                            if ti.static(len(laws.volumetric) > 0):
+                                if crowds and scatter:
+                                    strength = dt_gather * STIFFNESS * sound2 * fixed[0]
+                                    known = first - offset + k * WINDOW_NODES
+                                    crowding, given = part_crowd(
+                                        known, first, fx, strength, flow.crowding_window, pads.scattered
+                                    )
+                                    vp += given / fixed[0]
+                                    particles.memory[p] -= RELAXED * crowding
                             particles.v[p] = vp
                             particles.C[p] = Cp
                             if ti.static(len(laws.volumetric) > 0):

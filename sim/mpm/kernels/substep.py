@@ -6,6 +6,7 @@
 
     advance_grid      nodes over STEP: velocities, forces
     part_bodies       contact between deformable bodies that are near each other
+    crowd_fluids      crowding of fluids at the nodes
     resolve_contact   contact with plane, rigid bodies, colliders and pins; impulses on rigid bodies
     (rigid)           motion of rigid bodies: ``rigid_motion.search_worlds``, ``rigid_motion.move_worlds``
     advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
@@ -21,6 +22,7 @@ import taichi as ti
 from ..rigid.rigid_motion import move_worlds, predict, search_worlds
 from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
+from .crowding import add_pushes, find_crowding, leave_room, push_fields
 from .deformable_contact import gather_shares, scatter_shares, separate
 from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
@@ -76,13 +78,39 @@ def part_bodies_of(laws: int, lanes: Lanes) -> BundledKernel:
         overlap: OverlapBlocks,
         particles: ParticleArrays,
         nodes: NodeArrays,
+        flow: FlowArrays,
     ):
         """Impulses between coinciding nodes of different bodies."""
         scatter_shares(models, lanes, worlds, blocks, overlap, particles, nodes)
         gather_shares(lanes, worlds, grid, overlap, nodes)
+        if ti.static(len(models.volumetric) > 0):
+            leave_room(worlds, grid, overlap, nodes, flow)
         separate(lanes, worlds, grid, overlap, nodes)
 
     return part_bodies
+
+
+@functools.cache
+def crowd_fluids_of(meeting: bool) -> BundledKernel:
+    """Kernel of the crowding of fluids; ``meeting``: some fields overlap."""
+
+    @kernel
+    def crowd_fluids(
+        worlds: WorldArrays,
+        grid: GridBlocks,
+        overlap: OverlapBlocks,
+        nodes: NodeArrays,
+        flow: FlowArrays,
+        bodies: RigidArrays,
+        shapes: ShapeArrays,
+        coupling: CouplingArrays,
+    ):
+        """Crowding at the nodes, and what it does to the bodies around, before contact."""
+        find_crowding(meeting, worlds, grid, overlap, nodes, flow, bodies, shapes, coupling)
+        if ti.static(meeting):
+            push_fields(worlds, grid, overlap, nodes, flow)
+
+    return crowd_fluids
 
 
 @kernel
@@ -97,8 +125,9 @@ def plan_bodies(worlds: WorldArrays, bodies: RigidArrays):
 
 
 @functools.cache
-def resolve_contact_of(lanes: Lanes, pushed: bool) -> BundledKernel:
-    """Kernel of contact with what is no deformable body; ``pushed``: there are rigid bodies or colliders."""
+def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool) -> BundledKernel:
+    """Kernel of contact with what is no deformable body; ``pushed``: there are rigid bodies or colliders; ``fluid``:
+    there are fluids, whose crowding pushes rigid bodies, too."""
 
     @kernel
     def resolve_contact(
@@ -108,6 +137,7 @@ def resolve_contact_of(lanes: Lanes, pushed: bool) -> BundledKernel:
         near: NearBlocks,
         particles: ParticleArrays,
         nodes: NodeArrays,
+        flow: FlowArrays,
         bodies: RigidArrays,
         shapes: ShapeArrays,
         coupling: CouplingArrays,
@@ -121,6 +151,8 @@ def resolve_contact_of(lanes: Lanes, pushed: bool) -> BundledKernel:
             pass
         elif coupling.body_count > 0:
             gather_pushes(worlds, blocks, near, bodies, coupling)
+        if ti.static(fluid):
+            add_pushes(worlds, grid, flow, bodies, coupling)
 
     return resolve_contact
 
@@ -171,10 +203,13 @@ def substep_launcher(
     kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
     if overlap:
         kernels.append(part_bodies_of(laws, lanes))
+    fluid = bool(law_set(laws).volumetric)
+    if fluid:
+        kernels.append(crowd_fluids_of(overlap))
     if bodies:
         kernels.append(plan_bodies)
     if near:
-        kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel))
+        kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel, fluid))
     if bodies:
         kernels += [search_worlds, move_worlds]
     kernels.append(advance_matter_of(laws, lanes))

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Crowding of fluids: what their particles fill against the volume that they have integrated.
+
+The pressure of a fluid follows ln J, which is integrated at the particles. Between them the flow may converge unseen: a
+few particles of a cell are too coarse a quadrature of its volume, and gravity gains energy by every motion that brings
+them together (Baumgarten and Kamrin 2023 analyse these errors; Kugelstadt et al. 2019 hold the density of liquids
+besides their divergence). So nodes compare both. With the mass m that a node has, the mass M of a full cell and the
+share A of the node's surroundings that neither ground nor bodies fill,
+
+    d = ln(m / M A) + mean ln J            0 where the particles fill what ln J says
+
+and crowding pushes particles apart as the energy k K A d² / 2 of a node would (Monaghan 2005 has such forces between
+the particles of SPH). It is no stress, because a stress acts only on what changes ln J. Particle p and node i exchange
+
+    4 dt k K/rho0 m_p d_i w_ip (x_i - x_p)
+
+along their line, so both momenta stay; what takes room at a node is pushed by k K d_i |grad A|, and pushes back.
+Besides, ln J of the particles slowly gives way. Where particles fill what ln J says, all d are 0 and nothing changes.
+Nodes at a free surface are not full either; they are left out (``LOOSE``).
+"""
+
+import taichi as ti
+
+from ..rigid.rigid_layout import DYNAMIC, KIND, KINDS, STATE, X
+from .collider_distance import PUSH, body_distance, single3
+from .kernel_arrays import (
+    CouplingArrays,
+    FlowArrays,
+    GridBlocks,
+    NodeArrays,
+    OverlapBlocks,
+    RigidArrays,
+    ShapeArrays,
+    WorldArrays,
+)
+from .kernel_bundles import func
+from .layout import (
+    BLOCK_NODES,
+    CONTROL_ROW,
+    FIELD_INTEGERS,
+    FIELD_ROW,
+    FIRST_RIGID_BODY,
+    FULL,
+    FULL_MASS,
+    HAS_PLANE,
+    PHASE,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
+    RIGID_BODIES,
+    SOUND_SPEED_SQUARED,
+    SPREAD,
+    STEP,
+    WORLD,
+    WORLD_INTEGERS,
+    WORLD_ROW,
+    ivec3,
+    triple,
+    vec3,
+    vec4,
+)
+
+STIFFNESS = 0.05
+"""k: stiffness against crowding over the bulk modulus. In two dimensions a pond holds its volume from 0.02 on and is
+unstable at 0.5."""
+
+RELAXED = 0.001
+"""Share of the crowding that ln J takes up per substep, so that the pressure at rest is that of the fluid there. What
+lags behind the motion feeds it: a share above the stiffness times what the transfers damp would keep a pond moving."""
+
+LOOSE = 0.03
+"""ln of the mass that a node may lack before it counts as one of the free surface; from twice that on it does."""
+
+LEAST_ROOM = 0.05
+"""Share of a node's surroundings below which it is no measure: so little mass is there that its share is chance."""
+
+NOTHING = 1e3
+"""Crowding of nodes that are no measure."""
+
+PUSHED = 6
+"""Place in a row of ``FlowArrays.pushes`` that says whether the body takes room in the block."""
+
+LEAST_SHARE = 0.0026
+"""Share of a body at a node below which nothing pushes it there, as in ``deformable_contact``."""
+
+FARTHEST = 1.5
+"""Cells from a surface within which it takes room from a node."""
+
+HALF_DIAGONAL = 2.6
+"""Cells from the middle of a block's nodes to its farthest one."""
+
+
+@ti.func
+def share_beyond(d: ti.f32):
+    """Share of a node's surroundings, smoothed by the B-spline, behind a plane face ``d`` cells away; d < 0 inside."""
+    a = ti.abs(d)
+    share = 0.0
+    if a <= 0.5:
+        share = 0.5 - 0.75 * a + a * a * a / 3.0
+    elif a < FARTHEST:
+        share = (FARTHEST - a) ** 3 / 6.0
+    return ti.select(d >= 0.0, share, 1.0 - share)
+
+
+@ti.func
+def slope_beyond(d: ti.f32):
+    """How fast ``share_beyond`` falls with the distance, 1/cell, 0 or more."""
+    a = ti.abs(d)
+    slope = 0.0
+    if a <= 0.5:
+        slope = 0.75 - a * a
+    elif a < FARTHEST:
+        slope = 0.5 * (FARTHEST - a) ** 2
+    return slope
+
+
+@func
+def leave_room(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays, flow: FlowArrays):
+    """Room at nodes where bodies that deform meet, to ``flow.crowding``: what the other bodies' shares leave."""
+    for ss in range(overlap.lead_count * SPREAD):
+        if ss % SPREAD == 0:
+            lead = overlap.leads[ss // SPREAD]
+            w = worlds.field_integers[grid.field[lead] * FIELD_INTEGERS + WORLD]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                a = lead
+                while a >= 0:
+                    for i in range(BLOCK_NODES):
+                        room = 1.0
+                        b = lead
+                        while b >= 0:
+                            if b != a:
+                                room -= nodes.sums[overlap.slot[b] * BLOCK_NODES + i][3]
+                            b = overlap.mate[b]
+                        flow.crowding[a * BLOCK_NODES + i] = ti.max(room, 0.0)
+                    a = overlap.mate[a]
+
+
+@func
+def find_crowding(
+    meeting: ti.template(),
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """Crowding of all nodes of fluids, from their mass and mean ln J, and what it does to rigid bodies. meeting:
+    whether ``leave_room`` was called."""
+    for gg in range(grid.count * SPREAD):
+        if gg % SPREAD == 0:
+            g = gg // SPREAD
+            f = grid.field[g]
+            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            full = worlds.field_numbers[f * FIELD_ROW + FULL_MASS]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                for o in range(coupling.most_bodies):
+                    flow.pushes[(g * coupling.most_bodies + o) * PUSH + PUSHED] = 0.0
+                if full > 0.0:
+                    first = g * BLOCK_NODES
+                    shared = False
+                    if ti.static(meeting):
+                        shared = overlap.slot[g] >= 0
+                    if not shared:
+                        for i in range(BLOCK_NODES):
+                            flow.crowding[first + i] = 1.0
+                    take_room(g, w, worlds, grid, nodes, flow, bodies, shapes, coupling)
+                    dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
+                    modulus = full * worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
+                    for i in range(BLOCK_NODES):
+                        mass, room = nodes.mass[first + i], flow.crowding[first + i]
+                        crowding = NOTHING
+                        if mass > 0.0 and room > LEAST_ROOM:
+                            filled = ti.log(ti.max(mass / (full * room), 1e-3))
+                            crowding = 0.0
+                            if filled > -2.0 * LOOSE:
+                                if filled < -LOOSE:
+                                    filled = -(2.0 * LOOSE + filled)
+                                crowding = filled + flow.velocity[first + i][3]
+                                if room < 1.0:
+                                    strength = dt * STIFFNESS * modulus * crowding * room
+                                    push_apart(g, i, w, strength, worlds, grid, nodes, flow, bodies, shapes, coupling)
+                        flow.crowding[first + i] = crowding
+
+
+@func
+def take_room(
+    g: ti.i32,
+    w: ti.i32,
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """Multiply the room at the nodes of grid block ``g`` by what ground, rigid bodies and colliders each leave."""
+    corner = ti.cast(grid.cells[g] * 4, ti.f32)
+    plane = w * WORLD_ROW
+    if worlds.numbers[plane + HAS_PLANE] > 0.5:
+        normal = triple(worlds.numbers, plane + PLANE_NORMAL)
+        level = normal.dot(corner) - worlds.numbers[plane + PLANE_OFFSET]
+        if level + 1.5 * normal.sum() < HALF_DIAGONAL + FARTHEST:
+            for i in range(BLOCK_NODES):
+                at = ti.cast(ivec3(i // 16, i // 4 % 4, i % 4), ti.f32)
+                flow.crowding[g * BLOCK_NODES + i] *= 1.0 - share_beyond(level + normal.dot(at))
+    first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+    for o in range(worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+        middle, _, _ = body_distance(first + o, corner + vec3(1.5), HALF_DIAGONAL + FARTHEST, bodies, shapes)
+        if middle < HALF_DIAGONAL + FARTHEST:
+            row = (g * coupling.most_bodies + o) * PUSH
+            for n in range(PUSHED):
+                flow.pushes[row + n] = 0.0
+            flow.pushes[row + PUSHED] = 1.0
+            for i in range(BLOCK_NODES):
+                n = g * BLOCK_NODES + i
+                if nodes.mass[n] > 0.0:
+                    at = ti.cast(ivec3(i // 16, i // 4 % 4, i % 4), ti.f32)
+                    distance, _, _ = body_distance(first + o, corner + at, FARTHEST, bodies, shapes)
+                    flow.crowding[n] *= 1.0 - share_beyond(distance)
+
+
+@func
+def push_apart(
+    g: ti.i32,
+    i: ti.i32,
+    w: ti.i32,
+    strength: ti.f32,
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """What the crowding at node ``i`` of grid block ``g`` does in a substep to ground and rigid bodies that take room
+    there: the derivative of its energy by their place; and to the node, the opposite. strength: impulse (kg cells/s)
+    on the cell² of a surface that leaves the room that there is."""
+    n = g * BLOCK_NODES + i
+    place = ti.cast(grid.cells[g] * 4 + ivec3(i // 16, i // 4 % 4, i % 4), ti.f32)
+    change = vec3(0.0)
+    plane = w * WORLD_ROW
+    if worlds.numbers[plane + HAS_PLANE] > 0.5:
+        normal = triple(worlds.numbers, plane + PLANE_NORMAL)
+        distance = normal.dot(place) - worlds.numbers[plane + PLANE_OFFSET]
+        change += (strength * slope_beyond(distance) / (1.0 - share_beyond(distance))) * normal
+    first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+    for o in range(worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+        row = (g * coupling.most_bodies + o) * PUSH
+        if flow.pushes[row + PUSHED] > 0.5:
+            distance, normal, _ = body_distance(first + o, place, FARTHEST, bodies, shapes)
+            if distance < FARTHEST:
+                given = (strength * slope_beyond(distance) / (1.0 - share_beyond(distance))) * normal
+                change += given
+                if bodies.kinds[(first + o) * KINDS + KIND] == DYNAMIC:
+                    turn = given.cross(place - single3(bodies.state, (first + o) * STATE + X))
+                    for c in ti.static(range(3)):
+                        flow.pushes[row + c] -= given[c]
+                        flow.pushes[row + 3 + c] += turn[c]
+    u = nodes.velocity[n]
+    nodes.velocity[n] = u + vec4(change[0], change[1], change[2], 0.0) / nodes.mass[n]
+
+
+@func
+def add_pushes(worlds: WorldArrays, grid: GridBlocks, flow: FlowArrays, bodies: RigidArrays, coupling: CouplingArrays):
+    """Add what crowding does to rigid bodies to ``bodies.impulses``, block after block."""
+    ti.loop_config(serialize=True)
+    for g in range(grid.count):
+        f = grid.field[g]
+        w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+        if worlds.field_numbers[f * FIELD_ROW + FULL_MASS] > 0.0 and worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+            for o in range(worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+                row = (g * coupling.most_bodies + o) * PUSH
+                if flow.pushes[row + PUSHED] > 0.5:
+                    for n in range(6):
+                        bodies.impulses[6 * (first + o) + n] += flow.pushes[row + n]
+
+
+@func
+def push_fields(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays, flow: FlowArrays):
+    """The same to bodies that deform: impulses on their nodes, along the gradient of their share."""
+    for ss in range(overlap.lead_count * SPREAD):
+        if ss % SPREAD == 0:
+            lead = overlap.leads[ss // SPREAD]
+            w = worlds.field_integers[grid.field[lead] * FIELD_INTEGERS + WORLD]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+                dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
+                a = lead
+                while a >= 0:
+                    row = grid.field[a] * FIELD_ROW
+                    full = worlds.field_numbers[row + FULL_MASS]
+                    strength = dt * STIFFNESS * full * worlds.field_numbers[row + SOUND_SPEED_SQUARED]
+                    b = lead
+                    while b >= 0:
+                        if full > 0.0 and b != a:
+                            for i in range(BLOCK_NODES):
+                                crowding, n = flow.crowding[a * BLOCK_NODES + i], b * BLOCK_NODES + i
+                                share = nodes.sums[overlap.slot[b] * BLOCK_NODES + i]
+                                if crowding < NOTHING and nodes.mass[n] > 0.0 and share[3] > LEAST_SHARE:
+                                    push = strength * crowding * vec4(share[0], share[1], share[2], 0.0)
+                                    nodes.velocity[n] = nodes.velocity[n] + push / nodes.mass[n]
+                                    m = a * BLOCK_NODES + i
+                                    nodes.velocity[m] = nodes.velocity[m] - push / nodes.mass[m]
+                        b = overlap.mate[b]
+                    a = overlap.mate[a]
