@@ -33,7 +33,7 @@ from .kernels.kernel_arrays import (
 from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
 from .kernels.layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
-from .kernels.substep import substep_launcher
+from .kernels.substep import rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
 from .rigid.rigid_bodies import RigidBodies
@@ -467,12 +467,7 @@ class Engine:
             self._sort()
             while True:
                 prime_worlds(self._limits(), self._worlds())
-                if self.count:
-                    self._run_substeps(stop)
-                elif stop():
-                    raise Stopped
-                else:
-                    self._advance_rigid_bodies()
+                self._run_substeps(stop)
                 after = self.control()
                 lost = after[:, layout.STATUS] == layout.DIVERGED
                 if not lost.any():
@@ -501,8 +496,14 @@ class Engine:
 
     def _run_substeps(self, stop: IsCancelled) -> None:
         """Substeps until every world wants a sort, is done or has diverged."""
+        if not (self.count or self.rigid_bodies.solved_together):
+            if stop():
+                raise Stopped
+            rigid = self.rigid_bodies
+            advance_bodies(self._limits(), self._worlds(), rigid.bodies, rigid.shapes, rigid.contacts)
+            return
         launch = self._launcher().bind(self._arguments())
-        if not self._lanes.parallel:
+        if not (self._lanes.parallel and self.count):
             self._running[0] = self.world_count
             while self._running[0] > 0:
                 if stop():
@@ -519,13 +520,10 @@ class Engine:
             launches += 1
         self._launches = max(1, min(launches - 1, MOST_LAUNCHES))
 
-    def _advance_rigid_bodies(self) -> None:
-        """All substeps of all worlds, none of which holds particles."""
-        rigid = self.rigid_bodies
-        advance_bodies(self._limits(), self._worlds(), rigid.bodies, rigid.shapes, rigid.contacts)
-
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""
+        if not self.count:
+            return rigid_launcher(runtime.generation())
         return substep_launcher(
             runtime.generation(),
             self.laws,
@@ -533,6 +531,7 @@ class Engine:
             self._mean_fields > 0,
             self._overlap[2] > 0,
             self.rigid_bodies.count > 0,
+            self.rigid_bodies.solved_together,
             self._near[0] > 0,
         )
 

@@ -274,7 +274,8 @@ class RigidArrays(NamedTuple):
     """(W, WORLD) gravity (cells/s²), plane, recovery speed (cells/s)."""
 
     report: Doubles
-    """(W, REPORT) contacts, largest depth (cells), sweeps, steps of Newton's method."""
+    """(W, REPORT) contacts, largest depth (cells), sweeps, steps of Newton's method, largest change of velocity
+    (cells/s) in the last sweep."""
 
     kinds: Integers
     """(S, KINDS) kind, lattices, clusters of surface points."""

@@ -8,7 +8,7 @@
     part_bodies       contact between deformable bodies that are near each other
     crowd_fluids      crowding of fluids at the nodes
     resolve_contact   contact with plane, rigid bodies, colliders and pins; impulses on rigid bodies
-    (rigid)           motion of rigid bodies: ``rigid_motion.search_worlds``, ``rigid_motion.move_worlds``
+    (rigid)           motion of rigid bodies: ``rigid_motion.rigid_substep``
     advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
 
 Every world is in the phase that ``control`` says and takes its own step. The compiler takes more than twice as long for
@@ -19,7 +19,7 @@ import functools
 
 import taichi as ti
 
-from ..rigid.rigid_motion import move_worlds, predict, search_worlds
+from ..rigid.rigid_motion import predict, rigid_substep
 from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
 from .crowding import add_pushes, find_crowding, leave_room, push_fields
@@ -44,7 +44,7 @@ from .lanes import Lanes
 from .layout import CONTROL_ROW, FULL, PHASE, STEP, Integers
 from .particle_contact import apply_contact, solve_contact
 from .particle_transfer import advance_particles
-from .time_stepping import review, review_in_parallel
+from .time_stepping import forget_reports, review, review_in_parallel, settle
 
 
 @functools.cache
@@ -185,19 +185,19 @@ def advance_matter_of(laws: int, lanes: Lanes) -> BundledKernel:
     return advance_matter
 
 
-REPEATS = 4
-"""Substeps in a launch; worlds that need fewer stay idle for the rest."""
+REPEATS, RIGID_REPEATS = 4, 32
+"""Substeps in a launch, with and without particles; worlds that need fewer stay idle for the rest."""
 
 
 @functools.lru_cache(maxsize=32)
 def substep_launcher(
-    generation: int, laws: int, lanes: Lanes, means: bool, overlap: bool, bodies: bool, near: bool
+    generation: int, laws: int, lanes: Lanes, means: bool, overlap: bool, bodies: bool, together: bool, near: bool
 ) -> Launcher:
     """Launcher of a substep for worlds of these ``laws``, with the kernels that they need.
 
     generation: of the compute runtime; a launcher ends with it. means: some fields' means are wanted; overlap: several
-    fields overlap; bodies: there are rigid bodies or colliders; near: some particles are near the plane, a body or a
-    collider, or are held.
+    fields overlap; bodies: there are rigid bodies or colliders; together: contacts of some worlds may be solved at
+    once; near: some particles are near the plane, a body or a collider, or are held.
     """
     # The serial kernels leave out by themselves what is not there; compiling them twice would cost more.
     kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
@@ -211,6 +211,23 @@ def substep_launcher(
     if near:
         kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel, fluid))
     if bodies:
-        kernels += [search_worlds, move_worlds]
+        kernels += rigid_substep(together=together)
     kernels.append(advance_matter_of(laws, lanes))
     return Launcher(kernels, repeats=REPEATS)
+
+
+@kernel
+def review_bodies(running: Integers, limits: StepLimits, worlds: WorldArrays, bodies: RigidArrays):
+    """``review`` of worlds that hold no particles."""
+    going_on = 0
+    ti.loop_config(serialize=True)
+    for w in range(worlds.count):
+        forget_reports(w, worlds, bodies)
+        going_on += settle(w, limits, worlds)
+    running[0] = going_on
+
+
+@functools.lru_cache(maxsize=32)
+def rigid_launcher(generation: int) -> Launcher:
+    """Launcher of substeps for worlds that hold no particles, some of which may solve all contacts at once."""
+    return Launcher([plan_bodies, *rigid_substep(together=True), review_bodies], repeats=RIGID_REPEATS)

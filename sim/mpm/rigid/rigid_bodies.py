@@ -22,7 +22,7 @@ from ..surface_contact import GROUND_NAME, MODES
 from ..world_setup import WorldSetup
 from . import rigid_layout as at
 from .collision_shapes import NO_POINTS, PointSet, lattice_of, points_of, reach_of, tables
-from .rigid_motion import move_worlds, search_worlds
+from .rigid_motion import rigid_substep
 
 Array = NDArray[np.float64]
 
@@ -177,6 +177,7 @@ class RigidBodies:
                 kinds[i, at.KIND] = at.KINEMATIC if moves else at.STATIC
         pairs, pair_numbers, pair_spans = self._pairs(spans)
         ends, starts_of, size = self._systems(spans)
+        self.solved_together = max(starts_of, default=-1) >= 0
         world_spans = np.column_stack([spans, pair_spans, ends, starts_of]).astype(np.int32)
         self._put("steps", np.zeros(worlds), ti.f64)
         self._put("world_spans", world_spans, ti.i32)
@@ -431,8 +432,8 @@ class RigidBodies:
             raise InputError(f"dt is {dt!r}: give seconds above 0")
         self._put("steps", steps, ti.f64)
         for _ in range(substeps):
-            search_worlds(self.bodies, self.shapes, self.contacts)
-            move_worlds(self.bodies, self.contacts)
+            for each in rigid_substep(together=self.solved_together):
+                each(self.bodies, *([self.shapes] if "shapes_points" in each.arguments else []), self.contacts)
 
     # ---- state --------------------------------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ GRAVITY = 0  # (3)
 PLANE = 3  # two tangents and the normal of the plane (9)
 OFFSET = 12  # normal . x on the plane
 RECOVERY = 13  # fastest speed at which depth is taken out
-REPORT = 4  # contacts, largest depth, sweeps, steps of Newton's method
+REPORT = 5  # contacts, largest depth, sweeps, steps of Newton's method, largest change of velocity in the last sweep
 
 # ---- pairs: ``pairs`` i32, ``pair_numbers`` f64 ---------------------------------------------------------------------
 PAIRS = 4  # body a whose points touch, body b that they touch (-1: the plane), the pair the other way round or -1

@@ -12,7 +12,7 @@ orientation follows the angular velocity at the middle of the substep. ``rigid_l
 import taichi as ti
 
 from ..kernels.kernel_arrays import RigidArrays, RigidContacts, ShapeArrays, StepLimits, WorldArrays
-from ..kernels.kernel_bundles import func, kernel
+from ..kernels.kernel_bundles import BundledKernel, func, kernel
 from ..kernels.layout import CONTROL_ROW, FULL, IDLE, PHASE, STEP
 from ..kernels.time_stepping import forget_reports, settle
 from .rigid_contact import find_contacts, gather_points
@@ -60,6 +60,9 @@ from .rigid_layout import (
 )
 from .rigid_math import dvec3, dvec4, load3, load33, matrix_of, store3, store33, turned
 from .rigid_solver import ALONE, SETTLED, SWEEPS, finish, prepare, sweep, warm
+
+SWEPT, WORST = 2, 4
+"""Columns of ``report``: sweeps done, and the largest change of velocity in the last of them."""
 
 ITERATIONS = 512
 """Loop iterations spent on one world: Taichi's CPU backend gives a thread at least so many at a time."""
@@ -156,8 +159,14 @@ def move(w, i, dt, bodies: RigidArrays):
 
 
 @func
+def settled_change(w, dt, bodies: RigidArrays):
+    """Change of velocity (cells/s) in a sweep of world ``w`` below which its contacts count as solved."""
+    return SETTLED * (dt * load3(bodies.world_numbers, w * WORLD + GRAVITY).norm()) + 1e-7
+
+
+@func
 def push_and_search(w, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts):
-    """First half of a substep of world ``w``: forces on its bodies over ``dt`` (f64, s), and contact search."""
+    """Forces on the bodies of world ``w`` over ``dt`` (f64, s), and contact search."""
     for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
         act(w, i, dt, bodies)
     for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
@@ -166,27 +175,36 @@ def push_and_search(w, dt, bodies: RigidArrays, shapes: ShapeArrays, contacts: R
 
 
 @func
-def solve_and_move(w, dt, bodies: RigidArrays, contacts: RigidContacts):
-    """Second half: contact impulses between the bodies of world ``w``, and their motion over ``dt``."""
-    first_pair, end_pair = bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]
+def prepare_contacts(w, dt, bodies: RigidArrays, contacts: RigidContacts):
+    """Effective masses and targets of the contacts, and the impulses of the last substep."""
     for c in range(REPORT):
         bodies.report[w * REPORT + c] = 0
-    for p in range(first_pair, end_pair):
+    bodies.report[w * REPORT + WORST] = settled_change(w, dt, bodies) + 1
+    for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
         prepare(w, dt, p, bodies, contacts)
-    for p in range(first_pair, end_pair):
+    for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
         warm(p, bodies, contacts)
-    settled = SETTLED * (dt * load3(bodies.world_numbers, w * WORLD + GRAVITY).norm()) + 1e-7
-    worst = settled + 1
-    sweeps = 0
-    while sweeps < SWEEPS and worst > settled:
+
+
+@func
+def sweep_contacts(w, dt, most, bodies: RigidArrays, contacts: RigidContacts):
+    """Gauss-Seidel sweeps until the contacts are solved, at most ``most`` in all."""
+    settled = settled_change(w, dt, bodies)
+    worst = bodies.report[w * REPORT + WORST]
+    sweeps = ti.cast(bodies.report[w * REPORT + SWEPT], ti.i32)
+    while sweeps < most and worst > settled:
         worst = 0
-        if sweeps == ALONE and bodies.spans[w * SPANS + 5] >= 0:
-            solve_together(w, settled, bodies, contacts)
-        for p in range(first_pair, end_pair):
+        for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
             worst = ti.max(worst, sweep(p, bodies, contacts))
         sweeps += 1
-    bodies.report[w * REPORT + 2] = sweeps
-    for p in range(first_pair, end_pair):
+    bodies.report[w * REPORT + WORST] = worst
+    bodies.report[w * REPORT + SWEPT] = sweeps
+
+
+@func
+def finish_and_move(w, dt, bodies: RigidArrays, contacts: RigidContacts):
+    """Momentum from the impulses, and motion over ``dt``."""
+    for p in range(bodies.spans[w * SPANS + 2], bodies.spans[w * SPANS + 3]):
         finish(w, p, bodies, contacts)
     for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
         kind = bodies.kinds[i * KINDS + KIND]
@@ -196,8 +214,8 @@ def solve_and_move(w, dt, bodies: RigidArrays, contacts: RigidContacts):
 
 @kernel
 def search_worlds(bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts):
-    """``push_and_search`` in all worlds, ``steps[w]`` seconds in world w. Kernels of their own compile much faster than
-    the same code in a larger one: Taichi's passes take time in proportion to the square of a kernel's length."""
+    """``push_and_search`` in all worlds, ``steps[w]`` seconds in world w, as all kernels that follow. Each is short:
+    Taichi's passes take time in proportion to the square of a kernel's length."""
     ti.loop_config(serialize=True)
     for w in range(bodies.world_count):
         if bodies.steps[w] > 0.0:
@@ -205,19 +223,56 @@ def search_worlds(bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidConta
 
 
 @kernel
-def move_worlds(bodies: RigidArrays, contacts: RigidContacts):
-    """``solve_and_move`` in all worlds."""
+def prepare_worlds(bodies: RigidArrays, contacts: RigidContacts):
+    """``prepare_contacts`` in all worlds."""
     ti.loop_config(serialize=True)
     for w in range(bodies.world_count):
         if bodies.steps[w] > 0.0:
-            solve_and_move(w, bodies.steps[w], bodies, contacts)
+            prepare_contacts(w, bodies.steps[w], bodies, contacts)
+
+
+@kernel
+def sweep_worlds(bodies: RigidArrays, contacts: RigidContacts):
+    """``sweep_contacts`` in all worlds: at most ALONE the first time, SWEEPS in all."""
+    ti.loop_config(serialize=True)
+    for w in range(bodies.world_count):
+        if bodies.steps[w] > 0.0:
+            most = ti.select(bodies.report[w * REPORT + SWEPT] < ALONE, ALONE, SWEEPS)
+            sweep_contacts(w, bodies.steps[w], most, bodies, contacts)
+
+
+@kernel
+def solve_worlds(bodies: RigidArrays, contacts: RigidContacts):
+    """All contacts at once, of worlds with arrays for it whose contacts sweeps have not solved."""
+    ti.loop_config(serialize=True)
+    for w in range(bodies.world_count):
+        if bodies.steps[w] > 0.0 and bodies.spans[w * SPANS + 5] >= 0:
+            settled = settled_change(w, bodies.steps[w], bodies)
+            if bodies.report[w * REPORT + WORST] > settled:
+                solve_together(w, settled, bodies, contacts)
+
+
+@kernel
+def move_worlds(bodies: RigidArrays, contacts: RigidContacts):
+    """``finish_and_move`` in all worlds."""
+    ti.loop_config(serialize=True)
+    for w in range(bodies.world_count):
+        if bodies.steps[w] > 0.0:
+            finish_and_move(w, bodies.steps[w], bodies, contacts)
+
+
+def rigid_substep(*, together: bool) -> list[BundledKernel]:
+    """The kernels of a substep of all worlds; ``together``: some may solve all contacts at once."""
+    solving = [sweep_worlds, solve_worlds, sweep_worlds] if together else [sweep_worlds, sweep_worlds]
+    return [search_worlds, prepare_worlds, *solving, move_worlds]
 
 
 @kernel
 def advance_bodies(
     limits: StepLimits, worlds: WorldArrays, bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts
 ):
-    """Take every world that is not idle to the end of its segment of time; of worlds that hold no particles.
+    """Take every world that is not idle to the end of its segment of time; of worlds that hold no particles and solve
+    no contacts together: with that in it, the kernel took a minute to compile.
 
     All substeps in one launch, where a launch costs more than many substeps. They are the same, to the last bit, as
     those that ``substep`` takes one by one.
@@ -230,6 +285,8 @@ def advance_bodies(
                     step = worlds.control[w * CONTROL_ROW + STEP]
                     predict(w, step, bodies)
                     push_and_search(w, step, bodies, shapes, contacts)
-                    solve_and_move(w, step, bodies, contacts)
+                    prepare_contacts(w, step, bodies, contacts)
+                    sweep_contacts(w, step, SWEEPS, bodies, contacts)
+                    finish_and_move(w, step, bodies, contacts)
                 forget_reports(w, worlds, bodies)
                 settle(w, limits, worlds)
