@@ -26,7 +26,7 @@ import taichi as ti
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
 from .kernel_arrays import GridBlocks, NodeArrays, OverlapBlocks, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
-from .lanes import add_to, clear_window, gathered, meet, pads_of, store_window
+from .lanes import meet, pads_of
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -55,7 +55,7 @@ from .layout import (
     vec4,
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
-from .particle_transfer import sum_chosen_windows, weights
+from .windows import add_to, clear_window, gathered, store_window, sum_chosen_windows, weights
 
 LEAST_SHARE = 0.0026
 """Share below which a body is too far from the node (1.25 cells) for a distance."""

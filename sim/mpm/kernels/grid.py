@@ -11,7 +11,6 @@ import taichi as ti
 
 from .kernel_arrays import FlowArrays, GridBlocks, NodeArrays, WorldArrays
 from .kernel_bundles import func
-from .lanes import gathered
 from .layout import (
     ACCELERATION,
     ACCELERATION_RATE,
@@ -51,8 +50,8 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_transfer import sum_windows
 from .time_stepping import FARTHEST_STEP, not_finite
+from .windows import gathered, sum_windows
 
 SUMS = 16
 """Numbers that a grid block adds to its field's means: mass, mass x place (3), momentum (3), angular momentum (3) and

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201, SIM102
+# ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """How many threads share a block of particles or nodes: one on the CPU, a group of them, *lanes*, on a graphics card.
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import taichi as ti
 
-from .layout import BLOCK_NODES, SPREAD, WINDOW_NODES, Integers, Vectors4, vec4
+from .layout import SPREAD, WINDOW_NODES, vec4
 
 
 class Lanes(NamedTuple):
@@ -96,16 +96,6 @@ def counters(lanes: Lanes) -> Any:
     return (ti.simt.block.SharedArray((lanes.threads,), ti.i32),) if lanes.shared else ()
 
 
-def is_shared(window: Any) -> bool:
-    """Whether ``window`` lies in shared memory."""
-    return isinstance(window, ti.simt.block.SharedArray)
-
-
-def is_given(argument: Any) -> bool:
-    """Whether ``argument`` is not None; Taichi's own code cannot ask."""
-    return argument is not None
-
-
 @ti.func
 def meet(lanes: ti.template()):
     """Wait until all lanes of the block are here and see what the others wrote."""
@@ -147,95 +137,3 @@ def lane_sum(lanes: ti.template(), lane: ti.i32, value: ti.f32, pads: ti.templat
         result = pads.sums[0]
         ti.simt.block.sync()
     return result
-
-
-@ti.func
-def node_of(window: ti.template(), n: ti.i32):
-    """The four numbers of a node of a window."""
-    node = vec4(0.0)
-    if ti.static(is_shared(window)):
-        for c in ti.static(range(4)):
-            node[c] = window[c * WINDOW_NODES + n]
-    else:
-        node = window[n]
-    return node
-
-
-@ti.func
-def set_node(window: ti.template(), n: ti.i32, node: vec4):
-    """Set the four numbers of a node of a window."""
-    if ti.static(is_shared(window)):
-        for c in ti.static(range(4)):
-            window[c * WINDOW_NODES + n] = node[c]
-    else:
-        window[n] = node
-
-
-@ti.func
-def add_to(window: ti.template(), n: ti.i32, share: vec4):
-    """Add to a node of a window: in shared memory atomically, elsewhere one thread owns the window."""
-    if ti.static(is_shared(window)):
-        for c in ti.static(range(4)):
-            ti.atomic_add(window[c * WINDOW_NODES + n], share[c])
-    else:
-        window[n] = window[n] + share
-
-
-@ti.func
-def clear_window(lanes: ti.template(), lane: ti.i32, offset: ti.i32, window: ti.template()):
-    """Set a window to zero."""
-    i = lane
-    while i < WINDOW_NODES:
-        set_node(window, offset + i, vec4(0.0))
-        i += ti.static(lanes.threads)
-
-
-@ti.func
-def store_window(lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.template(), array: Vectors4):
-    """Copy block ``k``'s window from shared memory to its place in ``array``; without shared memory it is there."""
-    if ti.static(lanes.shared):
-        i = lane
-        while i < WINDOW_NODES:
-            array[k * WINDOW_NODES + i] = node_of(window, i)
-            i += ti.static(lanes.threads)
-
-
-@ti.func
-def fetch_window(
-    lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, nodes: Vectors4, window: ti.template()
-):
-    """Copy the nodes around particle block ``k`` into its window, node by node: ``particle_transfer.load_window`` for
-    many lanes."""
-    offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
-    n = lane
-    while n < WINDOW_NODES:
-        # Nodes 0 of the window's eight lie in the block before, 1 to 4 in the block itself, 5 to 7 in the one after.
-        i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
-        g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
-        set_node(window, offset + n, nodes[g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)])
-        n += ti.static(lanes.threads)
-
-
-@ti.func
-def gathered(g: ti.i32, n: ti.i32, neighbours: Integers, chosen: ti.template(), window: Vectors4):
-    """Sum at node ``n`` of grid block ``g`` of the eight windows that hold it, of particle blocks that have a 1 in
-    ``chosen`` (None: all): ``particle_transfer.sum_windows`` for one node."""
-    total = vec4(0.0)
-    place = ti.Vector([n >> 4, n >> 2 & 3, n & 3])
-    for corner in range(8):
-        d, node = 0, 0
-        for axis in ti.static(range(3)):
-            # Each axis has two: the block's own window, and that of the block before it (or, for the last node, after).
-            side = 0
-            if (corner >> axis) & 1:
-                side = ti.select(place[axis] == 3, 1, -1)
-            d = d * 3 + side + 1
-            node = node * 8 + place[axis] + 1 - 4 * side
-        k = neighbours[g * 27 + d]
-        wanted = k >= 0
-        if ti.static(is_given(chosen)):
-            if wanted:
-                wanted = chosen[k] == 1
-        if wanted:
-            total += window[k * WINDOW_NODES + node]
-    return total

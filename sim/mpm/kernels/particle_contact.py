@@ -39,7 +39,7 @@ from .kernel_arrays import (
     WorldArrays,
 )
 from .kernel_bundles import func
-from .lanes import add_to, clear_window, fetch_window, gathered, lane_maxima, meet, node_of, pads_of, store_window
+from .lanes import lane_maxima, meet, pads_of
 from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
@@ -75,7 +75,18 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_transfer import PIN, anchor_place, load_window, sum_chosen_windows, weights
+from .particle_transfer import PIN, anchor_place
+from .windows import (
+    add_to,
+    clear_window,
+    fetch_window,
+    gathered,
+    load_window,
+    node_of,
+    store_window,
+    sum_chosen_windows,
+    weights,
+)
 
 RECOVERY = 0.2
 """Share of a particle's penetration that one substep may correct."""

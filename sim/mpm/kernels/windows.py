@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, SIM102
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""Windows between particles and grid nodes: filling and summing them, interpolation at a particle, spreading from one.
+
+Quadratic B-splines; APIC (Jiang et al. 2015) with second derivatives for solids (PolyPIC, Fu et al. 2017). A block of
+particles owns a window of nodes (see ``layout``). Where many lanes share a block it lies in shared memory, component by
+component; ``node_of``, ``set_node`` and ``add_to`` hide that.
+"""
+
+from typing import Any
+
+import taichi as ti
+
+from .layout import BLOCK_NODES, WINDOW_NODES, Integers, Vectors4, vec3, vec4
+
+CURVED = 0.95
+"""Share of the second derivatives of the velocity around a particle of a solid that it carries from substep to substep
+(PolyPIC, Fu et al. 2017). 0 is plain APIC; 1 would damp third derivatives only, and keep noise of one cell for long."""
+
+
+def is_shared(window: Any) -> bool:
+    """Whether ``window`` lies in shared memory."""
+    return isinstance(window, ti.simt.block.SharedArray)
+
+
+def is_given(argument: Any) -> bool:
+    """Whether ``argument`` is not None; Taichi's own code cannot ask."""
+    return argument is not None
+
+
+@ti.func
+def node_of(window: ti.template(), n: ti.i32):
+    """The four numbers of a node of a window."""
+    node = vec4(0.0)
+    if ti.static(is_shared(window)):
+        for c in ti.static(range(4)):
+            node[c] = window[c * WINDOW_NODES + n]
+    else:
+        node = window[n]
+    return node
+
+
+@ti.func
+def set_node(window: ti.template(), n: ti.i32, node: vec4):
+    """Set the four numbers of a node of a window."""
+    if ti.static(is_shared(window)):
+        for c in ti.static(range(4)):
+            window[c * WINDOW_NODES + n] = node[c]
+    else:
+        window[n] = node
+
+
+@ti.func
+def add_to(window: ti.template(), n: ti.i32, share: vec4):
+    """Add to a node of a window: in shared memory atomically, elsewhere one thread owns the window."""
+    if ti.static(is_shared(window)):
+        for c in ti.static(range(4)):
+            ti.atomic_add(window[c * WINDOW_NODES + n], share[c])
+    else:
+        window[n] = window[n] + share
+
+
+@ti.func
+def clear_window(lanes: ti.template(), lane: ti.i32, offset: ti.i32, window: ti.template()):
+    """Set a window to zero."""
+    i = lane
+    while i < WINDOW_NODES:
+        set_node(window, offset + i, vec4(0.0))
+        i += ti.static(lanes.threads)
+
+
+@ti.func
+def store_window(lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.template(), array: Vectors4):
+    """Copy block ``k``'s window from shared memory to its place in ``array``; without shared memory it is there."""
+    if ti.static(lanes.shared):
+        i = lane
+        while i < WINDOW_NODES:
+            array[k * WINDOW_NODES + i] = node_of(window, i)
+            i += ti.static(lanes.threads)
+
+
+@ti.func
+def fetch_window(
+    lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, nodes: Vectors4, window: ti.template()
+):
+    """Copy the nodes around particle block ``k`` into its window, node by node: ``load_window`` for
+    many lanes."""
+    offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
+    n = lane
+    while n < WINDOW_NODES:
+        # Nodes 0 of the window's eight lie in the block before, 1 to 4 in the block itself, 5 to 7 in the one after.
+        i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
+        g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
+        set_node(window, offset + n, nodes[g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)])
+        n += ti.static(lanes.threads)
+
+
+@ti.func
+def gathered(g: ti.i32, n: ti.i32, neighbours: Integers, chosen: ti.template(), window: Vectors4):
+    """Sum at node ``n`` of grid block ``g`` of the eight windows that hold it, of particle blocks that have a 1 in
+    ``chosen`` (None: all): ``sum_windows`` for one node."""
+    total = vec4(0.0)
+    place = ti.Vector([n >> 4, n >> 2 & 3, n & 3])
+    for corner in range(8):
+        d, node = 0, 0
+        for axis in ti.static(range(3)):
+            # Each axis has two: the block's own window, and that of the block before it (or, for the last node, after).
+            side = 0
+            if (corner >> axis) & 1:
+                side = ti.select(place[axis] == 3, 1, -1)
+            d = d * 3 + side + 1
+            node = node * 8 + place[axis] + 1 - 4 * side
+        k = neighbours[g * 27 + d]
+        wanted = k >= 0
+        if ti.static(is_given(chosen)):
+            if wanted:
+                wanted = chosen[k] == 1
+        if wanted:
+            total += window[k * WINDOW_NODES + node]
+    return total
+
+
+@ti.func
+def weights(fx: vec3):
+    """Quadratic B-spline weights (list of three vectors) at distance ``fx`` from the lowest node, 0.5 <= fx < 1.5."""
+    return [0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2]
+
+
+@ti.func
+def span(side: ti.i32):
+    """Window nodes [low, high) that fall in the block before (0), of (1) or after (2) the window's own block."""
+    low = ti.select(side == 0, 0, ti.select(side == 1, 1, 5))
+    high = ti.select(side == 0, 1, ti.select(side == 1, 5, 8))
+    return low, high
+
+
+@ti.func
+def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """Copy the nodes around particle block ``k`` into its private window."""
+    for d in range(27):
+        g = neighbours[k * 27 + d]
+        il, ih = span(d // 9)
+        jl, jh = span(d // 3 % 3)
+        ml, mh = span(d % 3)
+        for i in range(il, ih):
+            for j in range(jl, jh):
+                for m in range(ml, mh):
+                    node = ((i + 3) & 3) * 16 + ((j + 3) & 3) * 4 + ((m + 3) & 3)
+                    window[k * WINDOW_NODES + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
+
+
+@ti.func
+def add_window(k: ti.i32, d: ti.i32, s: ti.i32, window: Vectors4, sums: Vectors4):
+    """Add to slot ``s`` the part of block ``k``'s window that lies in the grid block whose neighbour ``d`` it is."""
+    di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
+    il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
+    jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
+    ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
+    shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
+    for i in range(il, ih):
+        for j in range(jl, jh):
+            for m in range(ml, mh):
+                n = s * BLOCK_NODES + i * 16 + j * 4 + m
+                sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
+
+
+@ti.func
+def sum_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """The nodes of grid block ``g``: the sum of the windows of the 27 particle blocks around it."""
+    for i in range(BLOCK_NODES):
+        nodes[g * BLOCK_NODES + i] = vec4(0.0)
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        if k >= 0:
+            add_window(k, d, g, window, nodes)
+
+
+@ti.func
+def sum_chosen_windows(g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, window: Vectors4, sums: Vectors4):
+    """The same into slot ``s`` of ``sums``, of the particle blocks that have a 1 in ``chosen``."""
+    for i in range(BLOCK_NODES):
+        sums[s * BLOCK_NODES + i] = vec4(0.0)
+    for d in range(27):
+        k = neighbours[g * 27 + d]
+        wanted = False
+        if k >= 0:
+            wanted = chosen[k] == 1
+        if wanted:
+            add_window(k, d, s, window, sums)
+
+
+@ti.func
+def interpolate(first: ti.i32, fx: vec3, window: ti.template()):
+    """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis."""
+    w = weights(fx)
+    A = vec4(0.0)
+    B0 = vec4(0.0)
+    B1 = vec4(0.0)
+    B2 = vec4(0.0)
+    for i in ti.static(range(3)):
+        Ai = vec4(0.0)
+        B1i = vec4(0.0)
+        B2i = vec4(0.0)
+        for j in ti.static(range(3)):
+            Aj = vec4(0.0)
+            B2j = vec4(0.0)
+            for m in ti.static(range(3)):
+                u = node_of(window, first + (i * 64 + j * 8 + m)) * w[m][2]
+                Aj += u
+                if ti.static(m > 0):
+                    B2j += float(m) * u
+            Ai += w[j][1] * Aj
+            B2i += w[j][1] * B2j
+            if ti.static(j > 0):
+                B1i += (float(j) * w[j][1]) * Aj
+        A += w[i][0] * Ai
+        B1 += w[i][0] * B1i
+        B2 += w[i][0] * B2i
+        if ti.static(i > 0):
+            B0 += (float(i) * w[i][0]) * Ai
+    return A, B0 - fx[0] * A, B1 - fx[1] * A, B2 - fx[2] * A
+
+
+@ti.func
+def interpolate_curved(first: ti.i32, fx: vec3, window: ti.template()):
+    """As ``interpolate``, and second derivatives per cell²: a sixteenth of those along two axes (01, 02, 12), and
+    those along one (0, 1, 2)."""
+    w = weights(fx)
+    A = vec4(0.0)
+    B0 = vec4(0.0)
+    B1 = vec4(0.0)
+    B2 = vec4(0.0)
+    M01 = vec4(0.0)
+    M02 = vec4(0.0)
+    M12 = vec4(0.0)
+    D0 = vec4(0.0)
+    D1 = vec4(0.0)
+    D2 = vec4(0.0)
+    for i in ti.static(range(3)):
+        Ai = vec4(0.0)
+        B1i = vec4(0.0)
+        B2i = vec4(0.0)
+        M12i = vec4(0.0)
+        D1i = vec4(0.0)
+        D2i = vec4(0.0)
+        for j in ti.static(range(3)):
+            u0 = node_of(window, first + (i * 64 + j * 8))
+            u1 = node_of(window, first + (i * 64 + j * 8 + 1))
+            u2 = node_of(window, first + (i * 64 + j * 8 + 2))
+            v1 = w[1][2] * u1
+            v2 = w[2][2] * u2
+            Aj = w[0][2] * u0 + v1 + v2
+            B2j = v1 + 2.0 * v2
+            Ai += w[j][1] * Aj
+            B2i += w[j][1] * B2j
+            D2i += w[j][1] * (u0 - 2.0 * u1 + u2)
+            if ti.static(j > 0):
+                B1i += (float(j) * w[j][1]) * Aj
+                M12i += (float(j) * w[j][1]) * B2j
+            if ti.static(j == 1):
+                D1i -= 2.0 * Aj
+            else:
+                D1i += Aj
+        A += w[i][0] * Ai
+        B1 += w[i][0] * B1i
+        B2 += w[i][0] * B2i
+        M12 += w[i][0] * M12i
+        D1 += w[i][0] * D1i
+        D2 += w[i][0] * D2i
+        if ti.static(i > 0):
+            B0 += (float(i) * w[i][0]) * Ai
+            M01 += (float(i) * w[i][0]) * B1i
+            M02 += (float(i) * w[i][0]) * B2i
+        if ti.static(i == 1):
+            D0 -= 2.0 * Ai
+        else:
+            D0 += Ai
+    C0 = B0 - fx[0] * A
+    C1 = B1 - fx[1] * A
+    C2 = B2 - fx[2] * A
+    # Moments about the particle from those about the first node.
+    E01 = M01 - fx[0] * B1 - fx[1] * C0
+    E02 = M02 - fx[0] * B2 - fx[2] * C0
+    E12 = M12 - fx[1] * B2 - fx[2] * C1
+    return A, C0, C1, C2, E01, E02, E12, D0, D1, D2
+
+
+@ti.func
+def spread_curved(
+    first: ti.i32,
+    fx: vec3,
+    b4: vec4,
+    c0: vec4,
+    c1: vec4,
+    c2: vec4,
+    e01: vec4,
+    e02: vec4,
+    e12: vec4,
+    d0: vec4,
+    d1: vec4,
+    d2: vec4,
+    window: ti.template(),
+):
+    """As ``spread``, with ij e01 + im e02 + jm e12 more, and along each axis a mode (1, -2, 1) d that carries neither
+    momentum nor angular momentum."""
+    w = weights(fx)
+    for i in ti.static(range(3)):
+        bi = b4 + float(i) * c0
+        c1i = c1 + float(i) * e01
+        c2i = c2 + float(i) * e02
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            bj = wij * (bi + float(j) * c1i)
+            if ti.static(i == 1):
+                bj -= (2.0 * w[j][1]) * d0
+            else:
+                bj += w[j][1] * d0
+            if ti.static(j == 1):
+                bj -= (2.0 * w[i][0]) * d1
+            else:
+                bj += w[i][0] * d1
+            cj = wij * (c2i + float(j) * e12)
+            dj = wij * d2
+            n = first + (i * 64 + j * 8)
+            add_to(window, n, w[0][2] * bj + dj)
+            add_to(window, n + 1, w[1][2] * (bj + cj) - 2.0 * dj)
+            add_to(window, n + 2, w[2][2] * (bj + 2.0 * cj) + dj)
+
+
+@ti.func
+def spread_kept(
+    first: ti.i32,
+    fx: vec3,
+    mass: ti.f32,
+    b4: vec4,
+    c0: vec4,
+    c1: vec4,
+    c2: vec4,
+    E01: vec4,
+    E02: vec4,
+    E12: vec4,
+    D0: vec4,
+    D1: vec4,
+    D2: vec4,
+    window: ti.template(),
+):
+    """As ``spread``, with what a particle of ``mass`` keeps of the second derivatives that ``interpolate_curved``
+    gave."""
+    keep = CURVED * vec4(mass, mass, mass, 0.0)
+    e01 = 16.0 * keep * E01
+    e02 = 16.0 * keep * E02
+    e12 = 16.0 * keep * E12
+    # i j e01 stands for (i - x) (j - y) e01, and so on.
+    b4c = b4 + (fx[0] * fx[1]) * e01 + (fx[0] * fx[2]) * e02 + (fx[1] * fx[2]) * e12
+    c0c = c0 - fx[1] * e01 - fx[2] * e02
+    c1c = c1 - fx[0] * e01 - fx[2] * e12
+    c2c = c2 - fx[0] * e02 - fx[1] * e12
+    w3 = weights(fx)
+    # Factor from a second derivative to the mode that is orthogonal to 1 and x under the weights.
+    h = w3[0] * w3[1] * w3[2] / (w3[1] * w3[2] + 4.0 * w3[0] * w3[2] + w3[0] * w3[1])
+    d0, d1, d2 = h[0] * keep * D0, h[1] * keep * D1, h[2] * keep * D2
+    spread_curved(first, fx, b4c, c0c, c1c, c2c, e01, e02, e12, d0, d1, d2, window)
+
+
+@ti.func
+def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: ti.template()):
+    """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
+    w = weights(fx)
+    for i in ti.static(range(3)):
+        bi = b4 + float(i) * c0
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            bj = wij * (bi + float(j) * c1)
+            cj = wij * c2
+            for m in ti.static(range(3)):
+                add_to(window, first + (i * 64 + j * 8 + m), w[m][2] * (bj + float(m) * cj))
