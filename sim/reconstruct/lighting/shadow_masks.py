@@ -20,7 +20,8 @@ from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..segmentation.mask_cleanup import enclosed_holes
 from .ground_pixels import GroundPixels, ground_pixels, proxy_body
-from .shadow_model import fit_light, light_level_posterior, light_shares, shadow_probability
+from .shadow_lamps import fit_light, light_shares
+from .shadow_model import SHADOW_RATIO, light_level_posterior, shadow_probability
 
 Mask = NDArray[np.bool_]
 
@@ -154,6 +155,8 @@ FAR = 0.25
 """Weight of a distance of one object side against the log of the blocked light, where shadows meet."""
 
 
+UNFORESEEN = 0.02
+"""Lost light, as a logarithm, below which a shadow is its owner's."""
 FORESEEN, POSSIBLE = 0.8, 0.15
 """Share of light below which an object is expected to shade the ground; probability below which the photo says that it
 does not."""
@@ -181,8 +184,8 @@ def cast_shadows(
 
     pixels: (H, W, 3) sRGB. camera: above the ground z = 0; pixels above the horizon are not ground. stay: (H, W) things
     on the ground that are no objects; no shadow is looked for on them. All masks of a shadow are disjoint from all
-    objects and from ``stay``, shadows and penumbras also from those of others. A pixel in several shadows belongs to
-    the object that blocks most of its light. An object without a pixel, or above the horizon, has no shadow.
+    objects and from ``stay``. Shadows of several objects overlap where each of them alone darkens the ground; what they
+    block together belongs to the one that blocks most. An object without a pixel, or above the horizon, has no shadow.
     """
     found = [CastShadow(*np.zeros((3, *pixels.shape[:2]), dtype=bool)) for _ in masks]
     standing = [(index, body) for index, mask in enumerate(masks) if (body := proxy_body(mask, camera)) is not None]
@@ -194,29 +197,35 @@ def cast_shadows(
         return found
     light = fit_light(ground, bodies)
     total, alone, hidden = light_shares(ground, bodies, light)
-    owner = _owner(ground, alone, [masks[index] for index, _ in standing])
+    owned = _owned(ground, alone, [masks[index] for index, _ in standing])
+    parts = _parts(ground, alone, total, owned)
     posterior = light_level_posterior(ground, total, np.minimum(hidden.sum(axis=0), 1.0))
-    inner, outer = shadow_probability(ground, posterior, _part(ground, alone, owner))
-    taken = np.logical_or.reduce(masks)
-    closed = taken if stay is None else taken | stay
-    taken = closed.copy()
+    probable = [shadow_probability(ground, posterior, *each) for each in zip(parts, owned, strict=True)]
+    closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
+    dark = []
+    for (_, _, left), (index, _), kept in zip(probable, standing, alone, strict=True):
+        darkened = (_full_size(ground, 1.0 - left, closed.shape) > 1.0 - SHADOW_RATIO) & ~closed
+        dark.append(_connected(darkened, masks[index], ground, kept))
     for position, (index, _) in enumerate(standing):
-        own = owner == position
-        dark = (_full_size(ground, np.where(own, inner, 0.0), taken.shape) > 0.5) & ~taken
-        dim = (_full_size(ground, np.where(own, outer, 0.0), taken.shape) > 0.5) & ~taken
-        shadow = extend_hard_shadow(pixels, _connected(dark, masks[index], ground, alone[position]), taken)
+        inner, outer, _ = probable[position]
+        dim = (_full_size(ground, outer, closed.shape) > 0.5) & ~closed
+        # A hard shadow goes on, but not into that of another object.
+        others = [other & ~dark[position] for place, other in enumerate(dark) if place != position]
+        shadow = extend_hard_shadow(pixels, dark[position], np.logical_or.reduce([closed, *others]))
         penumbra = shadow | _touching(dim, shadow)
         foreseen = (alone[position] < FORESEEN) & (light.share > 0.0)
         wanted = (hidden[position] > CONTACT_SKY) | (foreseen & (outer > POSSIBLE))
-        expected = (_full_size(ground, wanted, taken.shape) > 0.5) & ~closed
+        expected = (_full_size(ground, wanted, closed.shape) > 0.5) & ~closed
         missing = float((foreseen & (inner < 0.5)).sum() / foreseen.sum()) if foreseen.sum() >= FEWEST else 0.0
         found[index] = CastShadow(shadow=shadow, penumbra=penumbra, expected=expected, missing=missing)
-        taken |= penumbra
     return found
 
 
-def _owner(ground: GroundPixels, alone: Values, masks: Sequence[Mask]) -> NDArray[np.int64]:
-    """Index (N,) of the object that blocks most of each pixel's light, nearer ones preferred."""
+def _owned(ground: GroundPixels, alone: Values, masks: Sequence[Mask]) -> Mask:
+    """Whether (objects, N) an object is the one that blocks most of a pixel's light, nearer ones preferred.
+
+    alone: (objects, N) ratio of the light with to without each object.
+    """
     size = ground.known.shape[::-1]
     costs = []
     for kept, mask in zip(alone, masks, strict=True):
@@ -224,14 +233,20 @@ def _owner(ground: GroundPixels, alone: Values, masks: Sequence[Mask]) -> NDArra
         distance = cv2.distanceTransform((small == 0).astype(np.uint8), cv2.DIST_L2, 5)
         far = distance[ground.rows, ground.columns] / ground.object_side
         costs.append(ground.blurred(np.log(kept), 1.5) + FAR * far)
-    return np.asarray(np.argmin(costs, axis=0))
+    return np.asarray(np.argmin(costs, axis=0) == np.arange(len(masks))[:, None])
 
 
-def _part(ground: GroundPixels, alone: Values, owner: NDArray[np.int64]) -> Values:
-    """Share (N,) of the ``owner`` (N,) in the lost light, as a logarithm, at least half."""
+def _parts(ground: GroundPixels, alone: Values, total: Values, owned: Mask) -> Values:
+    """Share (objects, N) of each object in the lost light, as a logarithm: what comes back if it alone is taken away.
+
+    Arguments (objects, N) as of ``_owned``, and its answer; total: (N,) share that is left past all. At least half is
+    the owner's, and all where no object is expected to shade the ground: what several block together has to leave
+    with one of them.
+    """
     lost = np.stack([ground.blurred(-np.log(kept), 1.5) for kept in alone])
-    own = np.take_along_axis(lost, owner[None], axis=0)[0]
-    return np.clip((own + 1e-3) / (lost.sum(axis=0) + 1e-3), 0.5, 1.0)
+    everything = ground.blurred(-np.log(total), 1.5)
+    parts = (lost + UNFORESEEN * owned) / (everything + UNFORESEEN)
+    return np.asarray(np.clip(parts, 0.5 * owned, 1.0))
 
 
 def _full_size(ground: GroundPixels, values: Values, shape: tuple[int, int]) -> NDArray[np.float32]:
