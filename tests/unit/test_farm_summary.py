@@ -113,7 +113,7 @@ def test_a_strip_is_made_again_only_for_other_frames(tmp_path):
     cv2.imwrite(str(frames[0]), np.full((60, 80, 3), 255, np.uint8))
     assert make_strip(frames, out) and cv2.imread(str(out))[5, 5].min() > 200
     assert not make_strip([tmp_path / "none.png"], tmp_path / "b.jpg")
-    # Somebody else's job may have a pipe there, which nobody writes to.
+    # A stranger's job may have a named pipe there, without a writer.
     out.unlink()
     os.mkfifo(out)
     assert make_strip(frames, out) and out.is_file()

@@ -165,17 +165,23 @@ def add_push(i: ti.i32, row: ti.i32, place: vec3, given: vec3, bodies: RigidArra
 
 
 @func
+def forget_pushes(w: ti.i32, worlds: WorldArrays, bodies: RigidArrays, coupling: CouplingArrays):
+    """Set the impulses and the touching mass of the bodies of world ``w`` to 0, unless it is idle."""
+    if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+        first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+        for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+            coupling.touching[i] = 0.0
+            for n in range(6):
+                bodies.impulses[6 * i + n] = 0.0
+
+
+@func
 def gather_pushes_in_parallel(
     worlds: WorldArrays, blocks: ParticleBlocks, near: NearBlocks, bodies: RigidArrays, coupling: CouplingArrays
 ):
     """As ``gather_pushes``, a thread a block of particles."""
     for w in range(worlds.count):
-        if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
-            for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
-                coupling.touching[i] = 0.0
-                for n in range(6):
-                    bodies.impulses[6 * i + n] = 0.0
+        forget_pushes(w, worlds, bodies, coupling)
     for s in range(near.particle_count):
         w = worlds.field_integers[blocks.field[near.particle_blocks[s]] * FIELD_INTEGERS + WORLD]
         if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
@@ -195,12 +201,7 @@ def gather_pushes(
     """Sum the blocks' impulses on each body into ``bodies.impulses`` and the touching mass (kg) into ``touching``."""
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
-        if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-            first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
-            for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
-                coupling.touching[i] = 0.0
-                for n in range(6):
-                    bodies.impulses[6 * i + n] = 0.0
+        forget_pushes(w, worlds, bodies, coupling)
     ti.loop_config(serialize=True)
     for s in range(near.particle_count):
         w = worlds.field_integers[blocks.field[near.particle_blocks[s]] * FIELD_INTEGERS + WORLD]

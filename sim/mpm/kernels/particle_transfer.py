@@ -22,7 +22,6 @@ from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, P
 from .kernel_bundles import func
 from .lanes import lane_maxima, lane_sum, meet, pads_of
 from .layout import (
-    BLOCK_NODES,
     CONTROL_ROW,
     ELAPSED,
     FAR,
@@ -68,6 +67,7 @@ from .windows import (
     add_to,
     clear_window,
     fetch_window,
+    grid_node,
     interpolate,
     interpolate_curved,
     load_window,
@@ -129,12 +129,10 @@ def goal_step(
 
 @ti.func
 def load_crowding(lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, window: Scalars, nodes: Scalars):
-    """Copy the crowding of the nodes around particle block ``k`` into its window, as ``lanes.fetch_window`` does."""
+    """Copy the crowding of the nodes around particle block ``k`` into its window, as ``fetch_window`` does."""
     n = lane
     while n < WINDOW_NODES:
-        i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
-        g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
-        window[k * WINDOW_NODES + n] = nodes[g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)]
+        window[k * WINDOW_NODES + n] = nodes[grid_node(k, n, neighbours)]
         n += ti.static(lanes.threads)
 
 

@@ -82,6 +82,15 @@ def store_window(lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.templ
 
 
 @ti.func
+def grid_node(k: ti.i32, n: ti.i32, neighbours: Integers):
+    """Index of node ``n`` of particle block ``k``'s window among the nodes of the grid blocks."""
+    # Nodes 0 of the window's eight lie in the block before, 1 to 4 in the block itself, 5 to 7 in the one after.
+    i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
+    g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
+    return g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)
+
+
+@ti.func
 def fetch_window(
     lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, nodes: Vectors4, window: ti.template()
 ):
@@ -90,10 +99,7 @@ def fetch_window(
     offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
     n = lane
     while n < WINDOW_NODES:
-        # Nodes 0 of the window's eight lie in the block before, 1 to 4 in the block itself, 5 to 7 in the one after.
-        i, j, m = (n >> 6) + 3, (n >> 3 & 7) + 3, (n & 7) + 3
-        g = neighbours[k * 27 + (i >> 2) * 9 + (j >> 2) * 3 + (m >> 2)]
-        set_node(window, offset + n, nodes[g * BLOCK_NODES + (i & 3) * 16 + (j & 3) * 4 + (m & 3)])
+        set_node(window, offset + n, nodes[grid_node(k, n, neighbours)])
         n += ti.static(lanes.threads)
 
 
