@@ -22,7 +22,7 @@ def tree(tmp_path):
     app.mkdir(parents=True)
     for name in ("launch.py", "stage_process.py"):
         (app / name).write_text((ROOT / "sim" / "app" / name).read_text(encoding="utf-8"), encoding="utf-8")
-    for name in ("children.py", "errors.py", "events.py", "memory.py"):
+    for name in ("errors.py", "events.py", "memory.py", "processes.py"):
         text = (ROOT / "sim" / name).read_text(encoding="utf-8")
         (app.parent / name).write_text(text, encoding="utf-8")
     for folder in (app, app.parent, app.parent.parent):
