@@ -12,27 +12,19 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..events import IsCancelled
-from .kernels import broad_phase, layout, parallel_sorting, runtime, sorting
-from .kernels.collider_distance import PUSH
+from .block_lists import BlockLists, block_keys, bytes_of
+from .kernels import layout, parallel_sorting, runtime, sorting
 from .kernels.constitutive_response import law_set
-from .kernels.grid import SUMS
 from .kernels.kernel_arrays import (
-    BlockTable,
     CouplingArrays,
-    FlowArrays,
-    GridBlocks,
-    NearBlocks,
-    NodeArrays,
-    OverlapBlocks,
     ParticleArrays,
-    ParticleBlocks,
     ParticleState,
     StepLimits,
     WorldArrays,
 )
 from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
-from .kernels.layout import BLOCK_NODES, FIXED_ONE, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, mat3, vec3, vec4
+from .kernels.layout import FIXED_ONE, ivec3, mat3, vec3, vec4
 from .kernels.substep import rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
@@ -59,10 +51,6 @@ RECOVER = 1.25
 
 LEAST_STEP = 1e-10
 """Seconds; a substep below this, or below a thousandth of what it was when the segment began, means a diverged run."""
-
-LEAST_BLOCKS = 64
-GROWTH = 1.3
-"""Spare capacity of block arrays, so that they are not reallocated at every sort."""
 
 
 class Stopped(Exception):
@@ -102,8 +90,6 @@ class Engine:
         self._touching = ti.ndarray(ti.f32, max(1, rigid_bodies.count))
         self.laws = numbers.laws
         models = law_set(self.laws)
-        self._flowing = models.flowing
-        self._fluid = bool(models.volumetric)
         self.world_count = len(numbers.worlds)
         self._running = ti.ndarray(ti.i32, self.world_count if lanes.parallel else 1)
         self._launches = 1
@@ -138,12 +124,13 @@ class Engine:
         self._particles = [self._particle_arrays() for _ in range(2)]
         self._keys = ti.ndarray(ti.i64, self._capacity)
         self._targets = ti.ndarray(ti.i32, self._capacity)
-        self._g_starts = ti.ndarray(ti.i32, self.field_count + 1)
-        self._p_blocks = self._g_blocks = 0
-        self._near = (0, 0)
-        self._overlap = (0, 0, 0)
-        self._p_capacity = self._g_capacity = 0
-        self._allocate_blocks(LEAST_BLOCKS, 4 * LEAST_BLOCKS)
+        self._blocks = BlockLists(
+            field_count=self.field_count,
+            rigid_bodies=self._most_rigid_bodies,
+            flowing=models.flowing,
+            fluid=bool(models.volumetric),
+            lanes=lanes,
+        )
 
     # ---- arrays -------------------------------------------------------------------------------------------------
 
@@ -165,45 +152,12 @@ class Engine:
         }
         return {name: ti.ndarray(kinds[name], self._capacity) for name in self._names}
 
-    def _allocate_blocks(self, p: int, g: int) -> None:
-        if p > self._p_capacity:
-            self._p_capacity = p
-            self._p_cells, self._p_field = ti.ndarray(ivec3, p), ti.ndarray(ti.i32, p)
-            self._starts, self._cursors = ti.ndarray(ti.i32, p + 1), ti.ndarray(ti.i32, p)
-            self._p_neighbours = ti.ndarray(ti.i32, p * 27)
-            self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._touched, self._slack = ti.ndarray(ti.i32, p), ti.ndarray(ti.f32, p)
-            self._pushes = ti.ndarray(ti.f32, max(1, p * self._most_rigid_bodies * PUSH))
-            self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
-            self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
-            self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
-            self._crowding_window = ti.ndarray(ti.f32, p * WINDOW_NODES if self._fluid else 1)
-            self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
-            self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
-            self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
-        if g > self._g_capacity:
-            self._g_capacity = g
-            self._g_cells, self._g_field = ti.ndarray(ivec3, g), ti.ndarray(ti.i32, g)
-            self._g_neighbours = ti.ndarray(ti.i32, g * 27)
-            self._near_g, self._mate, self._meet = (ti.ndarray(ti.i32, g) for _ in range(3))
-            self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
-            self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
-            self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self._flowing else 1)
-            self._crowding = ti.ndarray(ti.f32, g * BLOCK_NODES if self._fluid else 1)
-            crowded = max(1, g * self._most_rigid_bodies * PUSH) if self._fluid else 1
-            self._crowd_pushes = ti.ndarray(ti.f32, crowded)
-            self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
-            self._block_sums = ti.ndarray(ti.f32, g * SUMS)
-            self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
-            self._g_keys, self._g_slots = ti.ndarray(ti.i64, self._g_mask + 1), ti.ndarray(ti.i32, self._g_mask + 1)
-
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
         arrays = [a for group in self._particles for a in group.values()]
         arrays += [a for a in vars(self).values() if isinstance(a, ti.Ndarray)]
-        return sum(_bytes(a) for a in arrays)
+        return self._blocks.device_bytes + sum(bytes_of(a) for a in arrays)
 
     def control(self) -> Array:
         """Progress of the worlds (W, CONTROL_ROW), as ``layout`` names its columns."""
@@ -290,11 +244,7 @@ class Engine:
         """The particles in engine order, all or those arrays, with the block key of each under "keys"."""
         n = self.count
         state: State = {name: self._particles[0][name].to_numpy()[:n] for name in names or self._names}
-        cells = self._p_cells.to_numpy()[: self._p_blocks].astype(np.int64)
-        fields = self._p_field.to_numpy()[: self._p_blocks].astype(np.int64)
-        starts = self._starts.to_numpy()[: self._p_blocks + 1]
-        keys = _block_keys(fields, cells)
-        state["keys"] = np.repeat(keys, np.diff(starts)) if n else np.zeros(0, dtype=np.int64)
+        state["keys"] = self._blocks.particle_keys(n)
         return state
 
     def _upload(self, state: Mapping[str, NDArray[np.generic]], keys: NDArray[np.int64]) -> None:
@@ -340,37 +290,12 @@ class Engine:
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
         rebase = parallel_sorting.rebase_of(self._lanes) if self._lanes.parallel else sorting.rebase
-        rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks())
+        rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks.particle_blocks)
         self._group()
 
     def _group(self) -> None:
         """Lists, neighbours and permutation for the blocks named in ``_keys``."""
-        while True:
-            self._p_keys.fill(-1)
-            self._p_blocks = self._list_particle_blocks()
-            if self._p_blocks <= self._p_capacity:
-                break
-            self._allocate_blocks(int(GROWTH * self._p_blocks) + LEAST_BLOCKS, 0)
-        if self._lanes.parallel:
-            parallel_sorting.turn_counts_into_offsets_of(self._lanes)(self._cursors, self._blocks())
-        # The serial list of the grid turns the counts of particles into offsets, once: they are put back for every new
-        # attempt.
-        counts = None
-        while True:
-            self._g_keys.fill(-1)
-            if self._lanes.parallel:
-                pass
-            elif counts is None:
-                counts = self._starts.to_numpy()
-            else:
-                self._starts.from_numpy(counts)
-            self._g_blocks = self._list_grid_blocks()
-            if self._g_blocks <= self._g_capacity:
-                break
-            self._allocate_blocks(0, int(GROWTH * self._g_blocks) + LEAST_BLOCKS)
-        sorting.link_blocks(self._blocks(), self._grid(), self._p_table(), self._g_table())
-        place = parallel_sorting.place_in_parallel if self._lanes.parallel else sorting.place
-        place(self.count, self._keys, self._cursors, self._targets, self._p_table())
+        self._blocks.build(self.count, self._keys, self._targets)
         old, new = self._particles
         sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
@@ -385,51 +310,7 @@ class Engine:
             if name in movers:
                 movers[name](self.count, self._targets, old[name], new[name])
         self._particles.reverse()
-        self._list_contacts()
-
-    def _list_particle_blocks(self) -> int:
-        if self._lanes.parallel:
-            return int(
-                parallel_sorting.list_particle_blocks_in_parallel(
-                    self.count,
-                    self._p_capacity,
-                    self.field_count,
-                    self._keys,
-                    self._g_starts,
-                    self._p_table(),
-                    self._blocks(),
-                )
-            )
-        return int(
-            sorting.list_particle_blocks(self.count, self._p_capacity, self._keys, self._p_table(), self._blocks())
-        )
-
-    def _list_grid_blocks(self) -> int:
-        if self._lanes.parallel:
-            return int(
-                parallel_sorting.list_grid_blocks_in_parallel(
-                    self.field_count, self._g_capacity, self._g_table(), self._blocks(), self._grid()
-                )
-            )
-        return int(
-            sorting.list_grid_blocks(
-                self.field_count, self._g_capacity, self._cursors, self._g_table(), self._blocks(), self._grid()
-            )
-        )
-
-    def _list_contacts(self) -> None:
-        rigid, parallel = self.rigid_bodies, self._lanes.parallel
-        near, blocks, grid = self._near_blocks(), self._blocks(), self._grid()
-        list_near = broad_phase.list_near_blocks_in_parallel if parallel else broad_phase.list_near_blocks
-        found = list_near(self._worlds(), blocks, grid, near, rigid.bodies, rigid.shapes)
-        self._touched.fill(0)
-        self._slack.fill(0.0)
-        self._near = (int(found[0]), int(found[1]))
-        if self._several:
-            overlap = self._overlap_blocks()
-            list_overlap = broad_phase.list_overlap_blocks_in_parallel if parallel else broad_phase.list_overlap_blocks
-            found = list_overlap(self._worlds(), blocks, grid, self._g_table(), overlap)
-            self._overlap = (int(found[0]), int(found[1]), int(found[2]))
+        self._blocks.list_contacts(self._worlds(), self.rigid_bodies, several=self._several)
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
@@ -529,10 +410,10 @@ class Engine:
             self.laws,
             self._lanes,
             self._mean_fields > 0,
-            self._overlap[2] > 0,
+            self._blocks.any_overlap,
             self.rigid_bodies.count > 0,
             self.rigid_bodies.solved_together,
-            self._near[0] > 0,
+            self._blocks.any_near,
         )
 
     # ---- bundles ------------------------------------------------------------------------------------------------
@@ -542,26 +423,25 @@ class Engine:
         return {
             "limits": self._limits(),
             "worlds": self._worlds(),
-            "blocks": self._blocks(),
-            "grid": self._grid(),
-            "near": self._near_blocks(),
-            "overlap": self._overlap_blocks(),
+            "blocks": self._blocks.particle_blocks,
+            "grid": self._blocks.grid_blocks,
+            "near": self._blocks.near_blocks,
+            "overlap": self._blocks.overlap_blocks,
             "particles": self._particle_bundle(),
-            "nodes": NodeArrays(self._window, self._scattered, self._nodes, self._sums, self._masses, self._block_sums),
-            "flow": FlowArrays(
-                self._past_window,
-                self._past_scattered,
-                self._past_nodes,
-                self._crowding,
-                self._crowding_window,
-                self._crowd_pushes,
-            ),
+            "nodes": self._blocks.nodes,
+            "flow": self._blocks.flow,
             "bodies": self.rigid_bodies.bodies,
             "shapes": self.rigid_bodies.shapes,
             "contacts": self.rigid_bodies.contacts,
-            "coupling": CouplingArrays(self.rigid_bodies.count, self._most_rigid_bodies, self._touching, self._pushes),
+            "coupling": CouplingArrays(
+                self.rigid_bodies.count, self._most_rigid_bodies, self._touching, self._blocks.pushes
+            ),
             "running": self._running,
         }
+
+    def _coupling(self) -> CouplingArrays:
+        pushes = self._blocks.pushes
+        return CouplingArrays(self.rigid_bodies.count, self._most_rigid_bodies, self._touching, pushes)
 
     def _limits(self) -> StepLimits:
         return StepLimits(self.cfl_elastic, self.cfl_velocity)
@@ -581,51 +461,15 @@ class Engine:
             means=self._means,
         )
 
-    def _blocks(self) -> ParticleBlocks:
-        return ParticleBlocks(
-            self._p_blocks, self._p_cells, self._p_field, self._starts, self._p_neighbours, self._report
-        )
-
-    def _grid(self) -> GridBlocks:
-        return GridBlocks(self._g_blocks, self._g_cells, self._g_field, self._g_starts, self._g_neighbours)
-
-    def _p_table(self) -> BlockTable:
-        return BlockTable(self._p_mask, self._p_keys, self._p_slots)
-
-    def _g_table(self) -> BlockTable:
-        return BlockTable(self._g_mask, self._g_keys, self._g_slots)
-
-    def _near_blocks(self) -> NearBlocks:
-        lists = (self._near_of_p, self._near_p, self._near_g)
-        return NearBlocks(*self._near, *lists, touched=self._touched, slack=self._slack)
-
-    def _overlap_blocks(self) -> OverlapBlocks:
-        return OverlapBlocks(
-            *self._overlap, self._mate, self._meet, self._meet_g, self._leads, self._meet_p, self._meets_p
-        )
-
     def _particle_bundle(self) -> ParticleArrays:
         """Arrays that no kernel of this engine reads are stood in for by others of the same type."""
         here = self._particles[0]
-        spare = {
-            "material": self._starts,
-            "memory": self._masses,
-            "volumes": self._masses,
-            "anchors": self._nodes,
-            "slopes": here["v"],
-            "conformation": here["C"],
-        }
+        spare = {**self._blocks.spares, "slopes": here["v"], "conformation": here["C"]}
         return ParticleArrays(**{name: here.get(name, spare.get(name)) for name in ParticleArrays._fields})
 
 
 def _state_of(arrays: Mapping[str, ti.Ndarray]) -> ParticleState:
     return ParticleState(*(arrays[name] for name in ParticleState._fields))
-
-
-def _block_keys(fields: NDArray[np.int64] | np.int64, blocks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Keys (n,) of the blocks (n, 3) of the fields, as ``sorting.block_key`` packs them."""
-    x, y, z = (blocks + sorting.BIAS).T
-    return np.asarray(((fields << 16 | x) << 16 | y) << 16 | z)
 
 
 def _positions(keys: NDArray[np.int64], x: NDArray[np.generic]) -> Array:
@@ -637,7 +481,7 @@ def _positions(keys: NDArray[np.int64], x: NDArray[np.generic]) -> Array:
 def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Places (n, 3) in cells as ``state`` has them: "x" (n, 3) from the corner of the block of each, "keys" (n,)."""
     block = np.clip(np.floor(cells - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
-    return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), _block_keys(np.int64(field), block)
+    return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), block_keys(np.int64(field), block)
 
 
 def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
@@ -647,9 +491,3 @@ def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
     if values.size:
         array.from_numpy(np.ascontiguousarray(values).ravel())
     return array
-
-
-def _bytes(array: ti.Ndarray) -> int:
-    """Bytes of ``array`` on the device."""
-    elements = int(np.prod(array.shape)) * int(np.prod(array.element_shape))
-    return elements * (8 if array.dtype in (ti.i64, ti.f64) else 4)
