@@ -187,7 +187,7 @@ def recover(path: Path) -> list[str]:
 
 def _put_back_or_removed(left: Path) -> str:
     found = _TEMPORARY.fullmatch(left.name)
-    if found is not None and found["role"] == "old":
+    if found is not None and found["role"] == "old" and found["name"] not in (".", ".."):
         path = left.with_name(found["name"])
         if not path.exists():
             with contextlib.suppress(OSError):

@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, fri
 from ..mpm.world_setup import WorldSetup
 from ..scene.bake_quality import Quality, load_quality
 from ..scene.folder import Scene
-from ..scene.meshes import ObjectMesh, load_vertex_track
+from ..scene.meshes import MAX_TRACK_BYTES, ObjectMesh, load_vertex_track
 from ..scene.model import Contact, Ground, Keys, Material, Motion, SceneModel, SceneObject
 from ..scene.units import Similarity
 from ..weak_cache import WeakCache
@@ -96,17 +97,17 @@ def contact_table(scene: SceneModel) -> ContactTable:
         surfaces = {GROUND_NAME: ground, **surfaces}
     named = {frozenset(contact.between): contact for contact in scene.contacts}
     bounces = {GROUND_NAME: math.inf} | {item.name: _bounce(item, ground) for item in scene.objects}
-    table = ContactTable(default=ground)
+    pairs: dict[tuple[str, str], SurfaceContact] = {}
     for a, b in itertools.combinations(surfaces, 2):
         contact = named.get(frozenset((a, b)))
         mixed = mix(surfaces[a], surfaces[b])
         if 0.0 < min(bounces[a], bounces[b]) < math.inf:
             mixed = dataclasses.replace(mixed, restitution=max(mixed.restitution, min(bounces[a], bounces[b])))
         if contact is not None:
-            table = table.with_pair(a, b, _named(contact, mixed))
+            pairs[min(a, b), max(a, b)] = _named(contact, mixed)
         elif mixed != ground:
-            table = table.with_pair(a, b, mixed)
-    return table
+            pairs[min(a, b), max(a, b)] = mixed
+    return ContactTable(default=ground, pairs=MappingProxyType(pairs))
 
 
 def _bounce(item: SceneObject, ground: SurfaceContact) -> float:
@@ -243,7 +244,7 @@ def prepare_world(
         _body(folder, item, meshes[i], spacing, cell, options.seed, scattered=item.name in granular)
         for i, item in ((i, scene.objects[i]) for i in moving)
     )
-    colliders = tuple(_collider(folder, scene.objects[i], meshes[i]) for i in still)
+    colliders = _colliders(folder, [(scene.objects[i], meshes[i]) for i in still])
     warnings += [text for collider in colliders for text in _jump(collider)]
     apart = separate(bodies, colliders, spacing=spacing, cell=cell)
     warnings += apart.notices
@@ -359,6 +360,25 @@ def _pins(item: SceneObject, sample: InteriorSample) -> NDArray[np.bool_] | None
             )
         pinned |= inside
     return pinned
+
+
+MOST_TRACKS_BYTES = 2 * MAX_TRACK_BYTES
+"""Of the vertex tracks of all colliders: a packed file is a thousandth of what it unpacks to."""
+
+
+def _colliders(folder: Scene, still: Sequence[tuple[SceneObject, ObjectMesh]]) -> tuple[Collider, ...]:
+    """Raises InputError for vertex tracks of more than ``MOST_TRACKS_BYTES``."""
+    found, left = [], MOST_TRACKS_BYTES
+    for item, mesh in still:
+        found.append(_collider(folder, item, mesh))
+        track = found[-1].vertices
+        left -= 0 if track is None else track.values.nbytes
+        if left < 0:
+            raise InputError(
+                f"object {item.name}: the vertex tracks up to its own take more than {MOST_TRACKS_BYTES >> 30} GiB; "
+                "give fewer keyframes"
+            )
+    return tuple(found)
 
 
 def _collider(folder: Scene, item: SceneObject, mesh: ObjectMesh) -> Collider:

@@ -29,7 +29,8 @@ MANIFEST_FORMAT = "physgen-bake/1"
 MANIFEST_FILE = "manifest.json"
 STATES = ("running", "complete", "cancelled")
 
-MATTER_FILES = "checkpoints/{name}.{sample:05d}.matter.npy"
+MATTER_SUFFIX = ".matter.npy"
+MATTER_FILES = "checkpoints/{name}.{sample:05d}" + MATTER_SUFFIX
 """Particles in a sample in which they are far apart, until the bake is complete; ``name``: of the object."""
 
 CHECKPOINT_FILE = "checkpoints/state.npz"
@@ -350,8 +351,10 @@ def remove_matter(folder: Path, manifest: BakeManifest) -> None:
     place = (folder / CHECKPOINT_FILE).parent
     if place.is_symlink() or not place.is_dir():
         return
-    for item in manifest.objects:
-        for path in place.glob(f"{item.name}.*.matter.npy"):
+    # No pattern: names come from the manifest, and may be patterns themselves, or lead elsewhere.
+    starts = tuple(f"{item.name}." for item in manifest.objects)
+    for path in list(place.iterdir()):
+        if path.name.startswith(starts) and path.name.endswith(MATTER_SUFFIX):
             path.unlink(missing_ok=True)
 
 

@@ -14,6 +14,7 @@ import errno
 import json
 import os
 import socket
+import stat
 import threading
 import time
 from collections.abc import Iterator
@@ -110,6 +111,10 @@ def _acquired(path: Path, folder: Path) -> int:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         good = False
         try:
+            about = os.fstat(file)
+            if not stat.S_ISREG(about.st_mode) or about.st_nlink > 1:
+                # It would be written over: under its other name it may be anything of the user's.
+                raise InputError(f"{path}: is no lock file, but a pipe, or another name of another file; remove it")
             by_kernel = _take(file)
             owner = _owner(path)
             if by_kernel is False:

@@ -28,7 +28,11 @@ STIFFNESSES = ("soft", "medium", "hard")
 ROLES = ("fit", "predict")
 
 MAX_TRIAL_BYTES = 512 * 2**20
-"""Total size of a trial's arrays; larger files are rejected before reading."""
+"""Total size of a trial's arrays, as 64-bit floats; larger files are rejected before reading."""
+MAX_CAPTURE_BYTES = 4 * MAX_TRIAL_BYTES
+"""The same of all trials, and of all mesh files: one file may be named many times, and unpacks to a thousand times its
+own size."""
+MOST_OBJECTS, MOST_TRIALS = 1000, 10_000
 
 Vector = tuple[float, float, float]
 Array = NDArray[np.float64]
@@ -238,15 +242,22 @@ def load_capture(root: str | Path) -> Capture:
         found = data.get("format") if isinstance(data, dict) else None
         raise InputError(f"{path}: format is {found!r}: this program reads {FORMAT!r}")
     file = parse(_CaptureFile, data, str(path))
-    if not file.objects or not file.trials:
-        raise InputError(f"{path}: needs at least one object and one trial")
+    if not 0 < len(file.objects) <= MOST_OBJECTS or not 0 < len(file.trials) <= MOST_TRIALS:
+        raise InputError(
+            f"{path}: has {len(file.objects)} objects and {len(file.trials)} trials: needs at least one object and one "
+            f"trial, at most {MOST_OBJECTS} and {MOST_TRIALS}"
+        )
     if not file.noise_sigma > 0:
         raise InputError(f"{path}: noise_sigma is {file.noise_sigma!r}: give the standard deviation of a coordinate")
     _refuse_twins(path, "objects", [o.name for o in file.objects])
     _refuse_twins(path, "trials", [t.name for t in file.trials])
     objects = []
+    left = MAX_CAPTURE_BYTES
     for belief in file.objects:
-        mesh = read_mesh(inside(root, belief.mesh))
+        mesh_file = inside(root, belief.mesh)
+        left -= mesh_file.stat().st_size if mesh_file.is_file() else 0
+        _require_room(left, path, "meshes")
+        mesh = read_mesh(mesh_file)
         objects.append(
             CaptureObject(
                 belief=belief,
@@ -254,7 +265,11 @@ def load_capture(root: str | Path) -> Capture:
                 faces=np.asarray(mesh.faces, dtype=np.int64),
             )
         )
-    trials = [_load_trial(root, entry, len(objects)) for entry in file.trials]
+    trials, left = [], MAX_CAPTURE_BYTES
+    for entry in file.trials:
+        trials.append(_load_trial(root, entry, len(objects)))
+        left -= sum(array.nbytes for array in _trial_arrays(trials[-1]).values())
+        _require_room(left, path, "trials")
     if file.camera is None and any(t.pixels is not None for t in trials):
         raise InputError(f"{path}: camera is missing, and there are trials of pixels: give the camera")
     if len({t.pixels is None for t in trials}) > 1:
@@ -318,9 +333,16 @@ def _trial_arrays(trial: Trial) -> dict[str, NDArray[Any]]:
 
 
 def _refuse_twins(path: Path, what: str, names: list[str]) -> None:
+    seen: set[str] = set()
     for name in names:
-        if names.count(name) > 1:
+        if name in seen:
             raise InputError(f"{path}: {what}: two are called {name!r}: give each its own name")
+        seen.add(name)
+
+
+def _require_room(left: int, path: Path, what: str) -> None:
+    if left < 0:
+        raise InputError(f"{path}: its {what} take more than {MAX_CAPTURE_BYTES >> 20} MiB; make several captures")
 
 
 def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
@@ -329,6 +351,8 @@ def _load_trial(root: Path, entry: _TrialEntry, objects: int) -> Trial:
     if entry.role not in ROLES:
         raise InputError(f"{where}: role is {entry.role!r}: give {' or '.join(ROLES)}")
     arrays = read_arrays(path)
+    if 8 * sum(array.size for array in arrays.values()) > MAX_TRIAL_BYTES:
+        raise InputError(f"{where}: has more numbers than fit in {MAX_TRIAL_BYTES >> 20} MiB; shorten the trial")
     times = _array(arrays, "times", (None,), where)
     frames = len(times)
     if frames < 3:

@@ -11,6 +11,8 @@ highest data bit is the sign. From the fourth run on, a number is the difference
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -25,6 +27,8 @@ from .image_masks import MAX_BYTES, MAX_PIXELS, FileMask
 Mask = NDArray[np.bool_]
 MAX_RUNS = 20_000_000
 MAX_POLYGONS = 10_000
+MAX_POLYGON_WORK = 2 * 10**10
+"""Corners times pixels of the box around them, over all polygons of a file: filling them takes so many steps."""
 _MAX_CHARACTERS = 13
 """Of one number: 64 bits. A longer one is damaged."""
 
@@ -83,16 +87,29 @@ def mask_from_polygons(value: list[Any], width: int, height: int, where: str) ->
     if len(value) > MAX_POLYGONS:
         raise InputError(f"{where}: has {len(value)} polygons, more than the {MAX_POLYGONS} allowed")
     mask = np.zeros((height, width), dtype=bool)
+    for corners in _polygons(value, where):
+        rows, columns = polygon(corners[:, 1], corners[:, 0], shape=mask.shape)
+        mask[rows, columns] = True
+    return mask
+
+
+def _polygons(value: list[Any], where: str) -> Iterator[NDArray[np.float64]]:
+    """Yield the corners (K, 2) of each polygon. Raises InputError."""
     for points in value:
         numeric = isinstance(points, list) and all(
             isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e6 for x in points
         )
         if not numeric or len(points) < 6 or len(points) % 2:
             raise InputError(f"{where}: a polygon needs at least three points x, y as one list of numbers")
-        corners = np.array(points, dtype=np.float64).reshape(-1, 2) - 0.5
-        rows, columns = polygon(corners[:, 1], corners[:, 0], shape=mask.shape)
-        mask[rows, columns] = True
-    return mask
+        yield np.array(points, dtype=np.float64).reshape(-1, 2) - 0.5
+
+
+def _polygon_work(value: list[Any], size: tuple[int, int], where: str) -> int:
+    work = 0
+    for corners in _polygons(value, where):
+        low, high = (np.clip(end, 0, size) for end in (corners.min(axis=0), corners.max(axis=0)))
+        work += len(corners) * math.ceil(math.prod(high - low + 1.0))
+    return work
 
 
 MAX_ANNOTATIONS = 4096
@@ -119,13 +136,16 @@ def masks_from_json(path: Path, width: int, height: int, photo_name: str) -> lis
         raise InputError(f"{path}: expected a list of masks, or an object with annotations as COCO has them")
     if len(annotations) > MAX_ANNOTATIONS:
         raise InputError(f"{path}: has {len(annotations)} masks, more than the {MAX_ANNOTATIONS} allowed")
-    result, used = [], 0
+    result, used, work = [], 0, 0
     for index, annotation in enumerate(annotations):
         if "segmentation" not in annotation:
             raise InputError(f"{path}: annotations[{index}] has no segmentation; give boxes with --box")
         where = f"{path}: annotations[{index}].segmentation"
         segmentation = annotation["segmentation"]
         if isinstance(segmentation, list):
+            work += _polygon_work(segmentation, size, where)
+            if work > MAX_POLYGON_WORK:
+                raise InputError(f"{path}: its polygons have too many corners for their size; give masks as runs")
             mask = mask_from_polygons(segmentation, *size, where)
         else:
             mask = mask_from_rle(segmentation, where)

@@ -25,8 +25,10 @@ from ..files import read_text
 
 Array = NDArray[np.float64]
 
-MAX_BYTES = 256 * 2**20
-"""Largest file."""
+MAX_BYTES, MAX_TRACKER_BYTES = 256 * 2**20, 32 * 2**20
+"""Largest file, and largest Tracker project, which takes twenty times as much memory."""
+MOST_CELLS, MOST_COLUMNS, MOST_HEADING = 20_000_000, 4096, 200
+"""Cells of a table, columns of it, and characters of a heading; of a Tracker project its points times its frames."""
 
 LIKELIHOOD = 0.6
 """DeepLabCut's likelihood below which a point counts as not seen."""
@@ -87,7 +89,8 @@ def read_recording(
 
 def _read_tables(path: Path, columns: Mapping[str, str] | None) -> list[RecordedTable]:
     try:
-        text = read_text(path, MAX_BYTES, what="table of motion").removeprefix("\ufeff")
+        most = MAX_TRACKER_BYTES if path.suffix.lower() == ".trk" else MAX_BYTES
+        text = read_text(path, most, what="table of motion").removeprefix("\ufeff")
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; check its name") from None
     if path.suffix.lower() == ".trk":
@@ -96,6 +99,11 @@ def _read_tables(path: Path, columns: Mapping[str, str] | None) -> list[Recorded
         raise InputError(f"{path}: {path.suffix or 'no ending'} is not read; export CSV, C3D, or MCAP")
     first = text.partition("\n")[0]
     separator = max(",;\t", key=first.count)
+    if (cells := text.count(separator) + text.count("\n")) > MOST_CELLS or first.count(separator) >= MOST_COLUMNS:
+        raise InputError(
+            f"{path}: has {cells} cells, {first.count(separator) + 1} in a row; a table has at most {MOST_CELLS}, "
+            f"{MOST_COLUMNS} in a row: export fewer points"
+        )
     try:
         rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(cell.strip() for cell in row)]
     except csv.Error as error:
@@ -120,6 +128,8 @@ def _heading(cell: str) -> tuple[str, str]:
 def _read_table(path: Path, rows: list[list[str]], columns: dict[str, str]) -> list[RecordedTable]:
     if len(rows) < 4:
         raise InputError(f"{path}: has {max(len(rows) - 1, 0)} rows; a motion needs a heading and at least 3")
+    if (longest := max(map(len, rows[0]))) > MOST_HEADING:
+        raise InputError(f"{path}: has a heading of {longest} characters; give names of at most {MOST_HEADING}")
     headings = [_heading(cell) for cell in rows[0]]
     if all(re.fullmatch(r"[-+\d.eE]*", name) for name, _ in headings):
         raise InputError(f"{path}: the first row has no names; give headings such as time,x,y,z")
@@ -148,8 +158,10 @@ def _read_table(path: Path, rows: list[list[str]], columns: dict[str, str]) -> l
     if len(lengths) > 1:
         raise InputError(f"{path}: lengths in {' and '.join(sorted(lengths))}: export one unit")
     found = []
+    inside = {time, *(name for group in points.values() for name in group)} - {trial}
+    wanted = [(i, name) for i, name in enumerate(names) if name in inside]
     for name, lines in takes.items():
-        table = {n: _numbers(path, lines, i, n) for i, n in enumerate(names) if n != trial and _wanted(n, time, points)}
+        table = {n: _numbers(path, lines, i, n) for i, n in wanted}
         blank = np.zeros(len(lines))
         stacked = [[blank if n is None else table[n] for n in group] for group in points.values()]
         found.append(
@@ -165,10 +177,6 @@ def _read_table(path: Path, rows: list[list[str]], columns: dict[str, str]) -> l
             )
         )
     return found
-
-
-def _wanted(name: str, time: str | None, points: Mapping[str, Sequence[str | None]]) -> bool:
-    return name == time or any(name in group for group in points.values())
 
 
 def _point_columns(path: Path, names: Sequence[str]) -> dict[str, list[str | None]]:
@@ -300,6 +308,8 @@ def _read_tracker(path: Path, text: str) -> RecordedTable:
     order = sorted({frame for own in tracks.values() for frame in own})
     if len(order) < 3:
         raise InputError(f"{path}: {len(order)} frames are tracked; a motion needs at least 3")
+    if len(order) * len(tracks) > MOST_CELLS:
+        raise InputError(f"{path}: {len(tracks)} points in {len(order)} frames are too many; save fewer tracks")
     points = np.full((len(order), len(tracks), 3), math.nan)
     for k, own in enumerate(tracks.values()):
         for i, frame in enumerate(order):

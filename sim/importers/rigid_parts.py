@@ -22,6 +22,8 @@ from ..scene.meshes import read_mesh
 
 Array = NDArray[np.float64]
 MAX_DEPTH, MAX_PARTS, MAX_VERTICES = 64, 5000, 2_000_000
+MAX_ALL_VERTICES = 5 * MAX_VERTICES
+"""Of all shapes of a model that are mesh files, as often as they are named."""
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
 ROUND = 32
 """Segments of a circle in the meshes of round shapes; volumes and inertia are exact all the same."""
@@ -104,7 +106,8 @@ class ModelReader:
 
     def __init__(self, path: Path, root: ElementTree.Element) -> None:
         self.path, self.root, self.notes = path, root, list[str]()
-        self.parts = 0
+        self.parts = self.vertices = 0
+        self.read_meshes: dict[str, tuple[Array, NDArray[np.int64]]] = {}
 
     def fail(self, what: str) -> InputError:
         """Return the error that names the file."""
@@ -133,12 +136,17 @@ class ModelReader:
 
     def mesh(self, name: str, scale: Array) -> tuple[Array, NDArray[np.int64]]:
         """Return vertices (V, 3) and faces (T, 3) of a mesh file in the model's folder, times ``scale`` (3,)."""
-        try:
-            mesh = read_mesh(inside(self.path.parent, name))
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from None
-        faces = np.asarray(mesh.faces, dtype=np.int64)
-        return np.asarray(mesh.vertices) * scale, faces[:, ::-1] if np.prod(scale) < 0 else faces
+        if name not in self.read_meshes:
+            try:
+                mesh = read_mesh(inside(self.path.parent, name))
+            except InputError as error:
+                raise InputError(f"{self.path}: {error}") from None
+            self.read_meshes[name] = np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64)
+        vertices, faces = self.read_meshes[name]
+        self.vertices += len(vertices)
+        if self.vertices > MAX_ALL_VERTICES:
+            raise self.fail(f"its meshes have more than {MAX_ALL_VERTICES} vertices together; reduce them")
+        return vertices * scale, faces[:, ::-1] if np.prod(scale) < 0 else faces
 
 
 def solid(kind: str, size: Sequence[float] | Array) -> Inertia:

@@ -160,6 +160,10 @@ def file_hash(path: Path) -> str:
         raise InputError(f"{path}: {error.strerror or error}") from error
 
 
+MOST_NAMED_BYTES = 8 * 2**30
+"""Of all files that a scene names, as often as it names them: so much is read and hashed."""
+
+
 def load_scene(root: str | Path) -> Scene:
     """Return the scene in the folder ``root``, checked.
 
@@ -179,11 +183,16 @@ def load_scene(root: str | Path) -> Scene:
     path = root / SCENE_FILE
     data = read_json(path, folder=root)
     folder = Scene(root=root, model=parse_scene(data, str(path)))
+    left = MOST_NAMED_BYTES
     for name in referenced_files(folder.model):
-        if not is_file(folder.file(name)):
+        file = folder.file(name)
+        if not is_file(file):
             raise InputError(
                 f"{path}: names {name!r}, which is missing or cannot be read; restore it or reconstruct the scene again"
             )
+        left -= file.stat().st_size
+        if left < 0:
+            raise InputError(f"{path}: names files of more than {MOST_NAMED_BYTES >> 30} GiB; reduce its meshes")
     return folder
 
 
@@ -264,8 +273,10 @@ def referenced_files(scene: SceneModel) -> list[str]:
     return names
 
 
-MOST_NAMING = 512 * 2**20
-"""Bytes of a mesh file that is searched for names, as many as a mesh may have."""
+MOST_NAMING, MOST_LIBRARY = 512 * 2**20, 4 * 2**20
+"""Bytes of a mesh file that is searched for names, as many as a mesh may have, and of a material library."""
+MOST_LIBRARIES, MOST_BESIDE, MOST_LINE = 64, 10_000, 2**16
+"""Libraries that a mesh may name, names in it and them, and characters of a line with names."""
 
 _MTL_TEXTURE = re.compile(r"(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+)", re.IGNORECASE)
 
@@ -274,21 +285,42 @@ def side_files(mesh: Path) -> list[str]:
     """Return the files that a mesh file refers to, relative to its folder: an OBJ's material libraries and their
     textures, a glTF's buffers and images. Other formats are self-contained.
 
-    Files that are missing or lie outside the mesh's folder are left out; the mesh is read without them.
+    Files that are missing or lie outside the mesh's folder are left out; the mesh is read without them. A library names
+    no further ones. Raises InputError for more names than any mesh has.
+    """
+    tried: set[str] = set()
+    found = _beside(mesh, mesh, tried)
+    libraries = [name for name in found if name.lower().endswith(".mtl")]
+    if len(libraries) > MOST_LIBRARIES:
+        raise InputError(f"{mesh}: names {len(libraries)} material libraries; export it again with one")
+    for library in libraries:
+        textures = _beside(mesh, mesh.parent / library, tried)
+        found += [name for name in textures if not name.lower().endswith(".mtl")]
+    return list(dict.fromkeys(found))
+
+
+def _beside(mesh: Path, path: Path, tried: set[str]) -> list[str]:
+    """Return the files that ``path``, of the mesh or a library of it, names, relative to the mesh's folder.
+
+    tried: names that were looked at before, which are not again.
     """
     found: list[str] = []
-    for name in _named_beside(mesh):
+    for name in _named_beside(path):
+        if len(name) > MOST_NAME:
+            continue
+        wanted = (path.parent.relative_to(mesh.parent) / name.replace("\\", "/")).as_posix()
+        if wanted in tried:
+            continue
+        tried.add(wanted)
+        if len(tried) > MOST_BESIDE:
+            raise InputError(f"{mesh}: names more than {MOST_BESIDE} files; export it again with its textures inside")
         try:
-            inner = inside(mesh.parent, name.replace("\\", "/"))
+            inner = inside(mesh.parent, wanted)
         except InputError:
             continue
-        relative = inner.relative_to(mesh.parent).as_posix()
-        if relative not in found and inner.is_file():
-            found.append(relative)
-            if inner.suffix.lower() == ".mtl":
-                parent = PurePosixPath(relative).parent
-                found += [(parent / texture).as_posix() for texture in side_files(inner)]
-    return list(dict.fromkeys(found))
+        if inner.is_file():
+            found.append(inner.relative_to(mesh.parent).as_posix())
+    return found
 
 
 def _named_beside(path: Path) -> Iterator[str]:
@@ -298,8 +330,9 @@ def _named_beside(path: Path) -> Iterator[str]:
         if suffix == ".gltf":
             yield from _named_in_gltf(json.loads(read_bytes(path, MOST_NAMING)))
         elif suffix in (".obj", ".mtl"):
-            with io.TextIOWrapper(open_file(path, MOST_NAMING), encoding="utf-8", errors="replace") as file:
-                for line in map(str.strip, file):
+            most = MOST_NAMING if suffix == ".obj" else MOST_LIBRARY
+            with io.TextIOWrapper(open_file(path, most), encoding="utf-8", errors="replace") as file:
+                for line in map(str.strip, iter(lambda: file.readline(MOST_LINE), "")):
                     # Several names may follow, and one name may hold spaces; options may come before a texture's.
                     if suffix == ".obj" and line.startswith("mtllib "):
                         yield from (line.removeprefix("mtllib ").strip(), *line.split()[1:])

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import math
+import struct
 import threading
 import zipfile
 from collections.abc import Iterator
@@ -29,6 +31,10 @@ if TYPE_CHECKING:
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 MAX_MESH_BYTES = 512 * 2**20
+MAX_UNPACKED_BYTES = 4 * MAX_MESH_BYTES
+"""Of a glTF's views, numbers and instances together: parts of a small file may overlap, and be used again and again."""
+MAX_NODES, MAX_COMMAS = 10_000, 5_000_000
+"""Places in a glTF's scene, and commas in its description, which says how much memory that takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +79,12 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: mesh files are {', '.join(MESH_SUFFIXES)}, not {path.suffix or 'without suffix'!r}")
     try:
-        content = io.BytesIO(read_bytes(path, MAX_MESH_BYTES, what="mesh"))
+        content = read_bytes(path, MAX_MESH_BYTES, what="mesh")
         kind, beside = path.suffix.lower().removeprefix("."), _files_beside(path.parent)
+        if kind in ("glb", "gltf"):
+            _require_bounded(content, path)
         with _without_postscript():
-            mesh = trimesh.load(content, file_type=kind, resolver=beside, process=False, force="mesh")
+            mesh = trimesh.load(io.BytesIO(content), file_type=kind, resolver=beside, process=False, force="mesh")
     except InputError:
         raise
     except FileNotFoundError:
@@ -87,6 +95,66 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     except Exception as error:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again") from error
     return _checked_mesh(mesh, path)
+
+
+_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_NUMBER_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2}
+_GLB = struct.Struct("<4sIII4s")
+
+
+def _require_bounded(content: bytes, path: Path) -> None:
+    """Raise InputError for a glTF that unpacks to more than ``MAX_UNPACKED_BYTES``, before trimesh does it.
+
+    What is no glTF is left to trimesh, which says so.
+    """
+    if content[:4] == b"glTF" and len(content) >= _GLB.size:
+        content = content[_GLB.size : _GLB.size + _GLB.unpack_from(content)[3]]
+    if content.count(b",") > MAX_COMMAS:
+        raise InputError(f"{path}: its description has too many parts to be one mesh; export it again")
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError):
+        return
+    nodes = _listed(document, "nodes")
+    if len(nodes) > MAX_NODES:
+        raise InputError(f"{path}: has {len(nodes)} nodes, more than {MAX_NODES}; join its meshes and export it again")
+    views = sum(_count(view.get("byteLength")) for view in _listed(document, "bufferViews"))
+    stored = [
+        _count(item.get("count"))
+        * _NUMBERS.get(str(item.get("type")), 1)
+        * _NUMBER_BYTES.get(_count(item.get("componentType")), 4)
+        for item in _listed(document, "accessors")
+    ]
+
+    def bytes_of(index: Any) -> int:
+        return stored[index] if isinstance(index, int) and 0 <= index < len(stored) else 0
+
+    meshes = []
+    for mesh in _listed(document, "meshes"):
+        parts = _listed(mesh, "primitives")
+        named = [[*_values(part.get("attributes")), part.get("indices")] for part in parts]
+        meshes.append(sum(bytes_of(index) for indices in named for index in indices))
+    places = (node.get("mesh") for node in nodes)
+    placed = sum(meshes[index] for index in places if isinstance(index, int) and 0 <= index < len(meshes))
+    if (total := views + sum(stored) + sum(meshes) + placed) > MAX_UNPACKED_BYTES:
+        raise InputError(
+            f"{path}: unpacks to {total / 2**30:.3g} GiB, more than {MAX_UNPACKED_BYTES >> 30} GiB; reduce the mesh "
+            "and export it again"
+        )
+
+
+def _listed(value: Any, kind: str) -> list[dict[str, Any]]:
+    """Return the entries of the list ``kind`` of a damaged document, no objects as empty ones, so that places stay."""
+    found = value.get(kind) if isinstance(value, dict) else None
+    return [item if isinstance(item, dict) else {} for item in found] if isinstance(found, list) else []
+
+
+def _values(value: Any) -> list[Any]:
+    return list(value.values()) if isinstance(value, dict) else []
+
+
+def _count(value: Any) -> int:
+    return value if isinstance(value, int) and value > 0 else 0
 
 
 _pillow = threading.RLock()
@@ -145,13 +213,18 @@ def _files_beside(folder: Path) -> Any:
     class Beside(Resolver):  # type: ignore[misc]
         def __init__(self) -> None:
             self.folder = folder
+            self.left = 2 * MAX_MESH_BYTES
 
         def get(self, name: str) -> bytes:
             wanted = unquote(str(name)).replace("\\", "/").removeprefix("./").strip()
             # As programs on other machines wrote it, with folders that are not here: the file of that name beside.
             for candidate in (wanted, wanted.rpartition("/")[2]):
                 with contextlib.suppress(InputError, FileNotFoundError):
-                    return read_bytes(inside(folder, candidate), MAX_MESH_BYTES, what="part of a mesh", folder=folder)
+                    most = min(MAX_MESH_BYTES, self.left)
+                    content = read_bytes(inside(folder, candidate), most, what="part of a mesh", folder=folder)
+                    # One file may be named any number of times.
+                    self.left -= len(content)
+                    return content
             raise FileNotFoundError(wanted)
 
         def keys(self) -> tuple[str, ...]:

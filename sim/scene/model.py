@@ -8,6 +8,7 @@ to the camera's right and Y away from it.
 from __future__ import annotations
 
 import math
+import unicodedata
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -226,6 +227,10 @@ class Light:
         )
 
 
+MOST_OBJECTS, MOST_EFFECTS = 2000, 1000
+"""Of a scene; contacts are kept for every pair of objects."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneModel:
     """A complete scene. File names are relative to the scene folder.
@@ -249,7 +254,11 @@ class SceneModel:
     contacts: tuple[Contact, ...] = ()
 
     def __post_init__(self) -> None:
-        require(len(self.objects) > 0, "objects", (), "a scene needs at least one object")
+        count = len(self.objects)
+        require(count > 0, "objects", (), "a scene needs at least one object")
+        require(count <= MOST_OBJECTS, "number of objects", count, f"a scene has at most {MOST_OBJECTS}")
+        count = len(self.effects)
+        require(count <= MOST_EFFECTS, "number of effects", count, f"a scene has at most {MOST_EFFECTS}")
         require(
             (self.photo is None) == (self.background is None),
             "photo, background",
@@ -262,7 +271,8 @@ class SceneModel:
             self.gravity,
             "give three numbers in m/s², together up to 10000",
         )
-        names = [o.name.casefold() for o in self.objects]
+        # Some file systems take letters composed in other ways for the same.
+        names = [unicodedata.normalize("NFC", o.name).casefold() for o in self.objects]
         require(
             len(set(names)) == len(names),
             "objects",
@@ -272,12 +282,9 @@ class SceneModel:
         present = {o.name for o in self.objects}
         for index, effect in enumerate(self.effects):
             for name in effect.objects:
-                require(
-                    name in present,
-                    f"effects[{index}].objects",
-                    name,
-                    f"name some of {', '.join(sorted(present))}, or none for all",
-                )
+                if name not in present:
+                    remedy = f"name some of {', '.join(sorted(present))}, or none for all"
+                    require(False, f"effects[{index}].objects", name, remedy)
         require_rising("gravity_track", self.gravity_track)
         for i, key in enumerate(self.gravity_track):
             strength = math.hypot(*key.value)
@@ -285,17 +292,15 @@ class SceneModel:
         self._check_contacts()
 
     def _check_contacts(self) -> None:
-        known = [o.name for o in self.objects] + ([GROUND] if self.ground is not None else [])
+        # In order, for the message.
+        known = dict.fromkeys([o.name for o in self.objects] + ([GROUND] if self.ground is not None else []))
         pairs = set()
         for i, contact in enumerate(self.contacts):
             for name in contact.between:
-                missing = "no ground" if name == GROUND else f"no object {name!r}"
-                require(
-                    name in known,
-                    f"contacts[{i}].between",
-                    list(contact.between),
-                    f"there is {missing}; choose two of {', '.join(known)}",
-                )
+                if name not in known:
+                    missing = "no ground" if name == GROUND else f"no object {name!r}"
+                    remedy = f"there is {missing}; choose two of {', '.join(known)}"
+                    require(False, f"contacts[{i}].between", list(contact.between), remedy)
             pair = frozenset(contact.between)
             require(pair not in pairs, f"contacts[{i}].between", list(contact.between), "name every pair once")
             pairs.add(pair)

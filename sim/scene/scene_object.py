@@ -201,6 +201,9 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]
 ROLES = ("dynamic", "collider")
 IDENTITY4: Matrix4 = tuple(tuple(1.0 if i == j else 0.0 for j in range(4)) for i in range(4))  # type: ignore[misc]
 
+MOST_PINS = 1000
+"""Of an object: every particle is compared with each."""
+
 LEAST_ANGLE = 1e-6
 """Volume of the unit cube under ``world_from_mesh`` over the product of its edge lengths; below, it is degenerate."""
 
@@ -320,6 +323,7 @@ class SceneObject:
         )
         for name in ("acceleration", "velocity_keys", "pin_motion"):
             require_rising(f"{where}: {name}", getattr(self, name))
+        require(len(self.pins) <= MOST_PINS, f"{where}: number of pins", len(self.pins), f"give at most {MOST_PINS}")
         held = bool(self.pins) or self.goal_stiffness > 0
         require(held or not self.pin_motion, f"{where}: pin_motion", "given", "give pins or goal_stiffness as well")
         if self.role == "dynamic":

@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_bytes
 from ..errors import InputError
 from ..files import read_bytes
-from .meshes import MAX_MESH_BYTES, read_mesh
+from .meshes import MAX_MESH_BYTES, MAX_NODES, read_mesh
 
 MAX_JSON_BYTES = 16 * 2**20
-MAX_NODES = 10_000
 PICTURES = ("image/png", "image/jpeg")
 _MAGIC, _JSON, _BINARY, _TRIANGLES = b"glTF", b"JSON", b"BIN\0", 4
 _COMPONENTS: dict[int, np.dtype[Any]] = {

@@ -27,7 +27,8 @@ from .job_matrix import FIELDS, Variant, VariantPhysics, brief, read_physics, re
 
 FORMAT = "physgen-jobs/1"
 MAX_BYTES = 2**20
-MOST_SCENES = 1000
+MOST_SCENES, MOST_SIMULATIONS = 1000, 50_000
+"""Scenes, and variants of all of them together: more would not fit into a plan."""
 _ENDLESS_NAME = re.compile(r"""(?<![\w"'.-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){32}""")
 """Dotted keys this deep are meaningless here, and the time to parse one grows with the square of its depth."""
 
@@ -154,6 +155,8 @@ def _load(path: Path) -> Job:
                 f"{where}.scenes[{index}].name: {scene.name!r} is used twice; give every scene a unique name"
             )
         scenes.append(scene)
+        if sum(len(scene.variants) for scene in scenes) > MOST_SIMULATIONS:
+            raise InputError(f"{where}: makes more than {MOST_SIMULATIONS} simulations; split the job")
     return Job(name=name, root=root, out=out, scenes=tuple(scenes))
 
 
