@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from ...physgen_addon.frames.frame_index import INDEX_FILE
 from ...physgen_addon.render.render_options import require_video_name
 from ...sim.app.bake_options import BakeOptions
 from ...sim.app.default_motion import tells_motion
@@ -158,15 +159,19 @@ def fetch_models(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
 
 def run_run(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen run``; the exit code."""
+    unnamed = options.out is None
     if options.out is None:
         options.out = Path(f"{options.photo.stem}.mp4")
     require_video_name(options.out)
+    work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
+    if unnamed and options.out.exists() and not (work / "frames" / INDEX_FILE).is_file():
+        # As cameras call the recording beside a photo.
+        raise InputError(f"{options.out}: is there already, and no earlier run made it; name the video with --out")
     physics = physics_options(options)
     given = tells_motion(physics.velocities, physics.spins, physics.overrides)
     if options.still and given:
         raise InputError("--still: a motion is given as well (--velocity, --spin or --set); leave one of them out")
     fetch_models(options, terminal, cancelled)
-    work = options.work or options.out.resolve().with_name(options.out.resolve().stem + "_work")
     use_found_boxes(options, work / "proposals", terminal, cancelled)
     request = stages.RunRequest(
         photo=options.photo,

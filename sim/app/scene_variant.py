@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from .reconstruct import Physics
 
 
+MADE_OTHERWISE = {"reconstruct.json": "a reconstruction", "compose.json": "a composition"}
+"""Files that no variant has."""
+
+
 def make_variant(
     source: Scene,
     *,
@@ -62,6 +66,8 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
         leftovers = {Path(name).parts[0] for name in referenced_files(scene)}
         if any(p.name not in leftovers for p in out.iterdir() if not p.name.startswith(".")):
             raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
+    if (kind := next((kind for name, kind in MADE_OTHERWISE.items() if (out / name).is_file()), None)) is not None:
+        raise InputError(f"{out}: is {kind}, which the variant would replace; choose another folder")
     with folder_lock(out):
         for name in source.with_model(scene).files():
             _link_or_copy(source.file(name), inside(out, name))

@@ -107,6 +107,19 @@ def test_help_has_every_command_in_a_group_and_every_flag_of_one(capsys):
         assert not [word for word in wanted if not re.search(rf"(^|[ ,]){re.escape(word)}\b", text, re.M)]
 
 
+def test_a_recording_that_is_called_as_the_photo_is_not_written_over(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "toss.mp4").write_bytes(b"mine")
+    assert main(["run", "toss.jpg", "--box", "1,2,3,4"]) == 3
+    assert "toss.mp4: is there already, and no earlier run made it" in capsys.readouterr().err
+    # Of an earlier run of ours, it is: then the photo is looked for next.
+    (tmp_path / "toss_work" / "frames").mkdir(parents=True)
+    (tmp_path / "toss_work" / "frames" / "frames.json").write_text("{}")
+    assert main(["run", "toss.jpg", "--box", "1,2,3,4"]) == 3
+    assert "toss.jpg" in capsys.readouterr().err
+    assert (tmp_path / "toss.mp4").read_bytes() == b"mine"
+
+
 def test_help_is_written_in_any_encoding(monkeypatch):
     """A code page of Windows has no arrows."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")

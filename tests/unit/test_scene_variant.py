@@ -51,10 +51,15 @@ def test_invalid_variants_are_refused(ball_scene, tmp_path):
     root = ball_scene().root
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
+    edited, composed = ball_scene(name="edited").root, ball_scene(name="composed").root
+    (edited / "reconstruct.json").write_text("{}")
+    (composed / "compose.json").write_text("{}")
     for out, words in (
         (root, "is the scene itself"),
         (tmp_path / "mine", "holds other files"),
         (root / "photo.png", "is a file"),
+        (edited, "is a reconstruction"),
+        (composed, "is a composition"),
     ):
         with pytest.raises(InputError, match=words):
             make_variant(load_scene(root), out=out, physics=Physics())
