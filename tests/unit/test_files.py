@@ -14,6 +14,7 @@ import trimesh
 from physgen.batch.cli import main
 from physgen.sim.cache.bake_folder import disk_usage, load_bake
 from physgen.sim.cache.pc2 import Pc2Reader
+from physgen.sim.diagnose.track import initial_pose
 from physgen.sim.diagnose.track.track_videos import Video
 from physgen.sim.errors import InputError
 from physgen.sim.files import VIDEO_VARIABLE, name_for_ffmpeg, open_file, read_bytes, read_text, read_toml
@@ -396,3 +397,20 @@ def test_no_name_of_a_file_forges_a_line(tmp_path):
         (tmp_path / "a\nerror: \x1b[2Jb").mkdir()
         read_bytes(tmp_path / "a\nerror: \x1b[2Jb", 9)
     assert str(refused.value).isprintable()
+
+
+def test_a_photo_in_jpeg_2000_is_not_decoded_by_opencv(ball_scene):
+    """Whatever it is called: up to 4.11 its decoder has a hole (CVE-2025-53644)."""
+    scene = ball_scene()
+
+    def write(suffix):
+        done, content = cv2.imencode(suffix, np.zeros((32, 32, 3), np.uint8))
+        assert done
+        (scene.root / "photo.png").write_bytes(content.tobytes())
+
+    for suffix in (".png", ".jpg", ".bmp", ".webp", ".tiff"):
+        write(suffix)
+        assert initial_pose._picture(scene, "photo.png", (32, 32)).shape == (32, 32)
+    write(".jp2")
+    with pytest.raises(InputError, match="is not an image that can be read"):
+        initial_pose._picture(scene, "photo.png", (32, 32))

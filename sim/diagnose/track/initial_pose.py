@@ -53,11 +53,17 @@ def load_scene_photo(folder: Scene, camera: Camera, bodies: Sequence[SceneBody])
     return ScenePhoto(grey=_picture(folder, require_photo(folder)[0], size), masks=tuple(masks))
 
 
+_STARTS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM")
+"""Of PNG, JPEG, TIFF and BMP. OpenCV decodes by content, and its JPEG 2000 has a hole in 4.10 and 4.11, which Blender
+4.5's NumPy holds us to (CVE-2025-53644)."""
+
+
 def _picture(folder: Scene, name: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     path = folder.file(name)
     try:
         content = read_bytes(path, MAX_PICTURE_BYTES, what="picture")
-        image = cv2.imdecode(np.frombuffer(content or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+        known = content.startswith(_STARTS) or (content[:4] == b"RIFF" and content[8:12] == b"WEBP")
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE) if known else None
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; restore it or reconstruct the scene again") from None
     # OpenCV refuses more than 2^30 pixels, and some damage, by an error of its own.
