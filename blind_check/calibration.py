@@ -48,6 +48,7 @@ class JudgedCase:
     """A record and its verdict. right: the first cause is a true one (or ``none``, ``unknown``). pair: two named.
 
     both: both causes of two named. closed: share of the withheld gap that the verdict's model closes; NaN without one.
+    frame_auc: of its localisation; NaN where that was not recorded.
     """
 
     record: FitRecord
@@ -59,6 +60,7 @@ class JudgedCase:
     pair: bool
     both: bool
     closed: float
+    frame_auc: float
 
 
 def judge(record: FitRecord, settings: ComparisonSettings) -> JudgedCase:
@@ -79,6 +81,9 @@ def judge(record: FitRecord, settings: ComparisonSettings) -> JudgedCase:
         pair=len(verdict.effects) > 1,
         both=len(verdict.effects) > 1 and wanted == names,
         closed=1.0 - after / before if before > 0 and record.effect != NONE else math.nan,
+        frame_auc=math.nan
+        if record.effect == NONE
+        else record.frame_auc.get(_model(record, found) if verdict.effects else "", math.nan),
     )
 
 
@@ -95,8 +100,9 @@ class Reliability:
     """Quality of verdicts on N cases; shares are in [0, 1], NaN where no case applies.
 
     verdict_error, unknown_error: expected calibration error of the verdict's probability, and of that of ``unknown``
-    against whether the cause lies outside the vocabulary. rows: of the reliability table, (low, high, cases, mean
-    probability, share right) for verdicts, then for unknown.
+    against whether the cause lies outside the vocabulary; verdict_chance, unknown_chance: where it lies in nine of ten
+    sets with these probabilities if they are right (``chance_errors``). frame_auc: mean of the localisation. rows: of
+    the reliability table, (low, high, cases, mean probability, share right) for verdicts, then for unknown.
     """
 
     cases: int
@@ -106,6 +112,9 @@ class Reliability:
     abstains: float
     verdict_error: float
     unknown_error: float
+    verdict_chance: tuple[float, float]
+    unknown_chance: tuple[float, float]
+    frame_auc: float
     closed_median: float
     pairs_first: float
     pairs_both: float
@@ -122,7 +131,10 @@ class Reliability:
             f"false pairs on one cause {_percent(self.false_pairs)}",
             f"withheld gap closed, median {self.closed_median:.2f}; "
             f"95 % intervals hold the truth {self.covered[0]} of {self.covered[1]}",
+            f"localisation of the frames (AUC) {self.frame_auc:.2f}",
             f"expected calibration error: verdicts {self.verdict_error:.3f}, unknown {self.unknown_error:.3f}",
+            "  if the probabilities are right, in nine of ten such sets: "
+            + ", ".join(f"{low:.3f} to {high:.3f}" for low, high in (self.verdict_chance, self.unknown_chance)),
         ]
         for title, rows in zip(("verdict", "unknown"), self.rows, strict=True):
             lines.append(f"probability of the {title}: cases, mean, share right")
@@ -147,6 +159,9 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
         abstains=_share(c.verdict == UNKNOWN for c in cases if c.record.effect == UNKNOWN),
         verdict_error=calibration_error(p, right),
         unknown_error=calibration_error(q, outside),
+        verdict_chance=chance_errors(p),
+        unknown_chance=chance_errors(q),
+        frame_auc=_mean(c.frame_auc for c in cases if math.isfinite(c.frame_auc)),
         closed_median=float(np.median(closed)) if closed else math.nan,
         pairs_first=_share(c.right for c in two),
         pairs_both=_share(c.both for c in two),
@@ -154,6 +169,20 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
         covered=(sum(known), len(known)),
         rows=(_bins(p, right), _bins(q, outside)),
     )
+
+
+CHANCE_DRAWS = 2000
+
+
+def chance_errors(probability: Array) -> tuple[float, float]:
+    """Return the 5 and 95 % quantiles of the calibration error of outcomes drawn with ``probability`` (N,) itself.
+
+    Few cases have an error by chance, however right their probabilities are.
+    """
+    drawn = np.random.default_rng(0).random((CHANCE_DRAWS, len(probability))) < probability
+    errors = [calibration_error(probability, outcome) for outcome in drawn.astype(float)]
+    low, high = np.quantile(errors, (0.05, 0.95))
+    return float(low), float(high)
 
 
 def covered(record: FitRecord) -> bool | None:
@@ -244,7 +273,11 @@ def _bins(p: Array, right: Array) -> tuple[tuple[float, float, int, float, float
 
 
 def _share(values: Iterable[bool]) -> float:
-    found = [float(v) for v in values]
+    return _mean(float(v) for v in values)
+
+
+def _mean(values: Iterable[float]) -> float:
+    found = list(values)
     return float(np.mean(found)) if found else math.nan
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from ..sim.events import IsCancelled, never
 from ..sim.validation import read_json
 from .case import BlindCase
 from .check import PlannedCase, make_any
+from .scoring import localisation_auc
 
 FORMAT = "physgen-fit-record/1"
 
@@ -34,7 +35,9 @@ class FitRecord:
 
     matter: ``rigid`` or ``soft``. truth: the label (``Truth.label``). size_m: largest distance of the mesh to its
     middle. withheld_rms_m: by model (effects joined by "+", "" for the nominal one, "refitted"), RMS distance in m to
-    the withheld truth. cpu_s: of the fits. note: why there are no fits, or "".
+    the withheld truth. frame_auc: by model ("" for what is measured without one), how well its localisation ranks
+    frames in which the cause acts; none where it acts always or never. cpu_s: of the fits. note: why there are no
+    fits, or "".
     """
 
     matter: str
@@ -45,6 +48,7 @@ class FitRecord:
     floor_rms_m: float
     grain_rms_m: float
     withheld_rms_m: Mapping[str, float]
+    frame_auc: Mapping[str, float] = field(default_factory=dict)
     size_m: float = math.nan
     cpu_s: float = math.nan
     note: str = ""
@@ -84,6 +88,7 @@ def record_case(planned: PlannedCase, seed: Sequence[int], cancelled: IsCancelle
         "floor_rms_m": fits.floor_rms_m,
         "grain_rms_m": fits.grain_rms_m,
         "withheld_rms_m": _withheld(case, fits),
+        "frame_auc": _frame_auc(case, fits),
         "cpu_s": time.process_time() - started,
     }
 
@@ -96,6 +101,22 @@ def _withheld(case: BlindCase, fits: Fits) -> dict[str, float]:
         points = fits.predict(fit)
         squares = [np.sum((points[n] - wanted) ** 2, axis=-1).ravel() for n, wanted in truth.items() if n in points]
         found[name] = float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else math.nan
+    return found
+
+
+LOCALISED = 6
+"""Likeliest candidates whose localisation is recorded."""
+
+
+def _frame_auc(case: BlindCase, fits: Fits) -> dict[str, float]:
+    truth = case.truth.arrays()
+    likeliest = sorted(fits.candidates, key=lambda c: -c.log_evidence)[:LOCALISED]
+    found = {}
+    for name, fit in (("", None), *(("+".join(c.effects), c) for c in likeliest)):
+        where = {f"{trial}.frame_score": d.frame_score for trial, d in fits.discrepancy(fit).items()}
+        area = localisation_auc(where, {k: v for k, v in truth.items() if not k.endswith(".point_mask")})[0]
+        if area is not None:
+            found[name] = area
     return found
 
 
@@ -186,6 +207,7 @@ def _read_record(value: Mapping[str, Any]) -> FitRecord:
         floor_rms_m=_number(value["floor_rms_m"]),
         grain_rms_m=_number(value["grain_rms_m"]),
         withheld_rms_m={k: _number(v) for k, v in value["withheld_rms_m"].items()},
+        frame_auc={k: _number(v) for k, v in (value.get("frame_auc") or {}).items()},
         size_m=_number(value.get("size_m")),
         cpu_s=_number(value.get("cpu_s")),
     )

@@ -109,7 +109,7 @@ def score_report(
     frame_auc = point_auc = closed = reach = None
     if effect != NONE:
         try:
-            frame_auc, point_auc = _where(where, truth)
+            frame_auc, point_auc = localisation_auc(where, truth)
         except (KeyError, ValueError) as error:
             notes.append(f"where: {error!r}")
         try:
@@ -203,7 +203,7 @@ def _trial_names(truth: Arrays) -> list[str]:
     return sorted({key.split(".")[0] for key in truth})
 
 
-def _where(where: Arrays, truth: Arrays) -> tuple[float | None, float | None]:
+def localisation_auc(where: Arrays, truth: Arrays) -> tuple[float | None, float | None]:
     """Return the mean AUC over complete trials of frame scores, and of point scores where the cause is local."""
     frames, points = [], []
     for trial in _trial_names(truth):

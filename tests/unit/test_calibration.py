@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from physgen.blind_check.calibration import cross_validated, judge, pair_gain, reliability
+from physgen.blind_check.calibration import chance_errors, cross_validated, judge, pair_gain, reliability
 from physgen.blind_check.check import plan_cases
 from physgen.blind_check.fit_records import FORMAT, load_records, missing_cases, save_record
 from physgen.sim.diagnose.model_comparison import ComparisonSettings
@@ -38,6 +38,7 @@ def record(effects, *candidates, effect=None, parameters=None):
         "floor_rms_m": 0.001,
         "grain_rms_m": 0.001,
         "withheld_rms_m": {"": 0.02, "refitted": 0.03, **{"+".join(c["effects"]): 0.002 for c in candidates}},
+        "frame_auc": {"": 0.6, **{"+".join(c["effects"]): 0.9 for c in candidates}},
         "size_m": float("nan"),
         "cpu_s": 1.0,
     }  # fmt: skip
@@ -68,9 +69,19 @@ def test_records_are_judged_as_a_diagnosis_judges(folder):
     found = reliability(cases)
     assert found.first == 1.0 and found.pairs_both == 1.0 and found.false_pairs == 0.0 and found.false_alarms == 0.0
     assert found.covered == (1, 2)
+    # The cause found localises in three, the bare measurement where it is unknown; without a gap there is nothing.
+    assert found.frame_auc == pytest.approx((3 * 0.9 + 0.6) / 4) and np.isnan(cases[0].frame_auc)
     assert sum(row[2] for row in found.rows[0]) == len(cases) == sum(row[2] for row in found.rows[1])
     assert "both 100 %" in found.text() and "1 of 2" in found.text()
     assert pair_gain(records[3])[:2] == (("air_drag", "friction"), pytest.approx(400))
+
+
+def test_few_cases_have_a_calibration_error_by_chance():
+    """At one half it is |share - 1/2| of N coins: a half-normal one of deviation 1 / (2 sqrt N)."""
+    low, high = chance_errors(np.full(400, 0.5))
+    assert low == pytest.approx(0.0627 / 40, abs=1 / 400)  # outcomes come in steps of one in N
+    assert high == pytest.approx(1.96 / 40, abs=1 / 400)
+    assert chance_errors(np.ones(7)) == (0.0, 0.0)
 
 
 def test_constants_are_chosen_without_the_effect_that_is_judged(folder):

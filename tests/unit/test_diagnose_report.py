@@ -33,6 +33,7 @@ from physgen.sim.diagnose.report.diagnosis_page import scene_effects
 from physgen.sim.diagnose.report.object_heatmaps import object_scores
 from physgen.sim.diagnose.report.trajectory_plots import camera_plane
 from physgen.sim.diagnose.report.wording import headline, number_text, percent_text, quantity_text
+from physgen.sim.diagnose.verification_run import VerificationRun
 from physgen.sim.effects.registry import effects
 from physgen.sim.html import Picture, clean, element, text
 
@@ -304,6 +305,22 @@ def test_a_verdict_without_effect_adds_nothing(effect, tmp_path):
     assert "Add found effect" not in text and '"effects"' not in text
     wanted = {"none": "Nothing is missing", "unknown": "none of the known effects"}[effect]
     assert wanted in text
+
+
+def test_a_verification_run_is_a_table_with_units(tmp_path):
+    run = VerificationRun(
+        trial="take01",
+        seconds_s=0.5,
+        before_rms_m=0.0412,
+        after_rms_m=0.0031,
+        numerics_rms_m=0.0007,
+        against_model_rms_m=0.0029,
+    )
+    confirmation = {"takes": [dataclasses.asdict(run) | {"word": run.word}]}
+    text = said(written(*case(confirmation=confirmation), tmp_path)[0])
+    assert "rms_m" not in text and "{'" not in text
+    for word in ("take01", "0.500 s", "41.2\u00a0mm", "3.10\u00a0mm", "0.700\u00a0mm", "confirmed"):
+        assert word in text, word
 
 
 def test_a_cause_that_does_not_beat_its_controls_is_called_so(tmp_path):

@@ -41,6 +41,12 @@ MAX_ROWS = 80
 
 _TEMPLATE = Path(__file__).with_name("diagnosis_page.html")
 _MARKS = {"found-fill": "verdict", "nominal-fill": "indistinguishable from it"}
+VERIFIED = {
+    "confirmed": "confirmed: closer to the recording",
+    "contradicted": "contradicted: farther from the recording",
+    "undecided": "undecided: no difference beyond that of two resolutions",
+}
+"""Result of a verification run in words."""
 _BAR = 110.0
 """Width of a probability bar in CSS pixels, as in the template."""
 
@@ -132,7 +138,13 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         nothing_to_add=_nothing_to_add(diagnosis),
         assumptions=assumptions(capture),
         verification=[
-            (shortened(str(key).replace("_", " "), 60), _value(value)) for key, value in diagnosis.confirmation.items()
+            (shortened(str(key).replace("_", " "), 60), _value(value))
+            for key, value in diagnosis.confirmation.items()
+            if key != "takes"
+        ],
+        verified=[
+            {**take, "word": VERIFIED.get(take["word"], take["word"])}
+            for take in diagnosis.confirmation.get("takes") or ()
         ],
         marks=_MARKS,
         bar_class=bar_class,
