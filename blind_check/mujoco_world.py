@@ -212,15 +212,15 @@ def _loaded_inertia(body: Body, fraction: float, at: tuple[float, float, float],
     )
 
 
-def simulate_rigid(world: RigidWorld, state: State, times: Array) -> Motion:
-    """Return the motion from ``state`` at ``times[0]``. times: (T,) s, rising, true time.
+def simulate_rigid(world: RigidWorld, state: State, times: Array, *, step: float = STEP_S) -> Motion:
+    """Return the motion from ``state`` at ``times[0]``. times: (T,) s, rising, true time. step: longest one, s.
 
     Raises InputError without MuJoCo.
     """
     mujoco = load_mujoco()
     model = _model(mujoco, world)
     data = mujoco.MjData(model)
-    recorder = _Recorder(world, model, data, mujoco, len(times))
+    recorder = _Recorder(world, model, data, mujoco, len(times), step)
     recorder.place(state, float(times[0]))
     for frame in range(len(times)):
         if frame:
@@ -232,7 +232,8 @@ def simulate_rigid(world: RigidWorld, state: State, times: Array) -> Motion:
 class _Recorder:
     """Steps a model from frame to frame and records contacts in between."""
 
-    def __init__(self, world: RigidWorld, model: Any, data: Any, mujoco: Any, frames: int) -> None:
+    def __init__(self, world: RigidWorld, model: Any, data: Any, mujoco: Any, frames: int, step: float) -> None:
+        self._step = step
         self._world, self._model, self._data, self._mujoco = world, model, data, mujoco
         self._body = model.body("body").id
         self._mass = float(model.body_mass[self._body])
@@ -256,7 +257,7 @@ class _Recorder:
         self._mujoco.mj_forward(self._model, self._data)
 
     def advance(self, frame: int, duration: float) -> None:
-        steps = max(1, math.ceil(duration / STEP_S - 1e-9))
+        steps = max(1, math.ceil(duration / self._step - 1e-9))
         self._model.opt.timestep = duration / steps
         done = 0
         while done < steps:

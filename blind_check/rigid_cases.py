@@ -19,6 +19,7 @@ from ..sim.errors import SimulationError
 from ..sim.events import IsCancelled, never
 from .case import BlindCase, Lens, TrialTruth, Truth, draw_camera, drop_points, project
 from .mujoco_world import (
+    STEP_S,
     Array,
     Body,
     Motion,
@@ -45,6 +46,9 @@ MOST_ORACLE_M = 0.008
 
 BOUNCE_UNDERRATED = 0.016
 """Largest underestimate of the nominal restitution, as if measured from frames that miss the apex."""
+
+SEARCH_STEP_S = 4e-4
+"""Longest step while strengths are chosen and draws rejected, a fifth of a contact; captures have ``STEP_S``."""
 
 _ATTEMPTS = 20
 _AIRY = ("air_drag", "wind", "magnus")
@@ -104,19 +108,23 @@ def rigid_case(effects: Sequence[str], rng: np.random.Generator, cancelled: IsCa
             if cancelled():
                 break
         if all(LEAST_OVER_NOISE <= r <= 120 for r in ratios):
-            case = _assembled(stage, hidden, ratios, nominal, rng)
-            if _predictable(case, hidden):
-                return case
+            seen = _observe(stage, hidden)
+            notes, oracle = _notes(stage, seen, nominal), _oracle(stage, hidden, seen, rng)
+            if _predictable(hidden, oracle, notes["true_nominal_rms_withheld_m"]):
+                return _assembled(stage, hidden, ratios, oracle, notes, rng)
     raise SimulationError(f"no draw of {_ATTEMPTS} made {', '.join(names)} visible; choose another seed")
 
 
-def _predictable(case: BlindCase, hidden: Sequence[_Hidden]) -> bool:
-    """Return whether knowing the causes helps on withheld frames: tumbling on edges is chaotic."""
-    if case.truth.oracle_rms_m > MOST_ORACLE_M:
+def _predictable(hidden: Sequence[_Hidden], oracle: float, gap: float) -> bool:
+    """Return whether knowing the causes helps on withheld frames: tumbling on edges is chaotic.
+
+    oracle, gap: RMS errors there in m, of the true model from the shown frames and of the nominal one from the truth.
+    """
+    if oracle > MOST_ORACLE_M:
         return False
     if not hidden or any(h.cause.camera is not None or h.cause.lens is not None for h in hidden):
         return True
-    return bool(case.truth.notes["true_nominal_rms_withheld_m"] > 2 * case.truth.oracle_rms_m)
+    return gap > 2 * oracle
 
 
 def _draw_world(names: Sequence[str], rng: np.random.Generator) -> RigidWorld:
@@ -182,8 +190,13 @@ class _Seen:
     normals: Array
 
 
-def _observe(stage: _Stage, hidden: Sequence[_Hidden], states: Sequence[State] | None = None) -> list[_Seen]:
-    """Return noise-free observations of every trial; ``states`` replace the trials' own."""
+def _observe(
+    stage: _Stage,
+    hidden: Sequence[_Hidden],
+    states: Sequence[State] | None = None,
+    step: float = SEARCH_STEP_S,
+) -> list[_Seen]:
+    """Return noise-free observations of every trial; ``states`` replace the trials' own. step: the longest, s."""
     world, times, camera, lens = stage.world, stage.times, stage.camera, Lens()
     for item in hidden:
         cause, strength = item.cause, item.strength
@@ -196,7 +209,7 @@ def _observe(stage: _Stage, hidden: Sequence[_Hidden], states: Sequence[State] |
             lens = cause.lens(strength)
     seen = []
     for index, trial in enumerate(stage.trials):
-        motion = simulate_rigid(world, trial.state if states is None else states[index], times)
+        motion = simulate_rigid(world, trial.state if states is None else states[index], times, step=step)
         points = motion.points(stage.rest)
         pixels = None if camera is None else project(points, camera, lens)
         normals = np.einsum("tij,kj->tki", motion.rotation, stage.normals)
@@ -245,10 +258,12 @@ def _assembled(
     stage: _Stage,
     hidden: Sequence[_Hidden],
     ratios: Sequence[float],
-    nominal: Sequence[_Seen],
+    oracle: float,
+    notes: Mapping[str, Any],
     rng: np.random.Generator,
 ) -> BlindCase:
-    seen = _observe(stage, hidden) if hidden else nominal
+    """Return the case as recorded, simulated with ``STEP_S``. oracle, notes: of ``_oracle`` and ``_notes``."""
+    seen = _observe(stage, hidden, step=STEP_S)
     order = np.argsort(ratios)[::-1]
     hidden = [hidden[i] for i in order]
     effects = tuple(h.cause.effect for h in hidden if h.cause.effect != UNKNOWN)
@@ -278,11 +293,11 @@ def _assembled(
         mechanism=" + ".join(h.cause.mechanism for h in hidden) or NONE,
         simulator="mujoco-rigid",
         parameters=parameters[hidden[0].cause.mechanism] if len(hidden) == 1 else parameters,
-        oracle_rms_m=_oracle(stage, hidden, seen, rng),
+        oracle_rms_m=oracle,
         effect_rms_over_noise=float(max(ratios, default=0.0)),
         trials=truths,
         ambiguous_with=ambiguous,
-        notes=_notes(stage, seen, nominal),
+        notes=notes,
     )
     return BlindCase(capture=capture, truth=truth)
 

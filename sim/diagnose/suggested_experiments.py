@@ -22,17 +22,19 @@ NEAR_GROUND = 1.5
 @dataclass(frozen=True, kw_only=True)
 class RecordedSetting:
     """What an experiment can repeat. dropped: nothing moved sideways. lands: the ground was reached. turns: the points
-    show how the body turns."""
+    show how the body turns. lone: one complete trial is all."""
 
     dropped: bool = False
     lands: bool = True
     turns: bool = True
+    lone: bool = False
 
 
 def recorded_setting(capture: Capture) -> RecordedSetting:
     """Return the setting of ``capture``; of pixels, which leave the depth open, one in which everything is possible."""
+    lone = len(capture.fit_trials) == 1
     if any(t.points is None for t in capture.trials):
-        return RecordedSetting()
+        return RecordedSetting(lone=lone)
     normal, foot = capture.ground.unit_normal, np.asarray(capture.ground.point)
     size = max(float(np.ptp(item.vertices, axis=0).max()) for item in capture.objects)
     sideways, upright, low = 0.0, 0.0, np.inf
@@ -49,6 +51,7 @@ def recorded_setting(capture: Capture) -> RecordedSetting:
         dropped=sideways < DROPPED * upright,
         lands=low < NEAR_GROUND * size,
         turns=all(np.bincount(t.object_index).max() > 1 for t in capture.trials),
+        lone=lone,
     )
 
 
@@ -159,6 +162,11 @@ def next_experiment(
         return _SINGLE[own] if own == other else f"{_SINGLE[own]} {_SINGLE[other]}"
     if not resolvable:
         return "Record longer or faster trials: in these the gap is hardly larger than the noise."
+    if setting.lone:
+        return (
+            "Record the same motion two more times, from another height or at another speed: of a single recording one "
+            "half has to judge the other."
+        )
     return None
 
 

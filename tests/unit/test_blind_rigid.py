@@ -10,6 +10,7 @@ pytest.importorskip("mujoco")
 
 from physgen.blind_check.case import Lens, draw_camera, project
 from physgen.blind_check.mujoco_world import (
+    STEP_S,
     Body,
     RigidWorld,
     State,
@@ -17,7 +18,7 @@ from physgen.blind_check.mujoco_world import (
     damping_of_bounce,
     simulate_rigid,
 )
-from physgen.blind_check.rigid_cases import rigid_case
+from physgen.blind_check.rigid_cases import SEARCH_STEP_S, rigid_case
 from physgen.blind_check.rigid_causes import KNOWN_CAUSES
 from physgen.sim.diagnose.capture import load_capture, save_capture
 
@@ -48,10 +49,11 @@ def test_free_flight_is_a_parabola_to_a_micrometre():
     assert not motion.touched.any()
 
 
+@pytest.mark.parametrize("step", [STEP_S, SEARCH_STEP_S])
 @pytest.mark.parametrize("restitution", [0.25, 0.5, 0.75])
-def test_a_ball_bounces_to_e_squared_of_its_height(restitution):
+def test_a_ball_bounces_to_e_squared_of_its_height(restitution, step):
     times = np.linspace(0, 0.6, 601)
-    motion = simulate_rigid(_world(restitution=restitution), _state(0.54), times)
+    motion = simulate_rigid(_world(restitution=restitution), _state(0.54), times, step=step)
     height = motion.position[:, 2] - 0.04
     first = int(np.argmin(height[:400]))
     assert np.sqrt(height[first:].max() / 0.5) == pytest.approx(restitution, abs=0.03)

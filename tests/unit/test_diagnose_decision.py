@@ -24,8 +24,8 @@ from physgen.sim.diagnose.diagnosis import (
 )
 from physgen.sim.diagnose.gap_metrics import carried_residual, localise
 from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
-from physgen.sim.diagnose.report.wording import verdict_summary
-from physgen.sim.diagnose.suggested_experiments import next_experiment
+from physgen.sim.diagnose.report.wording import assumptions, verdict_summary
+from physgen.sim.diagnose.suggested_experiments import next_experiment, recorded_setting
 from physgen.sim.errors import InputError
 
 from .test_capture import a_capture, a_trial
@@ -315,6 +315,18 @@ def test_every_effect_has_words_and_an_experiment():
                 verdict = Verdict(effect=a, probability=0.5, alternatives=(b,), effects=(a,))
                 assert next_experiment(verdict, kinds, resolvable=True)
     assert next_experiment(Verdict(effect=NONE, probability=0.9), kinds, resolvable=True) is None
+
+
+def test_a_single_recording_is_to_be_repeated():
+    """Half of it judges the other half: that no further recording is needed would be said too soon."""
+    verdict, kinds = Verdict(effect="air_drag", probability=0.9, effects=("air_drag",)), {"air_drag": "force"}
+    for count in (1, 2):
+        capture = a_capture(*(a_trial(f"take{k}") for k in range(count)))
+        setting = recorded_setting(capture)
+        said = next_experiment(verdict, kinds, resolvable=True, setting=setting)
+        assert (said is not None and "two more times" in said) == (count == 1)
+        one = [line for line in assumptions(capture) if "complete trial" in line]
+        assert len(one) == 1 and ("second half judges" in one[0]) == (count == 1)
 
 
 def a_diagnosis(capture):

@@ -67,7 +67,7 @@ def bars_picture(diagnosis: Diagnosis) -> Picture:
     known = [b.value for b in bars if math.isfinite(b.value)]
     scale = Scale(low=0.0, high=max([*known, 1e-12]), start=0.0, end=WIDTH - 70)
     parts: list[Markup | None] = [
-        label("RMS error on held-out trials", 0, 13, class_="ink strong"),
+        label("RMS error on held-out motion", 0, 13, class_="ink strong"),
     ]
     y, floor = 24.0, diagnosis.gap.noise_floor_rms_m
     for bar in bars:

@@ -172,7 +172,7 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     elif found_effects(verdict):
         low, high = gap.closed_fraction_ci95
         spread = f"95 %: {percent_text(low)} to {percent_text(high)}" if math.isfinite(low + high) else ""
-        facts.append(("Gap closed on held-out trials", percent_text(gap.closed_fraction), spread))
+        facts.append(("Gap closed on held-out motion", percent_text(gap.closed_fraction), spread))
     before, after, floor = (
         quantity_text(value, "m", digits=2) for value in (gap.before_rms_m, gap.after_rms_m, gap.noise_floor_rms_m)
     )

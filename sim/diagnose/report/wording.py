@@ -281,13 +281,13 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
         )
     if not found_effects(diagnosis.verdict):
         return (
-            f"The gap on held-out trials is {_length(gap.before_rms_m)}, of which noise explains only "
+            f"The gap on held-out motion is {_length(gap.before_rms_m)}, of which noise explains only "
             f"{_length(gap.noise_floor_rms_m)}. Nothing was added.{_floor(gap)}"
         )
     low, high = gap.closed_fraction_ci95
     spread = f" (95 %: {percent_text(low)} to {percent_text(high)})" if math.isfinite(low + high) else ""
     return (
-        f"On held-out trials the error changes from {_length(gap.before_rms_m)} to "
+        f"On held-out motion the error changes from {_length(gap.before_rms_m)} to "
         f"{_length(gap.after_rms_m)}: {_closed(gap)}{spread}.{_floor(gap)}"
     )
 
@@ -395,10 +395,21 @@ def assumptions(capture: Capture) -> list[str]:
     noise = quantity_text(capture.noise_sigma, "m" if camera is None else "px")
     lines.append(f"Tracking noise is {noise} per coordinate (standard deviation), independent for each.")
     lines.append(
-        f"{len(capture.fit_trials)} complete trials, and {len(capture.predict_trials)} with only their first frames. "
-        "The initial state of each trial (position, velocity, spin) was estimated from its first frames."
+        f"{_trials(capture)} The initial state of each trial (position, velocity, spin) was estimated from its first "
+        "frames."
     )
     return lines
+
+
+def _trials(capture: Capture) -> str:
+    whole, begun = len(capture.fit_trials), len(capture.predict_trials)
+    if whole != 1:
+        said = f"{whole} complete trials"
+    elif all(item.belief.rigid for item in capture.objects):
+        said = "One complete trial, whose second half judges what was fitted to the first"
+    else:
+        said = "One complete trial"
+    return f"{said}, and {begun} with only {'its' if begun == 1 else 'their'} first frames." if begun else f"{said}."
 
 
 def _object(item: CaptureObject) -> str:
@@ -430,7 +441,7 @@ def verdict_summary(verdict: Verdict, gap: Gap) -> str:
         return text + " The gap is too close to the noise floor to say how much of it this closes."
     if math.isfinite(gap.closed_fraction):
         share = "nothing" if gap.closed_fraction <= 0.005 else _rounded_percent(min(gap.closed_fraction, 1.0))
-        text += f" It closes {share} of the gap on held-out trials."
+        text += f" It closes {share} of the gap on held-out motion."
     return text
 
 

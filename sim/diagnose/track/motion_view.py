@@ -293,10 +293,10 @@ def _setting(
             )
         way = places[best.last] - places[best.first]
         if np.degrees(np.arctan2(way[1], abs(way[0]))) > STEEPEST:
-            raise _strange_fall(best, scale, where)
+            raise _strange_fall(best, times, scale, where)
         return _slope(times, places, best, scale, clearance)
     if _curves_down(best, times, places):
-        raise _strange_fall(best, scale, where)
+        raise _strange_fall(best, times, scale, where)
     braking = -float(best.acceleration @ best.begin) / max(float(np.linalg.norm(best.begin)), 1e-9) / scale
     if braking > MOST_BRAKING * GRAVITY:
         raise InputError(
@@ -319,12 +319,13 @@ def _curves_down(piece: _Piece, times: Array, places: Array) -> bool:
     return across > ACROSS_SHARE * size and sag > max(10 * piece.miss, 0.04 * length)
 
 
-def _strange_fall(piece: _Piece, scale: float, where: str) -> InputError:
+def _strange_fall(piece: _Piece, times: Array, scale: float, where: str) -> InputError:
     fall = float(np.linalg.norm(piece.acceleration)) / scale
+    rate = 1.0 / float(np.median(np.diff(times)))
     return InputError(
         f"{where}: it falls with {fall:.3g} m/s² by the body's size and the frame rate: free fall would be a body "
-        f"{GRAVITY / fall:.3g} times as large, or {np.sqrt(GRAVITY / fall):.3g} times the frame rate; "
-        "check the size and --fps-override"
+        f"{GRAVITY / fall:.3g} times as large, or {rate * np.sqrt(GRAVITY / fall):.0f} frames per second in place of "
+        f"{rate:.0f}; check --object and --fps-override"
     )
 
 

@@ -142,7 +142,11 @@ def follow_plain_body(
     step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
     kept = np.arange(view.first, last + 1, step)
     if len(kept) < LEAST_FRAMES:
-        raise InputError(f"{path}: only {len(kept)} frames of free motion; film at a higher frame rate")
+        first, end = regions[int(kept[0])].frame, regions[int(kept[-1])].frame
+        raise InputError(
+            f"{path}: the body is seen in free motion in {len(kept)} frames, {first} to {end}; a motion needs "
+            f"{LEAST_FRAMES}: film it at a higher frame rate, with nothing in front of it"
+        )
     points = view.points[kept - view.first]
     part = slice(view.first, view.last + 1)
     noise_of_centre = noise_px(path_px[part])
