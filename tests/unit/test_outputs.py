@@ -195,6 +195,17 @@ def test_a_folder_holds_frames_of_one_kind(tmp_path):
         FrameIndex(folder, suffix=".exr")
 
 
+@pytest.mark.parametrize("name", ["scene.json", "manifest.json", "capture.json"])
+def test_frames_do_not_go_into_a_folder_of_something_else(tmp_path, name):
+    """A scene with frames in it could not be corrected again."""
+    (tmp_path / name).write_text("{}")
+    with pytest.raises(InputError, match="not a folder of frames"):
+        FrameIndex(tmp_path)
+    # Those of an earlier version, which are there already.
+    (tmp_path / "frames.json").write_text("{}")
+    FrameIndex(tmp_path)
+
+
 @given(
     content=st.binary(max_size=60)
     | st.builds(
