@@ -91,7 +91,7 @@ def _places() -> Iterator[tuple[str, Path]]:
     if python is not None:
         try:
             answer = subprocess.run(
-                [str(python), "-c", _WHERE_ARE_YOUR_PACKAGES],
+                [str(python), "-I", "-c", _WHERE_ARE_YOUR_PACKAGES],
                 capture_output=True,
                 text=True,
                 timeout=60,

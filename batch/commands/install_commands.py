@@ -99,7 +99,8 @@ def _package(name: str) -> Finding:
 def _import(name: str, code: str, remedy: str) -> Finding:
     try:
         result = subprocess.run(
-            [sys.executable, "-c", code],
+            # Not the working folder, which may be a stranger's, with modules of any name.
+            [sys.executable, "-P", "-c", code],
             capture_output=True,
             text=True,
             timeout=120,

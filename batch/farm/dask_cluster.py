@@ -148,7 +148,7 @@ def _at_address(distributed: Any, options: FarmOptions, cancelled: IsCancelled) 
             "check address and certificates"
         ) from error
     with client:
-        remedy = f"start some: python -m physgen.batch.farm.dask_worker {options.farm}"
+        remedy = f"start some: python -P -m physgen.batch.farm.dask_worker {options.farm}"
         _await_workers(client, 1, CONNECT_S, cancelled, lambda: f"{options.farm} has no workers; {remedy}")
         yield client
 
@@ -318,6 +318,8 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         job_extra_directives=[*(f"--gres={name}:{count}" for name, count in sorted(slots.items())), *wanted.sbatch],
         worker_extra_args=[*resources, "--memory-limit", "0", "--no-dashboard"],
         python=wanted.python,
+        # No modules from the working folder: a job may come from anybody.
+        job_script_prologue=["export PYTHONSAFEPATH=1"],
         log_directory=str(scratch),
         shared_temp_directory=str(scratch),
         security=True,

@@ -29,7 +29,8 @@ function compileJob(job) {
         task.addCommand(author.Command("exec", {
             exe: settings.python,
             args: [
-                "-m", "physgen.batch.farm.run_task", settings.plan, name,
+                // Not from the working folder: a job may come from anybody.
+                "-P", "-m", "physgen.batch.farm.run_task", settings.plan, name,
                 "--retries", String(settings.retries || 0),
             ],
         }));

@@ -200,7 +200,7 @@ def _submit_script(plan: Plan, arrays: Sequence[TaskArray], lists: Sequence[Path
 
 def _stage_script(plan_file: Path, options: FarmOptions) -> str:
     cluster = options.cluster
-    command = shlex.join([cluster.python, "-m", "physgen.batch.farm.run_task", str(plan_file)])
+    command = shlex.join([cluster.python, "-P", "-m", "physgen.batch.farm.run_task", str(plan_file)])
     return _STAGE.format(directives="\n".join(sbatch_directives(cluster)), command=command, retries=options.retries)
 
 

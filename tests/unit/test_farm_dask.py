@@ -220,6 +220,7 @@ def test_workers_of_slurm_ask_for_what_the_tasks_take(tmp_path):
     for line in ("-p short", "-A lab", "--cpus-per-task=6", "--mem=8G", "-t 4:00:00", "--gres=gpu:1", "--qos=high"):
         assert f"#SBATCH {line}" in script
     [command] = [line for line in script if "dask_worker" in line]
+    assert script.index("export PYTHONSAFEPATH=1") < script.index(command), "the job's folder may be a stranger's"
     assert "--resources gpu=1" in command and "--nthreads 1" in command and "--tls-key" in command
     for file in (tmp_path / "shared").iterdir():
         assert file.stat().st_mode & 0o077 == 0, "keys are for this user only"

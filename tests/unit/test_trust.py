@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from physgen.batch.cli import main
+from physgen.batch.commands import install_commands
 from physgen.sim import trust
 from physgen.sim.app import reconstruct_record
 from physgen.sim.app.reconstruct import correct, reconstruct
@@ -253,3 +254,31 @@ def test_the_threat_model_names_tests_that_are_there():
     named = set(re.findall(r"`(test_\w+\.py)`", (root / "docs" / "security.md").read_text(encoding="utf-8")))
     there = {path.name for path in (root / "tests").rglob("test_*.py")}
     assert len(named) >= 10 and named <= there, named - there
+
+
+@pytest.fixture
+def hostile_place(tmp_path, monkeypatch):
+    """A working folder with a module that is called as one that is imported; the file that it writes when it runs."""
+    (tmp_path / "colorsys.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "ran"
+
+
+def test_the_examination_of_an_installation_imports_nothing_from_the_working_folder(hostile_place):
+    found = install_commands._import("colorsys", "import colorsys; print(colorsys.__file__)", "install it")
+    assert found[1] and "colorsys" in found[2] and not hostile_place.exists()
+
+
+def test_programs_that_are_started_import_nothing_from_the_working_folder():
+    """Farms start Python in the job's folder, which may have come from anybody; -P and -I leave it out."""
+    tree = Path(__file__).parents[2]
+    files = [path for folder in ("sim", "batch", "physgen_addon") for path in (tree / folder).rglob("*.[pj][ys]")]
+    assert len(files) > 300
+    starts = {
+        path.name: line.strip()
+        for path in files
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.search(r'"-[cm]"', line) and not re.search(r'"-[IP]"', line)
+    }
+    # It works in a temporary folder of its own.
+    assert starts == {"render_engines.py": 'start = [sys.executable, "-c"]'}
