@@ -44,6 +44,11 @@ def surface_points(vertices: Points, faces: NDArray[np.integer], count: int = SU
     return np.asarray(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
 
 
+MARGIN = 4
+"""Cells around a shadow to which it cannot spread when it is closed and blurred."""
+_CLOSING = np.ones((3, 3), np.uint8)
+
+
 class ShadowCaster:
     """Shadows of surfaces at points of the ground, the plane z = 0."""
 
@@ -67,19 +72,30 @@ class ShadowCaster:
         """Return a faster one for the ground points ``index``, with every ``step``-th surface point."""
         return ShadowCaster([self._surface[:, ::step].T], self._ground[index])
 
-    def _shadow(self, direction: Points) -> NDArray[np.float32]:
-        """The shadow (rows, columns) of light from the unit vector ``direction`` (3,) on the grid: 1 inside."""
+    def _add_shadow(self, direction: Points, share: np.float32, to: NDArray[np.float32]) -> None:
+        """Add ``share`` times the shadow of light from the unit vector ``direction`` (3,), 1 inside, to the grid
+        ``to`` (rows, columns)."""
         rows, columns = self._shape
         x, y, z = self._surface
         slide = direction[:2] / direction[2]
-        column = np.floor((x - z * slide[0] - self._low[0]) / self._cell)
-        row = np.floor((y - z * slide[1] - self._low[1]) / self._cell)
+        column = x - z * slide[0]
+        column -= self._low[0]
+        column /= self._cell
+        row = y - z * slide[1]
+        row -= self._low[1]
+        row /= self._cell
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        grid = np.zeros(self._shape, dtype=np.uint8)
-        grid.reshape(-1)[(row * columns + column)[inside].astype(np.int64)] = 1
-        closed = cv2.morphologyEx(grid, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        row, column = row[inside].astype(np.int32), column[inside].astype(np.int32)
+        if not len(row):
+            return
+        # Only the part of the grid around it; beyond, there is nothing to close or blur.
+        top, left = max(0, int(row.min()) - MARGIN), max(0, int(column.min()) - MARGIN)
+        part = slice(top, int(row.max()) + 1 + MARGIN), slice(left, int(column.max()) + 1 + MARGIN)
+        shadow = np.zeros(to[part].shape, dtype=np.uint8)
+        shadow[row - top, column - left] = 1
+        closed = cv2.morphologyEx(shadow, cv2.MORPH_CLOSE, _CLOSING)
         # Smooth the stair-steps of the cells.
-        return np.asarray(cv2.blur(closed.astype(np.float32), (3, 3)))
+        to[part] += share * cv2.blur(closed.astype(np.float32), (3, 3))
 
     def reaching(self, directions: Points, weights: Points) -> NDArray[np.float64]:
         """Return the share (N,) of light from unit vectors ``directions`` (D, 3) that reaches the points past the
@@ -93,7 +109,7 @@ class ShadowCaster:
         shares = weights[use] / weights[use].sum()
         blocked = np.zeros(self._shape, dtype=np.float32)
         for direction, share in zip(directions[use], shares, strict=True):
-            blocked += np.float32(share) * self._shadow(direction)
+            self._add_shadow(direction, np.float32(share), blocked)
         seen = cv2.remap(blocked, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return 1.0 - np.clip(seen.reshape(-1)[: self._count].astype(np.float64), 0.0, 1.0)
 

@@ -7,9 +7,10 @@ its light shows the texture c − log s, and the frequency of that colour on lit
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -144,19 +145,30 @@ class GroundPixels:
     weight: Values
     known: NDArray[np.float32]
     object_side: float
+    _weights: dict[float, NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def picture(self, values: NDArray[np.generic], elsewhere: float = 0.0) -> NDArray[np.float32]:
         """Return ``values`` (N,) in the small picture (h, w), ``elsewhere`` off the ground."""
         found = np.full(self.known.shape, elsewhere, dtype=np.float32)
-        found[self.rows, self.columns] = values
+        found.reshape(-1)[self._flat] = values
         return found
 
     def blurred(self, values: NDArray[np.generic], sigma: float) -> Values:
         """Return Gaussian means (N,) of ``values`` (N,) over ``sigma`` pixels of ground."""
-        total = cv2.GaussianBlur(self.picture(values), (0, 0), sigma)
-        weight = cv2.GaussianBlur(self.known, (0, 0), sigma)
-        at = self.rows, self.columns
-        return np.asarray(total[at] / np.maximum(weight[at], 1e-6), dtype=np.float64)
+        total = cv2.GaussianBlur(self.picture(values), (0, 0), sigma).reshape(-1)[self._flat]
+        return np.asarray(total / self._weight(sigma), dtype=np.float64)
+
+    @functools.cached_property
+    def _flat(self) -> NDArray[np.int64]:
+        """Indices (N,) of the pixels in the flattened small picture."""
+        return np.asarray(self.rows * self.known.shape[1] + self.columns)
+
+    def _weight(self, sigma: float) -> NDArray[np.float32]:
+        """Share (N,) of ground within ``sigma`` pixels; kept, as many values are blurred alike."""
+        if sigma not in self._weights:
+            around = cv2.GaussianBlur(self.known, (0, 0), sigma).reshape(-1)[self._flat]
+            self._weights[sigma] = np.maximum(around, np.float32(1e-6))
+        return self._weights[sigma]
 
 
 def ground_pixels(
@@ -276,7 +288,7 @@ class GroundTexture:
 
     def __init__(self, samples: Values, weight: Values, grain: Values) -> None:
         counts = np.zeros(BINS)
-        np.add.at(counts, self._bins(samples), weight)
+        np.add.at(counts.reshape(-1), self._bins(samples), weight)
         width = np.maximum(grain * _PER_UNIT * max(len(samples), 2) ** (-1.0 / 7.0), FINEST)
         counts = ndimage.gaussian_filter(counts, width, mode="nearest")
         self._density = (1.0 - OTHER) * counts / max(float(counts.sum()), 1e-12) + OTHER / counts.size
@@ -293,12 +305,17 @@ class GroundTexture:
             blurred = np.log(ndimage.gaussian_filter(self._density, width, mode="nearest"))
             # All pixels of a shadow share its depth and tint: their uncertainty must not count once per pixel.
             self._logs[key] = blurred + float((self._density * (np.log(self._density) - blurred)).sum())
-        return np.asarray(self._logs[key][self._bins(samples)])
+        return np.asarray(self._logs[key].reshape(-1)[self._bins(samples)])
 
     @staticmethod
-    def _bins(samples: Values) -> tuple[NDArray[np.int64], ...]:
-        place = (samples - LOW) * _PER_UNIT
-        return tuple(np.clip(place.astype(np.int64), 0, np.array(BINS) - 1).T)
+    def _bins(samples: Values) -> NDArray[np.int64]:
+        """Flat indices (N,) of the bins of ``samples`` (N, 3)."""
+        flat = np.zeros(len(samples), dtype=np.int64)
+        for values, low, per_unit, count in zip(samples.T, LOW, _PER_UNIT, BINS, strict=True):
+            place = ((values - low) * per_unit).astype(np.int64)
+            flat *= count
+            flat += place.clip(0, count - 1, out=place)
+        return flat
 
 
 def pixel_noise(ground: GroundPixels, samples: Values) -> Values:

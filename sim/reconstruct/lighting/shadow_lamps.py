@@ -114,11 +114,23 @@ class _Search:
         self._caster = ShadowCaster([body.points[::2] for body in bodies], ground.places[chosen])
         self._hidden = 1.0 - self._caster.reaching(*overcast_sky(SKY))
         self._starts = _all_over()
+        # The search comes by the same lamps again, once more for every texture that it learns.
+        self._skies: dict[float, Values] = {}
+        self._reached: dict[tuple[bytes, float, int], Values] = {}
         self._rough = [self._reaching(slide, 0.15, 4) for slide in self._starts]
         self.learn(np.ones(len(chosen)))
 
     def _reaching(self, slide: Values, angle: float, count: int = 10) -> Values:
-        return self._caster.reaching(*sun_disc(direction_of(slide), angle, count))
+        key = (slide.tobytes(), angle, count)
+        if key not in self._reached:
+            self._reached[key] = self._caster.reaching(*sun_disc(direction_of(slide), angle, count))
+        return self._reached[key]
+
+    def _ambient(self, loss: float) -> Values:
+        """Share (N,) that is left of the sky's light."""
+        if loss not in self._skies:
+            self._skies[loss] = 1.0 - loss * self._hidden
+        return self._skies[loss]
 
     def learn(self, kept: Values) -> None:
         """Take the ground's texture from pixels that keep the share ``kept`` (N,) of their light."""
@@ -132,15 +144,20 @@ class _Search:
         self._usual = np.median(self._samples[lit if lit.any() else slice(None), 1:], axis=0)
         self._texture = GroundTexture(bare, weight, self._fineness)
         self._lit = self._texture.likelihood(self._samples)
+        # One row a channel, for the many trials.
+        self._channels = np.ascontiguousarray(self._samples.T)
 
     def gain(self, kept: Values) -> float:
         """Log likelihood over that of no shadow, if pixels keep the share ``kept`` (N,)."""
-        shaded = kept < VISIBLE
+        shaded = np.flatnonzero(kept < VISIBLE)
         depth = np.log(np.maximum(kept[shaded], 0.02))
-        samples = self._samples[shaded]
-        bare = samples - np.column_stack([depth, depth[:, None] * shadow_tint(samples, depth, self._usual)])
-        likelihood = self._texture.likelihood(bare, UNCERTAIN, TINT)
-        return float(np.clip(likelihood - self._lit[shaded], -MOST, MOST).sum())
+        bare = self._channels[:, shaded]
+        tint = shadow_tint(bare.T, depth, self._usual)
+        bare[0] -= depth
+        bare[1] -= depth * tint[0]
+        bare[2] -= depth * tint[1]
+        gained = self._texture.likelihood(bare.T, UNCERTAIN, TINT) - self._lit[shaded]
+        return float(gained.clip(-MOST, MOST, out=gained).sum())
 
     def kept(self, light: ShadowLight) -> Values:
         """Share (N,) of the light that the sample keeps under ``light``."""
@@ -209,10 +226,13 @@ class _Search:
                 shares = [*(change * lamp.share for lamp in lamps[:-1]), share]
                 if sum(shares) > MOST_SHARE:
                     continue
-                direct = np.sum([q * v for q, v in zip(shares, reaching, strict=True)], axis=0)
+                direct = shares[0] * reaching[0]
+                for q, v in zip(shares[1:], reaching[1:], strict=True):
+                    direct += q * v
                 mixed = tuple(replace(lamp, share=q) for lamp, q in zip(lamps, shares, strict=True))
                 for k in losses:
-                    kept = (1.0 - sum(shares)) * (1.0 - k * self._hidden) + direct
+                    kept = (1.0 - sum(shares)) * self._ambient(k)
+                    kept += direct
                     yield ShadowLight(mixed, k, self.gain(kept))
 
 
@@ -228,8 +248,18 @@ def shadow_tint(samples: Values, depth: Values, usual: Values) -> Values:
     deep = depth < DEEP
     if deep.sum() < FEWEST_DEEP:
         return np.zeros(2)
-    slope = np.median((samples[deep][:, 1:] - usual) / depth[deep, None], axis=0)
+    below = depth[deep]
+    slope = [_median((samples[deep, i + 1] - usual[i]) / below) for i in range(2)]
     return np.asarray(np.clip(slope, -MOST_TINT, MOST_TINT))
+
+
+def _median(values: Values) -> float:
+    """As NumPy's, without its checks, which take longer than the few hundred values of a shadow."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    ordered = np.partition(values, (middle - 1, middle))
+    return float((ordered[middle - 1] + ordered[middle]) / 2.0)
 
 
 def light_shares(

@@ -8,6 +8,7 @@ cannot leak. Doubtful masks give notices.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -293,7 +294,7 @@ def _coarse(
         again = _kept_part(without_ground(told, again) & near, closed, view.keep)
         rest = again if again.sum() > 0.5 * rest.sum() else rest
     chosen = rest
-    completed = completed_by_contours(view, chosen, shade=shaded_ground(view, chosen) if chosen.any() else None)
+    completed = completed_by_contours(view, chosen, shade=_shade(view, chosen))
     notices = mask_warnings(view, raw, chosen)
     if completed.doubtful.any():
         away = np.argwhere(completed.doubtful).mean(axis=0) - np.argwhere(completed.mask).mean(axis=0)
@@ -341,10 +342,15 @@ def _details(
     ]
     x0, y0, x1, y1 = (round(v * scale) for v in inner)
     view = crop_around_box(small, (x0, y0, x1, y1), masks[1], keep=masks[2], drop=masks[3] & ~masks[2])
-    gaps, rods = gaps_and_rods(view, masks[0], shade=shaded_ground(view, masks[0]) if masks[0].any() else None)
+    gaps, rods = gaps_and_rods(view, masks[0], shade=_shade(view, masks[0]))
     large = [cv2.resize(part.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
              for part in (gaps, rods)]  # fmt: skip
     return large[0] & ~keep, large[1] & ~drop & ~taken
+
+
+def _shade(view: BoxCrop, mask: Mask) -> Callable[[], Mask] | None:
+    """``shaded_ground`` around ``mask``, computed when it is first asked for; None around nothing."""
+    return functools.cache(lambda: shaded_ground(view, mask)) if mask.any() else None
 
 
 def _thin_parts(mask: Mask) -> Mask:

@@ -9,7 +9,7 @@ place, and edges surround them; rods are thin, unlike the ground, and join the o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -67,11 +67,12 @@ class Completed:
     doubtful: Mask
 
 
-def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Mask | None = None) -> Completed:
+def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None = None) -> Completed:
     """Return ``mask`` (h, w) with neighbouring parts that its contours close; see the module.
 
-    shade: (h, w) pixels of which no such part consists, as they look like shaded ground. Works on a small copy; cost: a
-    twentieth of a second. To a mask that is far from convex nothing is added but what fills its bays.
+    shade: returns (h, w) pixels of which no such part consists, as they look like shaded ground; asked once a candidate
+    is left. Works on a small copy; cost: a twentieth of a second. To a mask that is far from convex nothing is added
+    but what fills its bays.
     """
     nothing = np.zeros_like(mask)
     if mask.sum() < 50:
@@ -90,9 +91,9 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Mask | None = Non
             part = part & view.inside
             if not LEAST_PART * mask.sum() <= part.sum() <= MOST_PART * mask.sum():
                 continue
-            if shade is not None and shade[part].mean() > SHADE_SHARE:
-                continue
             if not _has_contour(view, part, result, crest):
+                continue
+            if shade is not None and shade()[part].mean() > SHADE_SHARE:
                 continue
             solid, before = _solidity(_joined(result, part)), _solidity(result)
             if solid >= max(CONVEX, before - 0.03):
@@ -245,13 +246,13 @@ above which it is none: the inside of a cup and a shade on it have the ground's 
 """
 
 
-def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Mask | None = None) -> tuple[Mask, Mask]:
+def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None = None) -> tuple[Mask, Mask]:
     """Return gaps (h, w) in the filled ``mask`` through which the ground shows, and rods (h, w) beside it.
 
     Both models of colour are learned with the gaps left out of the object, and the cut has little smoothness, so that
     it follows slats and spokes. A gap is typical ground by colour, texture and place, long, and surrounded by edges;
-    a rod is unlike the ground, lit or shaded, thin, on edges, and joined to the object. shade: (h, w) pixels of which
-    no rod consists, as they look like shaded ground.
+    a rod is unlike the ground, lit or shaded, thin, on edges, and joined to the object. shade: returns (h, w) pixels of
+    which no rod consists, as they look like shaded ground; asked once a candidate is left.
     """
     nothing = np.zeros_like(mask)
     size = float(np.sqrt(mask.sum()))
@@ -290,11 +291,11 @@ def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Mask | None = None) -> tu
         inwards = cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3)
         if 2.0 * float(inwards.max()) > THIN * size + 3.0 or length < 0.06 * size:
             continue
-        if shade is not None and shade[part].mean() > SHADE_SHARE:
-            continue
         rim = _around(part, 1) & ~mask
         joined = (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & mask
         if not joined.any() or not rim.any() or (crest[rim] > CREST).mean() < 0.6 or (ratio[part] > 1.0).mean() < 0.6:
+            continue
+        if shade is not None and shade()[part].mean() > SHADE_SHARE:
             continue
         rods |= part
     if gaps.sum() > 0.8 * mask.sum():

@@ -128,7 +128,10 @@ def _lit_ground(light: Light, free: Mask, sigma: float) -> Light:
         darker = away.mean(axis=2)
         colour = np.linalg.norm(away - darker[..., None], axis=2)
         lit = free & (darker > -0.2) & (darker < 0.6) & (colour < 0.5)
-        weight = (lit if lit.sum() > 50 else free).astype(np.float32)
+        following = (lit if lit.sum() > 50 else free).astype(np.float32)
+        if np.array_equal(following, weight):
+            break
+        weight = following
     return mean
 
 
