@@ -5,6 +5,7 @@ render_frames.py       scene folder and bake folder → frames
 render_options.py      options, file formats, flags
 renderer.py            one frame: small renders over the photo
 render_scene.py        the scene as three Blender scenes; render_regions.py what has to be rendered
+object_material.py     objects' materials and their highlights
 render_engines.py      Cycles and EEVEE; sky_lamps.py the sky as lamps, for EEVEE
 lighting.py            reference lighting, shadows, reflections
 motion_blur.py         motion while the shutter is open

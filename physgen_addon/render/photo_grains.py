@@ -22,15 +22,8 @@ from ..playback import particles, point_caches
 from ..playback.bake_record import spacing
 from ..playback.geometry_nodes import Tree, set_input
 from ..playback.particles import corner_values, new_mesh
-from .render_scene import (
-    COLOUR_LAYER,
-    REST_LIGHT,
-    UV,
-    RenderObject,
-    get_rest_light,
-    texture_colours,
-    texture_coordinates,
-)
+from .object_material import COLOUR_LAYER, REST_LIGHT
+from .render_scene import UV, RenderObject, get_rest_light, texture_colours, texture_coordinates
 
 GRAINS = "PhysGen photo grains"
 COLOUR, BEFORE, RADIUS = "grain_colour", "grain_before", "grain_radius"

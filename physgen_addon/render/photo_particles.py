@@ -25,15 +25,8 @@ from ...sim.skinning import TORN_STRETCH, first_torn
 from ..playback import particles, point_caches
 from ..playback.bake_record import spacing
 from ..playback.geometry_nodes import Tree, set_input
-from .render_scene import (
-    COLOUR_LAYER,
-    REST_LIGHT,
-    UV,
-    RenderObject,
-    get_rest_light,
-    texture_colours,
-    texture_coordinates,
-)
+from .object_material import COLOUR_LAYER, REST_LIGHT
+from .render_scene import UV, RenderObject, get_rest_light, texture_colours, texture_coordinates
 
 SKIN, SURFACE = "PhysGen photo skin", "PhysGen photo surface"
 REST_LENGTH = "rest_length"

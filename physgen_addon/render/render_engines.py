@@ -294,8 +294,8 @@ def subpixels(options: RenderOptions) -> int:
 def colours(
     scene: bpy.types.Scene, layers: tuple[str, str], frame: int, box: Box, side: int, folder: Path
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the first pass of ``layers`` (h, w, 3), coverage (h, w), and the red of the second pass (h, w) in ``box``,
-    averaged over ``side`` times ``side`` subpixels.
+    """Return the first pass of ``layers`` (h, w, 3), coverage (h, w), and red and green of the second pass (h, w, 2) in
+    ``box``, averaged over ``side`` times ``side`` subpixels.
 
     ``folder`` takes temporary files. Raises RenderError if Blender fails.
     """
@@ -304,11 +304,12 @@ def colours(
     for top in range(box.y0, box.y1, rows):
         strip = Box(box.x0 * side, top * side, box.x1 * side, min(top + rows, box.y1) * side)
         channels = render_passes(scene, frame, strip, folder)
-        whole = np.dstack([stack(channels, layers[0]), channels["Combined.A"], channels[f"{layers[1]}.R"]])
+        second = [channels[f"{layers[1]}.{channel}"] for channel in "RG"]
+        whole = np.dstack([stack(channels, layers[0]), channels["Combined.A"], *second])
         height, width = whole.shape[0] // side, whole.shape[1] // side
-        parts.append(whole.reshape(height, side, width, side, 5).mean(axis=(1, 3)))
+        parts.append(whole.reshape(height, side, width, side, 6).mean(axis=(1, 3)))
     pixels = np.concatenate(parts).astype(np.float32, copy=False)
-    return pixels[..., :3], pixels[..., 3], pixels[..., 4]
+    return pixels[..., :3], pixels[..., 3], pixels[..., 4:]
 
 
 def add_lamp(scenes: list[bpy.types.Scene], lamp: SkyLamp, *, finest: float) -> None:

@@ -28,17 +28,19 @@ from ..frames.frame_files import read_layers
 from ..playback import point_caches
 from ..scene_io.photo_view import add_camera, aim_camera, new_sun, photo_uv, render_size
 from . import render_engines
+from .object_material import (
+    AMBIENT_NODE,
+    COLOUR_LAYER,
+    LACK_LAYER,
+    REST_LIGHT,
+    object_material,
+    photo_highlights,
+    show_highlights,
+)
 from .render_options import RenderOptions
 from .render_regions import Box, plane_axes
 from .sky_lamps import SkyLamp, sky_lamps
 
-REST_LIGHT = "rest_light"
-"""Vertex colour attribute: L₀ + k, radiance of a white surface at rest plus the ambient term."""
-COLOUR_LAYER = "texture"
-"""Name of the pass with the photo's colours."""
-LACK_LAYER = "lack"
-"""Name of the pass with what the texture's alpha leaves uncovered; materials without it cover all."""
-AMBIENT_NODE = "ambient"
 UV = "photo"
 """Name of the texture coordinates."""
 
@@ -55,7 +57,7 @@ class RenderObject:
 def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObject) -> RenderObject:
     """Load ``source`` and link it to ``collection``. Raises InputError if its mesh is unreadable."""
     mesh = load_object_mesh(folder, source)
-    uv, image = _appearance(folder, source, mesh)
+    uv, picture = _appearance(folder, source, mesh)
     data = bpy.data.meshes.new(source.name)
     data.from_pydata(mesh.vertices, [], mesh.faces)
     corners = np.empty(len(data.loops), dtype=np.int32)
@@ -65,7 +67,11 @@ def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObj
     attribute = data.color_attributes.new(REST_LIGHT, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", np.ones(4 * len(mesh.vertices), dtype=np.float32))
     data.color_attributes.active_color = attribute
-    data.materials.append(_object_material(source.name, image))
+    data.materials.append(object_material(source.name, _load_image(source.name, picture)))
+    found = photo_highlights(folder.model.camera, mesh, uv, np.asarray(picture.convert("RGB"), dtype=np.uint8))
+    if found is not None:
+        matt = Image.fromarray(found.taken_out(np.asarray(picture.convert("RGB"), dtype=np.uint8)))
+        show_highlights(data, folder.model.camera, found, _load_image(f"{source.name} matt", matt))
     item = bpy.data.objects.new(source.name, data)
     collection.objects.link(item)
     return RenderObject(source=source, mesh=mesh, item=item)
@@ -112,7 +118,7 @@ def texture_colours(target: RenderObject, uv: NDArray[np.floating]) -> NDArray[n
     return np.rint(pixels.reshape(height, width, 4)[rows, columns, :3] * 255.0).astype(np.uint8)
 
 
-def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[NDArray[np.float64], bpy.types.Image]:
+def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[NDArray[np.float64], Image.Image]:
     """Return texture coordinates (V, 2), origin at the bottom left, and the image.
 
     A mesh without a texture gets the photo, projected along the camera's rays.
@@ -120,9 +126,9 @@ def _appearance(folder: Scene, source: SceneObject, mesh: ObjectMesh) -> tuple[N
     visual = read_mesh(folder.file(source.mesh)).visual
     uv, image = getattr(visual, "uv", None), _base_colour(visual)
     if uv is not None and image is not None and len(uv) == len(mesh.vertices) and np.isfinite(uv).all():
-        return np.asarray(uv, dtype=np.float64), _load_image(source.name, image)
+        return np.asarray(uv, dtype=np.float64), image
     photo = Image.fromarray(read_rgb(folder.file(folder.model.photo_files[0])))
-    return photo_uv(folder.model.camera, mesh.vertices), _load_image(source.name, photo)
+    return photo_uv(folder.model.camera, mesh.vertices), photo
 
 
 def _base_colour(visual: Any) -> Image.Image | None:
@@ -144,51 +150,6 @@ def _load_image(name: str, image: Image.Image) -> bpy.types.Image:
         loaded.pack()
     loaded.name = name
     return loaded
-
-
-def _object_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
-    """Return a material: diffuse with albedo 1 / (L₀ + k) plus emission k / (L₀ + k); radiance (L + k) / (L₀ + k), 1 at
-    rest.
-    """
-    material = bpy.data.materials.new(name)
-    # Emission towards the camera only: emission that Cycles samples as a lamp costs time and adds noise.
-    if hasattr(material, "cycles"):
-        material.cycles.emission_sampling = "NONE"
-    tree = compat.node_tree(material)
-    new, link = tree.nodes.new, tree.links.new
-    rest = new("ShaderNodeAttribute")
-    rest.attribute_name = REST_LIGHT
-    inverse = new("ShaderNodeVectorMath")
-    inverse.operation = "DIVIDE"
-    inverse.inputs[0].default_value = (1.0, 1.0, 1.0)
-    link(rest.outputs["Color"], inverse.inputs[1])
-    ambient = new("ShaderNodeVectorMath")
-    ambient.operation = "SCALE"
-    ambient.name = AMBIENT_NODE
-    ambient.inputs["Scale"].default_value = 0.0
-    link(inverse.outputs["Vector"], ambient.inputs[0])
-    diffuse, emission, both = (new(f"ShaderNode{kind}") for kind in ("BsdfDiffuse", "Emission", "AddShader"))
-    link(inverse.outputs["Vector"], diffuse.inputs["Color"])
-    link(ambient.outputs["Vector"], emission.inputs["Color"])
-    # Cycles' last ray still meets surfaces: the ground would be lit by the bodies' undersides, most at contact.
-    link(new("ShaderNodeLightPath").outputs["Is Camera Ray"], emission.inputs["Strength"])
-    link(diffuse.outputs["BSDF"], both.inputs[0])
-    link(emission.outputs["Emission"], both.inputs[1])
-    output = new("ShaderNodeOutputMaterial")
-    link(both.outputs["Shader"], output.inputs["Surface"])
-    texture = new("ShaderNodeTexImage")
-    texture.image = image
-    # Area-averaged whole texels, so that at rest a pixel shows the photo's pixel without interpolation.
-    texture.interpolation = "Closest"
-    texture.extension = "EXTEND"
-    colour = new("ShaderNodeOutputAOV")
-    colour.aov_name = COLOUR_LAYER
-    link(texture.outputs["Color"], colour.inputs["Color"])
-    uncovered, lack = new("ShaderNodeInvert"), new("ShaderNodeOutputAOV")
-    lack.aov_name = LACK_LAYER
-    link(texture.outputs["Alpha"], uncovered.inputs["Color"])
-    link(uncovered.outputs["Color"], lack.inputs["Color"])
-    return material
 
 
 ALBEDO = 0.8
@@ -355,8 +316,8 @@ class BlenderScene:
     def colours(
         self, number: int, box: Box, folder: Path
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return the objects' colours (h, w, 3), premultiplied, coverage (h, w), and what of it their textures' alpha
-        leaves uncovered (h, w), in ``box`` at frame ``number``.
+        """Return the objects' colours (h, w, 3), premultiplied, coverage (h, w), and (h, w, 2) what of it their
+        textures' alpha leaves uncovered and the highlights of what has turned, in ``box`` at frame ``number``.
 
         ``folder`` takes temporary files. Raises RenderError if Blender fails.
         """
@@ -364,7 +325,8 @@ class BlenderScene:
             side = render_engines.subpixels(self.options)
             return render_engines.colours(self.colour_scene, (COLOUR_LAYER, LACK_LAYER), number, box, side, folder)
         channels = render_engines.render_passes(self.colour_scene, number, box, folder)
-        return render_engines.stack(channels, COLOUR_LAYER), channels["Combined.A"], channels[f"{LACK_LAYER}.R"]
+        both = np.dstack([channels[f"{LACK_LAYER}.{channel}"] for channel in "RG"])
+        return render_engines.stack(channels, COLOUR_LAYER), channels["Combined.A"], both
 
     def ground_light(self, number: int, box: Box, folder: Path) -> NDArray[np.float32]:
         """Return the light on the ground in ``box`` (h, w, 3) at frame ``number``, with nothing in front of it.

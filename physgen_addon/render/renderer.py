@@ -372,9 +372,11 @@ class Renderer:
         for each in self._grains:
             each.let_see(grains=True, hull=False)
         self._open_shutter(self._built.colour_scene, moment, most_samples=2)
-        lack = np.zeros_like(layer.alpha)
-        found = self._built.colours(moment.number, box, self._scratch)
-        layer.texture[box.slices], layer.alpha[box.slices], lack[box.slices] = found
+        lack, gloss = np.zeros((2, *layer.alpha.shape), np.float32)
+        layer.texture[box.slices], layer.alpha[box.slices], second = self._built.colours(
+            moment.number, box, self._scratch
+        )
+        lack[box.slices], gloss[box.slices] = np.moveaxis(second, -1, 0)
         if self._soft_px is None:
             # The first call is of the rest pose by the photo's camera.
             self._soft_px = compositing.soft_reach(layer.alpha, lack)
@@ -389,7 +391,7 @@ class Renderer:
             ratio = compositing.continued_light(ratio, lit["Combined.A"])
         light[light_box.slices] = ratio
         layer.light[:] = cv2.resize(light, self._size, interpolation=cv2.INTER_LINEAR)
-        return layer
+        return compositing.with_highlights(layer, gloss)
 
     def _object_box(self, camera: Camera, moment: Moment, size: tuple[int, int]) -> Box | None:
         if not self._options.crop:

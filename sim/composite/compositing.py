@@ -171,6 +171,18 @@ def rolled_off(layer: ObjectLayer, brightest: NDArray[np.float32]) -> ObjectLaye
     return replace(layer, light=light.astype(np.float32))
 
 
+def with_highlights(layer: ObjectLayer, gloss: NDArray[np.float32]) -> ObjectLayer:
+    """Return ``layer`` with highlights ``gloss`` (H, W), linear and premultiplied by coverage, besides its light.
+
+    They are images of lamps: more light than at rest on the surface that mirrors them makes them no brighter. With
+    less they fade, since their lamp lights it as well.
+    """
+    if not gloss.any():
+        return layer
+    added = gloss[..., None] / np.maximum(layer.light, np.float32(1.0))
+    return replace(layer, texture=(layer.texture + added).astype(np.float32))
+
+
 def continued_light(ratio: Linear, alpha: NDArray[np.float32]) -> Linear:
     """Return the light ``ratio`` (H, W, 3) with that of its surroundings where the lit surface, of coverage ``alpha``
     (H, W), does not reach: grains fly about beyond the shell that stands for them. Unchanged where there is no surface.

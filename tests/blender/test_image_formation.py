@@ -2,14 +2,19 @@
 """Rendered frames against the photo and against what Cycles renders of the true world."""
 
 import dataclasses
+import shutil
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
+from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Light
+from PIL import Image
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.playback.point_caches import open_bake
@@ -99,3 +104,41 @@ def test_out_of_view_is_the_background_alone(world, bake):
     mask = read_mask(world.folder.file("masks/ball.png"))
     assert np.array_equal(gone[mask], world.background[mask])
     assert not [scene for scene in bpy.data.scenes if scene.name.startswith("PhysGen")]
+
+
+def test_a_highlight_stays_where_its_lamp_is_while_the_ball_turns(world, bake, tmp_path):
+    """Its texture holds the highlight: it would turn with the ball, and go dim where less light falls."""
+    shutil.copytree(world.folder.root, tmp_path / "glossy")
+    folder = load_scene(tmp_path / "glossy")
+    camera, rest = folder.model.camera, load_object_mesh(folder, folder.model.objects[0]).vertices
+    towards = camera.rays(np.array([camera.project(rest.mean(axis=0)[None])[0, :2]]))[0]
+    mirror = np.array([-0.25, -0.1, 1.0]) - towards / np.linalg.norm(towards)
+    centre = (rest.max(axis=0) + rest.min(axis=0)) / 2
+    spot = centre + np.linalg.norm(rest - centre, axis=1).mean() * mirror / np.linalg.norm(mirror)
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    place = camera.project(spot[None])[0, :2]
+    white = 0.3 * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 30.0)
+    mesh: Any = trimesh.load(folder.file("meshes/ball.glb"), process=False, force="mesh")
+    texture = mesh.visual.material.baseColorTexture
+    for name, pixels in (("photo.png", world.photo), ("texture", np.asarray(texture.convert("RGB")))):
+        shiny = linear_to_bytes((bytes_to_linear(pixels) + white[..., None]).astype(np.float32))
+        if name == "texture":
+            mesh.visual.material.baseColorTexture = Image.fromarray(shiny)
+        else:
+            Image.fromarray(shiny).save(folder.root / name)
+    mesh.export(folder.root / "meshes" / "ball.glb")
+    turn = trimesh.transformations.rotation_matrix(np.radians(50), (1.0, 0.0, 0.0))[:3, :3]
+    turned = (rest - centre) @ turn.T + centre
+    opened = open_bake(load_bake(bake([(0, 0, 0), turned - rest])), folder)
+    renderer = Renderer(folder, opened, RenderOptions(samples=8, grain=False, motion_blur=0))
+    still, now = (renderer.frame(sample).beauty for sample in (0, 1))
+    renderer.close()
+    inside = ndimage.binary_erosion(read_mask(world.folder.file("masks/ball.png")), iterations=4)
+    assert psnr(linear_to_bytes(still), read_rgb(folder.root / "photo.png"), inside) > 35
+    # The ball's own colour has hardly any blue.
+    blue = np.where(inside, ndimage.gaussian_filter(now[..., 2], 1.5), 0.0)
+    at = np.array(np.unravel_index(int(np.argmax(blue)), blue.shape))[::-1] + 0.5
+    assert at == pytest.approx(place, abs=4.0)
+    went = camera.project(((spot - centre) @ turn.T + centre)[None])[0, :2]
+    assert inside[int(went[1]), int(went[0])] and np.hypot(*(went - place)) > 10
+    assert now[int(went[1]), int(went[0]), 2] < 0.5 * blue.max()
