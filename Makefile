@@ -19,6 +19,8 @@ SEED ?= 0
 # Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
 SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTEST := $(BIN)/python -m pytest $(SPREAD)
+# Where PYTHONDONTWRITEBYTECODE is set, each of some 300 processes that tests start would compile all that it imports.
+COMPILED := __init__.py __main__.py batch benchmarks blind_check physgen_addon sim
 
 .PHONY: setup demo test test-all test-explore coverage fuzz lint lock audit docs benchmark extension assets test-blender-app clean
 
@@ -26,6 +28,7 @@ setup:
 	@test -n "$(PYTHON)" || exit 1
 	@setup/system_libraries.sh
 	@setup/venv.sh "$(PYTHON)" "$(VENV)"
+	@$(BIN)/python -m compileall -q $(COMPILED) || true
 
 demo: setup
 	@$(BIN)/python -m physgen.batch.demo --out $(DEMO_OUT) $(if $(BEST),--best)

@@ -7,6 +7,7 @@ import atexit
 import contextlib
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -78,13 +79,22 @@ LONGEST = (
 )
 """Files that take longest, in this order: workers begin with them, so that none of them is the last one running."""
 
+NO_BYTECODE = sys.dont_write_bytecode
+
 ONE_THREAD = ("test_raster.py", "test_diagnose_rigid.py", "test_diagnose_rigid_resting.py", "test_diagnose_work.py")
 ONE_THREAD += ("test_soft_elements.py", "test_soft_fits.py")
 """Files that ask Taichi for another number of threads, at which its process drops all kernels: they come first."""
 
 
+def pytest_collection() -> None:
+    """Keep the bytecode of test modules, whatever the environment says: each worker imports them all, and pytest takes
+    longer to rewrite their assertions than to import them."""
+    sys.dont_write_bytecode = False
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the files, but not the tests of a file, which may share what a fixture made."""
+    sys.dont_write_bytecode = NO_BYTECODE
     rank = {name: index for index, name in enumerate(LONGEST)}
     items.sort(key=lambda item: (item.path.name not in ONE_THREAD, rank.get(item.path.name, len(rank))))
 
