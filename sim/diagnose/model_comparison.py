@@ -48,6 +48,9 @@ class ComparisonSettings:
         divided by the same factor, and ``unknown`` gets the rest.
     second_fee: nats that a second effect pays, beside its prior; with unseen_fee where the pair predicts held-out
         trials no better than its better single effect.
+    clearly: fraction of the better single effect's held-out error at which a pair pays no second_fee, which falls from
+        ``predicts`` on: states between contacts absorb what a second effect explains there, so that the evidence
+        hardly shows it; held-out trials, predicted through their contacts, do.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
     many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
     lapse: share that is spread evenly over the vocabulary, ``none`` and ``unknown``; what falls to effects that were
@@ -66,6 +69,7 @@ class ComparisonSettings:
     unseen_fee: float = 100.0
     unshown: float = 0.9
     second_fee: float = 20.0
+    clearly: float = 0.5
     predicted: tuple[float, float] = (0.9, 0.98)
     many: float = 3.0
     lapse: float = 0.02
@@ -231,8 +235,11 @@ def _second_fee(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing:
     singles = _singles(fit, candidates)
     if not singles:
         return 0.0
-    shown = all(_left(fit, c) < weighing.predicts for c in singles)
-    return weighing.second_fee + (0.0 if shown else weighing.unseen_fee)
+    left = max(_left(fit, c) for c in singles)
+    if not left < weighing.predicts:
+        return weighing.second_fee + weighing.unseen_fee
+    share = math.log(max(left, 1e-9) / weighing.clearly) / math.log(weighing.predicts / weighing.clearly)
+    return weighing.second_fee * max(share, 0.0)
 
 
 def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings, grain: float) -> list[float]:

@@ -106,6 +106,21 @@ def test_a_pair_is_judged_in_nats():
     assert worse.verdict.effects == ("friction",)
 
 
+@pytest.mark.parametrize(("left", "both"), [(0.2, True), (0.5, True), (0.96, False), (1.1, False)])
+def test_a_second_cause_at_contacts_shows_in_held_out_trials(left, both):
+    """A hollow box in air: +31 nats over drag alone, because states between contacts absorb what its inertia does,
+    and held-out trials predicted four times as well."""
+    singles = fit("air_drag", evidence=900, misfit=0.96, chi=1.5), fit("inertia", evidence=20, misfit=20.0, chi=2.0)
+    nominal = fit(misfit=28.0, chi=2.4)
+    pair = fit("air_drag", "inertia", evidence=931, misfit=0.87, chi=1.5 * left)
+    models = Found(nominal=nominal, refitted=nominal, candidates=(*singles, pair))
+    found = compare_models(models, ComparisonSettings()).verdict
+    assert found.effects == (("air_drag", "inertia") if both else ("air_drag",))
+    # What it gains has to be more than a second prior is worth, all the same.
+    little = dataclasses.replace(models, candidates=(*singles, dataclasses.replace(pair, log_evidence=910.0)))
+    assert compare_models(little, ComparisonSettings()).verdict.effects == ("air_drag",)
+
+
 def test_a_pair_names_what_is_the_same_motion():
     singles = (
         fit("time_scale", evidence=900, misfit=2.2),
