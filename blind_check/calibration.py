@@ -48,7 +48,8 @@ class JudgedCase:
     """A record and its verdict. right: the first cause is a true one (or ``none``, ``unknown``). pair: two named.
 
     both: both causes of two named. closed: share of the withheld gap that the verdict's model closes; NaN without one.
-    frame_auc: of its localisation; NaN where that was not recorded.
+    reach: the same of what the true model, from states of the shown frames, would close. frame_auc: of its
+    localisation; NaN where that was not recorded.
     """
 
     record: FitRecord
@@ -60,6 +61,7 @@ class JudgedCase:
     pair: bool
     both: bool
     closed: float
+    reach: float
     frame_auc: float
 
 
@@ -71,6 +73,7 @@ def judge(record: FitRecord, settings: ComparisonSettings) -> JudgedCase:
     names = {verdict.effect, *verdict.effects}
     before = record.withheld_rms_m.get("", math.nan)
     after = record.withheld_rms_m.get(_model(record, found), math.nan)
+    oracle = float(record.truth.get("oracle_rms_m") or 0.0)
     return JudgedCase(
         record=record,
         verdict=verdict.effect,
@@ -81,6 +84,7 @@ def judge(record: FitRecord, settings: ComparisonSettings) -> JudgedCase:
         pair=len(verdict.effects) > 1,
         both=len(verdict.effects) > 1 and wanted == names,
         closed=1.0 - after / before if before > 0 and record.effect != NONE else math.nan,
+        reach=(before - after) / max(before - oracle, 1e-4) if record.effect != NONE else math.nan,
         frame_auc=math.nan
         if record.effect == NONE
         else record.frame_auc.get(_model(record, found) if verdict.effects else "", math.nan),
@@ -116,6 +120,7 @@ class Reliability:
     unknown_chance: tuple[float, float]
     frame_auc: float
     closed_median: float
+    reach_median: float
     pairs_first: float
     pairs_both: float
     false_pairs: float
@@ -129,7 +134,8 @@ class Reliability:
             f"false alarms {_percent(self.false_alarms)}, abstains on unknown {_percent(self.abstains)}",
             f"two causes: first {_percent(self.pairs_first)}, both {_percent(self.pairs_both)}; "
             f"false pairs on one cause {_percent(self.false_pairs)}",
-            f"withheld gap closed, median {self.closed_median:.2f}; "
+            f"withheld gap closed, median {self.closed_median:.2f}, of what the true model closes "
+            f"{self.reach_median:.2f}; "
             f"95 % intervals hold the truth {self.covered[0]} of {self.covered[1]}",
             f"localisation of the frames (AUC) {self.frame_auc:.2f}",
             f"expected calibration error: verdicts {self.verdict_error:.3f}, unknown {self.unknown_error:.3f}",
@@ -151,6 +157,7 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
     inside = [covered(c.record) for c in cases if len(c.record.effects) == 1]
     known = [i for i in inside if i is not None]
     closed = [c.closed for c in cases if c.record.effects and math.isfinite(c.closed)]
+    reach = [c.reach for c in cases if c.record.effects and math.isfinite(c.reach)]
     return Reliability(
         cases=len(cases),
         first=_share(c.right for c in cases),
@@ -163,6 +170,7 @@ def reliability(cases: Sequence[JudgedCase]) -> Reliability:
         unknown_chance=chance_errors(q),
         frame_auc=_mean(c.frame_auc for c in cases if math.isfinite(c.frame_auc)),
         closed_median=float(np.median(closed)) if closed else math.nan,
+        reach_median=float(np.median(reach)) if reach else math.nan,
         pairs_first=_share(c.right for c in two),
         pairs_both=_share(c.both for c in two),
         false_pairs=_share(c.pair for c in cases if len(c.record.effects) == 1),

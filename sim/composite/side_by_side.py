@@ -111,6 +111,8 @@ def with_box(background: Picture, faces: NDArray[np.uint8], pose: BoxPose) -> Pi
 
 PANEL = (420, 560)
 """Largest width and height of a panel, px."""
+LEAST_COLUMN = 200
+"""Least width of a panel and the room beside it, px: titles stay readable over a narrow picture, such as a drop's."""
 CURVE = 150
 """Height of the curve below, px."""
 INK, FAINT, BEFORE, AFTER = (35, 35, 35), (170, 170, 170), (60, 60, 215), (60, 150, 40)
@@ -202,7 +204,8 @@ def write_comparison(
     height, width = bottom - top, right - left
     scale = min(PANEL[0] / width, PANEL[1] / height, 2.0)
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
-    total = (3 * size[0] + 16, size[1] + 34 + CURVE)
+    column = max(size[0], LEAST_COLUMN)
+    total = (3 * column + 16, size[1] + 34 + CURVE)
     total = (total[0] + total[0] % 2, total[1] + total[1] % 2)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, total)  # type: ignore[attr-defined]
     if not writer.isOpened():
@@ -219,9 +222,10 @@ def write_comparison(
                 _trail(shown, (path_px[: k + 1] - corner) * (size[0] / width), (INK, BEFORE, AFTER)[i])
                 if i:
                     _ring(shown, (seen[k] - corner) * (size[0] / width))
-                x = i * (size[0] + 8)
-                sheet[30 : 30 + size[1], x : x + size[0]] = shown
-                _text(sheet, titles[i], (x + 2, 20), size[0] - 4, (INK, BEFORE, AFTER)[i])
+                x = i * (column + 8)
+                start = x + (column - size[0]) // 2
+                sheet[30 : 30 + size[1], start : start + size[0]] = shown
+                _text(sheet, titles[i], (x + 2, 20), column - 4, (INK, BEFORE, AFTER)[i])
             _curve(sheet, (34 + size[1], CURVE), times, gaps, k, withheld)
             writer.write(sheet)
             count += 1
@@ -277,7 +281,7 @@ def _curve(
     _text(sheet, f"{most * factor:.3g} {unit}", (4, high + 6), left - 6, INK)
     _text(sheet, "0", (left - 14, low + 4), 12, INK)
     _text(sheet, f"{span:.2f} s", (right - 46, low + 16), 46, INK)
-    _text(sheet, "distance to the real centre (the cross above)", (left, high - 6), 400, INK)
+    _text(sheet, "distance to the real centre (the cross above)", (left, high - 6), right - left, INK)
     for gap, colour in zip(gaps, (BEFORE, AFTER), strict=True):
         good = np.isfinite(gap)
         line = np.array([at(t, g) for t, g in zip(times[good], gap[good], strict=True)], np.int32)

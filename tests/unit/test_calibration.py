@@ -31,7 +31,7 @@ def record(effects, *candidates, effect=None, parameters=None):
         "format": FORMAT,
         "matter": "rigid",
         "truth": {"effect": effect or (effects[0] if effects else "none"), "effects": effects,
-                  "parameters": parameters or {}},
+                  "parameters": parameters or {}, "oracle_rms_m": 0.0005},
         "nominal": nominal,
         "refitted": {**nominal, "effects": ["friction"], "parameters": {}, "heldout_rms_m": 0.03},
         "candidates": list(candidates),
@@ -66,6 +66,7 @@ def test_records_are_judged_as_a_diagnosis_judges(folder):
     assert [c.verdict for c in cases] == ["none", "air_drag", "air_drag", "air_drag", "unknown"]
     assert cases[3].both and cases[3].pair and not cases[1].pair
     assert cases[1].closed == pytest.approx(0.9) and np.isnan(cases[0].closed)
+    assert cases[1].reach == pytest.approx(18.0 / 19.5)
     found = reliability(cases)
     assert found.first == 1.0 and found.pairs_both == 1.0 and found.false_pairs == 0.0 and found.false_alarms == 0.0
     assert found.covered == (1, 2)

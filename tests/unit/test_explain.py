@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
+from physgen.sim.composite.side_by_side import write_comparison
 from physgen.sim.diagnose.track.motion_view import understand_motion
 from physgen.sim.diagnose.track.moving_regions import Region, find_moving_regions
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
@@ -94,6 +95,22 @@ def test_frames_that_a_camera_has_dropped_are_put_in_and_an_impact_is_none():
     assert times[20] - times[19] == pytest.approx(2 / 30) and times[-1] == pytest.approx(39 / 30)
     struck = np.r_[10.0 * np.arange(20), 190 + 20.0 * np.arange(1, 20)]
     assert with_missing_frames(np.arange(39) / 30, np.stack([struck, 0 * struck], axis=1))[1] == 0
+
+
+def test_a_narrow_motion_is_compared_below_whole_titles(tmp_path):
+    """A drop's panels of 60 px had titles of eight letters."""
+    tall, path = np.full((560, 60, 3), 40, np.uint8), np.full((2, 2), 30.0)
+    written = write_comparison(
+        tmp_path / "drop.mp4", iter([tall, tall]), draw=lambda k, picture: (picture, picture), window=(0, 0, 60, 560),
+        seen=path, believed=path, found=path, times=np.array([0.0, 0.1]), gaps=(np.zeros(2), np.zeros(2)),
+        withheld=0.05, titles=("real", "simulated as believed", "with air drag 0.069"),
+    )  # fmt: skip
+    ok, sheet = cv2.VideoCapture(str(tmp_path / "drop.mp4")).read()
+    assert written == 2 and ok and sheet.shape[1] >= 3 * 200
+    # Where the dark pictures are: three columns, each in the middle of its third.
+    dark = np.flatnonzero(sheet[60:500].mean(axis=(0, 2)) < 100)
+    starts = dark[np.r_[True, np.diff(dark) > 1]]
+    assert np.abs(starts + 30 - (np.arange(3) * 208 + 100)).max() <= 2
 
 
 def test_a_throw_at_thirty_frames_a_second_is_one_flight():
