@@ -47,16 +47,24 @@ _guard = threading.Lock()
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold ``folder`` for this thread, by a file in it; it is made if it is not there.
+    """Hold ``folder`` for this thread, by a file in it. Where it is not there, it is made, and goes again if it stays
+    empty.
 
     Raises InputError when another process or thread holds it.
     """
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unwritable(folder, error) from error
-    with _locked(folder / LOCK_FILE, folder):
-        yield
+    try:
+        with _locked(folder / LOCK_FILE, folder):
+            yield
+    finally:
+        if made:
+            # Unless there is something in it.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager

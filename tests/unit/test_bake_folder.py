@@ -115,6 +115,18 @@ def test_nothing_is_deleted_through_a_link(tmp_path):
     assert outside.exists() and (other / "sand.pc2").exists()
 
 
+def test_a_folder_that_was_made_for_nothing_goes_again(tmp_path):
+    """As of a bake that is refused for lack of memory."""
+    new, there, full = tmp_path / "new", tmp_path / "there", tmp_path / "full"
+    there.mkdir()
+    for folder in (new, there, full):
+        with pytest.raises(InputError, match="refused"), folder_lock(folder):
+            if folder == full:
+                (folder / "a.pc2").write_text("")
+            raise InputError("refused")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["full", "there"]
+
+
 def test_a_bake_that_runs_is_not_freed(tmp_path):
     bake = a_bake(tmp_path / "bake", state="running")
     code = textwrap.dedent(f"""
