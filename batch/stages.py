@@ -29,6 +29,7 @@ from ..sim.reconstruct.reconstruct_options import object_names
 from ..sim.scene.bake_quality import load_quality
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
+from ..sim.scene.textured_mesh import texture_pixels
 
 if TYPE_CHECKING:
     from ..sim.app.default_motion import DefaultMotion
@@ -100,10 +101,12 @@ def run_render(
     camera = scene.model.camera
     width, height = round(camera.width * options.scale), round(camera.height * options.scale)
     points = sum(bake.manifest.files.values())
+    texels = sum(texture_pixels(scene.file(item.mesh)) for item in scene.objects)
+    textures = f" and {texels} pixels of textures" if texels else ""
     require_memory(
-        rendering_bytes(width * height, points),
+        rendering_bytes(width * height, points, texels),
         available_memory(RENDERING_RESERVED),
-        what=f"frames of {width}x{height} pixels with {points} vertices and particles",
+        what=f"frames of {width}x{height} pixels with {points} vertices and particles{textures}",
         remedy="give a lower --scale",
     )
     command = own_command("batch.render", str(scene.root.resolve()), "--bake", str(bake.root.resolve()))

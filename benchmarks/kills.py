@@ -269,6 +269,7 @@ def measure(
             happened, problem = kill(place, step, moment, victim, rng.choice)
         counts[happened] += 1
         each[step.name] += happened != "ended before"
+        print(f"{step.name}, {number}: {happened} after {moment:.1f} s", file=sys.stderr, flush=True)
         # Asked ones are run again one in four times: it takes longer than all else, and the kills are about that.
         if not problem and not (signals and turn % 4):
             started = time.monotonic()

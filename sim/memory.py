@@ -66,12 +66,17 @@ def composition_bytes(cells: int, splats: int, vertices: int, pixels: int) -> in
 RENDERING_BASE = 482 * MIB
 RENDERING_PIXEL = 441
 RENDERING_VERTEX = 1250
+RENDERING_TEXEL = 58
+"""Of a pixel of the objects' textures: decoded, as Blender's, and as Cycles' own."""
 RENDERING_RESERVED = 2300 * MIB
 
 
-def rendering_bytes(pixels: int, vertices: int) -> int:
-    """Return the bytes that rendering frames of ``pixels`` takes. vertices: of all objects and particles shown."""
-    return RENDERING_BASE + RENDERING_PIXEL * pixels + RENDERING_VERTEX * vertices
+def rendering_bytes(pixels: int, vertices: int, texels: int = 0) -> int:
+    """Return the bytes that rendering frames of ``pixels`` takes.
+
+    vertices: of all objects and particles shown; texels: pixels of all textures.
+    """
+    return RENDERING_BASE + RENDERING_PIXEL * pixels + RENDERING_VERTEX * vertices + RENDERING_TEXEL * texels
 
 
 def require_memory(needed: int, available: int | None, *, what: str, remedy: str) -> None:

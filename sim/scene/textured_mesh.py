@@ -8,6 +8,7 @@ registry.khronos.org/glTF). Rewriting keeps vertex count and order, faces and te
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import struct
@@ -65,6 +66,20 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
             return found
     mesh = read_mesh(path)
     return TexturedMesh(vertices=np.asarray(mesh.vertices, dtype=np.float64), faces=np.asarray(mesh.faces))
+
+
+def texture_pixels(path: Path) -> int:
+    """Return how many pixels the texture of the mesh file ``path`` has; 0 without one, or where that is not known."""
+    from PIL import Image
+
+    try:
+        mesh = _read_glb(path) if path.suffix.lower() == ".glb" else None
+        if mesh is None or mesh.picture is None:
+            return 0
+        with Image.open(io.BytesIO(mesh.picture), formats=("PNG", "JPEG")) as image:
+            return image.width * image.height
+    except (InputError, OSError, ValueError, Image.DecompressionBombError):
+        return 0
 
 
 def _read_glb(path: Path) -> TexturedMesh | None:

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from physgen.batch.cli import main
 from physgen.sim import memory
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.memory import available_memory, ran_out, require_memory
+from physgen.sim.scene.textured_mesh import texture_pixels
 from physgen.sim.version import VERSION
 from PIL import Image
 
@@ -192,6 +194,20 @@ def test_rendering_without_the_memory_is_refused_before_blender_starts(tmp_path,
     )
     said = refused(capsys, tmp_path, "render", root, "--bake", bake, "--out", tmp_path / "frames", "--scale", "4")
     assert re.search(r"GiB of memory for frames of 240x160 pixels with 642 vertices and particles, and 0 GiB", said)
+
+
+def test_textures_count_for_rendering(tmp_path, capsys, ball_scene):
+    """4096 x 4096 pixels took 1,528 MiB, of which 555 were estimated without them."""
+    scene = ball_scene()
+    path = scene.file(scene.objects[0].mesh)
+    mesh = trimesh.creation.icosphere(2, 0.05)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (64, 32)))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], material=material)
+    assert texture_pixels(path) == texture_pixels(tmp_path / "none.glb") == 0
+    mesh.export(path)
+    assert texture_pixels(path) == 64 * 32
+    few, many = (memory.rendering_bytes(480 * 360, 642, texels) for texels in (0, 4096**2))
+    assert abs(many / (1528 * MIB) - 1) < 0.25 and few < 0.4 * many
 
 
 @pytest.mark.long
