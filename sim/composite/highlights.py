@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..smoothstep import smoothstep
+from .pull_push import fill_gaps
 from .srgb import bytes_to_linear, linear_to_bytes
 
 CELLS = 32
@@ -44,6 +45,9 @@ BASE = 0.25
 BURNT = (0.75, 0.95)
 """Brightness of a texel's strongest channel from which it may have clipped, and from which it has: then it is what the
 body's colour and the second channel say."""
+BLANK = (0.5, 0.75)
+"""Share of a texel's light that its highlight takes from which little is known of what is below, and from which
+nothing: then it is what lies around."""
 HEADROOM = 2.0
 """Largest value of a texture without highlights: where a channel had clipped, the light was brighter than white."""
 SPREAD = 0.3
@@ -79,7 +83,7 @@ class Highlights:
     def taken_out(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return ``picture`` (h, w, 3) sRGB, a texture of the thing, without highlights, linear light over
         ``HEADROOM``."""
-        result = np.empty_like(picture)
+        result, blank = np.empty_like(picture), np.empty(picture.shape[:2], dtype=np.float32)
         second = int(np.argsort(self.colour)[1])
         for first in range(0, len(picture), ROWS):
             light = bytes_to_linear(picture[first : first + ROWS])
@@ -89,8 +93,17 @@ class Highlights:
             rest = light - taken[..., None]
             burnt = (share * smoothstep(light.max(axis=2), *BURNT))[..., None]
             whole = np.maximum(rest[..., second, None] / self.colour[second] * self.colour, rest)
-            result[first : first + ROWS] = linear_to_bytes((rest + burnt * (whole - rest)) / HEADROOM)
-        return result
+            rest += burnt * (whole - rest)
+            blank[first : first + ROWS] = smoothstep(taken / np.maximum(light.mean(axis=2), np.float32(1e-4)), *BLANK)
+            result[first : first + ROWS] = linear_to_bytes(rest / HEADROOM)
+        if not blank.any():
+            return result
+        # Texels beside it are as bright as it is, or have clipped.
+        blank = np.asarray(cv2.dilate(blank, np.ones((5, 5), np.uint8)))
+        known = (blank == 0.0).astype(np.float32)
+        light = bytes_to_linear(result)
+        filled = np.dstack([fill_gaps(np.ascontiguousarray(light[..., c]), known) for c in range(3)])
+        return linear_to_bytes(light + blank[..., None] * (filled - light))
 
 
 def find_highlights(light: NDArray[np.float32], normals: NDArray[np.floating]) -> Highlights | None:

@@ -59,6 +59,20 @@ def test_what_had_clipped_below_a_highlight_has_the_body_s_colour():
     assert np.median(hue) == pytest.approx(COLOUR[0] / COLOUR[1], rel=0.1)
 
 
+def test_below_a_highlight_that_has_nearly_burnt_out_lies_the_body_s_colour():
+    normals, inside = ball()
+    core = 0.5 * np.exp(-np.maximum(1 - normals @ LAMP, 0) / 0.01)[..., None]
+    picture = linear_to_bytes((matt(normals) + highlight(normals) + core).astype(np.float32))
+    found = find_highlights(bytes_to_linear(picture)[inside], normals[inside])
+    assert found is not None
+    burnt = inside & (bytes_to_linear(picture).min(axis=2) > 0.75)
+    assert burnt.sum() > 10
+    left = HEADROOM * bytes_to_linear(found.taken_out(picture))[burnt]
+    # Neither white nor a dark hole: about as bright as the ball is there, and of its hue.
+    assert left[:, 0] == pytest.approx(matt(normals)[burnt, 0], rel=0.35)
+    assert left[:, 1] / left[:, 0] == pytest.approx(COLOUR[1] / COLOUR[0], rel=0.3)
+
+
 def test_white_paint_stays_and_a_flat_side_tells_nothing():
     normals, inside = ball()
     lit = matt(normals) + highlight(normals)
