@@ -28,6 +28,7 @@ SIDE = 240
 """Pixels along the longer side of the object in the picture in which edges are detected."""
 SAMPLES = 14
 """Points along each edge."""
+_PLACES = np.linspace(0.08, 0.92, SAMPLES)[:, None]
 FACES = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
 """Axis and end of the faces that can be visible: all but the base."""
 STRONG = 90.0
@@ -52,8 +53,9 @@ class InnerEdges:
         # Logarithm: a shaded face differs from a lit one by a factor.
         tone = np.log1p(small.mean(axis=2))
         blurred = [ndimage.gaussian_filter(channel, 1.8) for channel in (tone, *_chroma(small))]
-        self._gradients = [np.stack([ndimage.sobel(c, axis=1), ndimage.sobel(c, axis=0)]) for c in blurred]
-        strength = np.sqrt(sum((g**2).sum(axis=0) for g in self._gradients))
+        gradients = [np.stack([ndimage.sobel(c, axis=1), ndimage.sobel(c, axis=0)]) for c in blurred]
+        self._gradients, self._known = np.concatenate(gradients), self._inside.astype(np.float64)
+        strength = np.sqrt(sum((g**2).sum(axis=0) for g in gradients))
         values = strength[self._inside]
         self._strong = max(float(np.percentile(values, STRONG)) if len(values) else 0.0, 0.05)
 
@@ -64,24 +66,31 @@ class InnerEdges:
         if not (projected[:, 2] > 1e-6).all():
             return np.ones(3)
         at = (projected[:, :2] - [self._left, self._top]) * self._ratio
-        answers = []
+        edges = []
         for first, second in _inner_edges(camera, box, corners):
             along = at[second] - at[first]
             length = float(np.linalg.norm(along))
-            if length < 6.0:
-                continue
-            normal = np.array([-along[1], along[0]]) / length
-            places = at[first] + np.linspace(0.08, 0.92, SAMPLES)[:, None] * along - 0.5
-            where = places[:, ::-1].T
-            known = ndimage.map_coordinates(self._inside.astype(np.float64), where, order=1, mode="constant")
+            if length >= 6.0:
+                edges.append((at[first] + _PLACES * along - 0.5, np.array([-along[1], along[0]]) / length, length))
+        if not edges:
+            return np.zeros(3)
+        # All edges and pictures at once: a call for so few places is mostly its checks.
+        where = np.concatenate([places for places, _, _ in edges])[:, ::-1].T
+        count, total = len(self._gradients), SAMPLES * len(edges)
+        stacked = np.empty((3, count, total))
+        stacked[0], stacked[1:] = np.arange(count)[:, None], where[:, None]
+        known = ndimage.map_coordinates(self._known, where, order=1, mode="constant").reshape(-1, SAMPLES)
+        found = ndimage.map_coordinates(self._gradients, stacked.reshape(3, -1), order=1, mode="nearest")
+        parts = found.reshape(-1, 2, len(edges), SAMPLES)
+        answers = []
+        for index, (_, normal, length) in enumerate(edges):
             across = np.zeros(SAMPLES)
-            for gradient in self._gradients:
-                dx, dy = (ndimage.map_coordinates(part, where, order=1, mode="nearest") for part in gradient)
+            for dx, dy in parts[:, :, index]:
                 across += (dx * normal[0] + dy * normal[1]) ** 2
-            shown = np.minimum(np.sqrt(across) / self._strong, 1.0)
-            if known.sum() < 3.0:
+            shown, inside = np.minimum(np.sqrt(across) / self._strong, 1.0), known[index]
+            if inside.sum() < 3.0:
                 continue
-            share = float((shown * known).sum() / known.sum())
+            share = float((shown * inside).sum() / inside.sum())
             answers.append((1.0 - share) * min(1.0, length / 40.0))
         return np.array(([*answers, 0.0, 0.0, 0.0])[:3])
 
