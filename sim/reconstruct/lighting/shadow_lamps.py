@@ -82,7 +82,9 @@ def fit_light(ground: GroundPixels, bodies: Sequence[ProxyBody]) -> ShadowLight:
     # Again, with the texture that the ground has without these shadows.
     search.learn(search.kept(best))
     if len(best.lamps) < 2:
-        return search.greedy()
+        best = search.greedy()
+        # Ground that no shadow at all explains better says nothing about a lamp.
+        return best if best.gain > 0.0 else search.soft()
     best = replace(best, gain=search.gain(search.kept(best)))
     for _ in best.lamps:
         # The first goes to the end, as it is or as it is found beside the others.

@@ -197,9 +197,10 @@ def cast_shadows(
         return found
     light = fit_light(ground, bodies)
     total, alone, hidden = light_shares(ground, bodies, light)
-    owned = _owned(ground, alone, [masks[index] for index, _ in standing])
+    distances = np.stack([_distance(ground, masks[index]) for index, _ in standing])
+    owned = _owned(ground, alone, distances)
     parts = _parts(ground, alone, total, owned)
-    posterior = light_level_posterior(ground, total, np.minimum(hidden.sum(axis=0), 1.0))
+    posterior = light_level_posterior(ground, total, np.minimum(hidden.sum(axis=0), 1.0), distances.min(axis=0))
     probable = [shadow_probability(ground, posterior, *each) for each in zip(parts, owned, strict=True)]
     closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
     dark = []
@@ -221,19 +222,20 @@ def cast_shadows(
     return found
 
 
-def _owned(ground: GroundPixels, alone: Values, masks: Sequence[Mask]) -> Mask:
+def _distance(ground: GroundPixels, mask: Mask) -> Values:
+    """Distance (N,) from the object in ``mask`` (H, W), over the objects' size."""
+    small = cv2.resize(mask.astype(np.uint8), ground.known.shape[::-1], interpolation=cv2.INTER_AREA)
+    pixels = cv2.distanceTransform((small == 0).astype(np.uint8), cv2.DIST_L2, 5)[ground.rows, ground.columns]
+    return np.asarray(pixels / ground.object_side)
+
+
+def _owned(ground: GroundPixels, alone: Values, distances: Values) -> Mask:
     """Whether (objects, N) an object is the one that blocks most of a pixel's light, nearer ones preferred.
 
-    alone: (objects, N) ratio of the light with to without each object.
+    alone: (objects, N) ratio of the light with to without each object. distances: (objects, N) of ``_distance``.
     """
-    size = ground.known.shape[::-1]
-    costs = []
-    for kept, mask in zip(alone, masks, strict=True):
-        small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_AREA)
-        distance = cv2.distanceTransform((small == 0).astype(np.uint8), cv2.DIST_L2, 5)
-        far = distance[ground.rows, ground.columns] / ground.object_side
-        costs.append(ground.blurred(np.log(kept), 1.5) + FAR * far)
-    return np.asarray(np.argmin(costs, axis=0) == np.arange(len(masks))[:, None])
+    costs = [ground.blurred(np.log(kept), 1.5) + FAR * far for kept, far in zip(alone, distances, strict=True)]
+    return np.asarray(np.argmin(costs, axis=0) == np.arange(len(costs))[:, None])
 
 
 def _parts(ground: GroundPixels, alone: Values, total: Values, owned: Mask) -> Values:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .ground_lighting import smooth_terms
-from .ground_pixels import GroundPixels, GroundTexture, fit_smooth, pixel_noise, relative_colour
+from .ground_pixels import LUMINANCE, GroundPixels, GroundTexture, fit_smooth, pixel_noise, relative_colour
 from .shadow_lamps import shadow_tint
 
 Values = NDArray[np.float64]
@@ -50,16 +51,33 @@ GROWTH = (0.03,) * 8
 """Radius of propagation of levels over the object's size, step by step."""
 ALONG = 0.7
 """Weight of the neighbours against the cast shadow."""
+SHADE_TINT = 0.4
+"""Log chroma (all channels) that a shadow changes at most, over its depth."""
 TINT_SPREAD = 0.2
 """Uncertainty of a shadow's tint: change of a log chroma over that of the log luminance."""
+RIM_DEPTH, RIM_SPREADS = 0.5, 2.5
+"""Lost light, as a logarithm, from which ground that touches an object is dark beside it; and the same over the spread
+of the ground."""
+RIM_GAP, RIM_REACH, RIM_INSIDE = 0.03, 0.25, 0.8
+"""Distances over the object's size: of dark ground that touches it, and within which that must end; and the share of
+its area that must lie within. What goes on is another surface."""
+RIM_SKY = 0.05
+"""Share of the sky that the objects hide there at least: ground seen beside an object, but far from where it stands, is
+dark for another reason."""
+RIM_SHADOW = 0.5
+"""Probability that such ground is in shadow, whatever the bodies predict: what stands close to the ground, a saucer or
+the sill of a car, shades a strip that a rough proxy body does not."""
 
 
-def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values) -> Values:
+def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values, distance: Values) -> Values:
     """Return the probability (N, levels) that pixels of ``ground`` keep each of ``LEVELS`` of their light.
 
-    kept: (N,) share of light past the bodies. hidden: (N,) share of the sky that they occlude.
+    kept: (N,) share of light past the bodies. hidden: (N,) share of the sky that they occlude. distance: (N,) from the
+    nearest object, over the objects' size.
     """
     prior = (1.0 - CONTACT) * _prior(ground, kept) + CONTACT * _prior(ground, 1.0 - CONTACT_LOSS * hidden)
+    rim = dark_rim(ground, prior, hidden, distance)
+    prior[rim] = (1.0 - RIM_SHADOW) * prior[rim] + RIM_SHADOW * IN_SHADOW / IN_SHADOW.sum()
     posterior = prior
     reached = prior @ IN_SHADOW > 0.15
     terms = smooth_terms(ground.places)
@@ -83,6 +101,30 @@ def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values) ->
             likelihood[:, index] = ground.blurred(likelihood[:, index], 1.2)
         posterior, reached = _grown(ground, prior, np.exp(likelihood), reached)
     return posterior
+
+
+def dark_rim(ground: GroundPixels, prior: Values, hidden: Values, distance: Values) -> Mask:
+    """Return (N,) whether pixels of ``ground`` belong to dark ground that touches an object and ends near it.
+
+    prior: (N, levels) of the light that they keep; hidden, distance: as of ``light_level_posterior``.
+    """
+    terms = smooth_terms(ground.places)
+    lit = prior @ (LEVELS > 0.95)
+    smooth = terms @ fit_smooth(ground.colour - (prior @ LOGS)[:, None], terms, ground.weight * (0.02 + lit))
+    off = ground.colour - smooth
+    luminance = off @ LUMINANCE
+    chroma = np.linalg.norm(off - luminance[:, None], axis=1)
+    spread = 1.48 * float(np.median(np.abs(luminance[lit >= np.median(lit)])))
+    dark = luminance < -max(RIM_DEPTH, RIM_SPREADS * spread)
+    # The darker, the less its tint is known; 0.5 as the least light is not zero.
+    dark &= (chroma < SHADE_TINT * (0.5 - luminance)) & (hidden > RIM_SKY)
+    number, labels = cv2.connectedComponents((ground.picture(dark) > 0).astype(np.uint8), connectivity=8)
+    own = labels.astype(np.int64)[ground.rows, ground.columns]
+    area = np.bincount(own, minlength=number)
+    keep = np.bincount(own[distance < RIM_GAP], minlength=number) > 0
+    keep &= np.bincount(own[distance < RIM_REACH], minlength=number) > RIM_INSIDE * area
+    keep[0] = False
+    return np.asarray(keep[own])
 
 
 def shadow_probability(

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: MIT
+"""Dark ground that touches an object: the shadow of what stands close to the ground, or another surface."""
+
+import math
+
+import numpy as np
+import pytest
+from physgen.sim.composite.srgb import linear_to_bytes
+from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
+from physgen.sim.reconstruct.lighting.ground_pixels import ground_pixels, proxy_body
+from physgen.sim.reconstruct.lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes
+from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim
+from scipy import ndimage
+
+WIDTH, HEIGHT = 240, 160
+CAMERA = camera_above_ground(WIDTH, HEIGHT, 230.0, math.radians(35.0))
+COLUMNS, ROWS = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+
+
+def ellipse(x, y):
+    return ((COLUMNS - x) / 62.0) ** 2 + ((ROWS - y) / 42.0) ** 2 < 1.0
+
+
+def photo(dark, kept):
+    """A red saucer on a wooden table whose pixels ``dark`` keep the share ``kept`` of their light; and its mask."""
+    saucer = ellipse(125.0, 80.0)
+    grain = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(HEIGHT, WIDTH)), (1.0, 5.0))
+    light = np.array([0.45, 0.22, 0.1]) * np.exp(0.25 * grain / grain.std())[..., None]
+    light[dark] *= kept
+    light[saucer] = [0.5, 0.05, 0.02]
+    return linear_to_bytes(ndimage.gaussian_filter(light, (0.6, 0.6, 0.0))), saucer
+
+
+@pytest.mark.parametrize("kept", [0.06, 0.2])
+def test_the_dark_crescent_under_a_saucer_is_its_shadow(kept):
+    crescent = ellipse(118.0, 89.0) & ~ellipse(125.0, 80.0)
+    pixels, saucer = photo(crescent, kept)
+    (found,) = cast_shadows(pixels, [saucer], CAMERA)
+    assert (found.shadow & crescent).sum() > 0.9 * crescent.sum()
+    assert (found.shadow & ~crescent).sum() < 0.5 * crescent.sum()
+    dilation = PENUMBRA_DILATION * WIDTH / 1024.0
+    (hole,) = object_holes([saucer], [found.penumbra | found.expected], dilation)
+    assert not (crescent & ~hole).any(), "a stain would stay where the saucer stood"
+
+
+def test_a_dark_floor_that_goes_on_is_no_shadow():
+    floor = ROWS > 100.0
+    pixels, saucer = photo(floor, 0.1)
+    (found,) = cast_shadows(pixels, [saucer], CAMERA)
+    far = floor & (ROWS > 135.0)
+    assert (found.shadow & far).sum() < 0.1 * far.sum()
+
+
+def test_only_ground_whose_sky_the_object_hides_belongs_to_the_rim():
+    crescent = ellipse(118.0, 89.0) & ~ellipse(125.0, 80.0)
+    pixels, saucer = photo(crescent, 0.1)
+    ground = ground_pixels(pixels, [saucer], CAMERA, [proxy_body(saucer, CAMERA)])
+    prior = np.tile(np.eye(len(LEVELS))[0], (len(ground.rows), 1))
+    near = np.zeros(len(ground.rows))
+    assert dark_rim(ground, prior, near + 1.0, near).any()
+    assert not dark_rim(ground, prior, near, near).any()
+    assert not dark_rim(ground, prior, near + 1.0, near + 1.0).any()
