@@ -106,3 +106,12 @@ def test_a_filling_of_another_level_has_no_border():
     # The edge of a thing is no difference of level.
     black = blend(truth, np.zeros_like(darker), hole, np.zeros_like(hole))
     assert black[disc(120, 90, 38)].max() < 5
+
+
+def test_a_deep_shadow_at_the_border_of_the_photo_is_inpainted():
+    deep = np.mgrid[:HEIGHT, :WIDTH][0] > HEIGHT - 30
+    photo = wood(4) * (1.0 - 0.92 * soft(deep, 2.0))
+    hole = np.mgrid[:HEIGHT, :WIDTH][0] > HEIGHT - 60
+    given, left = relit(photo, hole, np.zeros_like(hole), np.zeros_like(hole))
+    assert left[HEIGHT - 20 :].all(), "noise of the deepest shadow would be raised twelvefold"
+    assert np.abs(np.log(np.maximum(given, 1.0)) - np.log(np.maximum(photo, 1.0))).max() < 0.7

@@ -242,7 +242,9 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     # Between what is inpainted, slivers of the photo would be islands.
     wide = 2 * max(1, round(SLIVER * cells.side)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
-    sure = cv2.morphologyEx((trusted | cells.known).astype(np.uint8), cv2.MORPH_OPEN, disc, borderValue=1)
+    # Beyond the border of the photo goes on what is beside it: that is eroded, but nothing grows in from there.
+    sure = cv2.erode((trusted | cells.known).astype(np.uint8), disc, borderType=cv2.BORDER_REPLICATE)
+    sure = cv2.dilate(sure, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     trusted = cv2.erode(sure, np.ones((3, 3), np.uint8), borderValue=1) > 0
     # A shadow takes light away.
     lack[..., 0] = np.where(altered, lack[..., 0], np.maximum(lack[..., 0], 0.0))
