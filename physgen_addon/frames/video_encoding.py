@@ -154,4 +154,7 @@ def _encode(frames: list[Path], video: Path, fps: float, progress: StageProgress
         if video.suffix.lower() == ".webm":
             _name_tracks_evenly(video)
     finally:
-        bpy.data.scenes.remove(scene)
+        # Blender 4.5 crashes now and then as it removes a scene whose sequencer has just rendered: a process without
+        # windows, which ends with its work, keeps it.
+        if not bpy.app.background:
+            bpy.data.scenes.remove(scene)
