@@ -19,7 +19,8 @@ SEED ?= 0
 # Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
 SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTEST := $(BIN)/python -m pytest $(SPREAD)
-# Where PYTHONDONTWRITEBYTECODE is set, every process that tests start would compile all that it imports.
+# Where PYTHONDONTWRITEBYTECODE is set, every process that tests start would compile all that it imports. A tree that
+# may not be written works without.
 COMPILED := __init__.py __main__.py batch benchmarks blind_check physgen_addon sim
 
 .PHONY: setup demo test test-all test-explore coverage fuzz lint lock audit docs benchmark extension assets test-blender-app clean

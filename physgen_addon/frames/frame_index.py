@@ -67,7 +67,7 @@ def recorded_fps(folder: Path) -> float | None:
     return float(fps) if 0 < fps <= MOST_RATE else None
 
 
-MADE_OTHERWISE = {"scene.json": "a scene", "manifest.json": "a bake", "capture.json": "a capture"}
+OTHER_FOLDERS = {"scene.json": "a scene", "manifest.json": "a bake", "capture.json": "a capture"}
 """Files of folders in which frames would be foreign, so that the scene could not be corrected again."""
 
 
@@ -92,7 +92,7 @@ class FrameIndex:
         if path.is_file():
             self._entries, self._video = _entries(path)
         present = [p for p in folder.iterdir() if FRAME_NAME.fullmatch(p.name)] if folder.is_dir() else []
-        made = next((kind for name, kind in MADE_OTHERWISE.items() if (folder / name).is_file()), None)
+        made = next((kind for name, kind in OTHER_FOLDERS.items() if (folder / name).is_file()), None)
         if made is not None and not path.is_file():
             raise InputError(f"{folder}: is {made}, not a folder of frames; choose an empty or new folder")
         if present and not path.is_file():

@@ -68,9 +68,10 @@ def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObj
     attribute.data.foreach_set("color", np.ones(4 * len(mesh.vertices), dtype=np.float32))
     data.color_attributes.active_color = attribute
     data.materials.append(object_material(source.name, _load_image(source.name, picture)))
-    found = photo_highlights(folder.model.camera, mesh, uv, np.asarray(picture.convert("RGB"), dtype=np.uint8))
+    texture = np.asarray(picture.convert("RGB"), dtype=np.uint8)
+    found = photo_highlights(folder.model.camera, mesh, uv, texture)
     if found is not None:
-        matt = Image.fromarray(found.taken_out(np.asarray(picture.convert("RGB"), dtype=np.uint8)))
+        matt = Image.fromarray(found.taken_out(texture))
         show_highlights(data, folder.model.camera, found, _load_image(f"{source.name} matt", matt))
     item = bpy.data.objects.new(source.name, data)
     collection.objects.link(item)

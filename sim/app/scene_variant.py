@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .reconstruct import Physics
 
 
-MADE_OTHERWISE = {"reconstruct.json": "a reconstruction", "compose.json": "a composition"}
-"""Files that no variant has."""
+NEVER_REPLACED = {"reconstruct.json": "a reconstruction", "compose.json": "a composition"}
+"""Files that no variant has: their folders hold work that a variant does not."""
 
 
 def make_variant(
@@ -66,7 +66,7 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
         leftovers = {Path(name).parts[0] for name in referenced_files(scene)}
         if any(p.name not in leftovers for p in out.iterdir() if not p.name.startswith(".")):
             raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
-    if (kind := next((kind for name, kind in MADE_OTHERWISE.items() if (out / name).is_file()), None)) is not None:
+    if (kind := next((kind for name, kind in NEVER_REPLACED.items() if (out / name).is_file()), None)) is not None:
         raise InputError(f"{out}: is {kind}, which the variant would replace; choose another folder")
     with folder_lock(out):
         for name in source.with_model(scene).files():

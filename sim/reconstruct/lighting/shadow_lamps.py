@@ -84,7 +84,7 @@ def fit_light(ground: GroundPixels, bodies: Sequence[ProxyBody]) -> ShadowLight:
     if len(best.lamps) < 2:
         best = search.greedy()
         # Ground that no shadow at all explains better says nothing about a lamp.
-        return best if best.gain > 0.0 else search.soft()
+        return search.soft() if best.lamps and best.gain <= 0.0 else best
     best = replace(best, gain=search.gain(search.kept(best)))
     for _ in best.lamps:
         # The first goes to the end, as it is or as it is found beside the others.

@@ -27,7 +27,7 @@ PENUMBRA_RATIO = 0.95
 SHARPNESS = 1.2
 """Pixels over which a photo blurs the edge of a hard shadow: its rim is darkened too."""
 LEVELS = np.array([1.0, 0.965, 0.93, 0.87, 0.80, 0.72, 0.63, 0.54, 0.45, 0.36, 0.28, 0.20, 0.12, 0.06])
-IN_SHADOW = LEVELS < SHADOW_RATIO
+IN_SHADOW, LIT = LEVELS < SHADOW_RATIO, LEVELS > 0.95
 LOGS = np.log(LEVELS)
 ALIKE = np.exp(-0.5 * ((LOGS[:, None] - LOGS) / np.maximum(0.04, -0.12 * LOGS)[:, None]) ** 2)
 ALIKE /= ALIKE.sum(axis=1, keepdims=True)
@@ -51,8 +51,6 @@ GROWTH = (0.03,) * 8
 """Radius of propagation of levels over the object's size, step by step."""
 ALONG = 0.7
 """Weight of the neighbours against the cast shadow."""
-SHADE_TINT = 0.4
-"""Log chroma (all channels) that a shadow changes at most, over its depth."""
 TINT_SPREAD = 0.2
 """Uncertainty of a shadow's tint: change of a log chroma over that of the log luminance."""
 RIM_DEPTH, RIM_SPREADS = 0.5, 2.5
@@ -61,6 +59,8 @@ of the ground."""
 RIM_GAP, RIM_REACH, RIM_INSIDE = 0.03, 0.25, 0.8
 """Distances over the object's size: of dark ground that touches it, and within which that must end; and the share of
 its area that must lie within. What goes on is another surface."""
+RIM_TINT = 0.4
+"""Log chroma of all channels, over the depth, above which such ground is of another colour, not in shadow."""
 RIM_SKY = 0.05
 """Share of the sky that the objects hide there at least: ground seen beside an object, but far from where it stands, is
 dark for another reason."""
@@ -82,10 +82,7 @@ def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values, di
     reached = prior @ IN_SHADOW > 0.15
     terms = smooth_terms(ground.places)
     for _ in range(ROUNDS):
-        lit = posterior @ (LEVELS > 0.95)
-        depth = posterior @ LOGS
-        weight = ground.weight * (0.02 + lit)
-        smooth = terms @ fit_smooth(ground.colour - depth[:, None], terms, weight)
+        lit, depth, weight, smooth = _unshaded(ground, terms, posterior)
         samples = relative_colour(ground.colour, smooth)
         usual = np.median(samples[lit > 0.8][:, 1:], axis=0) if (lit > 0.8).any() else np.zeros(2)
         tint = shadow_tint(samples, depth, usual)
@@ -103,21 +100,27 @@ def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values, di
     return posterior
 
 
+def _unshaded(ground: GroundPixels, terms: Values, posterior: Values) -> tuple[Values, Values, Values, Values]:
+    """The probability (N,) that pixels are lit, the logarithm (N,) of the light that they keep, and weight (N,) and
+    smooth part (N, 3) in ``terms`` of the ground's colour without shadows."""
+    lit, depth = posterior @ LIT, posterior @ LOGS
+    weight = ground.weight * (0.02 + lit)
+    return lit, depth, weight, terms @ fit_smooth(ground.colour - depth[:, None], terms, weight)
+
+
 def dark_rim(ground: GroundPixels, prior: Values, hidden: Values, distance: Values) -> Mask:
     """Return (N,) whether pixels of ``ground`` belong to dark ground that touches an object and ends near it.
 
     prior: (N, levels) of the light that they keep; hidden, distance: as of ``light_level_posterior``.
     """
-    terms = smooth_terms(ground.places)
-    lit = prior @ (LEVELS > 0.95)
-    smooth = terms @ fit_smooth(ground.colour - (prior @ LOGS)[:, None], terms, ground.weight * (0.02 + lit))
+    lit, _, _, smooth = _unshaded(ground, smooth_terms(ground.places), prior)
     off = ground.colour - smooth
     luminance = off @ LUMINANCE
     chroma = np.linalg.norm(off - luminance[:, None], axis=1)
     spread = 1.48 * float(np.median(np.abs(luminance[lit >= np.median(lit)])))
     dark = luminance < -max(RIM_DEPTH, RIM_SPREADS * spread)
     # The darker, the less its tint is known; 0.5 as the least light is not zero.
-    dark &= (chroma < SHADE_TINT * (0.5 - luminance)) & (hidden > RIM_SKY)
+    dark &= (chroma < RIM_TINT * (0.5 - luminance)) & (hidden > RIM_SKY)
     number, labels = cv2.connectedComponents((ground.picture(dark) > 0).astype(np.uint8), connectivity=8)
     own = labels.astype(np.int64)[ground.rows, ground.columns]
     area = np.bincount(own, minlength=number)
@@ -192,7 +195,6 @@ def _prior(ground: GroundPixels, kept: Values) -> Values:
     # Depths are approximate too.
     spread = np.exp(-0.5 * ((LOGS[:, None] - LOGS) / np.maximum(0.06, -0.35 * LOGS)[:, None]) ** 2)
     prior = prior @ (spread / spread.sum(axis=1, keepdims=True))
-    lit = LEVELS > 0.95
-    unforeseen = np.where(lit, 0.9 / lit.sum(), 0.1 / (~lit).sum())
+    unforeseen = np.where(LIT, 0.9 / LIT.sum(), 0.1 / (~LIT).sum())
     prior = (1.0 - UNFORESEEN) * prior + UNFORESEEN * unforeseen
     return np.asarray(prior / prior.sum(axis=1, keepdims=True))
