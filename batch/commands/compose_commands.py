@@ -10,6 +10,7 @@ from typing import Any
 from ...sim.events import IsCancelled
 from ...sim.gaussians.compose.compose_options import METHODS, ComposeOptions, ComposeRequest
 from ...sim.scene.folder import load_scene
+from ...sim.scene.scene_output import COMPOSE_FILE
 from ...sim.validation import read_json
 from ..terminal import Terminal
 from .diagnosis_commands import parse_names
@@ -80,7 +81,7 @@ def run_compose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
         prompt=options.prompt,
     )
     compose(load_scene(options.scene), out=options.out, request=request, on_event=terminal, cancelled=cancelled)
-    record = read_json(options.out / "compose.json")
+    record = read_json(options.out / COMPOSE_FILE)
     terminal({"event": "done", "scene": str(options.out), "pairs": record["pairs"], "groups": record["groups"]})
     terminal.line("\n".join([*_lines(record), f"scene: {options.out}"]))
     return 0

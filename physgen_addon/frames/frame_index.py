@@ -15,6 +15,7 @@ from ...sim.atomic import write_json
 from ...sim.cache.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState
 from ...sim.errors import InputError
 from ...sim.scene.folder import file_hash
+from ...sim.scene.scene_output import folder_kind
 from ...sim.validation import read_json
 
 
@@ -67,10 +68,6 @@ def recorded_fps(folder: Path) -> float | None:
     return float(fps) if 0 < fps <= MOST_RATE else None
 
 
-OTHER_FOLDERS = {"scene.json": "a scene", "manifest.json": "a bake", "capture.json": "a capture"}
-"""Files of folders in which frames would be foreign, so that the scene could not be corrected again."""
-
-
 class FrameIndex:
     """Index of the frames of one folder. A frame is valid only while its file is, byte for byte, the one that was
     written.
@@ -92,7 +89,8 @@ class FrameIndex:
         if path.is_file():
             self._entries, self._video = _entries(path)
         present = [p for p in folder.iterdir() if FRAME_NAME.fullmatch(p.name)] if folder.is_dir() else []
-        made = next((kind for name, kind in OTHER_FOLDERS.items() if (folder / name).is_file()), None)
+        # Frames among the files of a scene would be foreign there, and it could not be corrected again.
+        made = folder_kind(folder)
         if made is not None and not path.is_file():
             raise InputError(f"{folder}: is {made}, not a folder of frames; choose an empty or new folder")
         if present and not path.is_file():

@@ -17,6 +17,7 @@ from ...sim.app.stage_process import run_stage
 from ...sim.errors import InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import Scene, load_scene
+from ...sim.scene.scene_output import COMPOSE_FILE
 from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
 from ..context import active, selected
@@ -165,7 +166,7 @@ def _reshape(scene: bpy.types.Scene, item: bpy.types.Object, vertices: np.ndarra
 
 def _pairs(folder: Scene, fitted: tuple[ComposedObject, ...]) -> list[dict[str, Any]]:
     """Return the penetration of each pair from ``compose.json``, by Blender's names."""
-    record = read_json(folder.root / "compose.json")
+    record = read_json(folder.root / COMPOSE_FILE)
     names = {item.name: item.label for item in fitted}
     found = []
     with contextlib.suppress(KeyError, TypeError):

@@ -12,6 +12,7 @@ import bpy
 from ...sim.errors import InputError
 from ...sim.scene.folder import SCENE_FILE
 from ...sim.scene.model import Camera
+from ...sim.scene.scene_output import STAMP_FILE
 from ...sim.validation import read_json, valid_names
 from .. import blend_trust
 from ..paths import folder_beside, require_folder
@@ -154,7 +155,7 @@ def _file(path: str, what: str) -> Path:
     return found
 
 
-STAMP_FILE, REPORT_FILE = "reconstruct.json", "report.html"
+REPORT_FILE = "report.html"
 
 
 def made_folder(state: bpy.types.PropertyGroup) -> Path | None:

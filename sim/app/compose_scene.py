@@ -35,7 +35,7 @@ from ..mpm.colliders import Surface
 from ..mpm.geometry.triangles import face_normals
 from ..scene.folder import Scene, inside, referenced_files, save_scene
 from ..scene.model import SceneModel, SceneObject
-from ..scene.scene_output import replacing_folder
+from ..scene.scene_output import COMPOSE_FILE, PHYSICS_FILE, replacing_folder
 from ..scene.textured_mesh import moved_suffix, transformed, write_moved_mesh
 from ..version import VERSION
 from .compose_inputs import (
@@ -57,8 +57,7 @@ from .compose_inputs import (
 
 Array = NDArray[np.float64]
 
-COMPOSE_FILE = "compose.json"
-UNNAMED_FILES = ("masks", "full", "shadows", "holes", "albedo", "physics.json")
+UNNAMED_FILES = ("masks", "full", "shadows", "holes", "albedo", PHYSICS_FILE)
 """Files of a scene that ``scene.json`` does not name. A composition cannot be corrected like the reconstruction that it
 came from, so ``reconstruct.json``, stages and report are not copied."""
 

@@ -28,10 +28,10 @@ from ..scene.folder import Scene, file_hash, load_scene, parse_scene, save_scene
 from ..scene.material import load_preset
 from ..scene.model import Ground, SceneModel, Vector
 from ..scene.overrides import PHYSICS_FIELDS, apply_overrides, without_physics
-from ..scene.scene_output import PHYSICS_FILE
+from ..scene.scene_output import PHYSICS_FILE, STAMP_FILE
 from ..trust import trusted_spec
 from ..validation import read_json, to_json
-from .reconstruct_record import STAMP_FILE, Request, read_stamp, require_stamp, stamp_to_json
+from .reconstruct_record import Request, read_stamp, require_stamp, stamp_to_json
 
 RECONSTRUCT_REVISION = 35
 """Raised with every change of reconstruction that changes what a photo becomes."""

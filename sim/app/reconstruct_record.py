@@ -25,6 +25,7 @@ from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.models import known_models
 from ..reconstruct.reconstruct_options import WITHOUT
 from ..scene.folder import Scene
+from ..scene.scene_output import STAMP_FILE
 from ..trust import NOTHING, READS, RUNS, Agreed, Claim, Replaced, Untrusted, UntrustedSpec, code_hash, trusted_spec
 from ..validation import MAX_JSON_BYTES, json_value, parse, to_json
 
@@ -87,8 +88,6 @@ def _command_claim(stage: str, spec: str, path: Path, where: str) -> Claim:
 
 
 T = TypeVar("T")
-
-STAMP_FILE = "reconstruct.json"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,13 +25,14 @@ from ..scene.folder import (
     scene_to_json,
 )
 from ..scene.model import SceneModel
+from ..scene.scene_output import COMPOSE_FILE, STAMP_FILE, folder_kind
 
 # Imported where they are used: Blender's process, which may lack what reconstruction needs, saves scenes with this.
 if TYPE_CHECKING:
     from .reconstruct import Physics
 
 
-NEVER_REPLACED = {"reconstruct.json": "a reconstruction", "compose.json": "a composition"}
+NEVER_REPLACED = (STAMP_FILE, COMPOSE_FILE)
 """Files that no variant has: their folders hold work that a variant does not."""
 
 
@@ -66,7 +67,7 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
         leftovers = {Path(name).parts[0] for name in referenced_files(scene)}
         if any(p.name not in leftovers for p in out.iterdir() if not p.name.startswith(".")):
             raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
-    if (kind := next((kind for name, kind in NEVER_REPLACED.items() if (out / name).is_file()), None)) is not None:
+    if (kind := folder_kind(out, NEVER_REPLACED)) is not None:
         raise InputError(f"{out}: is {kind}, which the variant would replace; choose another folder")
     with folder_lock(out):
         for name in source.with_model(scene).files():

@@ -25,7 +25,7 @@ from ..scene.equirectangular import FRAMES, Radiance
 from ..scene.folder import Scene, require_photo, save_scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import Ground, Light, Vector
-from .reconstruct_record import STAMP_FILE
+from ..scene.scene_output import STAMP_FILE
 
 LIGHT_FOLDER = "light"
 

@@ -79,11 +79,27 @@ def _state(root: Path, name: str, known: str | None) -> FileState:
     )
 
 
-PHYSICS_FILE = "physics.json"
+STAMP_FILE, COMPOSE_FILE, PHYSICS_FILE = "reconstruct.json", "compose.json", "physics.json"
+"""Records in a scene folder: of its reconstruction, of its composition, of where each object's material comes from."""
+FOLDER_KINDS = {
+    STAMP_FILE: "a reconstruction",
+    COMPOSE_FILE: "a composition",
+    SCENE_FILE: "a scene",
+    "manifest.json": "a bake",
+    "capture.json": "a capture",
+}
+"""What a folder is that holds a file of this name."""
+
+
+def folder_kind(folder: Path, files: Iterable[str] = tuple(FOLDER_KINDS)) -> str | None:
+    """Return what ``folder`` is ("a bake"), by the first of ``files`` in it; None without any."""
+    return next((FOLDER_KINDS[name] for name in files if (folder / name).is_file()), None)
+
+
 OWN_ENTRIES = frozenset(
     (
         SCENE_FILE,
-        "reconstruct.json",
+        STAMP_FILE,
         PHYSICS_FILE,
         "photo.png",
         "background.png",
@@ -94,8 +110,7 @@ OWN_ENTRIES = frozenset(
         "meshes",
         "splats",
         "albedo",
-        "splats",
-        "compose.json",
+        COMPOSE_FILE,
         SUMS_FILE,
         "light",
         "stages",

@@ -38,7 +38,7 @@ from physgen.sim.app.diagnose import diagnose
 from physgen.sim.app.explain import explain
 from physgen.sim.app.pack_bake import pack_bake, unpack_bake
 from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
-from physgen.sim.app.reconstruct_record import STAMP_FILE, read_stamp, require_request
+from physgen.sim.app.reconstruct_record import read_stamp, require_request
 from physgen.sim.app.scene_variant import make_variant
 from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, save_manifest
@@ -51,6 +51,7 @@ from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.scene.scene_output import STAMP_FILE
 from physgen.sim.version import VERSION
 from PIL import Image
 

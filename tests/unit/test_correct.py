@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from physgen.batch.cli import main
 from physgen.sim.app.reconstruct import Physics, correct, reconstruct, set_physics
-from physgen.sim.app.reconstruct_record import STAMP_FILE, require_request
+from physgen.sim.app.reconstruct_record import require_request
 from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.scene.scene_output import STAMP_FILE
 from PIL import Image
 
 BALL, CRATE = (30, 45, 85, 105), (110, 40, 165, 115)

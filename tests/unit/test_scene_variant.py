@@ -9,6 +9,7 @@ from physgen.sim.app.scene_variant import make_variant
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.model import Effect
+from physgen.sim.scene.scene_output import folder_kind
 
 WIND = [{"name": "wind", "parameters": {"drag_per_mass": 0.1, "wind_x": 2, "wind_y": 0, "wind_z": 0}}]
 
@@ -45,6 +46,19 @@ def test_a_variant_has_its_own_physics_and_the_scenes_files(ball_scene, tmp_path
     (out / "photo.png").write_bytes(b"half")
     make_variant(load_scene(source.root), out=out, physics=Physics())
     assert (out / "photo.png").read_bytes() == (source.root / "photo.png").read_bytes()
+
+
+def test_a_folder_is_named_by_the_file_that_it_holds(tmp_path):
+    assert folder_kind(tmp_path) is None and folder_kind(tmp_path / "missing") is None
+    for name, kind in (("scene.json", "a scene"), ("compose.json", "a composition"), ("manifest.json", "a bake")):
+        folder = tmp_path / name.removesuffix(".json")
+        folder.mkdir()
+        (folder / name).write_text("{}")
+        assert folder_kind(folder) == kind
+    # A composition is a scene as well: the more telling file counts.
+    (tmp_path / "compose" / "scene.json").write_text("{}")
+    assert folder_kind(tmp_path / "compose") == "a composition"
+    assert folder_kind(tmp_path / "compose", ("reconstruct.json",)) is None
 
 
 def test_invalid_variants_are_refused(ball_scene, tmp_path):

@@ -18,12 +18,13 @@ from physgen.batch.commands import install_commands
 from physgen.sim import trust
 from physgen.sim.app import reconstruct_record
 from physgen.sim.app.reconstruct import correct, reconstruct
-from physgen.sim.app.reconstruct_record import STAMP_FILE, read_stamp, require_request
+from physgen.sim.app.reconstruct_record import read_stamp, require_request
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.adapters.protocols import STAGES
 from physgen.sim.reconstruct.adapters.resolve import resolve
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.scene.scene_output import STAMP_FILE
 from physgen.sim.trust import NotTrusted, UntrustedSpec, trusted_spec
 from physgen.sim.validation import parse
 from PIL import Image
