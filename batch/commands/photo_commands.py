@@ -31,24 +31,21 @@ from .. import stages
 from ..terminal import Terminal
 from .flags import (
     add_anyway_flag,
-    add_bake_flags,
     add_environment_flags,
     add_object_flags,
-    add_physics_flags,
     add_reasoning_flags,
     add_reconstruction_flags,
     add_sun_flags,
-    bake_options,
     box_text,
     chat_request,
     corrected_requests,
     given_anew,
     light_request,
     object_requests,
-    physics_options,
     reconstruct_options,
 )
 from .render_commands import add_render_flags, render_options
+from .simulation_flags import add_bake_flags, add_physics_flags, bake_options, physics_options
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:

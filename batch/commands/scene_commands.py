@@ -18,7 +18,8 @@ from ...sim.scene.folder import SCENE_FILE, Scene, load_scene
 from ...sim.scene.scene_output import check_scene
 from .. import stages
 from ..terminal import Terminal
-from .flags import add_anyway_flag, add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options
+from .flags import add_anyway_flag
+from .simulation_flags import add_bake_flags, add_physics_flags, add_sample_flags, bake_options, physics_options
 
 
 def add_bake(parser: argparse.ArgumentParser) -> None:
