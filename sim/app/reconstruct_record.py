@@ -20,7 +20,8 @@ from typing import Any, TypeVar
 from ..errors import InputError
 from ..files import read_bytes
 from ..reconstruct import ObjectRequest, ReconstructOptions
-from ..reconstruct.adapters.adapter_registry import PROGRAMS, read_command_file, split_spec
+from ..reconstruct.adapters.adapter_registry import PROGRAMS, split_spec
+from ..reconstruct.adapters.command_file import read_command_file
 from ..reconstruct.adapters.protocols import STAGES
 from ..reconstruct.models import known_models
 from ..reconstruct.reconstruct_options import WITHOUT

@@ -23,7 +23,8 @@ from physgen.sim.app.preview_server import parse_request, request_id
 from physgen.sim.app.stage_process import parse_event
 from physgen.sim.errors import InputError
 from physgen.sim.gaussians.guidance.pretrained_models import read_json as read_model_json
-from physgen.sim.reconstruct.adapters.adapter_registry import named_adapters, read_toml
+from physgen.sim.reconstruct.adapters.adapter_registry import named_adapters
+from physgen.sim.reconstruct.adapters.command_file import read_toml
 from physgen.sim.reconstruct.models.model_folder import ArchiveReader
 from physgen.sim.reconstruct.reasoning.answer_parser import read_answer
 from physgen.sim.reconstruct.reasoning.material_names import load_names

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.reconstruct.adapters import resolve
-from physgen.sim.reconstruct.adapters.adapter_registry import read_command_file
+from physgen.sim.reconstruct.adapters.command_file import read_command_file
 from PIL import Image
 
 WIDTH, HEIGHT = 40, 30

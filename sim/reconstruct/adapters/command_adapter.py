@@ -33,7 +33,8 @@ from ...memory import how_it_was_killed, memory_kills
 from ...npz import read_npy, read_npz
 from ...processes import note_child
 from ...scene.meshes import MAX_MESH_BYTES
-from .adapter_registry import CommandFile, program_python
+from .adapter_registry import program_python
+from .command_file import CommandFile
 from .protocols import Depth, Mask, Pixels, checked_depth, checked_masks, checked_mesh, checked_pixels
 
 MARGIN = 0.1

@@ -32,10 +32,10 @@ from .adapter_registry import (
     named_adapters,
     other_stage,
     program_command,
-    read_command_file,
     split_spec,
 )
 from .command_adapter import DepthCommand, InpainterCommand, MesherCommand, SegmenterCommand
+from .command_file import read_command_file
 from .onnx_adapter import load_isnet, load_lama
 from .picture_adapter import load_picture
 from .protocols import STAGES, DepthEstimator, Inpainter, Mesher, Segmenter
