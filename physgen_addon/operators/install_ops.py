@@ -6,6 +6,7 @@ agrees.
 """
 
 from pathlib import Path
+from typing import ClassVar
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
@@ -18,15 +19,15 @@ from ...sim.reconstruct.models import model_folder
 from ...sim.reconstruct.models.known_models import ISNET
 from .. import bake_state, interpreter, text
 from ..background_jobs import Job, JobOperator, Work, no_job_runs, start_chosen
+from ..compat import OperatorMixin
 from ..interpreter import cli_command, find_python
 from ..props import preferences
 from ..props.preferences import python
 from ..text import report_errors
 
-OFFLINE_WHEELS = (
-    "Blender's preferences keep it offline (System > Network > Allow Online Access): allow it there, or choose a "
-    "folder of wheels that were downloaded elsewhere"
-)
+_OFFLINE = "Blender's preferences keep it offline (System > Network > Allow Online Access): allow it there, or choose "
+OFFLINE_WHEELS = f"{_OFFLINE}a folder of wheels that were downloaded elsewhere"
+OFFLINE_MODEL = f"{_OFFLINE}an archive that was fetched elsewhere"
 
 
 class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
@@ -72,21 +73,21 @@ class PHYSGEN_OT_check_python(JobOperator, bpy.types.Operator):
         return sentence
 
 
-class PHYSGEN_OT_install_python(bpy.types.Operator):
-    """Make a Python environment with all that simulates; shows size, folder and source first"""
+class _Consent(OperatorMixin):
+    """Mixin of dialogs that say what would be installed; their button is the agreement and starts the job.
 
-    bl_idname = "physgen.install_python"
-    bl_label = "Install"
+    heading: of the dialog. source: property that names files which were fetched elsewhere. offline: what to do without
+    a network. job: operator in ``bpy.ops.physgen`` that installs.
+    """
 
-    wheels: StringProperty(
-        name="Folder of Wheels",
-        description="Folder of wheels that were downloaded elsewhere; empty: pip downloads them",
-        subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
-    )
+    heading: ClassVar[str]
+    source: ClassVar[str]
+    offline: ClassVar[str]
+    job: ClassVar[str]
+
     agreed: BoolProperty(
         name="Agreed",
-        description="Agreement to size, folder and source, for scripts; pressing Install agrees as well",
+        description="Agreement to what the dialog says, for scripts; pressing Install agrees as well",
         options={"HIDDEN", "SKIP_SAVE"},
     )
 
@@ -99,24 +100,49 @@ class PHYSGEN_OT_install_python(bpy.types.Operator):
         """Show what would be installed; its button is the agreement."""
         self.agreed = True
         manager = context.window_manager
-        return manager.invoke_props_dialog(self, width=460, title="Install what simulates", confirm_text="Install")
+        return manager.invoke_props_dialog(self, width=460, title=self.heading, confirm_text="Install")
+
+    def says(self) -> list[str]:
+        """Return what would be installed, in sentences: size, source, and where it is kept."""
+        raise NotImplementedError
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw what is installed, where, from where, and how much it is."""
+        """Draw these sentences, the field of files fetched elsewhere, and how to go online where that is needed."""
         column = self.layout.column()
-        for line in install_description():
-            text.paragraph(column, line, 76)
-        column.prop(self, "wheels")
-        if not self.wheels.strip() and not bpy.app.online_access:
-            text.paragraph(column, f"{OFFLINE_WHEELS}.", 76)
+        for line in self.says():
+            text.paragraph(column, line[0].upper() + line[1:], 80)
+            column.separator(factor=0.4)
+        column.prop(self, self.source)
+        if not getattr(self, self.source).strip() and not bpy.app.online_access:
+            text.paragraph(column, f"{self.offline}.", 80)
             column.operator("screen.userpref_show", text="Network Preferences…", icon="PREFERENCES").section = "SYSTEM"
 
     @report_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start the installation."""
         if not self.agreed:
-            raise InputError("Install: not agreed to; nothing was installed (agreed=True agrees, for scripts)")
-        return start_chosen(self, context, bpy.ops.physgen.install_packages, {"wheels": self.wheels})
+            raise InputError(f"{self.heading}: not agreed to; nothing was installed (agreed=True agrees, for scripts)")
+        given = {self.source: getattr(self, self.source)}
+        return start_chosen(self, context, getattr(bpy.ops.physgen, self.job), given)
+
+
+class PHYSGEN_OT_install_python(_Consent, bpy.types.Operator):
+    """Make a Python environment with all that simulates; shows size, folder and source first"""
+
+    bl_idname = "physgen.install_python"
+    bl_label = "Install"
+    heading, source, offline, job = "Install What Simulates", "wheels", OFFLINE_WHEELS, "install_packages"
+
+    wheels: StringProperty(
+        name="Folder of Wheels",
+        description="Folder of wheels that were downloaded elsewhere; empty: pip downloads them",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    def says(self) -> list[str]:
+        """Return what is installed, where, from where, and how much it is."""
+        return install_description()
 
 
 def install_description() -> list[str]:
@@ -203,19 +229,14 @@ class PHYSGEN_OT_copy_command(bpy.types.Operator):
         return {"FINISHED"}
 
 
-OFFLINE_MODEL = (
-    "Blender's preferences keep it offline (System > Network > Allow Online Access): allow it there, or choose an "
-    "archive that was fetched elsewhere"
-)
-
-
-class PHYSGEN_OT_improve_cutouts(bpy.types.Operator):
+class PHYSGEN_OT_improve_cutouts(_Consent, bpy.types.Operator):
     """Install IS-Net, a network that cuts out objects with holes, thin parts and fur; shows size, source and licence
     first
     """
 
     bl_idname = "physgen.improve_cutouts"
     bl_label = "Improve Cut-outs"
+    heading, source, offline, job = "Improve Cut-outs", "archive", OFFLINE_MODEL, "install_model"
 
     archive: StringProperty(
         name="Archive",
@@ -223,39 +244,10 @@ class PHYSGEN_OT_improve_cutouts(bpy.types.Operator):
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
-    agreed: BoolProperty(
-        name="Agreed",
-        description="Agreement to size, source and licence, for scripts; pressing Install agrees as well",
-        options={"HIDDEN", "SKIP_SAVE"},
-    )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Enabled unless a job runs."""
-        return no_job_runs(cls)
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Show what would be installed; its button is the agreement."""
-        self.agreed = True
-        manager = context.window_manager
-        return manager.invoke_props_dialog(self, width=460, title="Improve Cut-outs", confirm_text="Install")
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw name, size, source and licence."""
-        column = self.layout.column()
-        for line in ISNET.description():
-            text.paragraph(column, line[0].upper() + line[1:], 76)
-        column.prop(self, "archive")
-        text.paragraph(column, f"It is kept in {model_folder.models_folder()}.", 76)
-        if not self.archive.strip() and not bpy.app.online_access:
-            text.paragraph(column, f"{OFFLINE_MODEL}.", 76)
-
-    @report_errors
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start the installation."""
-        if not self.agreed:
-            raise InputError(f"{ISNET.name}: not agreed to; nothing was fetched (agreed=True agrees, for scripts)")
-        return start_chosen(self, context, bpy.ops.physgen.install_model, {"archive": self.archive})
+    def says(self) -> list[str]:
+        """Return name, size, source and licence, and where it is kept."""
+        return [*ISNET.description(), f"It is kept in {model_folder.models_folder()}."]
 
 
 class PHYSGEN_OT_install_model(JobOperator, bpy.types.Operator):

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 bpy = pytest.importorskip("bpy")
+from physgen.physgen_addon.operators import install_ops
 from physgen.physgen_addon.panels.photo_panel import draw_cutouts
 from physgen.sim.reconstruct.models import model_folder
 from physgen.sim.reconstruct.models.known_models import ISNET
 
-from .checked_layout import CheckedLayout, Context
+from .checked_layout import CheckedLayout, Context, Drawn
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -52,6 +53,17 @@ def test_nothing_is_fetched_while_blender_is_to_stay_offline():
         pytest.skip("this Blender may go online")
     with pytest.raises(RuntimeError, match="offline"):
         bpy.ops.physgen.improve_cutouts(agreed=True)
+
+
+@pytest.mark.parametrize("kind", [install_ops.PHYSGEN_OT_improve_cutouts, install_ops.PHYSGEN_OT_install_python])
+def test_each_dialog_says_what_it_installs_and_leads_online(kind):
+    layout = CheckedLayout()
+    kind.draw(Drawn(kind, layout), Context())
+    # Long paths are wrapped, too.
+    words = "".join(layout.words).replace(" ", "")
+    assert "MB" in words and (str(model_folder.models_folder()) in words or "physgen-python" in words)
+    assert kind.source in layout.names
+    assert bpy.app.online_access or "screen.userpref_show" in layout.names
 
 
 def test_the_panel_offers_the_installation_then_the_choice(tmp_path):
