@@ -156,6 +156,14 @@ class PHYSGEN_OT_remove_body(bpy.types.Operator):
 
     name: bpy.props.StringProperty(name="Object", description="Empty: the active object", options={"SKIP_SAVE"})
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Enabled if there is anything to remove."""
+        if not bodies(context.scene):
+            cls.poll_message_set("Nothing is in the simulation yet")
+            return False
+        return True
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Disable it."""
         item = context.scene.objects.get(self.name) if self.name else active(context)

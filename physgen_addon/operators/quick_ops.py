@@ -8,7 +8,7 @@ import bpy
 from ..compat import OperatorMixin
 from ..context import active
 from ..preview.live_preview import PHYSGEN_OT_toggle_preview
-from ..props.body_props import is_body
+from ..props.body_props import bodies, is_body
 from ..props.preferences import PIE
 from ..text import count
 from .asset_ops import PHYSGEN_OT_open_sample
@@ -98,7 +98,9 @@ class PHYSGEN_MT_object(bpy.types.Menu):
             layout.operator(operator.bl_idname, icon=icon)
         layout.separator()
         layout.operator(PHYSGEN_OT_toggle_preview.bl_idname, text="Live Preview of the Simulation", icon="PLAY")
-        layout.operator(PHYSGEN_OT_bake.bl_idname, text="Bake Simulation", icon="PHYSICS")
+        row = layout.row()
+        row.enabled = bool(bodies(context.scene))
+        row.operator(PHYSGEN_OT_bake.bl_idname, text="Bake Simulation", icon="PHYSICS")
         layout.operator(PHYSGEN_OT_free_bake.bl_idname, text="Free Simulation Bake", icon="TRASH")
         layout.separator()
         layout.operator(PHYSGEN_OT_compose_objects.bl_idname, icon="CON_SHRINKWRAP")
@@ -119,7 +121,9 @@ class PHYSGEN_MT_pie(bpy.types.Menu):
         pie.operator(PHYSGEN_OT_quick_jelly.bl_idname, icon="META_BALL")
         pie.operator(PHYSGEN_OT_quick_rigid.bl_idname, icon="RIGID_BODY")
         pie.operator(PHYSGEN_OT_toggle_preview.bl_idname, text="Live Preview", icon="PLAY")
-        pie.operator(PHYSGEN_OT_bake.bl_idname, icon="PHYSICS")
+        ready = pie.row()
+        ready.enabled = bool(bodies(context.scene))
+        ready.operator(PHYSGEN_OT_bake.bl_idname, icon="PHYSICS")
         pie.operator(PHYSGEN_OT_quick_sand.bl_idname, icon="POINTCLOUD_DATA")
         pie.operator(PHYSGEN_OT_quick_liquid.bl_idname, icon="MOD_FLUIDSIM")
         pie.operator(PHYSGEN_OT_add_colliders.bl_idname, text="Collider", icon="MOD_PHYSICS")
@@ -127,9 +131,10 @@ class PHYSGEN_MT_pie(bpy.types.Menu):
 
 
 def _draw_quick_effects(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """Draw them below Blender's own, of which one is a Quick Liquid, too."""
     self.layout.separator()
     for operator, icon in QUICK:
-        self.layout.operator(operator.bl_idname, icon=icon)
+        self.layout.operator(operator.bl_idname, text=f"{operator.bl_label} (PhysGen)", icon=icon)
 
 
 def _draw_object_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:

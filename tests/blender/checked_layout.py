@@ -33,12 +33,14 @@ class OperatorSettings:
 class CheckedLayout:
     """Stands where a panel has its ``UILayout``.
 
-    names: properties and operators in the order drawn; words: text of labels and buttons, in the same order.
+    names: properties and operators in the order drawn; words: text of labels and buttons, in the same order; grey:
+    operators whose buttons the layout itself disables.
     """
 
     def __init__(self, whole: CheckedLayout | None = None) -> None:
         self.__dict__["names"] = [] if whole is None else whole.names
         self.__dict__["words"] = [] if whole is None else whole.words
+        self.__dict__["grey"] = [] if whole is None else whole.grey
 
     def __setattr__(self, name: str, value: Any) -> None:
         assert name in ATTRIBUTES and not ATTRIBUTES[name].is_readonly, f"a layout has no {name} to set"
@@ -82,6 +84,8 @@ class CheckedLayout:
         group, _, operator = name.partition(".")
         kind = getattr(getattr(bpy.ops, group), operator).get_rna_type()
         self.names.append(name)
+        if not self.__dict__.get("enabled", True):
+            self.grey.append(name)
         if "text" not in options:
             self.words.append(kind.name)
         return OperatorSettings(kind)

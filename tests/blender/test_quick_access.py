@@ -2,6 +2,7 @@
 """Where artists look first: samples, quick effects, menus, the pie menu's key, and the ground below a default cube."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from physgen.physgen_addon.operators import asset_ops, photo_ops, quick_ops
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
+
+from . import checked_layout
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -118,6 +121,24 @@ def test_menus_and_key_come_and_go():
 def test_every_operator_that_one_would_type_has_its_name():
     titles = {kind.bl_label for kind, _ in quick_ops.QUICK}
     assert titles == {"Quick Jelly", "Quick Sand", "Quick Liquid", "Quick Rigid"}
+
+
+def test_blenders_own_quick_liquid_is_told_from_ours():
+    layout = checked_layout.CheckedLayout()
+    quick_ops._draw_quick_effects(SimpleNamespace(layout=layout), checked_layout.Context())
+    assert "Quick Liquid (PhysGen)" in layout.words and "Quick Liquid" not in layout.words
+
+
+@pytest.mark.parametrize("menu", [quick_ops.PHYSGEN_MT_object, quick_ops.PHYSGEN_MT_pie])
+def test_menus_bake_and_remove_only_what_there_is(menu):
+    def grey():
+        layout = checked_layout.CheckedLayout()
+        menu.draw(checked_layout.Drawn(menu, layout), checked_layout.Context())
+        return layout.grey
+
+    assert grey() == ["physgen.bake"] and not bpy.ops.physgen.remove_body.poll()
+    assert bpy.ops.physgen.open_sample(sample="MESHES") == {"FINISHED"}
+    assert grey() == [] and bpy.ops.physgen.remove_body.poll()
 
 
 def test_a_material_chosen_for_a_box_is_that_of_its_object():
