@@ -56,6 +56,17 @@ def frame_name(number: int, suffix: str = ".png") -> str:
     return f"{number:04d}{suffix}"
 
 
+def folder_for(folder: Path, suffix: str) -> Path:
+    """Return the folder of frames with ``suffix``: ``folder``, or ``NAME_exr`` beside it where that has others only.
+
+    A folder keeps one format, and who changes the format should not have to choose another folder for it.
+    """
+    if not folder.is_dir():
+        return folder
+    there = {path.suffix for path in folder.iterdir() if FRAME_NAME.fullmatch(path.name)}
+    return folder.with_name(f"{folder.name}_{suffix[1:]}") if there and suffix not in there else folder
+
+
 def recorded_fps(folder: Path) -> float | None:
     """Return the frame rate recorded in the index of ``folder``; None without an index or rate."""
     try:

@@ -25,7 +25,7 @@ from .. import bake_state, paths
 from ..background_jobs import Job, JobOperator, Work
 from ..compat import OperatorMixin
 from ..context import replace_shown, show_result
-from ..frames.frame_index import FRAME_NAME, frame_name
+from ..frames.frame_index import FRAME_NAME, folder_for, frame_name
 from ..interpreter import find_python, missing_modules, require_renderer
 from ..paths import require_folder
 from ..playback import bake_record, particles, show_bake
@@ -74,12 +74,15 @@ def photo_names(scene: bpy.types.Scene) -> dict[str, str]:
 
 
 def _output_folder(scene: bpy.types.Scene) -> Path:
+    """Return the folder of frames of the chosen format."""
     path = scene.physgen.rendering.output
     if path.startswith("//") and not bpy.data.filepath:
         # Where the bake of an unsaved file waits, too.
         paths.make_unsaved_root()
-        return paths.unsaved_root() / paths.unsaved_key() / "rendered frames"
-    return require_folder(path, "Output")
+        folder = paths.unsaved_root() / paths.unsaved_key() / "rendered frames"
+    else:
+        folder = require_folder(path, "Output")
+    return folder_for(folder, render_options(scene.physgen.rendering).frame_format.suffix)
 
 
 def _camera_path(scene: bpy.types.Scene, photo: Path, bake: Path) -> CameraPath | None:

@@ -74,7 +74,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     size: percentage("scale", "Size", "Share of the photo's resolution", low=5.0, high=400.0)
     format: EnumProperty(
         name="Format",
-        description="Of the frames' files; each format needs an output folder of its own",
+        description="Of the frames' files. PNG and EXR do not mix: the second goes to a folder beside the first",
         items=[
             ("png", "PNG", "8 bits a channel, as in the photo"),
             ("png16", "PNG 16 Bit", "For later colour grading"),

@@ -180,7 +180,7 @@ def test_every_choice_of_the_panel_reaches_the_command(world, bake, tmp_path, mo
 
 
 @pytest.mark.long
-def test_layers_of_a_still_are_shown_and_another_format_wants_another_folder(world, bake, tmp_path):
+def test_layers_of_a_still_are_shown_and_another_format_gets_another_folder(world, bake, tmp_path):
     state = a_photo_scene(world, bake([(0, 0, 0), (-0.02, 0, 0)]), tmp_path)
     state.rendering.format, state.rendering.video = "exr_layers", "webm"
     bpy.context.scene.frame_set(11)
@@ -192,8 +192,8 @@ def test_layers_of_a_still_are_shown_and_another_format_wants_another_folder(wor
     assert bpy.ops.physgen.render_video() == {"FINISHED"}
     assert Path(state.rendering.result).name == "video.webm" and Path(state.rendering.result).suffix in RESULTS
     state.rendering.format = "png"
-    with pytest.raises(RuntimeError, match=r"holds frames as 000\d.exr; choose another folder"):
-        bpy.ops.physgen.render_still()
+    assert bpy.ops.physgen.render_still() == {"FINISHED"}
+    assert Path(state.rendering.result) == tmp_path / "out é_png" / "0001.png"
 
 
 def test_rendering_reports_why_it_is_impossible(world, bake, tmp_path, monkeypatch):
@@ -227,3 +227,14 @@ def test_frames_of_a_file_that_is_not_saved_go_where_its_bakes_wait(tmp_path):
     assert waiting.is_relative_to(paths.unsaved_root()) and paths.unsaved_root().is_dir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
     assert render_ops._output_folder(bpy.context.scene) == tmp_path / "physgen_render"
+
+
+def test_another_format_goes_to_a_folder_of_its_own(tmp_path):
+    """A folder keeps one format: the second still of an artist who changes it was refused."""
+    rendering = bpy.context.scene.physgen.rendering
+    rendering.output = str(tmp_path / "frames")
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "0009.png").write_bytes(b"")
+    assert render_ops._output_folder(bpy.context.scene) == tmp_path / "frames"
+    rendering.format = "exr_layers"
+    assert render_ops._output_folder(bpy.context.scene) == tmp_path / "frames_exr"
