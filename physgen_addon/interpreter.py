@@ -37,6 +37,8 @@ RENDERING = {"scipy": "scipy", "trimesh": "trimesh", "PIL": "Pillow", "cv2": "Op
 _USUAL_PLACES = ("/usr/local/bin", "/opt/homebrew/bin", "/usr/bin")
 _FRAMEWORK = "/Library/Frameworks/Python.framework/Versions/{}/bin"
 """Where Pythons are that are not on the search path of programs started from a desktop."""
+_MANAGED = (".local/bin", ".pyenv/versions/*/bin", ".local/share/uv/python/*/bin")
+"""In the home folder, by pip and pipx, pyenv and uv: on the search path of a shell at most."""
 _BASE_PROBE = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2]); print(sys.executable)"
 _TIMEOUT_S = 60.0
 _MOST_BYTES = 2**20
@@ -198,7 +200,8 @@ def find_base() -> Path:
 
     In this order: those on the search path and where installers put them, Blender's own. Raises NoPython.
     """
-    places = [*os.environ.get("PATH", "").split(os.pathsep), *_USUAL_PLACES]
+    kept = [str(place) for pattern in _MANAGED for place in sorted(Path.home().glob(pattern))]
+    places = [*os.environ.get("PATH", "").split(os.pathsep), *_USUAL_PLACES, *kept]
     for version in (f"3.{minor}" for minor in range(NEWEST[1], OLDEST[1] - 1, -1)):
         launcher = [["py", f"-{version}"]] if os.name == "nt" else []
         named = shutil.which(f"python{version}", path=os.pathsep.join([*places, _FRAMEWORK.format(version)]))

@@ -110,11 +110,19 @@ def test_check_reports_and_fails_with_the_remedy(bare, monkeypatch):
 def test_a_python_to_start_from_is_found(tmp_path, monkeypatch):
     assert interpreter.find_base().is_file()
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(interpreter, "_USUAL_PLACES", ())
     assert interpreter.find_base().is_file(), "Blender's own will do"
+    real = sys.executable
     monkeypatch.setattr(sys, "executable", "/bin/echo")
     with pytest.raises(interpreter.NoPython, match=r"no Python 3\.11 to 3\.13 with venv was found: install one"):
         interpreter.find_base()
+    # As pyenv and uv keep them, which no program started from a desktop has on its search path.
+    name = f"python3.{sys.version_info[1]}"
+    own = tmp_path / ".pyenv" / "versions" / "any" / "bin" / name
+    own.parent.mkdir(parents=True)
+    own.symlink_to(real)
+    assert interpreter.find_base() == own
 
 
 def test_nothing_is_installed_without_agreement_or_from_a_folder_that_is_not_there(tmp_path, monkeypatch):
