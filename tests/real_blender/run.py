@@ -102,9 +102,11 @@ class Run:
         task = self.out / "task.json"
         words = {"out": str(self.out), "python": self.options.python, "addon": f"bl_ext.{REPOSITORY}.physgen"}
         words["photo"] = str(self.options.photo.resolve()) if self.options.photo else ""
+        words["scene"] = str(self.options.scene.resolve()) if self.options.scene else ""
+        words["wheels"] = str(self.options.wheels.resolve()) if self.options.wheels else ""
         words["only"] = self.options.only
         task.write_text(json.dumps(words), encoding="utf-8")
-        for name, size in (("tour", TOUR_SIZE), ("work", self.options.size)):
+        for name, size in (("tour", TOUR_SIZE), ("odd", TOUR_SIZE), ("work", self.options.size)):
             if self.options.script not in ("", name):
                 continue
             window = ("--window-geometry", "0", "0", *size.split("x"))
@@ -112,7 +114,7 @@ class Run:
                 script = ("--python-exit-code", "1", "-P", str(HERE / f"{name}.py"), "--", str(task))
                 self.start(name, *window, *script, timeout=self.options.timeout, **screen)
             self.require(f"{name}.json")
-        if self.options.only or self.options.script == "tour":
+        if self.options.only or self.options.script in ("tour", "odd"):
             return
         # Another user, who has never heard of the extension.
         script = ("--python-exit-code", "1", "-P", str(HERE / "reopen.py"), "--", str(task))
@@ -143,10 +145,11 @@ def main() -> int:
     parser.add_argument("--zip", type=Path, default=default_zip(), help="the extension (default: %(default)s)")
     parser.add_argument("--python", default="", help="interpreter that simulates, for the add-on's preferences")
     parser.add_argument("--photo", type=Path, help="photo to open and find objects in (default: one that is rendered)")
-    parser.add_argument(
-        "--only", default="", help="steps of tour.py and work.py, by commas; nothing is opened again then"
-    )
-    parser.add_argument("--script", default="", choices=["", "tour", "work"], help="only this one (default: both)")
+    parser.add_argument("--only", default="", help="steps of the scripts, by commas; nothing is opened again then")
+    parser.add_argument("--scene", type=Path, help="scene.json of a photo, for the steps farm and nodes alone")
+    parser.add_argument("--wheels", type=Path, help="folder of wheels of all that simulates, to try Install with")
+    names = ["", "tour", "odd", "work"]
+    parser.add_argument("--script", default="", choices=names, help="only this one (default: all)")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds for the work inside Blender")

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import subprocess
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,20 @@ def open_all(names: Sequence[str] = ()) -> list[str]:
             kind.bl_options = set(options) - {"DEFAULT_CLOSED"}
         bpy.utils.register_class(kind)
     return [kind.__name__ for kind in kinds]
+
+
+@contextlib.contextmanager
+def only(names: Sequence[str]) -> Iterator[None]:
+    """Show these panels of the tab alone, open, so that long ones are seen whole."""
+    others = [kind for kind in panels() if kind.__name__ not in names]
+    for kind in reversed(others):
+        bpy.utils.unregister_class(kind)
+    try:
+        open_all(names)
+        yield
+    finally:
+        for kind in others:
+            bpy.utils.register_class(kind)
 
 
 def on_screen(place: Any, shown: bpy.types.Region) -> tuple[int, int]:

@@ -9,15 +9,17 @@ import time
 import traceback
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import bpy
+import numpy as np
 
 Step = Generator[float, None, dict | None]
 """Yields seconds to wait; may return what it measured."""
 
 
 def task() -> dict[str, str]:
-    """What run.py asks for: ``out``, ``python``, ``addon``, ``photo``, ``only``."""
+    """What run.py asks for: ``out``, ``python``, ``addon``, ``photo``, ``scene``, ``wheels``, ``only``."""
     return json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8"))
 
 
@@ -32,6 +34,36 @@ def until(condition: Callable[[], bool], seconds: float, what: str) -> Generator
         if now - began > seconds:
             raise AssertionError(f"waited {seconds:g} s for {what}")
     return longest
+
+
+def a_capture(form: Any, folder: Path) -> None:
+    """Save a recording of a box in flight, as points in space, in ``folder``; form: ``sim.diagnose.capture``."""
+    corners = 0.05 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))])
+    times = np.arange(12) / 50.0
+    places = np.stack([times, 0 * times, 0.5 + times - 4.9 * times**2], axis=1)
+    belief = form.ObjectBelief(
+        name="box", mesh="box.obj", density_kg_m3=500.0, stiffness="hard", youngs_modulus_pa=None
+    )
+    take = form.Trial(
+        name="throw",
+        role="fit",
+        times=times,
+        points=corners[None] + places[:, None],
+        pixels=None,
+        object_index=np.zeros(len(corners), dtype=np.int64),
+        rest_points=corners,
+    )
+    capture = form.Capture(
+        gravity=(0.0, 0.0, -9.81),
+        ground=form.Ground(),
+        objects=(form.CaptureObject(belief=belief, vertices=corners, faces=faces),),
+        noise_sigma=0.001,
+        camera=None,
+        trials=(take,),
+    )
+    form.save_capture(capture, folder)
 
 
 def run(name: str, steps: list[Callable[[], Step]]) -> None:

@@ -219,16 +219,39 @@ def sample_photo():
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
 
 
+def a_photo():
+    """The scene folder of the task and a short bake of it, unless the sample photo was reconstructed before."""
+    if bpy.context.scene.physgen.folder:
+        return
+    assert TASK["scene"], "neither sample_photo nor --scene"
+    yield from home()
+    assert bpy.ops.physgen.import_scene(filepath=TASK["scene"]) == {"FINISHED"}
+    bpy.context.scene.physgen.simulation.quality, bpy.context.scene.physgen.simulation.frame_end = "preview", 3
+    with screens.focus():
+        assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from ended("the bake")
+    bpy.context.scene.frame_set(2)
+
+
 def farm():
-    """The panels Render, Look and Farm, open, with the photo of the step before."""
-    opened = ("PHYSGEN_PT_render", "PHYSGEN_PT_look", "PHYSGEN_PT_farm")
-    screens.open_all(opened)
-    yield 0.5
-    yield from screens.shoot(SCREENS, "32_farm")
+    """The panels Render, Look and Farm, open, with a photo; a job is written."""
+    yield from a_photo()
+    rendering = bpy.context.scene.physgen.rendering
+    with screens.only(("PHYSGEN_PT_render", "PHYSGEN_PT_look", "PHYSGEN_PT_farm", "PHYSGEN_PT_out")):
+        yield 0.5
+        yield from screens.shoot(SCREENS, "32_farm")
+        folder = OUT / "a farm"
+        rendering.farm, rendering.farm_folder = "slurm", str(folder)
+        with screens.focus():
+            assert bpy.ops.physgen.farm("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+        yield from ended("the job to be written")
+        yield from screens.shoot(SCREENS, "32_farm_written")
+    assert (folder / "slurm").is_dir(), "no job was written"
 
 
 def nodes():
-    """A still with layers of that photo, and its nodes in the compositor."""
+    """A still with layers of a photo, and its nodes in the compositor."""
+    yield from a_photo()
     rendering = bpy.context.scene.physgen.rendering
     rendering.format, rendering.own_samples, rendering.samples, rendering.size = "exr_layers", True, 2, 40
     windows = set(bpy.context.window_manager.windows)
@@ -239,9 +262,11 @@ def nodes():
     for shown in set(bpy.context.window_manager.windows) - windows:
         with bpy.context.temp_override(window=shown):
             bpy.ops.wm.window_close()
+    assert rendering.result.endswith(".exr"), f"no layers: {rendering.result!r}"
     with screens.focus():
         assert bpy.ops.physgen.look_nodes() == {"FINISHED"}
-    yield from screens.shoot(SCREENS, "33_look_nodes_panel")
+    with screens.only(("PHYSGEN_PT_render", "PHYSGEN_PT_look")):
+        yield from screens.shoot(SCREENS, "33_look_nodes_panel")
     area = min((a for a in screens.window().screen.areas if a.type == "VIEW_3D"), key=lambda a: a.x)
     area.ui_type = "CompositorNodeTree"
     area.spaces.active.show_backdrop = False

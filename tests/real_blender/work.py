@@ -288,33 +288,7 @@ def capture_loaded():
     """A recording in the Diagnose panel."""
     bpy.ops.wm.read_homefile()
     yield from screens.show_sidebar()
-    form = extension("sim.diagnose.capture")
-    corners = 0.05 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))])
-    times = np.arange(12) / 50.0
-    places = np.stack([times, 0 * times, 0.5 + times - 4.9 * times**2], axis=1)
-    belief = form.ObjectBelief(
-        name="box", mesh="box.obj", density_kg_m3=500.0, stiffness="hard", youngs_modulus_pa=None
-    )
-    take = form.Trial(
-        name="throw",
-        role="fit",
-        times=times,
-        points=corners[None] + places[:, None],
-        pixels=None,
-        object_index=np.zeros(len(corners), dtype=np.int64),
-        rest_points=corners,
-    )
-    capture = form.Capture(
-        gravity=(0.0, 0.0, -9.81),
-        ground=form.Ground(),
-        objects=(form.CaptureObject(belief=belief, vertices=corners, faces=faces),),
-        noise_sigma=0.001,
-        camera=None,
-        trials=(take,),
-    )
-    form.save_capture(capture, OUT / "capture")
+    session.a_capture(extension("sim.diagnose.capture"), OUT / "capture")
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     with screens.focus():
         assert bpy.ops.physgen.load_capture() == {"FINISHED"}
