@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import re
@@ -132,7 +133,8 @@ def _json(content: bytes, choose: random.Random) -> bytes:
         elif way == 4:
             holder[key] = _deep(choose)
         else:
-            holder[key] = choose.choice(VALUES)
+            # A copy: a second change may be in it, and no input may depend on earlier ones.
+            holder[key] = copy.deepcopy(choose.choice(VALUES))
         if isinstance(tree, dict | list) and not tree:
             break
     text = _written(tree)
