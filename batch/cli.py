@@ -298,7 +298,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             return error.exit_code
         # A path that no file system takes, a disk that went away, no memory left: one line, like any other mistake.
         except OSError as error:
-            name = "" if error.filename is None else f"{shown(str(error.filename))}: "
+            name = "" if error.filename is None else f"{shown(atomic.at_last(Path(str(error.filename))))}: "
             terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
             return InputError.exit_code
         except Exception as error:

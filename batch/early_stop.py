@@ -57,6 +57,22 @@ def heed() -> None:
         signal.signal(number, lambda *_: os._exit(CANCELLED))
 
 
+def fill_streams() -> None:
+    """Have the null device in the place of standard streams that were closed (``physgen … >&-``): the next files that
+    are opened would get their numbers, and what is printed would go into those."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is not None:
+            continue
+        with contextlib.suppress(OSError):
+            null = os.open(os.devnull, os.O_RDWR)
+            if null == number:
+                os.set_inheritable(number, True)
+            else:
+                # Nothing was closed there, or something took it since.
+                os.close(null)
+            setattr(sys, name, open(os.devnull, "r+" if number else "r", encoding="utf-8"))  # noqa: SIM115, PTH123
+
+
 def _ended_by(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Report what ``cli.main`` did not get to see: libraries that cannot be loaded for lack of memory, in one line."""
     from ..sim.memory import ran_out
@@ -141,6 +157,7 @@ def _say(kind: str, message: str) -> None:
 
 if _is_own_process():
     heed()
+    fill_streams()
     sys.excepthook = _ended_by
     os.environ.setdefault(*ONE_BLAS_THREAD)
     if _is_typed():

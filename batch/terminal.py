@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import io
 import json
 import math
@@ -162,8 +164,10 @@ class Terminal:
         try:
             self._out.write(text)
             self._out.flush()
-        except BrokenPipeError:
-            # As in ``physgen … | head -1``: the reader has gone, which means stop, not crash.
+        except OSError as error:
+            # As in ``physgen … | head -1``, or a terminal that was closed: the reader has gone, which means stop.
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
             self.reader_gone = True
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._out.fileno())
 
@@ -195,10 +199,13 @@ class Terminal:
 
     def error(self, kind: str, message: str) -> None:
         """Report the error that ends the run."""
-        if self._json:
-            self._write_json({"event": "error", "kind": kind, "message": message})
-        else:
-            tolerant(sys.stderr).write(("\n" if self._open_line else "") + f"error: {printable(message)}\n")
+        # Where even that cannot be written, the exit code says it.
+        with contextlib.suppress(OSError):
+            if self._json:
+                self._write_json({"event": "error", "kind": kind, "message": message})
+            else:
+                tolerant(sys.stderr).write(("\n" if self._open_line else "") + f"error: {printable(message)}\n")
+                sys.stderr.flush()
 
 
 def _clock(seconds: float) -> str:

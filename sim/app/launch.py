@@ -27,6 +27,9 @@ ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
 """Matrices here are small: more threads wait on each other, and sums would depend on how many cores there are."""
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name))
 """Signals that ask to stop; on Windows a process asks another by Ctrl-Break, which would end it at once."""
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+    # The end of the terminal, unless it is to be ignored, as nohup has it.
+    STOP_SIGNALS = (*STOP_SIGNALS, signal.SIGHUP)
 ORPHAN_GRACE_S = 20.0
 """Time for an orphaned process to clean up."""
 

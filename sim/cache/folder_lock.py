@@ -29,6 +29,7 @@ from ..processes import UNKNOWN_START, Mark, own_mark, parse_mark
 LOCK_FILE = ".lock"
 MOST_BYTES = 4096
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EINVAL, getattr(errno, "ENOTSUP", errno.ENOSYS), errno.EOPNOTSUPP)
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 _UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -83,7 +84,8 @@ def lock_beside(folder: Path) -> Iterator[None]:
 
 
 def _unwritable(folder: Path, error: OSError) -> InputError:
-    return InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder")
+    remedy = "free space or choose another folder" if error.errno in _FULL else "choose another folder"
+    return InputError(f"{folder}: cannot be written ({error.strerror or error}); {remedy}")
 
 
 @contextmanager
@@ -134,7 +136,14 @@ def _acquired(path: Path, folder: Path) -> int:
                 raise InputError(_in_use(folder, path, owner))
             if by_kernel is None and owner is not None and owner != own_mark() and not owner.is_dead:
                 raise InputError(_in_use(folder, path, owner))
-            _write_owner(file)
+            try:
+                _write_owner(file)
+            except OSError:
+                # The disk is full: no empty file stays there.
+                if by_kernel:
+                    with contextlib.suppress(OSError):
+                        path.unlink()
+                raise
             good = True
             return file
         finally:

@@ -108,7 +108,10 @@ def test_a_library_that_cannot_be_loaded_for_lack_of_memory_is_one_line(tmp_path
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 130), (signal.SIGINT, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGTERM, 130), (signal.SIGINT, 130), (signal.SIGHUP, 130), (signal.SIGKILL, -9)],
+)
 def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
     with typed(tmp_path, "doctor", then="time.sleep(120)") as process:
         while not (tmp_path / "worker").exists() or not (worker := (tmp_path / "worker").read_text()):
@@ -121,6 +124,14 @@ def test_a_signal_to_the_command_reaches_its_worker(tmp_path, number, code):
     while is_running(int(worker)):
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+@pytest.mark.parametrize(("before", "heeded"), [("", "True"), ("trap '' HUP; ", "False")])
+def test_the_end_of_the_terminal_is_heeded_unless_it_is_to_be_ignored(before, heeded):
+    code = "import signal; from physgen.sim.app.launch import STOP_SIGNALS; print(signal.SIGHUP in STOP_SIGNALS)"
+    command = ["sh", "-c", f'{before}exec "$@"', "sh", sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split() == [heeded], done.stderr
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
