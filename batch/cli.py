@@ -253,7 +253,7 @@ def _named_paths(options: argparse.Namespace) -> Iterator[Path]:
                 yield item
 
 
-def end_at_last(terminal: Terminal) -> NoReturn:
+def force_exit(terminal: Terminal) -> NoReturn:
     """End a command that does not stop by itself, and leave nothing of it but what was complete."""
     kill_children()
     atomic.remove_unfinished()
@@ -283,7 +283,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     if getattr(options, "anyway", False):
         # For the processes that this one starts, too.
         os.environ[ANYWAY] = "1"
-    with stop_signals(lambda: end_at_last(terminal)) as stopped:
+    with stop_signals(lambda: force_exit(terminal)) as stopped:
         try:
             # Before this command has a temporary folder of its own: the others' are beside it.
             recover(options, terminal)
@@ -298,7 +298,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             return error.exit_code
         # A path that no file system takes, a disk that went away, no memory left: one line, like any other mistake.
         except OSError as error:
-            name = "" if error.filename is None else f"{shown(atomic.at_last(Path(str(error.filename))))}: "
+            name = "" if error.filename is None else f"{shown(atomic.final_path(Path(str(error.filename))))}: "
             terminal.error(InputError.__name__, f"{name}{error.strerror or error}; choose another path, or free space")
             return InputError.exit_code
         except Exception as error:

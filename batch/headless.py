@@ -105,11 +105,11 @@ class Stop:
         """Return whether to stop; the work checks it between steps."""
         return self._asked.is_set() or (self._parent is not None and os.getppid() != self._parent)
 
-    def listen(self, at_last: Callable[[], object]) -> None:
+    def listen(self, on_timeout: Callable[[], object]) -> None:
         """Install the signal handlers; called by the main thread.
 
         Work that has not ended ``STOP_GRACE_S`` after the request is inside a long render: another thread then calls
-        ``at_last`` and ends the process as cancelled. A second signal does not wait.
+        ``on_timeout`` and ends the process as cancelled. A second signal does not wait.
         """
         # Python's handlers run when the main thread returns from Blender; the pipe is written at once.
         reading, writing = os.pipe()
@@ -119,7 +119,7 @@ class Stop:
         for number in STOP_SIGNALS:
             signal.signal(number, lambda *_: self._asked.set())
         threading.Thread(target=self._hear, args=(reading,), daemon=True).start()
-        threading.Thread(target=self._end_at_last, args=(at_last,), daemon=True).start()
+        threading.Thread(target=self._force_exit, args=(on_timeout,), daemon=True).start()
 
     def _hear(self, pipe: int) -> None:
         heard_at: float | None = None
@@ -131,12 +131,12 @@ class Stop:
             if now - heard_at > ECHO_S:
                 self._insisted.set()
 
-    def _end_at_last(self, at_last: Callable[[], object]) -> None:
+    def _force_exit(self, on_timeout: Callable[[], object]) -> None:
         while not self():
             time.sleep(0.05)
         self._insisted.wait(STOP_GRACE_S)
         with contextlib.suppress(OSError):
-            at_last()
+            on_timeout()
         if tempfile.tempdir is not None:
             shutil.rmtree(tempfile.tempdir, ignore_errors=True)
         _end(Cancelled.exit_code)

@@ -26,10 +26,10 @@ STOP_S = 1.3
 
 
 @contextmanager
-def stop_signals(at_last: Callable[[], object] | None = None) -> Iterator[IsCancelled]:
+def stop_signals(on_timeout: Callable[[], object] | None = None) -> Iterator[IsCancelled]:
     """Yield a function that returns whether one of ``STOP_SIGNALS`` has arrived; the former handlers return at the end.
 
-    at_last: called by another thread, ``STOP_S`` after the signal, if the work has not ended by then; it ends the
+    on_timeout: called by another thread, ``STOP_S`` after the signal, if the work has not ended by then; it ends the
     process. For the main thread: only there Python allows handlers.
     """
     stop, done = threading.Event(), threading.Event()
@@ -43,8 +43,8 @@ def stop_signals(at_last: Callable[[], object] | None = None) -> Iterator[IsCanc
     def watch() -> None:
         while not done.is_set() and os.read(reading, 1) not in (b"", b"\0"):
             stop.set()
-            if at_last is not None and not done.wait(STOP_S):
-                at_last()
+            if on_timeout is not None and not done.wait(STOP_S):
+                on_timeout()
 
     watcher = threading.Thread(target=watch, name="physgen-signals", daemon=True)
     watcher.start()

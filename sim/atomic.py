@@ -59,15 +59,15 @@ def replacing(path: Path) -> Iterator[Path]:
         _replace(partial, path)
     except OSError as error:
         raise InputError(
-            f"{at_last(path)}: cannot be written ({error.strerror or error}); free space or choose another folder"
+            f"{final_path(path)}: cannot be written ({error.strerror or error}); free space or choose another folder"
         ) from error
     finally:
         _remove(partial)
         _unfinished.discard(partial)
 
 
-def at_last(path: Path) -> Path:
-    """Return ``path`` with the names of folders as they will be, in the place of temporary ones, for a message."""
+def final_path(path: Path) -> Path:
+    """Return ``path`` with every temporary name replaced by the one that it becomes, for messages."""
     found = [_TEMPORARY.fullmatch(part) for part in path.parts]
     return Path(
         *(match["name"] + match["suffix"] if match else part for part, match in zip(path.parts, found, strict=True))

@@ -132,7 +132,7 @@ class _Wish:
         return self.heard.is_set()
 
 
-def _end_at_last(wish: _Wish, emit: OnEvent) -> None:
+def _force_exit(wish: _Wish, emit: OnEvent) -> None:
     """End the process when it was asked to stop and does not."""
     while not wish.pending():
         if wish.over.wait(0.05):
@@ -180,7 +180,7 @@ def _serve(emit: OnEvent) -> None:
 
 def _take_job(line: bytes, wish: _Wish, emit: OnEvent) -> None:
     """Run the job on ``line``; its error is an event, and the process lives on."""
-    threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
+    threading.Thread(target=_force_exit, args=(wish, emit), daemon=True).start()
     try:
         try:
             data = json.loads(line)
@@ -247,7 +247,7 @@ def main(arguments: list[str]) -> int:
         if serves:
             _serve(emit)
             return 0
-        threading.Thread(target=_end_at_last, args=(wish, emit), daemon=True).start()
+        threading.Thread(target=_force_exit, args=(wish, emit), daemon=True).start()
         if len(arguments) != 1:
             raise InputError(f"worker: expected one job file, found {len(arguments)} arguments")
         emit(run_job(Path(arguments[0]), emit, wish.cancelled))

@@ -166,9 +166,9 @@ class _Inbox:
             self._closed = True
             self._news.notify()
         # Compiling a kernel cannot be interrupted.
-        threading.Thread(target=self._end_at_last, daemon=True).start()
+        threading.Thread(target=self._force_exit, daemon=True).start()
 
-    def _end_at_last(self) -> None:
+    def _force_exit(self) -> None:
         time.sleep(LAST_GRACE_S)
         self._clean()
         os._exit(Cancelled.exit_code)

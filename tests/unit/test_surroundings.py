@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from physgen.batch.terminal import Terminal
-from physgen.sim.atomic import at_last, replacing, replacing_tree
+from physgen.sim.atomic import final_path, replacing, replacing_tree
 from physgen.sim.cache import folder_lock as locks
 from physgen.sim.errors import InputError
 
@@ -87,4 +87,4 @@ def test_a_message_names_the_file_as_it_would_be_called(tmp_path):
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert str(refused.value).startswith(f"{tmp_path}/scene/pages/index.html: cannot be written")
-    assert at_last(Path("/a/.b/c.partial.png")) == Path("/a/.b/c.partial.png")
+    assert final_path(Path("/a/.b/c.partial.png")) == Path("/a/.b/c.partial.png")
