@@ -182,16 +182,16 @@ def build_parser() -> CommandParser:
     scene_commands.add_estimate(command("estimate", scene_commands.run_estimate, cost))
     previews = "serve coarse runs requested on standard input (docs/file-formats.md)"
     scene_commands.add_preview(command("preview", scene_commands.run_preview, previews))
-    sound = "whether the files of a bake, scene or frames folder are what was written"
+    sound = "compare the files of a bake, scene or frames folder with their checksums"
     scene_commands.add_check(command("check", scene_commands.run_check, sound))
-    packed = "a bake, packed to be sent; with --unpack back again"
+    packed = "pack a bake to send it; --unpack unpacks one"
     scene_commands.add_pack(command("pack", scene_commands.run_pack, packed))
     scene_commands.add_free(
         command("free", scene_commands.run_free, "delete a bake: the files its manifest lists, nothing else")
     )
 
-    groups["How real a video is"] = []
-    real = "figures of a video against recordings, or by itself; a page, JSON and tables"
+    groups["Realism of a video"] = []
+    real = "measure a video against recordings, or by itself; a page, JSON and tables"
     evaluation_commands.add_evaluate(command("evaluate", evaluation_commands.run_evaluate, real))
     asked = "photos and videos → pages on which people judge them; with --collect: answers → results"
     evaluation_commands.add_questionnaire(command("questionnaire", evaluation_commands.run_questionnaire, asked))

@@ -160,7 +160,7 @@ def draw_asking(layout: bpy.types.UILayout, context: bpy.types.Context, state: A
     text.sentences(
         column,
         context,
-        f"Nobody is asked without it. The key, where one is needed, is read from the environment variable "
+        f"Without it nothing is sent. A key, where one is needed, is read from the environment variable "
         f"{KEY_VARIABLE} that Blender was started with.",
     )
 

@@ -73,7 +73,7 @@ def add_drops(scene: Scene, drops: Sequence[Drop]) -> Scene:
     names = [drop.name for drop in drops]
     own = [item for item in scene.objects if item.name not in names or item.mask is not None]
     if taken := [item.name for item in own if item.name in names] or sorted({n for n in names if names.count(n) > 1}):
-        raise InputError(f"{taken[0]}: is the name of another object; name what is dropped otherwise")
+        raise InputError(f"{taken[0]}: is the name of another object; choose another name for the dropped one")
     made = [(drop, load_preset(drop.preset), _mesh(drop)) for drop in drops]
     items: list[SceneObject] = []
     for drop, material, (vertices, content) in made:

@@ -23,7 +23,7 @@ ENGINE_REVISION = 8
 
 @dataclass(frozen=True, kw_only=True)
 class BakeOptions:
-    """How a scene is simulated.
+    """Options of a bake.
 
     frames: samples to bake, 1 to 100000; the first is the scene at rest.
     fps: frames a second of the clip, above 0 and up to 1000.

@@ -52,7 +52,8 @@ Array = NDArray[np.float64]
 
 
 class Tears:
-    """What a body of a bake has to say about its skin's tears; of matter that has a shape, and so parts in pieces."""
+    """Writer of a body's torn skin: keeps particles while it bakes, cuts the skin at the end. Only for matter with a
+    shape, which parts in pieces."""
 
     @classmethod
     def of(

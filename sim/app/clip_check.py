@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is known of a clip before it is rendered: objects that leave the picture or never move, and when it is over.
+"""Checks of a clip before it is rendered: objects that leave the picture or never move, and when it is over.
 
 A ballistic estimate knows a motion up to the first contact. The engine knows the rest, and a coarse bake costs seconds:
 it tells what leaves the picture, what falls over, and when the action ends.

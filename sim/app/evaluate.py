@@ -48,7 +48,7 @@ STILL = "the first frame repeated"
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeRequest:
-    """Who judges, and what beside the video itself.
+    """A request to a model that judges the video.
 
     endpoint: the model; its ``consent`` is to sending the photo and the frames. prompt: what should happen in the
     videos. photo: what they start from; None: the video's first frame. beside: videos of the same photo and prompt,
@@ -136,7 +136,7 @@ JUDGE_FILE = "judge.json"
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What an evaluation does.
+    """Options of an evaluation.
 
     seconds: only the first so many seconds of every video; None: all that the videos have in common, Physics-IQ has 5.
     fps: frames per second of a folder of pictures, or instead of what a video file says; None: as it says.

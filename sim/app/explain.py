@@ -59,7 +59,7 @@ FACE_FRAMES = 24
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """What a video shows. diagnosis: of its capture. video: the comparison. setting: flight, slope or surface.
+    """Result of ``explain``. diagnosis: of its capture. video: the comparison. setting: flight, slope or surface.
 
     closed: share of the gap that the cause closes on withheld time, NaN where there is no gap to close. notes: what was
     decided about scale, gravity, ground and clock.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a diagnosis found → a model for MuJoCo (MJCF), or a layer for USD Physics.
+"""The findings of a diagnosis → a model for MuJoCo (MJCF), or a layer for USD Physics.
 
 The MJCF model is complete: ground and body as captured, with the found effects as MuJoCo's own parameters. USD Physics
 knows friction, restitution, gravity, centre of mass and moments of inertia; the rest is kept there as custom data,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a default motion must know of a scene at rest: its things, their supports, how near they are, and the frame."""
+"""A scene at rest, as a default motion sees it: its things, their supports, how near they are, and the frame."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ AXES: Mapping[str, tuple[tuple[int, float], ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ImportRequest:
-    """What a table does not say.
+    """Facts about a recording that its table does not hold.
 
     diameter: of a ball in m; or mesh: file of the body in its rest frame, m. density: kg/m³; or mass: kg. name: of the
     object. rest: CSV with NAME,x,y,z of the markers in the mesh's frame; not needed for a single point, which is the

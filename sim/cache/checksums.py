@@ -137,7 +137,7 @@ def _sum_of(file: io.BufferedReader, count: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class FileState:
-    """What a check found of one file: ``state`` is one of ok, damaged, missing, no checksum; ``text`` says more."""
+    """Result of checking one file: ``state`` is ok, damaged, missing or no checksum; ``text`` explains it."""
 
     file: str
     state: str

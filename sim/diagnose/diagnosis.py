@@ -92,7 +92,7 @@ class Discrepancy:
 
 
 class FittedModels(Protocol):
-    """What a verdict is decided from: all candidates fitted to one capture.
+    """The basis of a verdict: all candidates fitted to one capture.
 
     nominal: the model as given. refitted: the same with its own parameters fitted. candidates: one or two effects each.
     floor_rms_m: noise floor, distance in m that noise alone leaves on held-out data.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a diagnosis was made of: name and content hash of the capture, command and version, without paths or times."""
+"""Provenance of a diagnosis: name and content hash of the capture, command and version, without paths or times."""
 
 from __future__ import annotations
 

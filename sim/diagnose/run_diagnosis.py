@@ -50,7 +50,7 @@ CONFIRMED_TAKES = 2
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnoseOptions:
-    """How a capture is diagnosed.
+    """Options of a diagnosis.
 
     budget_s: time in s that the fits may take on two idle cores, 10 to 86400, turned into work at a fixed rate
         (``sim.diagnose.work``), so that no verdict depends on the machine; the verification run comes on top.

@@ -23,7 +23,7 @@ JSON_FILE, PAGE_FILE = "evaluation.json", "report.html"
 MEASURES_FILE, CURVES_FILE = "measures.csv", "curves.csv"
 
 HIGHER, LOWER, NEITHER = "higher", "lower", "neither"
-"""What is better of a figure; ``neither`` where more is only more."""
+"""Which direction of a figure is better; ``neither`` where it only describes."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from ..reconstruct.reasoning.material_query import jpeg_bytes
 from ..validation import quantity, require_quantities
 
 CRITERIA = ("physical_realism", "photorealism", "semantic_consistency")
-"""What is judged, by the model as by people."""
+"""Criteria, the same for the model as for people."""
 
 TITLES = {name: name.replace("_", " ").capitalize() for name in CRITERIA}
 MOST_VIDEOS = 8
@@ -55,7 +55,7 @@ _LINE = "Video {}: Physical Realism Score: [score]; Photorealism Score: [score];
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeOptions:
-    """How a model is asked. Raises InputError on a value out of range.
+    """Options of a request to a model as judge. Raises InputError on a value out of range.
 
     repetitions: questions, each with its own order of the videos, 1 to 100. attempts: times that a question is asked
     until the answer can be read whole, 1 to 5. frames: of each video, 2 to 32 (the paper: 10). longest_side: of a frame
@@ -96,7 +96,7 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """What a model thought of some videos.
+    """A model's judgements of some videos.
 
     scores: video → criterion → score. orders: the videos as each repetition showed them. answers: as they came, one
     list for each repetition. notes: everything that was wrong with an answer, one sentence each.

@@ -84,7 +84,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class QuestionnaireOptions:
-    """How a questionnaire is made. Raises InputError on a value out of range.
+    """Options of a questionnaire. Raises InputError on a value out of range.
 
     title: of the pages, 1 to 120 characters. seed: of the anonymous names of the videos. image_size: longer side of the
     photo in pixels, 128 to 4096.

@@ -35,7 +35,7 @@ _PERSON = re.compile(r"[A-Za-z0-9_-]{1,40}\Z")
 
 @dataclass(frozen=True, kw_only=True)
 class CollectOptions:
-    """How answers are evaluated. resamples: of the bootstrap, 100 to 100000. confidence: 0.5 to 0.999. seed: of it."""
+    """Options of evaluating answers. resamples, seed: of the bootstrap, 100 to 100000. confidence: 0.5 to 0.999."""
 
     resamples: int = quantity(2000, 100, 100_000, "a whole number")
     confidence: float = quantity(0.95, 0.5, 0.999)

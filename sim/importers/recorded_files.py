@@ -164,7 +164,7 @@ def _c3d(path: Path, wanted: Sequence[str]) -> RecordedTable:
 
 @dataclasses.dataclass(kw_only=True)
 class _Source:
-    """What moves in a bag. seen: rows (stamp ns, log ns) int64 and poses (7)."""
+    """The moving frames of a bag. seen: rows (stamp ns, log ns) int64 and poses (7)."""
 
     name: str
     topic: str

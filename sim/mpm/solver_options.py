@@ -22,7 +22,7 @@ ARCHITECTURES = ("cpu", "cuda", "vulkan", "metal")
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """How finely, how fast and where the engine computes. Raises InputError on a value out of range."""
+    """Resolution, time step and device of the engine. Raises InputError on a value out of range."""
 
     grid: int = 256
     """Cells along each side of the engine's box; a multiple of 4, 32 to 1024."""

@@ -19,7 +19,7 @@ COARSEST = "preview"
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """How finely a scene is simulated.
+    """Resolution of a simulation.
 
     description: human-readable.
     particles: target for all moving objects together, 500 to 20 million; determines the cell size.
