@@ -26,6 +26,13 @@ from ...sim.errors import Cancelled, InputError
 from ...sim.events import IsCancelled
 from .runners import FarmOptions
 
+NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Configuration of Dask without its status pages: they are served without TLS, without a password and to whatever host
+name a browser asks for, also where the dashboard is off, and show tasks, their paths and logs to every user of this
+machine, and to every page that they have open."""
+NO_PAGES_VARIABLES = ("DASK_DISTRIBUTED__WORKER__HTTP__ROUTES=[]",)
+"""The same, of workers that Dask starts by itself."""
+
 
 def file_security(address: str, ca: Path | None, cert: Path | None, key: Path | None) -> Any:
     """Return Dask's ``Security`` for a scheduler at ``address``; None for ``tcp://``.
@@ -109,7 +116,9 @@ def dask_client(
             f"--farm {options.farm} needs Dask.distributed, which cannot be imported ({error}): "
             "pip install 'physgen[farm]'"
         ) from error
-    with _quiet():
+    import dask
+
+    with _quiet(), dask.config.set(NO_PAGES):
         if options.farm == "dask":
             with _on_this_machine(distributed, options, slots, in_all, cancelled) as client:
                 yield client
@@ -319,7 +328,7 @@ def slurm_cluster(options: FarmOptions, slots: Mapping[str, int], scratch: Path)
         worker_extra_args=[*resources, "--memory-limit", "0", "--no-dashboard"],
         python=wanted.python,
         # No modules from the working folder: a job may come from anybody.
-        job_script_prologue=["export PYTHONSAFEPATH=1"],
+        job_script_prologue=[f"export {words}" for words in ("PYTHONSAFEPATH=1", *NO_PAGES_VARIABLES)],
         log_directory=str(scratch),
         shared_temp_directory=str(scratch),
         security=True,

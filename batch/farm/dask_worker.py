@@ -21,7 +21,7 @@ from typing import Any
 
 from ...sim.atomic import scratch_prefix
 from ...sim.errors import PhysGenError
-from .dask_cluster import check_trust, file_security
+from .dask_cluster import NO_PAGES, check_trust, file_security
 from .dask_tasks import ending
 
 
@@ -59,11 +59,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 async def _work(address: str, host: str | None, resources: dict[str, float], security: Any) -> None:
+    import dask
     from distributed import Worker
     from distributed.comm.addressing import get_address_host
     from distributed.utils import get_ip
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
+    dask.config.set(NO_PAGES)
     with tempfile.TemporaryDirectory(prefix=scratch_prefix("worker"), ignore_cleanup_errors=True) as scratch:
         # Tasks run in child processes, so its own memory is meaningless.
         worker = Worker(

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import distributed
@@ -140,6 +142,26 @@ def test_strangers_are_refused(tmp_path):
         run_dask(plan, FarmOptions(farm="tcp://127.0.0.1:9"), ignore, never)
 
 
+@pytest.mark.parametrize("page", ["health", "info/main/workers.html", "json/identity.json", "metrics"])
+def test_no_page_tells_other_users_of_this_machine_what_runs(ports, page):
+    """Nor a page in a browser, by a host name of its own that leads to the loopback."""
+    assert ports
+    for port in ports:
+        asked = urllib.request.Request(f"http://127.0.0.1:{port}/{page}", headers={"Host": "example.org"})
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(asked, timeout=60)
+
+
+@pytest.fixture(scope="module")
+def ports():
+    """Where scheduler and worker of ``--farm dask`` answer browsers."""
+    options = FarmOptions(farm="dask", workers=1)
+    with dask_cluster.dask_client(options, {}, {}, Path(), never) as client:
+        found = client.scheduler_info()
+        served = [found["services"], *(worker["services"] for worker in found["workers"].values())]
+        yield [port for services in served for port in services.values()]
+
+
 @pytest.mark.long
 def test_tls_and_a_wish_to_stop(ball_scene, tmp_path):
     ball_scene()
@@ -221,6 +243,7 @@ def test_workers_of_slurm_ask_for_what_the_tasks_take(tmp_path):
         assert f"#SBATCH {line}" in script
     [command] = [line for line in script if "dask_worker" in line]
     assert script.index("export PYTHONSAFEPATH=1") < script.index(command), "the job's folder may be a stranger's"
+    assert script.index("export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES=[]") < script.index(command)
     assert "--resources gpu=1" in command and "--nthreads 1" in command and "--tls-key" in command
     for file in (tmp_path / "shared").iterdir():
         assert file.stat().st_mode & 0o077 == 0, "keys are for this user only"
