@@ -30,6 +30,11 @@ JOB_FILE, SCENE = "job.toml", "scene"
 """File of the job, and folder of its scene beside it."""
 NAME, CLIP = "results", "clip"
 """Names of the job, which is that of the folder of its results, and of its only scene there."""
+START = {
+    "flamenco": "submit job.json there to Flamenco (docs/farm.md)",
+    "slurm": "run submit.sh there on the cluster",
+}
+"""What to do with a job that was written for another machine."""
 VARIANT = "base"
 """Of the only variant, as the job file calls it."""
 
@@ -112,7 +117,7 @@ class PHYSGEN_OT_farm(JobOperator, bpy.types.Operator):
         """Report what was made."""
         rendering, folder = scene.physgen.rendering, Path(str(final["folder"]))
         if rendering.farm != "local":
-            return f"written: {', '.join(map(str, final.get('files') or [folder]))}"
+            return f"the job is written to {folder / rendering.farm}: {START[rendering.farm]}"
         video = folder / NAME / CLIP / VARIANT / f"video.{rendering.video}"
         if not video.is_file():
             raise InputError(f"{video}: is not there, although the job has ended; see {folder / NAME}")

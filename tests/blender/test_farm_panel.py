@@ -79,7 +79,7 @@ def test_the_job_has_the_physics_of_the_panel_and_the_photo_of_the_folder(photo,
     assert {path: path.read_bytes() for path in (folder / "slurm").iterdir()}.keys() == before.keys()
 
 
-def test_the_job_file_says_everything(photo, tmp_path):
+def test_the_job_file_says_everything(photo, tmp_path, capfd):
     rendering = bpy.context.scene.physgen.rendering
     rendering.farm, rendering.engine, rendering.format, rendering.blurs_depth = "flamenco", "eevee", "exr_layers", True
     rendering.grain = False
@@ -91,6 +91,9 @@ def test_the_job_file_says_everything(photo, tmp_path):
     (planned,) = load_job(tmp_path / "physgen_farm" / "job.toml").scenes
     assert planned.options == dataclasses.replace(render_options(rendering), f_number=planned.options.f_number)
     assert (tmp_path / "physgen_farm" / "flamenco" / "job.json").is_file()
+    # What there is to do, not a list of a dozen files in one line of the status bar.
+    (said,) = [line for line in capfd.readouterr().out.splitlines() if "the job is written" in line]
+    assert said.endswith("flamenco: submit job.json there to Flamenco (docs/farm.md)")
 
 
 def test_what_a_photos_scene_cannot_say_is_refused_before_anything_is_written(photo, tmp_path):

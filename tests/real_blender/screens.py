@@ -67,15 +67,33 @@ def open_all(names: Sequence[str] = ()) -> list[str]:
 
 @contextlib.contextmanager
 def only(names: Sequence[str]) -> Iterator[None]:
-    """Show these panels of the tab alone, open, so that long ones are seen whole."""
-    others = [kind for kind in panels() if kind.__name__ not in names]
-    for kind in reversed(others):
+    """Show these panels of the tab alone, open, so that long ones are seen whole.
+
+    Blender keeps by a panel's identifier whether it is open, so they get others.
+    """
+    kinds = panels()
+    before = {kind: dict(vars(kind)) for kind in kinds}
+    for kind in reversed(kinds):
         bpy.utils.unregister_class(kind)
+    shown = [kind for kind in kinds if kind.__name__ in names]
+    for kind in shown:
+        kind.bl_idname = f"{kind.__name__}_open"
+        kind.bl_options = set(getattr(kind, "bl_options", ())) - {"DEFAULT_CLOSED"}
+        parent = getattr(kind, "bl_parent_id", "")
+        if parent:
+            kind.bl_parent_id = f"{parent}_open"
+        bpy.utils.register_class(kind)
     try:
-        open_all(names)
         yield
     finally:
-        for kind in others:
+        for kind in reversed(shown):
+            bpy.utils.unregister_class(kind)
+            for name in ("bl_idname", "bl_options", "bl_parent_id"):
+                if name in before[kind]:
+                    setattr(kind, name, before[kind][name])
+                elif name in vars(kind):
+                    delattr(kind, name)
+        for kind in kinds:
             bpy.utils.register_class(kind)
 
 
