@@ -253,7 +253,7 @@ def nodes():
     """A still with layers of a photo, and its nodes in the compositor."""
     yield from a_photo()
     rendering = bpy.context.scene.physgen.rendering
-    rendering.format, rendering.own_samples, rendering.samples, rendering.size = "exr_layers", True, 2, 40
+    rendering.format, rendering.own_samples, rendering.samples, rendering.size = "exr_layers", True, 2, 100
     windows = set(bpy.context.window_manager.windows)
     with screens.focus():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
