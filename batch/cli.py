@@ -273,12 +273,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 signal.signal(number, signal.SIG_IGN)
 
 
+def _expected_seconds(options: argparse.Namespace) -> dict[str, float] | None:
+    """Return first guesses of the stages of a command that has several; None for others."""
+    if options.command == "run":
+        return stages.expected_seconds(options.frames or BakeOptions.frames)
+    return dict(stages.EXPLAIN_SECONDS) if options.command == "explain" else None
+
+
 def _main(arguments: Sequence[str] | None) -> int:
     # Help, too, has arrows and quotes that not every encoding has.
     tolerant(sys.stdout)
     options = build_parser().parse_args(_keep_negative_vectors(sys.argv[1:] if arguments is None else arguments))
-    expected = stages.expected_seconds(options.frames or BakeOptions.frames) if options.command == "run" else None
-    terminal = Terminal(as_json=options.json, expected_s=expected)
+    terminal = Terminal(as_json=options.json, expected_s=_expected_seconds(options))
     run: Command = options.run
     if getattr(options, "anyway", False):
         # For the processes that this one starts, too.

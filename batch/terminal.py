@@ -179,10 +179,11 @@ class Terminal:
             return
         self._last_line = now
         message = str(event.get("message") or event.get("step") or "")
-        left = _clock(float(event["job_eta_s"]))
-        text = (
-            f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed, about {left} left"
-        )
+        left = float(event["job_eta_s"])
+        text = f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed"
+        if left >= 1.0:
+            # Less is not known: a stage that has ended, or whose pace has not shown yet, is no promise.
+            text += f", about {_clock(left)} left"
         text = printable(text).replace("\n", " ")
         if self._live:
             self._write("\r\x1b[K" + text + ("\n" if finished else ""))

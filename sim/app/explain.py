@@ -32,7 +32,7 @@ from ..diagnose.report.wording import found_effects
 from ..diagnose.run_diagnosis import DiagnoseOptions
 from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError
-from ..events import IsCancelled, OnEvent, ignore, never
+from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..rigid_alignment import nearest_pose
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def explain(
         (partial / DIAGNOSIS_FOLDER).mkdir()
         write_diagnosis(diagnosis, partial / DIAGNOSIS_FOLDER)
         write_report(diagnosis, capture, partial / DIAGNOSIS_FOLDER)
-        _compare(trial, motion, diagnosis, partial / VIDEO_FILE)
+        _compare(trial, motion, diagnosis, partial / VIDEO_FILE, on_event)
         gap = diagnosis.gap
         closed = gap.closed_fraction if diagnosis.verdict.effect != NONE else math.nan
         write_json(
@@ -169,7 +169,7 @@ def title_of_cause(diagnosis: Diagnosis) -> str:
     return "with " + " and ".join(words)
 
 
-def _compare(trial: VideoTrial, motion: VideoMotion, diagnosis: Diagnosis, path: Path) -> None:
+def _compare(trial: VideoTrial, motion: VideoMotion, diagnosis: Diagnosis, path: Path, on_event: OnEvent) -> None:
     """Write the comparison of ``motion``."""
     from ..diagnose.track.moving_regions import aligned_frames
 
@@ -190,7 +190,10 @@ def _compare(trial: VideoTrial, motion: VideoMotion, diagnosis: Diagnosis, path:
         for region in other:
             others.setdefault(region.frame, []).append(region)
 
+    progress = StageProgress(on_event, "compare", len(picks))
+
     def both(k: int, picture: Picture) -> tuple[Picture, Picture]:
+        progress.report(k + 1, path.name)
         ground = found.background
         for region in others.get(int(wanted[k]), []):
             # What is not simulated is shown as it was recorded.

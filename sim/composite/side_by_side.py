@@ -115,6 +115,8 @@ LEAST_COLUMN = 200
 """Least width of a panel and the room beside it, px: titles stay readable over a narrow picture, such as a drop's."""
 CURVE = 150
 """Height of the curve below, px."""
+MARK = (5, 10)
+"""Inner and outer ends of the arms that mark the real centre, px."""
 INK, FAINT, BEFORE, AFTER = (35, 35, 35), (170, 170, 170), (60, 60, 215), (60, 150, 40)
 """Colours, BGR."""
 
@@ -254,8 +256,12 @@ def _ring(picture: Picture, place: Array) -> None:
     """Mark where the real body is."""
     if np.isfinite(place).all():
         x, y = (int(v) for v in np.round(place))
+        # Open in the middle, where a small body would be hidden.
         for colour, thick in (((255, 255, 255), 3), (INK, 1)):
-            cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 11, thick, cv2.LINE_AA)
+            for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                inner, outer = MARK
+                ends = (x + inner * i, y + inner * j), (x + outer * i, y + outer * j)
+                cv2.line(picture, *ends, colour, thick, cv2.LINE_AA)
 
 
 def _curve(
@@ -272,10 +278,13 @@ def _curve(
 
     x = at(withheld, 0)[0]
     cv2.rectangle(sheet, (x, high), (right, low), (232, 232, 232), -1)
-    _text(
-        sheet, "second half: predicted, nothing is fitted here", (x + 4, high + 12), max(right - x - 6, 40), (110,) * 3
-    )
-    _text(sheet, "first half: starts fitted to the recording", (left + 4, high + 12), max(x - left - 8, 40), (110,) * 3)
+    for at_x, room, words in (
+        (left, x - left - 8, ("first half: starts fitted to the recording", "first half: fitted")),
+        (x, right - x - 6, ("second half: predicted, nothing is fitted here", "second half: predicted")),
+    ):
+        # Smaller letters are hard to read in a video.
+        short = cv2.getTextSize(words[0], cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] > room
+        _text(sheet, words[short], (at_x + 4, high + 12), max(room, 40), (110,) * 3)
     cv2.line(sheet, (left, low), (right, low), FAINT, 1)
     unit, factor = ("mm", 1e3) if most < 0.5 else ("m", 1.0)
     _text(sheet, f"{most * factor:.3g} {unit}", (4, high + 6), left - 6, INK)

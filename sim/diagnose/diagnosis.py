@@ -50,6 +50,7 @@ class CandidateFit:
     heldout_rms_m: RMS distance in m between observed and predicted points on held-out data.
     heldout_chi: the same, each trial's over what noise and contacts make of its prediction, RMS of the trials: one that
         tumbled chaotically does not decide whether a model predicts better. NaN where that is not known.
+    heldout_trials: what ``heldout_chi`` is the RMS of, in the order of bodies and trials; () where that is not known.
     misfit: RMS residual over what noise and numerical error would leave; 1 is explained, far above 1 means that
         something is still missing.
     """
@@ -62,6 +63,7 @@ class CandidateFit:
     heldout_rms_m: float
     misfit: float
     heldout_chi: float = math.nan
+    heldout_trials: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

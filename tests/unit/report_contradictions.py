@@ -2,6 +2,7 @@
 """What no report may say beside something else that it says."""
 
 import math
+import re
 
 from physgen.sim.effects.registry import effects
 
@@ -42,7 +43,7 @@ def _gap(report, page):
     closed, (low, high) = gap["closed_fraction"], gap["closed_fraction_ci95"]
     if floor > min(before, after) + TOLERANCE:
         yield f"an error below the noise floor of {floor}"
-    high_floor = verdict != "none" and gap["resolvable"] and floor > 3 * gap["noise_rms_m"]
+    high_floor = (verdict == "none" or gap["resolvable"]) and floor > 3 * gap["noise_rms_m"]
     if high_floor and "far above the tracking noise" not in page:
         yield "a noise floor far above the noise, unexplained"
     if verdict == "none" and (closed is not None or low is not None):
@@ -59,6 +60,15 @@ def _gap(report, page):
     grain = math.hypot(floor, gap["grain_rms_m"])
     if verdict == "none" and before > 3.0001 * grain:
         yield f"nothing is missing, with an error of {before} beside noise and grain of {grain}"
+    if verdict == "none" and before > 1.50001 * grain:
+        if "down to its noise" in report["summary"]:
+            yield f"explained down to its noise, with an error of {before} beside noise and grain of {grain}"
+        if "no gap to close" in page or "No discrepancy above the noise" in page:
+            yield f"no gap, with an error of {before} beside noise and grain of {grain}"
+    errors = [before, after, gap["refitted_rms_m"], *report["controls"].values()]
+    errors += [row["heldout_rms_m"] for row in report["effects"]]
+    if any(e is not None and e < floor - TOLERANCE for e in errors) and "below it is so by chance" not in page:
+        yield "an error below the noise floor, unexplained"
     if gap["numerics_rms_m"] > after and "own numerical error" in page:
         yield "more numerical error than error"
 
@@ -122,11 +132,17 @@ def _words(report, page, dropped, lands):
     if verdict["effect"] not in ("none", "unknown"):
         if gap["resolvable"] and gap["before_rms_m"] < gap["grain_rms_m"] and "chaotic" not in page:
             yield "a share of a gap within the simulator's own uncertainty, unsaid"
-        if gap["refitted_rms_m"] <= gap["after_rms_m"] and "does as well" not in page:
-            yield "re-fitting does as well, unsaid"
+        if gap["refitted_rms_m"] <= gap["after_rms_m"]:
+            better = gap["refitted_rms_m"] < 0.9 * gap["after_rms_m"]
+            if f"own parameters does {'better' if better else 'as well'}" not in page:
+                yield "re-fitting does as well or better, unsaid"
         beaten = [v for v in report["controls"].values() if v is not None and v <= gap["after_rms_m"]]
         if beaten and "not a cause" not in page:
             yield "a control does as well, unsaid"
+    for words in re.findall(r"(?<![\d.,])1 (?:trials|tracked points|effects|causes)\b", page):
+        yield f"one of several: {words}"
+    for words in re.findall(r"10⁻[\d⁰¹²³⁴-⁹]+\s*[µn]m", page):
+        yield f"a length smaller than an atom: {words}"
     made = report["provenance"]
     for words in (made["content_sha256"], made["version"], made["command"]):
         if words not in page:

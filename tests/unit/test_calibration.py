@@ -21,6 +21,7 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=0.002, value=1.0, spread=0.1):
         "heldout_rms_m": rms,
         "misfit": misfit,
         "heldout_log_score": [0.0, None],
+        "heldout_trials": [0.4, 2.2],
         "parameters": {e: {names[e]: interval} for e in effects},
     }
 
@@ -62,6 +63,7 @@ def folder(tmp_path):
 
 def test_records_are_judged_as_a_diagnosis_judges(folder):
     records = load_records(folder)
+    assert records[1].candidates[0].heldout_trials == (0.4, 2.2)
     cases = [judge(r, ComparisonSettings()) for r in records]
     assert [c.verdict for c in cases] == ["none", "air_drag", "air_drag", "air_drag", "unknown"]
     assert cases[3].both and cases[3].pair and not cases[1].pair

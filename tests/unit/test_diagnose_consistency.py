@@ -141,14 +141,15 @@ class Reports(dict):
 
     def __init__(self, root):
         super().__init__()
-        self.root = root
+        self.root, self.events = root, {}
 
     def __missing__(self, kind):
         root = self.root
         capture, names, setting = made(kind)
         save_capture(capture, root / kind)
         options = DiagnoseOptions(effects=names, confirm=False)
-        diagnose(load_capture(root / kind), out=root / f"{kind}_out", options=options)
+        events = self.events[kind] = []
+        diagnose(load_capture(root / kind), out=root / f"{kind}_out", options=options, on_event=events.append)
         page = (root / f"{kind}_out" / "report.html").read_text(encoding="utf-8")
         words = html.unescape(re.sub(r"<[^>]+>", "", re.sub(r"<style>.*?</style>", "", page, flags=re.S)))
         self[kind] = read_diagnosis(root / f"{kind}_out")[0], words, setting
@@ -166,6 +167,14 @@ def test_no_line_contradicts_another(reports, kind):
     assert contradictions(report, page, **setting) == []
     verdict = report["verdict"]
     assert EXPECTED[kind] in (verdict["effect"], *verdict["alternatives"])
+
+
+def test_the_fits_have_ended_only_when_pairs_are_tried_and_judged(reports):
+    """A bar that is full while the longest part is to come says that no time is left."""
+    assert reports["pair"]
+    told = [e for e in reports.events["pair"] if e["event"] == "progress" and e["stage"] == "fit"]
+    assert [e["done"] for e in told] == list(range(1, told[-1]["total"] + 1))
+    assert [e["message"] for e in told[-3:]] == ["best again", "pairs", "judged"]
 
 
 def test_two_causes_are_told_on_one_line(reports):
@@ -244,6 +253,24 @@ DOCTORED = {
     "without a reason": doctored("drag", lambda r, p: _row(r, "buoyancy").update(reason="")),
     "is not on the page": doctored("drag", lambda r, p: p.replace(r["provenance"]["content_sha256"], "")),
     "unsaid": doctored("drag", lambda r, p: r["work"]["skipped"].update(tether="tried")),
+    "explained down to its noise": doctored(
+        "plain",
+        lambda r, p: r["gap"].update(
+            before_rms_m=2 * np.hypot(r["gap"]["noise_floor_rms_m"], r["gap"]["grain_rms_m"]), resolvable=True
+        ),
+    ),
+    "below the noise floor, unexplained": doctored(
+        "drag", lambda r, p: r["controls"].update(wrong_effect_rms_m=0.0) or p.replace("below it is so by chance", "")
+    ),
+    "re-fitting does as well or better": doctored(
+        "drag",
+        lambda r, p: (
+            r["gap"].update(refitted_rms_m=0.5 * r["gap"]["after_rms_m"])
+            or p + " the nominal model's own parameters does as well"
+        ),
+    ),
+    "one of several": doctored("drag", lambda r, p: p + " Mean of 1 trials. "),
+    "smaller than an atom": doctored("drag", lambda r, p: p + " 1.14 × 10⁻⁸\u00a0µm"),
     "two errors of the nominal": doctored("kick", lambda r, p: _row(r, "none").update(heldout_rms_m=9.0)),
     "allowed": doctored(
         "drag", lambda r, p: _row(r, "air_drag")["parameters"]["drag_per_mass"].update(ci95=[-1.7e10, 1])

@@ -316,6 +316,15 @@ def test_the_verdict_in_words():
     assert "no known effect" in verdict_summary(Verdict(effect=UNKNOWN, probability=0.9), GAP)
 
 
+def test_a_verdict_of_none_does_not_explain_more_than_noise_and_grain_do():
+    """16 mm beside a floor of 6 mm, as of a ball launched at 45 degrees: too little for a cause, and not nothing."""
+    none = Verdict(effect=NONE, probability=0.85)
+    left = dataclasses.replace(GAP, before_rms_m=0.0162, noise_floor_rms_m=0.0059, grain_rms_m=0.0)
+    assert "2.7 times" in verdict_summary(none, left) and "down to its noise" not in verdict_summary(none, left)
+    chaotic = dataclasses.replace(left, grain_rms_m=0.03)
+    assert "down to its noise and the simulator's own uncertainty" in verdict_summary(none, chaotic)
+
+
 def test_every_effect_has_words_and_an_experiment():
     from physgen.sim.diagnose.model_comparison import kind_of
     from physgen.sim.diagnose.report.wording import LABELS

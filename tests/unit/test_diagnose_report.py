@@ -492,6 +492,7 @@ def test_text_never_becomes_markup(given_text):
         (-0.02, "s", "−20.0\u00a0ms"),
         (NAN, "m", "–"),
         (None, "m", "–"),
+        (1.14e-14, "m", "<\u00a01\u00a0nm"),
         (1.5e9, "kg", "1.50\u00a0×\u00a010⁹\u00a0kg"),
     ],
 )

@@ -390,6 +390,8 @@ def test_a_hollow_ball_is_told_by_the_speed_at_which_it_begins_to_roll():
     assert found.value == pytest.approx(5 / 3, rel=0.05)
     # The held-out error counts by trial, in units of what noise and contacts make of it.
     assert best.heldout_chi < 0.3 * fits.nominal.heldout_chi
+    assert len(best.heldout_trials) == 3
+    assert best.heldout_chi == pytest.approx(np.sqrt(np.mean(np.square(best.heldout_trials))), rel=1e-9)
 
 
 def test_a_solid_ball_is_not_called_hollow():

@@ -113,6 +113,21 @@ def test_a_narrow_motion_is_compared_below_whole_titles(tmp_path):
     assert np.abs(starts + 30 - (np.arange(3) * 208 + 100)).max() <= 2
 
 
+def test_the_mark_of_the_real_centre_hides_no_small_body(tmp_path):
+    """A ball of 8 px disappeared below its cross."""
+    wall, path = np.full((200, 200, 3), 200, np.uint8), np.full((1, 2), 100.0)
+    ball = cv2.circle(wall.copy(), (100, 100), 2, (20, 20, 220), -1)
+    write_comparison(
+        tmp_path / "small.mp4", iter([ball]), draw=lambda k, picture: (picture, picture), window=(0, 0, 200, 200),
+        seen=path, believed=path, found=path, times=np.zeros(1), gaps=(np.zeros(1), np.zeros(1)),
+        withheld=0.0, titles=("real", "simulated as believed", "nothing is missing"),
+    )  # fmt: skip
+    _, sheet = cv2.VideoCapture(str(tmp_path / "small.mp4")).read()
+    for column in range(3):
+        blue, _, red = sheet[228:233, 408 * column + 198 : 408 * column + 203].reshape(-1, 3).mean(axis=0)
+        assert red > 150 > 100 > blue
+
+
 def test_a_throw_at_thirty_frames_a_second_is_one_flight():
     t = np.arange(24) / 30
     places = np.stack([100 + 1200 * t, 700 - 2900 * t + 0.5 * 7800 * t**2], axis=1)

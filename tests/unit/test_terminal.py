@@ -118,3 +118,13 @@ def test_a_terminal_that_lacks_a_character_gets_its_number():
     stream = out("ascii")
     Terminal(as_json=False, out=stream).line("photo → video")
     assert written(stream) == b"photo \\u2192 video\n"
+
+
+def test_no_line_promises_that_nothing_is_left():
+    """The end of a stage is not the end of the command, and the end of the last one needs no promise."""
+    stream = out()
+    terminal = Terminal(as_json=False, expected_s={"track": 6.0, "fit": 12.0}, out=stream)
+    terminal(event("track", 10, 10))
+    terminal(event("fit", 5, 5))
+    first, second = written(stream).decode().splitlines()
+    assert first.endswith("elapsed, about 0:12 left") and second.endswith("elapsed")

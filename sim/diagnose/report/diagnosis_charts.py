@@ -15,6 +15,7 @@ from ..capture import Capture
 from ..diagnosis import PHASES, Diagnosis, IntervalShare, RankedEffect
 from .wording import PHASES as PHASE_WORDS
 from .wording import (
+    counted,
     effect_label,
     found_effects,
     number_text,
@@ -228,8 +229,8 @@ def timeline_picture(diagnosis: Diagnosis, capture: Capture, *, width: float) ->
         height=y + 34,
         title="Discrepancy over time",
         description=(
-            f"{len(shown)} trials over recorded time, coloured by phase; the curve is the force per mass missing from "
-            f"the nominal model, up to {number_text(overall)} m/s²."
+            f"{counted(len(shown), 'trial')} over recorded time, coloured by phase; the curve is the force per mass "
+            f"missing from the nominal model, up to {number_text(overall)} m/s²."
             + (" The scale is a square root." if score.root else "")
         ),
         body=join(parts),

@@ -16,7 +16,7 @@ from ..diagnosis import Diagnosis, TrialArrays
 from .diagnosis_charts import Scale, curve, is_root, ranking_picture, timeline_picture
 from .object_heatmaps import object_pictures
 from .trajectory_plots import MAX_TAKES, camera_plane, tracks_legend, tracks_pictures
-from .wording import axis_unit, found_effects, found_label, quantity_text, tick_text
+from .wording import axis_unit, counted, found_effects, found_label, quantity_text, tick_text
 
 Array = NDArray[np.float64]
 
@@ -207,7 +207,7 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
         width=WIDTH,
         height=bottom + 42,
         title="Error over time since the start of a trial",
-        description=f"Mean of {data.trials} trials. {'; '.join(captions) or 'No error available'}.",
+        description=f"Mean of {counted(data.trials, 'trial')}. {'; '.join(captions) or 'No error available'}.",
         body=join(parts),
     )
 

@@ -33,6 +33,7 @@ from .wording import (
     number_text,
     percent_text,
     quantity_text,
+    remains,
     shares_sentence,
 )
 
@@ -183,10 +184,14 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     return facts
 
 
+NO_DISCREPANCY = "No discrepancy above the noise was found"
+
+
 def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
     """Return the localisation of the discrepancy in sentences."""
     if diagnosis.verdict.effect == NONE:
-        return ["No discrepancy above the noise was found: the figures below show mostly noise."]
+        found = "No discrepancy is large enough to name a cause" if remains(diagnosis.gap) else NO_DISCREPANCY
+        return [f"{found}: the figures below show mostly noise."]
     where = diagnosis.where
     phases: dict[str, float] = {}
     for interval in where.intervals:
@@ -212,6 +217,8 @@ def _next_experiment(diagnosis: Diagnosis) -> str:
         return diagnosis.next_experiment
     if diagnosis.verdict.effect == UNKNOWN:
         return "No recording is known that would narrow it down; vary one thing at a time."
+    if diagnosis.verdict.effect == NONE and remains(diagnosis.gap):
+        return "Record the same motion two more times: what is left here does not show its cause."
     return "No further recording is needed to distinguish the causes."
 
 

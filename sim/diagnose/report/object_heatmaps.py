@@ -21,7 +21,7 @@ from ...html import Markup, Picture, element, join, label, shortened
 from ..capture import Capture, CaptureObject
 from ..diagnosis import Diagnosis
 from .diagnosis_charts import round_up
-from .wording import number_text, percent_text, tick_text
+from .wording import counted, number_text, percent_text, tick_text
 
 Array = NDArray[np.float64]
 
@@ -304,7 +304,7 @@ def _view(item: CaptureObject, scores: Scores, top: float, name: str, view: View
         height=_HEIGHT + _TOP,
         title=title,
         description=(
-            f"Mean discrepancy at its {len(scores.means)} tracked points: {mean}. "
+            f"Mean discrepancy at its {counted(len(scores.means), 'tracked point')}: {mean}. "
             f"Share of the total discrepancy: {percent_text(share)}."
         ),
         body=join(

@@ -24,12 +24,23 @@ _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
 """Unit → (upper limit, factor, display name) in rising order."""
 
 
+LEAST_LENGTH_M = 1e-9
+"""Lengths below are rounding errors, and shown as that."""
+
+
 def quantity_text(value: float | None, unit: str, *, digits: int = 3) -> str:
     """Return ``value`` with ``digits`` significant digits and a suitable unit, such as "3.4 mm"; a dash for NaN."""
     if value is None or not math.isfinite(value):
         return NOTHING
+    if unit == "m" and 0 < abs(value) < LEAST_LENGTH_M:
+        return "<\u00a01\u00a0nm"
     factor, name = _scale(abs(value), unit)
     return with_unit(number_text(value * factor, digits=digits), name)
+
+
+def counted(number: int, what: str) -> str:
+    """Return "1 trial" or "3 trials"."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def with_unit(number: str, unit: str) -> str:
@@ -271,8 +282,14 @@ def alternatives_sentence(verdict: Verdict) -> str | None:
 def closure_sentence(diagnosis: Diagnosis) -> str:
     """Return the sentence on how much of the gap is closed, or why no number is given."""
     gap = diagnosis.gap
+    if diagnosis.verdict.effect == NONE and remains(gap):
+        return (
+            f"No effect was added. The nominal model's error is {_length(gap.before_rms_m)}, of which noise and the "
+            f"simulator's own uncertainty explain {_length(_expected(gap))}; no known effect explains the rest clearly."
+            f"{_floor(gap)}"
+        )
     if diagnosis.verdict.effect == NONE:
-        return "No effect was added, so there is no gap to close."
+        return f"No effect was added, so there is no gap to close.{_floor(gap)}"
     if not gap.resolvable:
         return (
             "Not resolvable: the nominal model is already so close to the noise floor "
@@ -306,6 +323,20 @@ def _floor(gap: Gap) -> str:
     )
 
 
+EXPLAINED = 1.5
+"""Error of the nominal model over noise and grain together up to which these explain it."""
+
+
+def _expected(gap: Gap) -> float:
+    """Return the error in m that noise and the simulator's own uncertainty make."""
+    return max(math.hypot(gap.noise_floor_rms_m, gap.grain_rms_m), LEAST_LENGTH_M)
+
+
+def remains(gap: Gap) -> bool:
+    """Return whether the nominal model leaves clearly more than noise and the simulator's own uncertainty do."""
+    return gap.before_rms_m > EXPLAINED * _expected(gap)
+
+
 def _length(value: float) -> str:
     return quantity_text(value, "m", digits=2)
 
@@ -324,6 +355,10 @@ def _closed(gap: Gap) -> str:
     if fraction < 0:
         return "the gap widens, so do not trust this cause"
     return f"{percent_text(min(fraction, 1.0))} of the gap above the noise floor is closed"
+
+
+CLEARLY_BETTER = 0.9
+"""Fraction of an error below which another one is better, not as good."""
 
 
 def control_sentences(diagnosis: Diagnosis) -> list[str]:
@@ -349,8 +384,9 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
                 "A cause that does not beat its controls is not a cause: treat this verdict with caution."
             )
     if gap.refitted_rms_m <= after:
+        how = "better" if gap.refitted_rms_m < CLEARLY_BETTER * after else "as well"
         said.append(
-            "Re-fitting the nominal model's own parameters does as well "
+            f"Re-fitting the nominal model's own parameters does {how} "
             f"({_length(gap.refitted_rms_m)}), without any new effect."
         )
     if gap.numerics_rms_m > max(0.25 * gap.before_rms_m, after):
@@ -429,7 +465,14 @@ def verdict_summary(verdict: Verdict, gap: Gap) -> str:
     """Return the verdict in a sentence or two: cause, confidence, alternatives, gap closure."""
     others = listed([effect_label(name) for name in verdict.alternatives], "or")
     if verdict.effect == NONE:
-        return f"The nominal model explains the recording down to its noise ({_confidence(verdict)})."
+        if remains(gap):
+            return (
+                f"No known effect explains the recording clearly better than the nominal model ({_confidence(verdict)})"
+                f", although its error is {number_text(gap.before_rms_m / _expected(gap), digits=2)} times what noise "
+                "and the simulator's own uncertainty make."
+            )
+        own = " and the simulator's own uncertainty" if gap.resolvable else ""
+        return f"The nominal model explains the recording down to its noise{own} ({_confidence(verdict)})."
     if verdict.effect == UNKNOWN:
         text = f"Something is missing from the model, and no known effect explains it ({_confidence(verdict)})."
         return f"{text} Closest: {others}." if others else text

@@ -148,7 +148,7 @@ def fit_rigid(
             bodies.append(BodyFits(problem=body_problem(capture, index, work), work=work))
     if not bodies:
         raise InputError("capture: no object is rigid and tracked; fit it as deformable")
-    progress = StageProgress(on_event, "fit", len(bodies) * (len(wanted) + 2))
+    progress = StageProgress(on_event, "fit", len(bodies) * (len(wanted) + 4) + 1)
     done = 0
 
     def tick(what: str) -> None:
@@ -177,13 +177,17 @@ def fit_rigid(
         refit_best(body)
         refine_promising(body)
         reconsider_nominal(body)
+        tick("best again")
         search_pairs(body, wanted)
         for _ in range(SHARPENINGS):
             if not sharpen(body):
                 break
             # Sharper noise may leave room for a second effect.
             search_pairs(body, wanted)
-    return _assemble(capture, bodies)
+        tick("pairs")
+    fits = _assemble(capture, bodies)
+    tick("judged")
+    return fits
 
 
 def _wanted(capture: Capture, names: Sequence[str] | None) -> list[CandidateEffect]:
@@ -268,8 +272,11 @@ def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
         best = max(clock.log_evidence, weight.log_evidence)
         error = min(clock.heldout_rms_m, weight.heldout_rms_m)
         chi = min(clock.heldout_chi, weight.heldout_chi)
+        trials = min(clock, weight, key=lambda fit: fit.heldout_chi).heldout_trials
         for twin in (clock, weight):
-            made[twin.effects] = dataclasses.replace(twin, log_evidence=best, heldout_rms_m=error, heldout_chi=chi)
+            made[twin.effects] = dataclasses.replace(
+                twin, log_evidence=best, heldout_rms_m=error, heldout_chi=chi, heldout_trials=trials
+            )
 
 
 def _candidate(
@@ -308,6 +315,7 @@ def _candidate(
         heldout_log_score=np.sum([h.log_score for h in held], axis=0),
         heldout_rms_m=float(np.sqrt(np.mean([h.rms_m**2 for h in held]))),
         heldout_chi=float(np.sqrt(np.mean([h.chi**2 for h in held]))),
+        heldout_trials=tuple(chi for h in held for chi in h.trials),
         misfit=math.sqrt(square),
     )
 

@@ -239,12 +239,13 @@ def prediction_spread(fit: Fit) -> Array:
 class HeldOutScore:
     """Held-out scores. log_score: (fit trials,) nats. rms_m: RMS error predicted from the first frames.
 
-    chi: RMS over trials of each one's error over ``prediction_spread``; NaN without it.
+    trials: each one's error over ``prediction_spread``; () without it. chi: their RMS; NaN without them.
     """
 
     log_score: Array
     rms_m: float
     chi: float = math.nan
+    trials: tuple[float, ...] = ()
 
 
 def leave_one_out(fit: Fit) -> Array:
@@ -317,10 +318,10 @@ def score_held_out(fit: Fit, spread: Array | None = None) -> HeldOutScore:
         off = off[max(0, first - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
         if spread is not None and np.isfinite(spread[i]) and np.isfinite(squares[-1]).any():
-            chis.append(float(mean_known(squares[-1])) / spread[i] ** 2)
+            chis.append(math.sqrt(float(mean_known(squares[-1]))) / float(spread[i]))
     rms = float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("nan")
-    chi = float(np.sqrt(np.mean(chis))) if chis else math.nan
-    return HeldOutScore(log_score=np.array(scores), rms_m=rms, chi=chi)
+    chi = float(np.sqrt(np.mean(np.square(chis)))) if chis else math.nan
+    return HeldOutScore(log_score=np.array(scores), rms_m=rms, chi=chi, trials=tuple(chis))
 
 
 def _own_noise(seen: ObservedBody) -> float:

@@ -85,6 +85,7 @@ def follow_plain_body(
             progress.report(min(count, max(1, 2 * info.frames)), path.name)
 
     found = find_moving_regions(path, video.start_frame, video.end_frame, on_frame)
+    progress.report(max(1, 2 * info.frames), path.name)
     if len(found.stamps) < LEAST_FRAMES:
         raise InputError(
             f"{path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
