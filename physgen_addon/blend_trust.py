@@ -30,36 +30,42 @@ WRITTEN = ("output", "farm_folder", "cache", "bake", "report", "scene_folder", "
 """Properties whose files or folders are written, or deleted; the others are read."""
 
 
-def _paths(scene: bpy.types.Scene) -> Iterator[tuple[str, str, str]]:
-    """Yield kind, name and text of every property of ``scene`` that names a file or folder."""
+def _paths(scene: bpy.types.Scene, *, only_set: bool = False) -> Iterator[tuple[str, str, str]]:
+    """Yield kind, name and text of every property of ``scene`` that names a file or folder. only_set: no defaults."""
     for name in GROUPS:
-        yield from _paths_in(getattr(scene, name), "")
+        yield from _paths_in(getattr(scene, name), "", only_set)
 
 
-def _paths_in(group: bpy.types.PropertyGroup, where: str) -> Iterator[tuple[str, str, str]]:
+def _paths_in(group: bpy.types.PropertyGroup, where: str, only_set: bool) -> Iterator[tuple[str, str, str]]:
     for prop in group.bl_rna.properties:
         if prop.identifier == "rna_type":
             continue
         if prop.type == "STRING" and prop.subtype in PATHS:
+            if only_set and not group.is_property_set(prop.identifier):
+                continue
             kind = WRITES if prop.identifier in WRITTEN else READS
             yield kind, f"{where}{prop.name}", getattr(group, prop.identifier)
         elif prop.type == "POINTER" and isinstance(getattr(group, prop.identifier), bpy.types.PropertyGroup):
-            yield from _paths_in(getattr(group, prop.identifier), where)
+            yield from _paths_in(getattr(group, prop.identifier), where, only_set)
         elif prop.type == "COLLECTION":
             for item in getattr(group, prop.identifier):
                 if isinstance(item, bpy.types.PropertyGroup):
-                    yield from _paths_in(item, f"{item.name}: " if item.name else where)
+                    yield from _paths_in(item, f"{item.name}: " if item.name else where, only_set)
 
 
-def _outside(text: str) -> str | None:
-    """Return where ``text`` leads, if that is not the folder of the open file; None if it is.
+def _own_file() -> Path | None:
+    return Path(bpy.data.filepath) if bpy.data.filepath else None
+
+
+def _outside(text: str, file: Path | None) -> str | None:
+    """Return where ``text`` in ``file`` leads, if that is not the folder of the file; None if it is.
 
     Nothing outside is touched to find out: on Windows a look at another computer's folder tells it who looks.
     """
-    path = Path(os.path.normpath(bpy.path.abspath(text.strip())))
-    if not bpy.data.filepath:
-        return str(path)
-    home = Path(bpy.data.filepath).parent
+    if file is None:
+        return os.path.normpath(bpy.path.abspath(text.strip()))
+    home = file.parent
+    path = Path(os.path.normpath(bpy.path.abspath(text.strip(), start=str(home))))
     if path.is_relative_to(home) or path.is_relative_to(home.resolve()):
         # A link may lead out.
         found = path.resolve()
@@ -67,9 +73,10 @@ def _outside(text: str) -> str | None:
     return str(path)
 
 
-def _claims(scene: bpy.types.Scene) -> list[Claim]:
-    """Return all that the settings of ``scene`` name outside the folder of the file."""
-    named = ((kind, where, _outside(text)) for kind, where, text in _paths(scene) if text.strip())
+def _claims(scene: bpy.types.Scene, file: Path | None = None) -> list[Claim]:
+    """Return all that the settings of ``scene`` name outside the folder of ``file``; None: of the open one."""
+    file = file or _own_file()
+    named = ((kind, where, _outside(text, file)) for kind, where, text in _paths(scene) if text.strip())
     return [Claim(kind, where, path) for kind, where, path in named if path is not None]
 
 
@@ -87,6 +94,16 @@ def note_loaded() -> None:
         claims = _claims(scene)
         if claims and _key(claims) not in keys:
             _came.update(claims)
+
+
+def note_imported(scene: bpy.types.Scene, file: Path | None) -> None:
+    """Remember what ``scene``, appended or linked from ``file``, asks for beyond the folder of the open file, unless
+    the user saved that one or agreed to it."""
+    if file is not None and _key(_claims(scene, file)) in trusted_keys():
+        return
+    # What is at its default is ours, wherever it leads in a file that has no folder yet.
+    chosen = {where for _, where, _ in _paths(scene, only_set=True)}
+    _came.update(claim for claim in _claims(scene) if claim.where in chosen)
 
 
 def note_saved() -> None:
@@ -112,7 +129,7 @@ def agree(scene: bpy.types.Scene) -> None:
 
 def is_pending(text: str) -> bool:
     """Return whether the path ``text`` of a property waits for the user's word."""
-    return bool(_came) and bool(text.strip()) and _outside(text) in {claim.text for claim in _came}
+    return bool(_came) and bool(text.strip()) and _outside(text, _own_file()) in {claim.text for claim in _came}
 
 
 PROGRAMS = (
@@ -137,7 +154,7 @@ def may_open(path: Path, suffixes: Collection[str] = ()) -> bool:
 def require(text: str) -> None:
     """Raise NotTrusted if the path ``text`` of a property waits for the user's word."""
     if is_pending(text):
-        found = _outside(text)
+        found = _outside(text, _own_file())
         _refuse([claim for claim in sorted(_came) if claim.text == found])
 
 

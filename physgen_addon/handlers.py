@@ -179,6 +179,16 @@ def _on_load(*_: Any) -> None:
         _refresh_all()
 
 
+@persistent
+def _on_import(found: bpy.types.BlendImportContext, *_: Any) -> None:
+    # A scene that is appended brings its settings, as a file that is opened does.
+    for item in found.import_items:
+        if isinstance(item.id, bpy.types.Scene):
+            library = item.source_library
+            blend_trust.note_imported(item.id, None if library is None else paths.absolute(library.filepath))
+    bake_state.mark_dirty()
+
+
 def _refresh_all() -> None:
     for scene in bpy.data.scenes:
         bake_state.refresh(scene)
@@ -220,6 +230,7 @@ HANDLERS = {
     "undo_post": _on_history,
     "redo_post": _on_history,
     "load_post": _on_load,
+    "blend_import_post": _on_import,
     "save_pre": _before_save,
     "save_post": _after_save,
     "save_post_fail": _after_save,

@@ -78,6 +78,32 @@ def test_somebody_elses_reads_nothing_outside_its_folder_before_the_word(blend, 
     blend_trust.require_agreed(scene)
 
 
+@pytest.mark.parametrize("link", [False, True])
+def test_a_scene_from_somebody_elses_file_waits_for_the_word(blend, tmp_path, monkeypatch, link):
+    """Appended or linked, it brings its settings with it, and they are not those of this session."""
+    monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
+    name = bpy.context.scene.name
+    bpy.ops.wm.read_homefile(use_empty=True)
+    own = bpy.context.scene
+    own.physgen_photo.depth = str(tmp_path / "my own.exr")
+    before = set(bpy.data.scenes)
+    bpy.ops.wm.link(directory=f"{blend}/Scene/", filename=name) if link else bpy.ops.wm.append(
+        directory=f"{blend}/Scene/", filename=name
+    )
+    [scene] = set(bpy.data.scenes) - before
+    assert sorted(wheres(scene)) == ["Photo", "ball: Mesh"]
+    with pytest.raises(NotTrusted):
+        blend_trust.require_agreed(scene)
+    assert wheres(own) == []
+
+
+def test_a_scene_from_ones_own_file_needs_no_word(blend):
+    name = bpy.context.scene.name
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.append(directory=f"{blend}/Scene/", filename=name)
+    assert [wheres(scene) for scene in bpy.data.scenes] == [[], []]
+
+
 def test_a_yes_is_remembered_until_the_file_asks_for_something_else(blend, tmp_path, monkeypatch):
     monkeypatch.setenv("PHYSGEN_CONFIG", str(tmp_path / "another user"))
     bpy.ops.wm.open_mainfile(filepath=str(blend))
