@@ -7,6 +7,7 @@ import webbrowser
 from pathlib import Path
 
 import bpy
+from mathutils import Vector
 
 from ...sim.app.add_effect import AddRequest, add_and_bake, found_effects, with_effects
 from ...sim.app.stage_process import run_stage
@@ -26,9 +27,11 @@ from ..playback import capture_scene, capture_view
 from ..playback import capture_view as overlay
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..props import diagnose_props as report_props
+from ..props.body_props import is_body
 from ..props.diagnose_props import apply_view
 from ..props.preferences import python
 from ..text import count, report_errors
+from .import_ops import hide_all
 
 
 def capture_folder(path: str) -> Path:
@@ -127,14 +130,32 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
         folder = report_folder(state) if state.report.strip() or _found_beside(state) else None
         if folder is not None and not (folder / REPORT_FILE).is_file():
             folder = None
+        is_first = state.root is None
         capture = show_capture(scene, folder)
+        hidden = _hide_around(scene) if is_first else ""
         if folder is not None:
             state.report = str(folder)
         turn_to(context, *capture_view.capture_bounds(state.root, state.trial))
         if capture.camera is not None:
             look_through_camera(context)
-        self.report({"INFO"}, f"{count(len(capture.trials), 'trial')} of {capture_folder(state.capture).name} loaded")
+        trials = f"{count(len(capture.trials), 'trial')} of {capture_folder(state.capture).name}"
+        self.report({"INFO"}, f"{trials} loaded{hidden}")
         return {"FINISHED"}
+
+
+def _hide_around(scene: bpy.types.Scene) -> str:
+    """Hide meshes that the recording lies inside, such as Blender's default cube; return the end of a report."""
+    state = scene.physgen_diagnose
+    low, high = capture_view.capture_bounds(state.root, state.trial)
+    middle, own = (low + high) / 2, set(state.root.all_objects)
+
+    def is_around(item: bpy.types.Object) -> bool:
+        if item.type != "MESH" or item in own or is_body(item):
+            return False
+        corners = [item.matrix_world @ Vector(corner) for corner in item.bound_box]
+        return all(min(c[axis] for c in corners) < middle[axis] < max(c[axis] for c in corners) for axis in range(3))
+
+    return hide_all(item for item in scene.objects if is_around(item))
 
 
 def _found_beside(state: bpy.types.PropertyGroup) -> bool:
@@ -290,7 +311,10 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
         state = scene.physgen_diagnose
         state.capture, state.report = str(final["capture"]), str(final["diagnosis"])
         state.video.comparison = str(final["video"])
+        is_first = state.root is None
         show_capture(scene, Path(state.report))
+        if is_first:
+            _hide_around(scene)
         turn_to(bpy.context, *capture_view.capture_bounds(state.root, state.trial))
         return str(state.summary)
 

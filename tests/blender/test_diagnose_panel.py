@@ -251,6 +251,21 @@ def test_saved_file_plays_without_the_addon(throw, tmp_path):
     assert bpy.context.scene.physgen_diagnose.trial == "take é"
 
 
+def test_nothing_stands_around_the_recording(throw, capfd):
+    """Blender's default cube, in which a recording of something small disappeared."""
+    bpy.ops.mesh.primitive_cube_add(size=50)
+    around = bpy.context.object
+    bpy.ops.mesh.primitive_cube_add(size=1, location=(100, 0, 0))
+    beside = bpy.context.object
+    state = load(throw[1])
+    assert around.hide_viewport and around.hide_render and not beside.hide_viewport
+    assert not any(item.hide_viewport for item in state.root.all_objects if item.type == "CAMERA")
+    assert f"loaded; {around.name} hidden" in capfd.readouterr().out
+    around.hide_viewport = False
+    load(throw[1])
+    assert not around.hide_viewport, "who shows it again wants it"
+
+
 def test_loading_again_and_clearing_leave_nothing_behind(throw):
     _, folder = throw
     state = load(folder)
