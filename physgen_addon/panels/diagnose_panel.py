@@ -25,6 +25,8 @@ from ..operators.diagnose_ops import (
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
 from .sidebar import DIAGNOSE, Sidebar, draw_job
 
+WORTH_SAYING = 0.01
+"""Least share of the largest error at which the simulator's own is mentioned."""
 TITLES = {OBSERVED: "Observed", NOMINAL: "Nominal", FOUND: "Found"}
 ICONS = {OBSERVED: "STRIP_COLOR_09", NOMINAL: "STRIP_COLOR_02", FOUND: "STRIP_COLOR_04"}
 
@@ -228,8 +230,8 @@ def _draw_gap(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any
         text.sentences(box, context, "Too close to the noise floor to quantify the closure.")
     elif state.closed > -1:
         box.label(text=f"{text.percent(state.closed)} of the gap is closed")
-    if state.numerics_m > 0:
-        box.label(text=f"{text.length(state.numerics_m)} of it is the simulator's own error")
+    if state.numerics_m >= WORTH_SAYING * most > 0:
+        text.sentences(box, context, f"{text.length(state.numerics_m)} of it is the simulator's own error.")
 
 
 class PHYSGEN_PT_diagnose_add(_Part, bpy.types.Panel):

@@ -173,6 +173,17 @@ def test_every_diagnosis_is_drawn(numbers, resolvable, verdict):
         draw_all("diagnose_video")
 
 
+@pytest.mark.parametrize(("error", "is_said"), [(7.6e-17, False), (2e-6, True)])
+def test_the_simulators_own_error_is_said_where_it_counts(error, is_said):
+    """Not "7.6e-11 µm of it"."""
+    state = bpy.context.scene.physgen_diagnose
+    state.root, state.has_report = bpy.data.collections.new("root"), True
+    state.before_m = state.refitted_m = state.after_m = state.floor_m = 45e-6
+    state.numerics_m = error
+    words = " ".join(draw_all("diagnose_causes")["PHYSGEN_PT_diagnose_causes"].words)
+    assert ("simulator" in words) == is_said
+
+
 def test_a_photo_is_drawn_with_its_boxes():
     bpy.ops.physgen.open_photo(filepath=str(COFFEE))
     photo = bpy.context.scene.physgen_photo
