@@ -49,6 +49,22 @@ def test_a_block_on_a_slope_slides_where_friction_says_so(degrees):
     assert found.stands == (degrees == 15)
 
 
+def test_what_is_held_has_a_ground_where_the_other_stands_on_it():
+    ball, stand = block((0.04, 0.04, 0.04), (0, 0, 0.05)), block((0.06, 0.06, 0.03), (0, 0, 0.014))
+    assert drop(ball, [stand], held=True, seconds=0.3).stands
+
+
+def test_a_ring_on_a_ledge_is_found_to_lie_on_it():
+    """A ring on the shoulder of a bar has no way to go; contacts found in a few places only let it creep."""
+    bar = trimesh.creation.revolve(
+        [(0, 0), (0.012, 0), (0.012, 0.03), (0.01, 0.0302), (0.01, 0.06), (0, 0.06)], sections=64
+    )
+    ring = trimesh.creation.annulus(0.0102, 0.014, 0.006, sections=64)
+    ring.apply_translation((0, 0, 0.0332))
+    found = drop(surface(bar), [surface(ring)], held=True, seconds=0.3)
+    assert found.stands and found.drift < 0.001
+
+
 def test_a_ring_is_not_filled():
     pole = surface(trimesh.creation.cylinder(0.01, 0.2, sections=64))
     loose = surface(trimesh.creation.annulus(0.014, 0.02, 0.01, sections=64))

@@ -16,9 +16,10 @@ Deformable parts are seated in the fixed ones, and on the ground, so that a comp
 optimisation ends where nothing penetrates, with some air left between the parts and a base that is as uneven as its
 particles. A rigid ring then slides down its finger until the air is used up, and a head rocks on its neck. What is soft
 would lie against its neighbour on the whole area of contact and bulge beside it. So vertices near another part move out
-along their normals by up to a thickness well below what the image shows: in the contact until the air is closed, beside
-it by all of the thickness, which makes a groove that the other part sits in. A base within the thickness of the ground
-becomes flat.
+along their normals by up to a thickness well below what the image shows: in the contact until the air is closed,
+beside it by all of the thickness more than that, which makes a groove that the other part sits in: a wall measured
+from the surface without its air would be thinner where there was more air, and none where the part narrows. A base
+within the thickness of the ground becomes flat.
 """
 
 from __future__ import annotations
@@ -320,6 +321,9 @@ REACH = 4.0
 """Thicknesses from another part within which a vertex moves by the whole thickness; none beyond twice that. Several
 spacings of a mesh, else the groove has no wall."""
 
+HEAD_ON = 1.2
+"""How much longer than the air a vertex's way to the other part may be where that faces it. Beyond, it met an edge."""
+
 ITERATIONS = 30
 """Of the search for how far a vertex may move: each goes as far as the distance to the other part is."""
 
@@ -348,23 +352,38 @@ def seated_parts(
 def seated(
     surface: Surface, others: Sequence[DistanceLattice], *, thickness: float, ground: Ground | None = None
 ) -> Surface:
-    """Return ``surface`` with its vertices near ``others``, and near the ``ground``, moved by up to ``thickness`` m.
+    """Return ``surface`` with its vertices near ``others``, and near the ``ground``, moved to lie against them.
 
+    In contacts they move by up to ``thickness`` metres, the air there; beside them by the thickness more than that.
     others: signed distances to the other parts' surfaces, metres. Vertices keep their order.
     """
     vertices = surface.vertices
     normals = area_normals(vertices, surface.faces)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-    weight = smoothstep(_least_distance(others, vertices), 2.0 * REACH * thickness, REACH * thickness)
+    air = _least_distance(others, vertices)
+    weight = smoothstep(air, 2.0 * REACH * thickness, REACH * thickness)
     near = np.flatnonzero(weight > 0)
-    room, way = thickness * weight[near], np.zeros(len(near))
-    for _ in range(ITERATIONS):
-        free = _least_distance(others, vertices[near] + way[:, None] * normals[near])
-        way = np.clip(way + free, 0.0, room)
+    room = thickness * weight[near]
+    way = _moved_out(others, vertices[near], normals[near], np.zeros(len(near)), room)
+    met = way < room
+    faced = met & (way <= HEAD_ON * air[near])
+    if faced.any():
+        closed = way[faced][cKDTree(vertices[near][faced]).query(vertices[near])[1]]
+        way = _moved_out(others, vertices[near], normals[near], way, np.where(met, way, room + closed * weight[near]))
     moved = vertices.copy()
     moved[near] += way[:, None] * normals[near]
     resolved = resolve_penetration(Surface(vertices=moved, faces=surface.faces), others)
     return resolved if ground is None else _on_ground(resolved, ground, thickness)
+
+
+def _moved_out(others: Sequence[DistanceLattice], places: Array, normals: Array, way: Array, room: Array) -> Array:
+    """Return how far (N,) in metres ``places`` move along ``normals`` until they meet a surface, by ``room`` at most.
+
+    way: where the search begins.
+    """
+    for _ in range(ITERATIONS):
+        way = np.clip(way + _least_distance(others, places + way[:, None] * normals), 0.0, room)
+    return way
 
 
 def _least_distance(lattices: Sequence[DistanceLattice], points: Array) -> Array:
