@@ -127,10 +127,11 @@ def _section(found: Judgement, subject: str) -> Section:
         f"frames of each video, in another order each time. The text was: {found.prompt}"
     )
     notices = tuple(f"judge: {note}" for note in found.notes)
-    return Section(name="judge", title="Judged by a model", text=text, measures=tuple(measures), notices=notices)
+    return Section(name=JUDGE, title="Judged by a model", text=text, measures=tuple(measures), notices=notices)
 
 
 STAGE = "evaluate"
+JUDGE = "judge"
 JUDGE_FILE = "judge.json"
 
 
@@ -217,8 +218,11 @@ def evaluate(
         subject = subject or baked.root.resolve().name
         sections.append(bake_physics(baked, _scene_of(baked, scene), cancelled=cancelled))
     found = Evaluation(root=out, subject=subject, sections=tuple(sections))
+    # Those of a judge were said as they came.
+    said = {notice for section in sections if section.name == JUDGE for notice in section.notices}
     for notice in found.notices:
-        progress.notice(notice)
+        if notice not in said:
+            progress.notice(notice)
     save(found, out, strip, tables)
     progress.report(3)
     return found

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from ..errors import InputError
 from ..files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
@@ -70,8 +70,10 @@ def _read(path: Path, mode: str) -> NDArray[np.uint8]:
         raise
     # Decoders of damaged files raise arbitrary exceptions (SyntaxError, struct.error, …).
     except Exception as error:
+        # Pillow names the open file by its address in memory.
+        reason = "of no kind that is read" if isinstance(error, UnidentifiedImageError) else str(error)
         raise InputError(
-            f"{path}: not a readable image ({type(error).__name__}: {error}); restore it or reconstruct the scene again"
+            f"{path}: not a readable image ({reason}); restore it, or give another as PNG or JPEG"
         ) from error
 
 

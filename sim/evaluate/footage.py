@@ -128,9 +128,8 @@ def _gaps(folder: Path, found: list[Path]) -> tuple[str, ...]:
     if len(numbers) < len(found) or len(set(numbers)) < len(numbers):
         return ()
     missing = numbers[-1] - numbers[0] + 1 - len(numbers)
-    return (f"{folder.name}: {missing} frames are missing between {found[0].name} and {found[-1].name}",) * bool(
-        missing
-    )
+    what = "1 frame is" if missing == 1 else f"{missing} frames are"
+    return (f"{folder.name}: {what} missing between {found[0].name} and {found[-1].name}",) * bool(missing)
 
 
 def at_rate(footage: Footage, fps: float, most: int) -> Iterator[Frame]:

@@ -258,7 +258,8 @@ def judge_videos(
     prompt: what should happen. notice: receives the recipient and everything that is wrong with an answer.
 
     Raises InputError for no or too many videos, for one with fewer than two frames, without a prompt, and where no
-    answer arrives; an answer that cannot be read is a note instead. Raises Cancelled.
+    answer arrives; an answer that cannot be read is a note instead, and so is an endpoint that falls silent later, and
+    is not asked again then. Raises Cancelled.
     """
     options = options or JudgeOptions()
     if not 1 <= len(videos) <= MOST_VIDEOS:
@@ -298,10 +299,19 @@ def judge_videos(
             content += [f"{shown[name]} evenly spaced frames of video {number}:", *pictures[name]]
         best: ReadAnswer | None = None
         raw: list[str] = []
+        silent = False
         for attempt in range(1, options.attempts + 1):
-            text = complete_content(
-                request, content, notice, cancelled, temperature=options.temperature, wording=_WORDING
-            )
+            try:
+                text = complete_content(
+                    request, content, notice, cancelled, temperature=options.temperature, wording=_WORDING
+                )
+            except InputError as error:
+                # What was answered before is not lost, and may have been paid for.
+                if not (answers or raw):
+                    raise
+                note(f"answer {repetition}{f', attempt {attempt}' if attempt > 1 else ''}: {error}")
+                silent = True
+                break
             raw.append(text[:MAX_TEXT])
             read = read_scores(text, len(order))
             for problem in read.problems:
@@ -311,13 +321,17 @@ def judge_videos(
             if _readable(best) == len(order):
                 break
         answers.append(tuple(raw))
-        assert best is not None
-        for name, scores in zip(order, best.scores, strict=True):
+        for name, scores in zip(order, best.scores if best else (None,) * len(order), strict=True):
             if scores is None:
                 note(f"repetition {repetition}: no score for {name}, which has one value less")
                 continue
             for criterion, value in scores.items():
                 values[name][criterion].append(value)
+        if silent:
+            left = options.repetitions - repetition
+            if left:
+                note(f"{left} of {options.repetitions} repetitions were not asked: the endpoint does not answer")
+            break
     return Judgement(
         model=request.model,
         endpoint=str(request.address),

@@ -3,6 +3,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
+from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
 from physgen.sim.evaluate import physics_iq
 from physgen.sim.evaluate.footage import at_rate, open_footage
@@ -233,7 +236,19 @@ def test_a_folder_of_pictures_is_a_video_and_its_gaps_are_said(tmp_path):
     assert any("do not say their frame rate" in text for text in found.notices)
     (folder / "0005.png").unlink()
     found = physgen.evaluate(folder, against=[video], out=tmp_path / "o", options=physgen.EvaluateOptions(fps=24.0))
-    assert any("1 frames are missing between 0001.png and 0012.png" in text for text in found.notices)
+    assert any("1 frame is missing between 0001.png and 0012.png" in text for text in found.notices)
+
+
+def test_a_file_that_is_no_video_or_no_photo_costs_one_line(tmp_path):
+    """FFmpeg writes to the terminal by itself, and once a process has opened a video it does as it did then."""
+    (tmp_path / "text.mp4").write_text("no video")
+    command = [sys.executable, "-m", "physgen", "evaluate", "text.mp4", "--out", "out"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    wanted = "error: text.mp4: not a readable video; convert it to MP4 (H.264) or AVI (MJPEG)\n"
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "", wanted)
+    with pytest.raises(InputError) as caught:
+        read_rgb(tmp_path / "text.mp4")
+    assert str(caught.value).endswith("(of no kind that is read); restore it, or give another as PNG or JPEG")
 
 
 def test_what_is_no_video_is_refused_and_nothing_is_written(tmp_path, monkeypatch):

@@ -168,6 +168,22 @@ def test_no_answer_at_all_is_an_error_without_the_key():
         judge(server.url)
 
 
+def test_an_endpoint_that_falls_silent_does_not_cost_the_answers_before():
+    def tires(handler, number):
+        if number < 2:
+            honest(handler, number)
+        else:
+            send(handler, b"{}", status=404)
+
+    with Judge(tires) as server:
+        found = judge(server.url, repetitions=5)
+    assert len(server.received) == 3 and len(found.answers) == 3 and found.answers[2] == ()
+    for of in found.scores.values():
+        assert all(len(score.values) == 2 for score in of.values())
+    assert any("answer 3: " in note and "404" in note for note in found.notes)
+    assert "2 of 5 repetitions were not asked: the endpoint does not answer" in found.notes
+
+
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
@@ -266,3 +282,23 @@ def test_the_command_judges_files_beside_a_still_one_and_only_with_consent(tmp_p
     assert len(kept["answers"]) == 3 and kept["model"] == "m"
     shown = "".join(p.read_text(errors="replace") for p in (tmp_path / "out").iterdir() if p.is_file())
     assert KEY not in shown and "Judged by a model" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_what_is_wrong_with_an_answer_is_said_once(tmp_path, capsys):
+    ours = a_video(tmp_path / "clip.webm", 60)
+    with Judge(lambda h, n: send(h, completion("Lovely, all of them."))) as server:
+        asked = [
+            "evaluate",
+            str(ours),
+            "--judge",
+            server.url,
+            "--judge-model",
+            "m",
+            "--prompt",
+            PROMPT,
+            "--send-frames",
+        ]
+        assert main([*asked, "--repetitions", "1", "--out", str(tmp_path / "out")]) == 0
+    said = "".join(capsys.readouterr())
+    assert said.count("answer 1: no line of scores") == 1
+    assert "answer 1: no line of scores" in (tmp_path / "out" / "report.html").read_text()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,6 +64,12 @@ class Frame:
 MAX_VIDEO_BYTES = 2**40
 
 
+def _quiet() -> None:
+    """Keep OpenCV and FFmpeg from writing to the terminal what is wrong with a file: our message says it."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+
+
 class Video:
     """An open video, a context manager; ``frames`` reads it once from its beginning."""
 
@@ -75,6 +82,7 @@ class Video:
         if empty:
             raise InputError(f"{path}: is empty; copy the video again")
         self._path = path
+        _quiet()
         self._source = cv2.VideoCapture(name_for_ffmpeg(path), cv2.CAP_FFMPEG)
         if not self._source.isOpened():
             raise InputError(f"{path}: not a readable video; convert it to MP4 (H.264) or AVI (MJPEG)")
