@@ -185,6 +185,13 @@ def physics_iq_section(submission: Submission, rows: Sequence[ViewRow], folder: 
     notices = list(submission.problems)
     if rows and not complete:
         notices.append(f"of {len(rows)} of {VIEWS} views: not the benchmark's score, which is of all")
+    # A still video overlaps with a recording in which the masks find no motion, and with no other.
+    calm = sum(row.still["spatial_iou"] == 1.0 for row in rows)
+    if calm:
+        notices.append(
+            f"in {calm} of {len(rows)} views nothing moves in the real video by the measures' threshold: a video that "
+            "stands still has full overlaps there"
+        )
     if not rows:
         text = (
             f"{len(submission.videos)} videos at {submission.fps:g} a second in {folder.name}, checked and not compared"

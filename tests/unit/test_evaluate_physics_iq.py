@@ -64,6 +64,17 @@ def test_a_complete_folder_gives_the_table(folders, tmp_path, capsys):
     assert values["spatial_iou"]["still"] == 0 < values["spatial_iou"]["value"]
 
 
+def test_recordings_in_which_the_masks_see_no_motion_are_said(folders, tmp_path):
+    ours, benchmark = folders
+    for path in benchmark.rglob("0001_*.mp4"):
+        path.unlink()
+        clip(path, 10, fps=30.0, speed=0)
+    for path in sorted(ours.iterdir())[2:]:
+        path.unlink()
+    found = evaluate_physics_iq(ours, benchmark=benchmark, out=tmp_path / "o")
+    assert any(text.startswith("in 1 of 2 views nothing moves in the real video") for text in found.notices)
+
+
 def test_a_real_take_in_our_place_has_the_best_score(folders, tmp_path):
     ours, benchmark = folders
     for path in ours.iterdir():
