@@ -98,16 +98,10 @@ def _read_glb(path: Path) -> TexturedMesh | None:
 
 def _parse(content: bytes) -> TexturedMesh | None:
     document, binary = glb_chunks(content)
-    if document.get("extensionsRequired"):
+    found = _only_primitive(document)
+    if found is None:
         return None
-    instances = mesh_instances(document)
-    if len(instances) != 1:
-        return None
-    (mesh_index, matrix) = instances[0]
-    primitives = listed_item(document, "meshes", mesh_index)["primitives"]
-    if len(primitives) != 1 or primitives[0].get("mode", _TRIANGLES) != _TRIANGLES:
-        return None
-    primitive = primitives[0]
+    primitive, matrix = found
     attributes = primitive["attributes"]
     vertices = accessor_values(document, binary, attributes["POSITION"], 3).astype(np.float64)
     vertices = transformed(vertices, matrix)
@@ -125,6 +119,20 @@ def _parse(content: bytes) -> TexturedMesh | None:
     faces = faces[:, ::-1].copy() if np.linalg.det(matrix[:3, :3]) < 0 else faces
     colours = _colours(document, binary, attributes, len(vertices))
     return TexturedMesh(vertices=vertices, faces=faces, uv=uv, picture=picture, colours=colours)
+
+
+def _only_primitive(document: dict[str, Any]) -> tuple[dict[str, Any], NDArray[np.float64]] | None:
+    """Return the triangles of the file's one mesh, and their transform (4, 4); None for another number of parts."""
+    if document.get("extensionsRequired"):
+        return None
+    instances = mesh_instances(document)
+    if len(instances) != 1:
+        return None
+    index, matrix = instances[0]
+    primitives = listed_item(document, "meshes", index)["primitives"]
+    if len(primitives) != 1 or primitives[0].get("mode", _TRIANGLES) != _TRIANGLES:
+        return None
+    return primitives[0], matrix
 
 
 def glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -276,9 +284,7 @@ def transformed(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDA
 
 Array = NDArray[np.float64]
 
-_FLOAT, _TRIANGLE_MODE = 5126, 4
-_MALFORMED = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_FLOAT = 5126
 _PLY_START = b"ply\nformat binary_little_endian 1.0\n"
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -338,16 +344,13 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
     """Return the file's bytes, or None for an unsupported layout: several meshes, positions shared or not 32-bit."""
     try:
         document, binary = glb_chunks(content)
-        instances = mesh_instances(document)
-        if document.get("extensionsRequired") or len(instances) != 1:
+        found = _only_primitive(document)
+        if found is None:
             return None
-        index, matrix = instances[0]
-        primitives = listed_item(document, "meshes", index)["primitives"]
-        if len(primitives) != 1 or primitives[0].get("mode", _TRIANGLE_MODE) != _TRIANGLE_MODE:
-            return None
-        attributes = primitives[0]["attributes"]
+        primitive, matrix = found
+        attributes = primitive["attributes"]
         buffer = bytearray(binary)
-        if "TANGENT" in attributes or primitives[0].get("targets"):
+        if "TANGENT" in attributes or primitive.get("targets"):
             return None
         # Duplicate vertices along a texture seam stay coincident to the last bit.
         before = accessor_values(document, binary, attributes["POSITION"], 3)
@@ -365,15 +368,13 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
             turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
             if not _overwrite(document, buffer, attributes["NORMAL"], _normals(local, turned, place)):
                 return None
-    except _MALFORMED:
+    except _GARBAGE:
         return None
     text = json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8")
     text += b" " * (-len(text) % 4)
     data = bytes(buffer) + bytes(-len(buffer) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data))
-    return (
-        head + struct.pack("<II", len(text), _JSON_CHUNK) + text + struct.pack("<II", len(data), _BINARY_CHUNK) + data
-    )
+    head = struct.pack("<4sII", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(data))
+    return head + struct.pack("<I4s", len(text), _JSON) + text + struct.pack("<I4s", len(data), _BINARY) + data
 
 
 def _overwrite(document: dict[str, Any], buffer: bytearray, index: Any, values: Array) -> bool:
