@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Points = NDArray[np.float64]
 
-CHUNK = 2_000_000
+CHUNK = 200_000
 """Pairs of triangle and pixel that are tested at a time."""
 NEAR = 1e-9
 """Triangles that come this near, as depth, are left out."""
@@ -53,7 +53,6 @@ def fragments(
     """
     width, height = size
     corner = at[faces]
-    a, b, c = corner[:, 0, :2], corner[:, 1, :2], corner[:, 2, :2]
     with np.errstate(invalid="ignore"):
         area = doubled_area(corner)
         low = np.maximum(np.ceil(corner[..., :2].min(axis=1) - 0.5), 0)
@@ -62,24 +61,29 @@ def fragments(
         kept = np.flatnonzero(
             use & (corner[..., 2] > NEAR).all(axis=1) & (np.abs(area) > 1e-12) & (span > 0).all(axis=1)
         )
-    counts = (span[kept, 0] * span[kept, 1]).astype(np.int64)
+    low, span, area = low[kept].astype(np.int64), span[kept].astype(np.int64), area[kept]
+    a, b, c = (corner[kept, k, :2] for k in range(3))
+    edges = [(p, q - p) for p, q in ((b, c), (c, a), (a, b))]
+    counts = span[:, 0] * span[:, 1]
     ends = np.cumsum(counts)
     start = 0
     while start < len(kept):
         done = ends[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
-        part, number = kept[start:stop], counts[start:stop]
-        face = np.repeat(part, number)
-        offset = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
-        columns = (low[face, 0] + offset % span[face, 0]).astype(np.int64)
-        rows = (low[face, 1] + offset // span[face, 0]).astype(np.int64)
-        x, y = columns + 0.5, rows + 0.5
-        flat = np.empty((len(face), 3))
-        for k, (first, second) in enumerate(((b, c), (c, a), (a, b))):
-            p, q = first[face], second[face]
-            flat[:, k] = ((q[:, 0] - p[:, 0]) * (y - p[:, 1]) - (q[:, 1] - p[:, 1]) * (x - p[:, 0])) / area[face]
-        inside = (flat >= -1e-9).all(axis=1)
-        yield face[inside], (rows * width + columns)[inside], flat[inside]
+        face = np.repeat(np.arange(start, stop), counts[start:stop])
+        offset = np.arange(done, ends[stop - 1]) - (ends - counts)[face]
+        rows = offset // span[face, 0]
+        columns = offset - rows * span[face, 0] + low[face, 0]
+        rows += low[face, 1]
+        flat: list[Points] = []
+        # What one edge leaves out, the next needs not look at.
+        for p, way in edges:
+            x, y = columns + 0.5 - p[face, 0], rows + 0.5 - p[face, 1]
+            flat.append((way[face, 0] * y - way[face, 1] * x) / area[face])
+            inside = flat[-1] >= -1e-9
+            face, rows, columns = face[inside], rows[inside], columns[inside]
+            flat = [values[inside] for values in flat]
+        yield kept[face], rows * width + columns, np.stack(flat, axis=1)
         start = stop
 
 
@@ -112,7 +116,7 @@ def rasterise(at: Points, faces: Ints, size: tuple[int, int], use: NDArray[np.bo
     """Return the nearest triangles ``faces`` (T, 3) at the pixels of a grid of ``size`` (width, height).
 
     at: (N, 3) x, y in pixels and depth of the vertices, as in ``fragments``. use: (T,) which triangles are drawn, all
-    by default. Among equal depths the first triangle of a batch wins.
+    by default. Among equal depths the first triangle wins.
     """
     width, height = size
     depths = at[:, 2][faces]

@@ -141,3 +141,29 @@ def test_texture_colours_and_plain_meshes_are_all_shown():
     body = turntable.turned(flat, np.array([0.0, -3.0, 0.0]))
     view = turntable.view(body, 30.0, side=40)
     assert (np.abs(view.body[view.cover > 0.99].astype(int) - (10, 200, 30)) <= 1).all()
+
+
+def test_the_nearest_triangle_is_seen_as_by_rays_and_of_equals_the_first():
+    generator = np.random.default_rng(5)
+    at = np.column_stack([generator.uniform(-5, 45, (30, 2)), generator.uniform(1, 3, 30)])
+    faces = generator.integers(0, 30, (25, 3))
+    faces = np.concatenate([faces, faces])
+    shown = rasterise(at, faces, (40, 30))
+    found = np.full((30, 40), -1)
+    found[shown.rows, shown.columns] = shown.faces
+    depth = np.full((30, 40), np.inf)
+    depth[shown.rows, shown.columns] = shown.depth
+    places = np.stack(np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5), axis=-1)
+    nearest, first = np.full((30, 40), np.inf), np.full((30, 40), -1)
+    for number, (a, b, c) in enumerate(at[faces]):
+        if abs(np.linalg.det(np.stack([b - a, c - a])[:, :2])) < 1e-9:
+            continue
+        # 1 / depth is linear on the screen.
+        st = np.linalg.solve(np.stack([b - a, c - a])[:, :2].T, (places - a[:2])[..., None])[..., 0]
+        inside = (st >= 0).all(axis=-1) & (st.sum(axis=-1) <= 1)
+        here = 1 / (1 / a[2] + st @ (1 / np.array([b[2], c[2]]) - 1 / a[2]))
+        closer = inside & (here < nearest - 1e-12)
+        nearest[closer], first[closer] = here[closer], number
+    assert (first >= 0).mean() > 0.5 and first.max() < 25
+    assert np.array_equal(found, first)
+    np.testing.assert_allclose(depth, nearest, rtol=1e-12)
