@@ -7,8 +7,9 @@ needed. Schemas: openusd.org, UsdPhysics, UsdGeom, UsdShade.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,7 +85,7 @@ def export_usd(
     if file.exists():
         raise InputError(f"{file}: is there already; choose another name")
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Tf, Usd, UsdGeom
     except ImportError:
         raise InputError("export to USD needs usd-core: pip install 'physgen[usd]'") from None
     if bake is not None and bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
@@ -101,13 +102,33 @@ def export_usd(
     writer = _Writer(stage, scene, bake, file, cancelled)
     writer.write()
     # Only now: a texture or a file is never left of an export that failed.
-    for path, content in writer.pictures.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, content)
-    with replacing(file) as partial:
-        if not stage.GetRootLayer().Export(str(partial)):
+    with replacing(file) as partial, _written(writer.pictures):
+        try:
+            good = stage.GetRootLayer().Export(str(partial))
+        except Tf.ErrorException:
+            good = False
+        if not good:
             raise InputError(f"{file}: cannot be written; free space or choose another folder")
     return tuple(writer.notes)
+
+
+@contextlib.contextmanager
+def _written(pictures: dict[Path, bytes]) -> Iterator[None]:
+    """Have ``pictures`` written; those that were not there before go again if this fails."""
+    new = [path for path in pictures if not path.exists()]
+    try:
+        for path, content in pictures.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, content)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for path in new:
+                path.unlink(missing_ok=True)
+                # Unless there is something else in it.
+                if not any(path.parent.iterdir()):
+                    path.parent.rmdir()
+        raise
 
 
 class _Writer:

@@ -206,6 +206,24 @@ def test_what_cannot_be_written_is_one_line(scene, bake, tmp_path, capsys, monke
     assert not (tmp_path / "y.usda").exists()
 
 
+FULL_DISK = """
+import resource, sys
+from physgen.batch.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+sys.exit(main(["export", sys.argv[1], "--usd", sys.argv[2]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
+@pytest.mark.parametrize("ending", ["usda", "usdc"])
+def test_a_disk_that_is_full_is_one_line_and_keeps_no_texture(scene, tmp_path, ending):
+    before = set(tmp_path.rglob("*"))
+    command = [sys.executable, "-c", FULL_DISK, str(scene.root), str(tmp_path / f"x.{ending}")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 3 and "cannot be written" in done.stderr and done.stderr.count("\n") == 1
+    assert set(tmp_path.rglob("*")) == before
+
+
 def test_importing_it_needs_no_pxr():
     code = "import sys, physgen.sim.app.export_usd, physgen.batch.cli; assert 'pxr' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
