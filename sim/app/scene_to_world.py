@@ -22,7 +22,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive import COHERENT, GRANULAR, DeformableMaterial, RigidMaterial, cohesion_of, model_of
+from ..constitutive import COHERENT, GRANULAR, SHAPED, DeformableMaterial, RigidMaterial, cohesion_of, model_of
 from ..effects.registry import apply_effects
 from ..errors import InputError
 from ..memory import ENGINE_RESERVED, available_memory
@@ -41,7 +41,7 @@ from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
 from .matter_maps import factors_of, nearest_on_surface
-from .scene_to_world_checks import require_above_ground, resolve, separate, surface_warnings, vertices_at
+from .scene_to_world_checks import require_above_ground, resolve, separate, surface_warnings, thickness_in, vertices_at
 
 
 def engine_material(material: Material) -> DeformableMaterial | RigidMaterial:
@@ -165,6 +165,7 @@ def _named(contact: Contact, mixed: SurfaceContact) -> SurfaceContact:
 _SURFACES: WeakCache[ObjectMesh, Surface] = WeakCache()
 _SAMPLES: WeakCache[ObjectMesh, InteriorSample] = WeakCache()
 _WARNINGS: WeakCache[ObjectMesh, list[str]] = WeakCache()
+_THICKNESS: WeakCache[ObjectMesh, float | None] = WeakCache()
 
 JUMP = 1e-3
 """Share of its size by which a collider's motion may begin off the place of its mesh."""
@@ -235,7 +236,8 @@ def prepare_world(
     )
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):
-        warnings += _surface_warnings(mesh, item.name, cell)
+        deforms = item.role == "dynamic" and cohesion_of(item.material.law) == SHAPED
+        warnings += _surface_warnings(mesh, item.name, cell, deforms)
     if scene.ground is not None:
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
@@ -321,6 +323,7 @@ def _body(
         positions=sample.positions,
         volumes=sample.volumes,
         contact_radii=sample.contact_radii,
+        thickness=_thickness(item, mesh, cell),
         material=engine_material(item.material),
         surface=_surface(mesh),
         velocity=item.velocity,
@@ -410,8 +413,18 @@ def _surface(mesh: ObjectMesh) -> Surface:
     return _SURFACES.get(mesh, None, lambda: Surface(vertices=mesh.vertices, faces=mesh.faces))
 
 
-def _surface_warnings(mesh: ObjectMesh, name: str, cell: float) -> list[str]:
-    return _WARNINGS.get(mesh, (name, cell), lambda: surface_warnings(_surface(mesh), name, cell))
+def _surface_warnings(mesh: ObjectMesh, name: str, cell: float, deforms: bool) -> list[str]:
+    key = (name, cell, deforms)
+    return _WARNINGS.get(mesh, key, lambda: surface_warnings(_surface(mesh), name, cell, deforms=deforms))
+
+
+def _thickness(item: SceneObject, mesh: ObjectMesh, cell: float) -> float | None:
+    """Of matter that is thin all over and deforms, None of other. A shell is as thin as it is made."""
+    if cohesion_of(item.material.law) != SHAPED:
+        return None
+    if not item.fill:
+        return SHELL_CELLS * cell if item.shell_thickness is None else item.shell_thickness
+    return _THICKNESS.get(mesh, cell, lambda: thickness_in(_surface(mesh), cell))
 
 
 def _track(keys: Keys) -> Track | None:

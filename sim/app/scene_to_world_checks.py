@@ -22,12 +22,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import InputError
 from ..memory import available_memory, require_memory
-from ..mpm.bodies import BodyParticles
+from ..mpm.bodies import THIN_CELLS, BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import SAMPLING_BYTES
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES
-from ..mpm.geometry.mesh_checks import check_surface
+from ..mpm.geometry.mesh_checks import check_surface, thickness_of
 from ..mpm.geometry.signed_distance import DistanceLattice, overlap, signed_distance
+from ..mpm.geometry.triangles import bounding_faces, validated
 from ..mpm.solver_options import SolverOptions, centred
 from ..scene.bake_quality import Quality
 from ..scene.meshes import ObjectMesh
@@ -134,9 +135,20 @@ DEEPEST_CELLS = 1.0
 """Cells that a body may stand in the ground, or two in each other, at the start: contact pushes them out gently."""
 
 
-def surface_warnings(surface: Surface, name: str, cell: float) -> list[str]:
+THINNEST_CELLS = 0.5
+"""Cells from which on contact of a body that is thin all over and deforms is right."""
+
+
+def surface_warnings(surface: Surface, name: str, cell: float, *, deforms: bool) -> list[str]:
     """Return warnings about the mesh of object ``name``. Raises InputError for an unusable one."""
-    return [str(warning) for warning in check_surface(surface, name=f"object {name}", cell_size=cell)]
+    least = THINNEST_CELLS * cell if deforms else None
+    return list(check_surface(surface, name=f"object {name}", cell_size=cell, least_thickness=least))
+
+
+def thickness_in(surface: Surface, cell: float) -> float | None:
+    """Return the thickness in m of a body thin all over whose contact has to know it; None of others."""
+    points, triangles = validated(surface.vertices, surface.faces)
+    return thickness_of(points, bounding_faces(points, triangles).triangles, THIN_CELLS * cell)
 
 
 def require_above_ground(name: str, vertices: Array, ground: Ground, cell: float) -> None:

@@ -19,6 +19,9 @@ from .surface_contact import GROUND_NAME
 
 Vector = tuple[float, float, float]
 
+THIN_CELLS = 1.5
+"""Thickness in grid cells from which on a body's faces are found as those of any other."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BodyForces:
@@ -160,6 +163,10 @@ class BodyParticles:
     """Distance (N,) in metres at which a particle touches the ground: its distance to the body's surface, at most half
     the particle spacing, as ``sample_interior`` returns it. None takes half the cube root of the volume."""
 
+    thickness: float | None = None
+    """Metres across a body that is thin all over, a sheet or a rod; None of others. Its contact with other bodies that
+    deform then knows its faces, see ``deformable_contact``; its other contacts know them anyway."""
+
     velocity: Vector = (0.0, 0.0, 0.0)
     """Velocity of the centre of mass, m/s."""
 
@@ -207,6 +214,10 @@ class BodyParticles:
         )
         object.__setattr__(self, "contact_radii", radii)
         self._check_fields(len(positions))
+        thin = self.thickness
+        self._require(
+            thin is None or (math.isfinite(thin) and thin > 0), "thickness", thin, "give metres above 0, or None"
+        )
         for name in ("velocity", "spin"):
             vector = getattr(self, name)
             self._require(

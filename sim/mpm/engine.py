@@ -103,6 +103,7 @@ class Engine:
         self._names += ("slopes",) if models.volumetric else ()
         self._names += ("conformation",) if models.relaxing else ()
         self._several = several
+        self._thin = several and numbers.thin
         self.count = 0
         self.retries = 0
         self._table = upload_new(numbers.table)
@@ -411,6 +412,7 @@ class Engine:
             self._lanes,
             self._mean_fields > 0,
             self._blocks.any_overlap,
+            self._thin,
             self.rigid_bodies.count > 0,
             self.rigid_bodies.solved_together,
             self._blocks.any_near,

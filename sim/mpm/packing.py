@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive import FLUID, ROW, DeformableMaterial, ElasticMaterial
+from ..constitutive import FLUID, ROW, SHAPED, DeformableMaterial, ElasticMaterial
 from ..scene.units import Similarity
-from .bodies import BodyParticles
+from .bodies import THIN_CELLS, BodyParticles
 from .kernels import layout
 from .kernels.particle_transfer import GOAL, PIN
 from .rigid.rigid_bodies import LEAST_RECOVERY, RECOVERY_HEIGHT
@@ -26,7 +26,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class PackedWorlds:
-    """Parameters of worlds and fields as the kernels read them; ``layout`` names the columns."""
+    """Parameters of worlds and fields as the kernels read them; ``layout`` names the columns.
+
+    thin: whether a world needs the kernel for bodies that are thin all over.
+    """
 
     laws: int
     table: NDArray[np.float32]
@@ -36,6 +39,7 @@ class PackedWorlds:
     fields: NDArray[np.float32]
     touches: NDArray[np.float32]
     pairs: NDArray[np.float32]
+    thin: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +158,7 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
         fields=field_rows(all_places, [0.0] * len(all_places), [0.0] * len(all_places)),
         touches=np.asarray(touches, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
         pairs=np.asarray(pairs, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
+        thin=any(has_thin(place.setup, place.cells.scale) for place in all_places),
     )
 
 
@@ -231,9 +236,25 @@ def field_row(place: WorldSlot, body_index: int, start: float, end: float) -> ND
     row[layout.FULL_MASS] = full_mass(body) / scale**3
     if row[layout.FULL_MASS] > 0:
         row[layout.SOUND_SPEED_SQUARED] = (scale * body.material_at(start).wave_speed) ** 2
+    else:
+        row[layout.THICKNESS] = thin_cells(body, scale)
     row[layout.GOAL_STIFFNESS] = body.goal_stiffness
     row[layout.GOAL_DAMPING] = 2.0 * body.goal_damping * math.sqrt(body.goal_stiffness)
     return row.astype(np.float32)
+
+
+def thin_cells(body: BodyParticles, scale: float) -> float:
+    """``layout.THICKNESS`` of a body, with ``scale`` cells a metre; 0 of matter that loses its shape."""
+    if body.thickness is None or any(material.cohesion != SHAPED for material in body.materials_over_time):
+        return 0.0
+    cells = body.thickness * scale
+    return cells if cells < THIN_CELLS else 0.0
+
+
+def has_thin(setup: WorldSetup, scale: float) -> bool:
+    """Whether the world has a kernel for thin bodies: one is, and there are others that deform."""
+    soft = [body for body in setup.bodies if not body.rigid]
+    return len(soft) > 1 and any(thin_cells(body, scale) > 0 for body in soft)
 
 
 def full_mass(body: BodyParticles) -> float:

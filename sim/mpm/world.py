@@ -62,9 +62,10 @@ class Worlds:
         self.similarity = similarity or fit_similarity(
             [body.positions for body in self.setups[0].bodies], options=self.options
         )
-        members: dict[int, list[int]] = {}
+        cell = self.options.cell_size(self.similarity)
+        members: dict[tuple[int, bool], list[int]] = {}
         for number, setup in enumerate(self.setups):
-            members.setdefault(packing.laws_of(setup), []).append(number)
+            members.setdefault((packing.laws_of(setup), packing.has_thin(setup, 1.0 / cell)), []).append(number)
         self._members = tuple(members.values())
         self._groups = tuple(
             WorldGroup(

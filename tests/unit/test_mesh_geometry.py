@@ -14,7 +14,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.mpm.colliders import Surface
 from physgen.sim.mpm.geometry import mesh_checks
 from physgen.sim.mpm.geometry.mass_properties import MassProperties, mass_properties
-from physgen.sim.mpm.geometry.mesh_checks import check_surface, thin_share
+from physgen.sim.mpm.geometry.mesh_checks import check_surface, thickness_of, thin_share
 from physgen.sim.mpm.geometry.triangles import bounding_faces, validated
 from physgen.sim.mpm.rigid.collision_shapes import surface_points
 from scipy.spatial import cKDTree
@@ -218,6 +218,34 @@ def test_notices_name_the_object_and_the_defect():
     assert check_surface(plate, name="plate") == ()
     (line,) = check_surface(plate, name="plate", cell_size=0.05)
     assert "thinner than a grid cell of 0.05 m" in line
+
+
+def test_a_thin_solid_says_how_thick_it_should_be():
+    """One line with thickness, cells and remedy, and none where its contact is right; other bodies as ever."""
+    cell = 0.05
+    for thing in (box((1, 1, 0.01)), turned(box((1, 0.01, 0.01)))):
+        (line,) = check_surface(surface(thing), name="leaf", cell_size=cell, least_thickness=0.5 * cell)
+        assert line.startswith("leaf: 0.01 m thick, 0.2 grid cells of 0.05 m")
+        assert "make it 0.025 m thick or more" in line and "cells 0.4 times as large or less" in line
+    sheet = surface(box((1, 1, 0.03)))
+    assert check_surface(sheet, name="leaf", cell_size=cell, least_thickness=0.5 * cell) == ()
+    both = joined(box((1, 1, 1)), box((1, 1, 0.01), at=(0, 0, 2)))
+    (line,) = check_surface(both, name="thing", cell_size=cell, least_thickness=0.5 * cell)
+    assert "thinner than a grid cell" in line
+
+
+def test_the_thickness_is_that_of_sheets_and_rods_and_no_other_body():
+    def thick(thing, limit):
+        points, triangles = validated(thing.vertices, thing.faces)
+        return thickness_of(points, bounding_faces(points, triangles).triangles, limit)
+
+    assert thick(surface(turned(box((1, 1, 0.03)))), 0.1) == pytest.approx(0.03, rel=1e-6)
+    assert thick(surface(turned(box((1, 0.04, 0.04)))), 0.1) == pytest.approx(0.04, rel=1e-6)
+    tube = surface(trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64))
+    assert thick(tube, 0.08) == pytest.approx(0.05, rel=0.02)
+    assert thick(surface(box((1, 1, 0.03))), 0.02) is None
+    assert thick(surface(ball()), 0.3) is None
+    assert thick(joined(box((1, 1, 1)), box((1, 1, 0.02), at=(0, 0, 2))), 0.1) is None
 
 
 def test_unusable_surfaces_are_input_errors_that_name_the_thing():

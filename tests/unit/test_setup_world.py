@@ -49,6 +49,11 @@ def away(x):
     return ((1.0, 0.0, 0.0, x), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
+def lifted(z):
+    """A place z m up."""
+    return ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, z), (0.0, 0.0, 0.0, 1.0))
+
+
 def test_a_rigid_ball_has_its_mesh(world):
     body = estimate_bake(world({"material": load_preset("wood")}), OPTIONS).setup.bodies[0]
     assert body.rigid and isinstance(body.material, RigidMaterial) and body.material.density == 550.0
@@ -96,6 +101,27 @@ def test_a_shell_weighs_what_its_thickness_says(world):
     assert from_middle.min() > inner - 0.003 * RADIUS
     with pytest.raises(InputError, match=r"object ball0: shell_thickness.*spacing"):
         estimate_bake(world({"fill": False, "shell_thickness": 0.001}), OPTIONS)
+
+
+@pytest.mark.parametrize(("millimetres", "told"), [(1.5, True), (8.0, False)])
+def test_a_leaf_has_its_thickness_and_says_when_it_is_too_thin(world, millimetres, told):
+    """Beside a ball, whose cells are 8 to 9 mm: a sheet is thin, a ball is not; the line names object and remedy."""
+    folder = world()
+    trimesh.creation.box((0.1, 0.1, millimetres / 1000)).export(folder.root / "meshes" / "leaf.glb")
+    leaf = SceneObject(
+        name="leaf", mesh="meshes/leaf.glb", size_m=0.1, material=load_preset("soft"), world_from_mesh=lifted(0.2)
+    )
+    model = dataclasses.replace(folder.model, objects=(*folder.model.objects, leaf))
+    prepared = estimate_bake(save_scene(folder.root, model), OPTIONS)
+    ball, sheet = prepared.setup.bodies
+    assert ball.thickness is None
+    assert sheet.thickness == pytest.approx(millimetres / 1000, rel=1e-3)
+    lines = [line for line in prepared.warnings if "leaf" in line]
+    assert len(lines) == told
+    if told:
+        assert "object leaf: 0.0015 m thick" in lines[0] and "or bake with a finer quality" in lines[0]
+        half = 0.5 * prepared.solver.cell_size(prepared.similarity)
+        assert f"make it {half:.2g} m thick" in lines[0]
 
 
 def test_colliders_move_as_the_scene_says(world):
@@ -225,7 +251,8 @@ def test_bodies_that_come_in_at_different_times_keep_their_shape(world):
 @pytest.mark.parametrize("kind", ["thin", "self-intersecting"])
 def test_odd_meshes_are_told_by_name(world, kind):
     folder = world()
-    mesh = trimesh.creation.box((0.1, 0.1, 0.002))
+    # Alone it has cells of 2.4 mm, and contact of soft sheets is right from half a cell on.
+    mesh = trimesh.creation.box((0.1, 0.1, 0.001))
     if kind == "self-intersecting":
         ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
         mesh = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.04, 0, 0))])

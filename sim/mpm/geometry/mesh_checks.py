@@ -40,10 +40,17 @@ THIN_SHARE = 0.02
 """Share of a surface that may be thin without a warning."""
 
 
-def check_surface(surface: Surface, *, name: str, cell_size: float | None = None) -> tuple[str, ...]:
+ALL_OVER = 0.75
+"""Share of a surface behind which a body is thin that is thin all over: a sheet or a rod but for its rims."""
+
+
+def check_surface(
+    surface: Surface, *, name: str, cell_size: float | None = None, least_thickness: float | None = None
+) -> tuple[str, ...]:
     """Return warnings about a surface of a body or collider called ``name``, in sentences; nothing is changed.
 
     cell_size: metres; says in addition where the surface is thinner than that.
+    least_thickness: metres; of what is thin all over it says so below this only, None: below ``cell_size``.
 
     Raises InputError where it cannot be used at all: no faces with area, not closed, no volume.
     """
@@ -81,8 +88,17 @@ def check_surface(surface: Surface, *, name: str, cell_size: float | None = None
             "very dense or tangled: simplify it (in Blender: Decimate or Remesh modifier)"
         )
     if cell_size is not None:
-        share = thin_share(points, found.triangles, cell_size)
-        if share > THIN_SHARE:
+        depths = inward_depths(points, found.triangles, cell_size)
+        share = float(np.isfinite(depths).mean())
+        thickness = _thickness(depths)
+        if thickness is not None and least_thickness is not None:
+            if thickness < least_thickness:
+                warnings.append(
+                    f"{name}: {thickness:.2g} m thick, {thickness / cell_size:.2g} grid cells of {cell_size:.2g} m; "
+                    f"other soft objects may sink into it or pass: make it {least_thickness:.2g} m thick or more, "
+                    f"or bake with a finer quality, with cells {thickness / least_thickness:.2g} times as large or less"
+                )
+        elif share > THIN_SHARE:
             warnings.append(
                 f"{name}: {100 * share:.0f} % of the surface is thinner than a grid cell of {cell_size:g} m; contact "
                 "there is inexact: thicken it or bake with a finer quality"
@@ -184,19 +200,45 @@ def _pierces(start: Array, end: Array, corners: Array, beyond: Array, least: flo
     return result
 
 
+def thickness_of(points: Array, outward: Faces, limit: float) -> float | None:
+    """Return the thickness in metres of a closed surface that is thin all over, None where it is not below ``limit``.
+
+    points, outward: see ``thin_share``. The median of what is straight inward from places all over the surface.
+    """
+    corners = points[outward]
+    area = float(face_normals(corners)[1].sum())
+    volume = abs(float(np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum())) / 6
+    # A sheet is 2 V / A thick, a rod twice as thick: most bodies need no closer look.
+    if not area > 0 or 2 * volume / area > limit:
+        return None
+    return _thickness(inward_depths(points, outward, limit))
+
+
+def _thickness(depths: Array) -> float | None:
+    thin = np.isfinite(depths)
+    return float(np.median(depths[thin])) if thin.mean() >= ALL_OVER else None
+
+
 def thin_share(points: Array, outward: Faces, cell_size: float) -> float:
     """Return the share of a closed surface, 0 to 1, behind which the body is thinner than ``cell_size`` metres.
 
-    points: (V, 3); outward: (T, 3), see ``bounding_faces``. Measured straight inward from 2000 places spread evenly
-    over the surface, or fewer where that is too much work. Raises InputError on a cell size that is not above 0.
+    points: (V, 3); outward: (T, 3), see ``bounding_faces``. Raises InputError on a cell size that is not above 0.
+    """
+    return float(np.isfinite(inward_depths(points, outward, cell_size)).mean())
+
+
+def inward_depths(points: Array, outward: Faces, cell_size: float) -> Array:
+    """Return how far in metres it is to the other side (S,), inf where it is farther than ``cell_size``.
+
+    Measured straight inward from 2000 places spread evenly over the surface, or fewer where that is too much work.
     """
     if not (math.isfinite(cell_size) and cell_size > 0):
         raise InputError(f"cell_size is {cell_size!r}: give metres above 0")
     corners = points[outward]
     size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     normals, area = face_normals(corners)
-    if cell_size > 2 * size:
-        return 1.0
+    # Farther than the body is large there is nothing to find.
+    cell_size = min(cell_size, 2 * size)
     number = np.arange(THIN_SAMPLES)
     face = np.searchsorted(np.cumsum(area), (number + 0.5) / THIN_SAMPLES * area.sum())
     face = np.minimum(face, len(area) - 1)
@@ -212,7 +254,7 @@ def thin_share(points: Array, outward: Faces, cell_size: float) -> float:
     work = tree.query_ball_point(middle, reach, return_length=True)
     every = max(1, -(-int(work.sum()) // MAX_NEIGHBOURS))
     looked = np.arange(0, THIN_SAMPLES, every)
-    thin = np.zeros(THIN_SAMPLES, dtype=np.bool_)
+    depths = np.full(THIN_SAMPLES, np.inf)
     for begin in range(0, len(looked), 100):
         some = looked[begin : begin + 100]
         lists = tree.query_ball_point(middle[some], reach)
@@ -222,5 +264,9 @@ def thin_share(points: Array, outward: Faces, cell_size: float) -> float:
         ray, piece = ray[distinct], piece[distinct]
         beyond = np.repeat(normals[owner[piece], None], 3, axis=1)
         hit = _pierces(start[ray], end[ray], pieces[piece], beyond, 1e-9 * size)
-        thin[ray[hit]] = True
-    return float(thin[looked].mean())
+        ray, hit_pieces = ray[hit], pieces[piece[hit]]
+        across = face_normals(hit_pieces)[0]
+        height = np.einsum("ni,ni->n", across, start[ray] - hit_pieces[:, 0])
+        slope = np.einsum("ni,ni->n", across, normals[face[ray]])
+        np.minimum.at(depths, ray, np.abs(height / np.where(slope != 0, slope, 1.0)))
+    return depths[looked]

@@ -19,6 +19,15 @@ all directions. With the normal n from the gradients of both shares, gap = d_a +
 or, for the share e of it (the pair's restitution), j from a spring on the overlap, as in ``particle_contact``.
 They are equal and opposite and act at one point: momentum and angular momentum are exact. Edges and corners fill
 less of their surroundings than faces do and count as rounded, by about a third of a cell.
+
+**Thin bodies** never fill a node's surroundings. A sheet of thickness t fills, at the distance s from its middle,
+
+    g(s) = f(s - t/2) - f(s + t/2),
+
+a strip or rod a part of it. The ratio g / |g'| knows neither that part nor how much the body is stretched; it falls
+with s, so that share and gradient at a node give s, and s - t/2 is the distance. g looks alike from both sides. Where
+the shares of both bodies rise in the same direction the node lies behind the thin one, which touches with the face on
+its other side: its distance is -(s + t/2), its normal the other way round.
 """
 
 import taichi as ti
@@ -31,11 +40,13 @@ from .layout import (
     BLOCK_NODES,
     CONTROL_ROW,
     FIELD_INTEGERS,
+    FIELD_ROW,
     FIELDS,
     FIRST_FIELD,
     FIRST_PAIR,
     FIXED_ONE,
     FULL,
+    FULL_MASS,
     MODE,
     PHASE,
     RECOVERY_SPEED,
@@ -46,6 +57,7 @@ from .layout import (
     SPREAD,
     STEP,
     STICKING,
+    THICKNESS,
     TOUCH_ROW,
     WINDOW_NODES,
     WORLD,
@@ -56,6 +68,18 @@ from .layout import (
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
 from .windows import add_to, clear_window, gathered, store_window, sum_chosen_windows, weights
+
+SWEEPS = 8
+"""Passes over the pairs of bodies at a node where three or more meet and some are thin."""
+
+BISECTIONS = 10
+"""Halvings of 2 cells or so: to 0.002 cells."""
+
+LEAST_SLOPE = 0.05
+"""Gradient (1/cell) of a share below which it tells no direction: that of a half-space 1.2 cells away."""
+
+MOST_SHARE = 0.6
+"""Share of a thick body at a node that may lie behind a thin one which touches it; 0.5 where nothing overlaps."""
 
 LEAST_SHARE = 0.0026
 """Share below which a body is too far from the node (1.25 cells) for a distance."""
@@ -74,6 +98,51 @@ def distance_of_share(share: ti.f32):
         for _ in ti.static(range(3)):
             d -= (0.5 - 0.75 * d + d * d * d / 3.0 - outside) / (d * d - 0.75)
     return ti.select(q > 0.5, -d, d)
+
+
+@ti.func
+def share_of_distance(d: ti.f32):
+    """The share f(d) of a node's surroundings that a half-space fills whose face is ``d`` cells away; see above."""
+    outside = ti.min(ti.abs(d), 1.5)
+    far = 1.5 - outside
+    q = far * far * far / 6.0
+    if outside < 0.5:
+        q = 0.5 - 0.75 * outside + outside * outside * outside / 3.0
+    return ti.select(d < 0.0, 1.0 - q, q)
+
+
+@ti.func
+def slope_of_distance(d: ti.f32):
+    """-f'(d) (1/cell), how steeply that share falls."""
+    outside = ti.abs(d)
+    slope = 0.75 - outside * outside
+    if outside > 0.5:
+        slope = 0.5 * ti.max(1.5 - outside, 0.0) ** 2
+    return slope
+
+
+@ti.func
+def distance_from_middle(share: ti.f32, slope: ti.f32, thickness: ti.f32):
+    """Distance in cells from the middle of a thin body whose share at a node is ``share`` and falls by ``slope``."""
+    near, far = 0.0, 1.5 + 0.5 * thickness
+    for _ in range(BISECTIONS):
+        s = 0.5 * (near + far)
+        g = share_of_distance(s - 0.5 * thickness) - share_of_distance(s + 0.5 * thickness)
+        falls = slope_of_distance(s - 0.5 * thickness) - slope_of_distance(s + 0.5 * thickness)
+        if g * slope > share * falls:
+            near = s
+        else:
+            far = s
+    return 0.5 * (near + far)
+
+
+@ti.func
+def slope_along(slope: vec3, other: vec3, thick: ti.i32):
+    """How steeply a thin body's share changes across its face: along the other body's slope where that one is thick."""
+    steep = slope.norm()
+    if thick == 1 and other.norm() > LEAST_SLOPE:
+        steep = ti.abs(slope.dot(other)) / other.norm()
+    return steep
 
 
 @func
@@ -154,20 +223,34 @@ def gather_shares(
 
 
 @func
-def separate(lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays):
-    """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``."""
+def separate(
+    thin: ti.template(),
+    lanes: ti.template(),
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
+):
+    """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``; ``thin``: some
+    fields are thin bodies."""
     share = ti.static(BLOCK_NODES if lanes.parallel else SPREAD)
     for ss in range(overlap.lead_count * share):
         if ti.static(lanes.parallel):
-            separate_node(overlap.leads[ss // share], ss % share, worlds, grid, overlap, nodes)
+            separate_node(thin, overlap.leads[ss // share], ss % share, worlds, grid, overlap, nodes)
         elif ss % share == 0:
             for i in range(BLOCK_NODES):
-                separate_node(overlap.leads[ss // share], i, worlds, grid, overlap, nodes)
+                separate_node(thin, overlap.leads[ss // share], i, worlds, grid, overlap, nodes)
 
 
 @func
 def separate_node(
-    lead: ti.i32, i: ti.i32, worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, nodes: NodeArrays
+    thin: ti.template(),
+    lead: ti.i32,
+    i: ti.i32,
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
 ):
     """The same at node ``i`` of the fields' blocks in the place of the block ``lead``."""
     f = grid.field[lead]
@@ -178,24 +261,55 @@ def separate_node(
         recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
         first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
         count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
-        a = lead
-        while overlap.mate[a] >= 0:
-            b = overlap.mate[a]
-            while b >= 0:
-                pair = (
-                    worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
-                    + (grid.field[a] - first) * count
-                    + (grid.field[b] - first)
-                ) * TOUCH_ROW
-                na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
-                if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
-                    sa, sb = (
-                        nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
-                        nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
-                    )
+        if ti.static(thin):
+            # What is light between heavy bodies takes one push and the other in turn.
+            sweeps = 1
+            if overlap.mate[lead] >= 0 and overlap.mate[overlap.mate[lead]] >= 0:
+                sweeps = SWEEPS
+            for _ in range(sweeps):
+                separate_pairs(thin, lead, i, w, first, count, dt, recovery, worlds, grid, overlap, nodes)
+        else:
+            separate_pairs(thin, lead, i, w, first, count, dt, recovery, worlds, grid, overlap, nodes)
+
+
+@func
+def separate_pairs(
+    thin: ti.template(),
+    lead: ti.i32,
+    i: ti.i32,
+    w: ti.i32,
+    first: ti.i32,
+    count: ti.i32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
+):
+    """Pass once over all pairs of fields at node ``i``."""
+    a = lead
+    while overlap.mate[a] >= 0:
+        b = overlap.mate[a]
+        while b >= 0:
+            pair = (
+                worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
+                + (grid.field[a] - first) * count
+                + (grid.field[b] - first)
+            ) * TOUCH_ROW
+            na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
+            if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
+                sa, sb = (
+                    nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
+                    nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
+                )
+                if ti.static(thin):
+                    fa, fb = grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW
+                    exchange_thin(fa, fb, na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
+                else:
                     exchange(na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
-                b = overlap.mate[b]
-            a = overlap.mate[a]
+            b = overlap.mate[b]
+        a = overlap.mate[a]
 
 
 @func
@@ -216,30 +330,94 @@ def exchange(
     if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE and length > 1e-6:
         normal /= length
         gap = distance_of_share(sa[3]) + distance_of_share(sb[3])
-        ua, ub = nodes.velocity[na], nodes.velocity[nb]
-        relative = vec3(ua[0] - ub[0], ua[1] - ub[1], ua[2] - ub[2])
-        closing = relative.dot(normal)
-        wanted = parting_speed(gap, dt, recovery)
-        mode = ti.cast(worlds.pairs[pair + MODE], ti.i32)
-        elastic = worlds.pairs[pair + RESTITUTION]
-        push = (1.0 - elastic) * ti.max(0.0, closing + wanted) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
-        touching = push > 0.0
-        if mode != SEPARATE and gap < HOLD:
-            push = closing
-            touching = True
-        if touching:
-            rub = relative - closing * normal
-            if mode == SLIP:
-                rub *= 0.0
-            elif mode == SEPARATE:
-                rub = coulomb(rub, push, worlds.pairs[pair + STICKING], worlds.pairs[pair + SLIDING])
-            change = push * normal + rub
-            ma, mb = nodes.mass[na], nodes.mass[nb]
-            part = mb / (ma + mb)
-            nodes.velocity[na] = vec4(
-                ua[0] - part * change[0], ua[1] - part * change[1], ua[2] - part * change[2], ua[3]
-            )
-            part = ma / (ma + mb)
-            nodes.velocity[nb] = vec4(
-                ub[0] + part * change[0], ub[1] + part * change[1], ub[2] + part * change[2], ub[3]
-            )
+        push_apart(na, nb, normal, gap, pair, dt, recovery, worlds, nodes)
+
+
+@func
+def thickness_of(row: ti.i32, worlds: WorldArrays):
+    """Cells across the body whose field's numbers start at ``row``; 0 where it is not thin."""
+    t = 0.0
+    if worlds.field_numbers[row + FULL_MASS] == 0.0:
+        t = worlds.field_numbers[row + THICKNESS]
+    return t
+
+
+@func
+def exchange_thin(
+    fa: ti.i32,
+    fb: ti.i32,
+    na: ti.i32,
+    nb: ti.i32,
+    sa: vec4,
+    sb: vec4,
+    pair: ti.i32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    worlds: WorldArrays,
+    nodes: NodeArrays,
+):
+    """As ``exchange`` where bodies may be thin; ``fa`` and ``fb``: where the rows of both fields start."""
+    if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE:
+        slope_a, slope_b = vec3(sa[0], sa[1], sa[2]), vec3(sb[0], sb[1], sb[2])
+        ta, tb = thickness_of(fa, worlds), thickness_of(fb, worlds)
+        da, db, middle_a, middle_b = 0.0, 0.0, 1e9, 1e9
+        if ta > 0.0:
+            middle_a = distance_from_middle(sa[3], slope_along(slope_a, slope_b, ti.cast(tb == 0.0, ti.i32)), ta)
+            da = middle_a - 0.5 * ta
+        else:
+            da = distance_of_share(sa[3])
+        if tb > 0.0:
+            middle_b = distance_from_middle(sb[3], slope_along(slope_b, slope_a, ti.cast(ta == 0.0, ti.i32)), tb)
+            db = middle_b - 0.5 * tb
+        else:
+            db = distance_of_share(sb[3])
+        alike = slope_a.dot(slope_b) > 0.0 and ti.min(slope_a.norm(), slope_b.norm()) > LEAST_SLOPE
+        # Well inside a thick body its share may fall towards its other face.
+        if alike and middle_a < middle_b and (tb > 0.0 or sb[3] < MOST_SHARE):
+            da = -middle_a - 0.5 * ta
+            slope_a = -slope_a
+        elif alike and middle_b < 1e8 and (ta > 0.0 or sa[3] < MOST_SHARE):
+            db = -middle_b - 0.5 * tb
+            slope_b = -slope_b
+        normal = slope_b - slope_a
+        length = normal.norm()
+        if length > 1e-6:
+            push_apart(na, nb, normal / length, da + db, pair, dt, recovery, worlds, nodes)
+
+
+@func
+def push_apart(
+    na: ti.i32,
+    nb: ti.i32,
+    normal: vec3,
+    gap: ti.f32,
+    pair: ti.i32,
+    dt: ti.f32,
+    recovery: ti.f32,
+    worlds: WorldArrays,
+    nodes: NodeArrays,
+):
+    """Apply the impulse between nodes of surfaces ``gap`` cells apart; ``normal``: from the first to the second."""
+    ua, ub = nodes.velocity[na], nodes.velocity[nb]
+    relative = vec3(ua[0] - ub[0], ua[1] - ub[1], ua[2] - ub[2])
+    closing = relative.dot(normal)
+    wanted = parting_speed(gap, dt, recovery)
+    mode = ti.cast(worlds.pairs[pair + MODE], ti.i32)
+    elastic = worlds.pairs[pair + RESTITUTION]
+    push = (1.0 - elastic) * ti.max(0.0, closing + wanted) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
+    touching = push > 0.0
+    if mode != SEPARATE and gap < HOLD:
+        push = closing
+        touching = True
+    if touching:
+        rub = relative - closing * normal
+        if mode == SLIP:
+            rub *= 0.0
+        elif mode == SEPARATE:
+            rub = coulomb(rub, push, worlds.pairs[pair + STICKING], worlds.pairs[pair + SLIDING])
+        change = push * normal + rub
+        ma, mb = nodes.mass[na], nodes.mass[nb]
+        part = mb / (ma + mb)
+        nodes.velocity[na] = vec4(ua[0] - part * change[0], ua[1] - part * change[1], ua[2] - part * change[2], ua[3])
+        part = ma / (ma + mb)
+        nodes.velocity[nb] = vec4(ub[0] + part * change[0], ub[1] + part * change[1], ub[2] + part * change[2], ub[3])

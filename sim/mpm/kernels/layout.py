@@ -61,6 +61,9 @@ SUNK_LIMIT = 30
 # Mass (kg) of a cell that is full of the fluid that the field consists of, 0 where it is no fluid of one density.
 # SOUND_SPEED_SQUARED: of that fluid, cells²/s².
 FULL_MASS, SOUND_SPEED_SQUARED = 31, 32
+# THICKNESS: in the same place, of a field that is no such fluid: cells across a body that is thin all over, else 0;
+# see ``deformable_contact``. (Another length of the row makes other machine code, and other last bits, of all kernels.)
+THICKNESS = 32
 FIELD_ROW = 33
 
 FAR = 1e9

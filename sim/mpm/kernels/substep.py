@@ -66,8 +66,9 @@ def advance_grid_of(flowing: bool, parallel: bool, means: bool) -> BundledKernel
 
 
 @functools.cache
-def part_bodies_of(laws: int, lanes: Lanes) -> BundledKernel:
-    """Kernel of contact between deformable bodies for the set ``laws`` of constitutive models."""
+def part_bodies_of(laws: int, lanes: Lanes, thin: bool) -> BundledKernel:
+    """Kernel of contact between deformable bodies for the set ``laws`` of constitutive models; ``thin``: some are thin
+    all over."""
     models = law_set(laws)
 
     @kernel
@@ -85,7 +86,7 @@ def part_bodies_of(laws: int, lanes: Lanes) -> BundledKernel:
         gather_shares(lanes, worlds, grid, overlap, nodes)
         if ti.static(len(models.volumetric) > 0):
             leave_room(worlds, grid, overlap, nodes, flow)
-        separate(lanes, worlds, grid, overlap, nodes)
+        separate(thin, lanes, worlds, grid, overlap, nodes)
 
     return part_bodies
 
@@ -191,18 +192,26 @@ REPEATS, RIGID_REPEATS = 4, 32
 
 @functools.lru_cache(maxsize=32)
 def substep_launcher(
-    generation: int, laws: int, lanes: Lanes, means: bool, overlap: bool, bodies: bool, together: bool, near: bool
+    generation: int,
+    laws: int,
+    lanes: Lanes,
+    means: bool,
+    overlap: bool,
+    thin: bool,
+    bodies: bool,
+    together: bool,
+    near: bool,
 ) -> Launcher:
     """Launcher of a substep for worlds of these ``laws``, with the kernels that they need.
 
     generation: of the compute runtime; a launcher ends with it. means: some fields' means are wanted; overlap: several
-    fields overlap; bodies: there are rigid bodies or colliders; together: contacts of some worlds may be solved at
-    once; near: some particles are near the plane, a body or a collider, or are held.
+    fields overlap; thin: some are thin all over; bodies: there are rigid bodies or colliders; together: contacts of
+    some worlds may be solved at once; near: some particles are near the plane, a body or a collider, or are held.
     """
     # The serial kernels leave out by themselves what is not there; compiling them twice would cost more.
     kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
     if overlap:
-        kernels.append(part_bodies_of(laws, lanes))
+        kernels.append(part_bodies_of(laws, lanes, thin))
     fluid = bool(law_set(laws).volumetric)
     if fluid:
         kernels.append(crowd_fluids_of(overlap))
