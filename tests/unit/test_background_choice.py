@@ -236,3 +236,44 @@ def test_detail_of_a_large_hole_comes_in_stretches_from_beside_it():
         assert abs(slope(laid, rows) / slope(photo, rows) - 1.0) < 0.25
         assert laid[rows, 200:400].std() > 0.7 * photo[rows, 200:400].std()
     assert blurred[90:170, 200:400].std() < 0.4 * photo[90:170, 200:400].std()
+
+
+def shaded_table(seed, tilt, up):
+    """A table before a cluttered room, its left side slanting away, with an object over its far edge and shadow around,
+    ``up`` the room as well: logarithms, the object, the hole with the shadow, the edge's rows by columns."""
+    rng, (height, width) = np.random.default_rng(seed), (240, 300)
+    y, x = np.mgrid[:height, :width] + 0.5
+    edge = 95.0 + tilt * (x - width / 2)
+    grain = cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigmaX=15, sigmaY=1.2)
+    table = np.array((120.0, 75.0, 45.0)) * (1.0 + 0.06 * grain / grain.std())[..., None]
+    room = cv2.resize(rng.uniform(20, 240, size=(8, 9, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
+    photo = np.where(((y > edge) & (y - edge > 0.45 * (70.0 - x)))[..., None], table, room)
+    photo += rng.normal(scale=1.5, size=photo.shape)
+    thing = (np.abs(x - 160) < 36) & (y > 60) & (y < 165)
+    shade = ((np.abs(x - 160) < 40) & (y > 100)) | ((x < 160) & (x > 20) & (y > 135) & (y < 175))
+    if up:
+        shade |= (x > 150) & (x < 225) & (y > 70) & (y < 165)
+    photo *= 1.0 - 0.4 * cv2.GaussianBlur(shade.astype(float), (0, 0), 2)[..., None]
+    photo[thing] = 30.0
+    hole = cv2.dilate((thing | shade).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    return logarithms(np.clip(photo, 1, 255).astype(np.float32)), thing, hole, edge[0]
+
+
+@pytest.mark.parametrize(("seed", "tilt", "up"), [(1, 0.03, False), (3, -0.08, False), (3, 0.1, True)])
+def test_a_shadow_hides_no_edge(seed, tilt, up):
+    logs, thing, hole, true = shaded_table(seed, tilt, up)
+    hidden = cv2.dilate(thing.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    (edge,) = edges_behind(logs, hole, hidden, hole)
+    columns = np.flatnonzero(thing.any(axis=0))
+    # A pixel: the edge is sharp, and the photo is all that is known of it.
+    assert np.abs((edge.c - edge.a * (columns + 0.5)) / edge.b - true[columns]).max() < 1.0
+
+
+def test_the_border_of_a_shadow_is_no_edge():
+    shade = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    shade[70:] = True
+    thing = disc(100, 75, 24)
+    photo = wood(5, 130.0) * (1.0 - 0.5 * cv2.GaussianBlur(shade.astype(np.float32), (0, 0), 0.7))[..., None]
+    hole = cv2.dilate((thing | shade).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert len(edges_behind(logarithms(photo), hole, thing)) == 1
+    assert edges_behind(logarithms(photo), hole, thing, hole) == []

@@ -28,6 +28,8 @@ FEATHER = 4.0
 """Pixels at 1024 over which the inpainting fades into the photo, inside the hole only."""
 CLEAR = 2.0
 """Pixels beside an object that are mixed with it."""
+BESIDE = 3.0
+"""The same in pixels at 1024, for what is looked at beside an object inside its hole."""
 LEVEL, REACH = 3.0, 10.0
 """Pixels at 1024: blur in which levels are compared along the border, and depth over which a local difference is
 compensated."""
@@ -221,7 +223,7 @@ def fill_background(
         # Leftover shadow outside of the hole is neither a source nor a reference level.
         dark = leftover_shadow(logarithms(filling), part, open_hole | barred)
         shade |= dark
-        _fill_part(filling, part, open_hole, barred | dark, objects, changed, camera, options, notice)
+        _fill_part(filling, part, open_hole, barred, dark, objects, changed, camera, options, notice)
         open_hole &= ~part
     return blend(pixels, filling, hole, objects, shade)
 
@@ -243,14 +245,20 @@ def _fill_part(
     part: Mask,
     open_hole: Mask,
     barred: Mask,
+    dark: Mask,
     objects: Mask,
     changed: Mask | None,
     camera: Camera,
     options: FillOptions,
     notice: Notice,
 ) -> None:
-    """Inpaint the connected ``part`` of ``open_hole`` in ``filling``, in place, surface by surface."""
-    edges = edges_behind(logarithms(filling), part, open_hole | barred)
+    """Inpaint the connected ``part`` of ``open_hole`` in ``filling``, in place, surface by surface.
+
+    dark: shadow outside of the hole, which is no source.
+    """
+    covered = _widened(objects & open_hole, max(1, round(BESIDE * max(part.shape) / 1024))) | barred
+    edges = edges_behind(logarithms(filling), part, covered, open_hole | dark)
+    barred = barred | dark
     for side, ground in _sides(edges, part.shape):
         target = part & side
         if ground:

@@ -37,6 +37,16 @@ LEAST_ERROR = 0.02
 """Residual in logarithms below which surfaces are not distinguished better."""
 RIDGE = 1e-3
 """Regularisation of polynomials, relative to the data."""
+MOST_THINGS, LEAST_THING = 4, 0.05
+"""Most things in a hole around which edges are looked for, and the least size of one over the largest."""
+NEAR = 0.35
+"""Range beside what hides an edge in which it must be seen and is located, over the width of what hides it."""
+FEWEST = 0.05
+"""Least width on each side on which it must be seen, over the width of the window."""
+PENUMBRA = 12.0
+"""Pixels at 1024 inside a shadow's border in which it may still grow darker."""
+ALIKE_DIM = 0.25
+"""Difference in the share of shadow above which two pixels are not compared."""
 
 
 @dataclass(frozen=True)
@@ -57,21 +67,54 @@ class Edge:
         return np.asarray(self.height(shape) > 0.0)
 
 
-def edges_behind(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
+def edges_behind(logs: Picture, part: Mask, hidden: Mask, shaded: Mask | None = None) -> list[Edge]:
     """Return edges that pass behind ``part`` (H, W), at most ``MOST_EDGES``, none of which cross there.
 
-    logs: (H, W, 3) logarithms of the photo's values, valid where not ``closed``.
+    They are looked for around what hides them. A shadow does not: an edge is seen in it, and the hole that it makes is
+    often so large that its surroundings are all of the photo, whose lines are not straight from side to side. Its
+    border counts as no edge.
+
+    logs: (H, W, 3) logarithms of the photo's values, valid where not ``hidden``. shaded: (H, W) pixels that are seen in
+    shadow.
     """
-    rows, columns = _window(part)
-    known, inner = ~closed[rows, columns], part[rows, columns]
+    dark = np.zeros_like(part) if shaded is None else shaded & ~hidden
+    things = _things(part, hidden)
+    if dark.any():
+        side = 2 * max(1, round(PENUMBRA * max(part.shape) / 1024.0)) + 1
+        deep = cv2.erode((dark | hidden).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        hidden, dark = hidden | (dark & ~deep), dark & deep
+    for thing in things:
+        edges = _edges_near(logs, thing, hidden, dark)
+        if edges:
+            return edges
+    return []
+
+
+def _things(part: Mask, hidden: Mask) -> list[Mask]:
+    """What hides edges in ``part``, largest first; all of it where nothing does."""
+    covered = part & hidden
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(covered.astype(np.uint8), connectivity=8)
+    if count < 2:
+        return [part]
+    areas = stats[1:count, cv2.CC_STAT_AREA]
+    order = np.argsort(-areas, kind="stable")[:MOST_THINGS]
+    return [np.asarray(labels == index + 1) for index in order if areas[index] >= LEAST_THING * areas.max()]
+
+
+def _edges_near(logs: Picture, thing: Mask, hidden: Mask, shade: Mask) -> list[Edge]:
+    """Edges that pass behind ``thing`` (H, W)."""
+    rows, columns = _window(thing)
+    known, inner, dark = ~hidden[rows, columns], thing[rows, columns], shade[rows, columns]
     values = np.where(known[..., None], logs[rows, columns], 0.0).astype(np.float32)
-    small, seen, cut = _copy(values, known, inner, COARSE)
-    first = _best_line(small, seen, cut)
+    fine = _copy(values, known, inner, dark, FINE)
+    steps = _steps(*fine)
+    first = _best_line(*_copy(values, known, inner, dark, COARSE), steps)
     found: list[tuple[float, float]] = []
     if first is not None:
-        ratio = known.shape[0] / seen.shape[0]
-        found.append(_settled(values, known, (first[0] * ratio, first[1] * ratio), first[2], ratio))
-    found = _further_lines(values, known, inner, found, 0.0 if first is None else float(np.linalg.norm(first[2])))
+        ratio = known.shape[0] / fine[0].shape[0]
+        found.append(_settled(values, known, inner, (first[0] * ratio, first[1] * ratio), first[2], ratio))
+    strongest = 0.0 if first is None else float(np.linalg.norm(first[2]))
+    found = _further_lines(values, known, inner, dark, found, strongest)
     width = columns.stop - columns.start
     edges = []
     for left, right in found:
@@ -82,14 +125,17 @@ def edges_behind(logs: Picture, part: Mask, closed: Mask) -> list[Edge]:
     return edges
 
 
-def _copy(values: Picture, known: Mask, inner: Mask, side: int) -> tuple[Picture, Mask, Mask]:
-    """A copy (h, w, 3) of ``values`` whose longer side has ``side`` pixels, with what is known and the hole."""
+def _copy(values: Picture, known: Mask, inner: Mask, dark: Mask, side: int) -> tuple[Picture, Mask, Mask, Picture]:
+    """A copy (h, w, 3) of ``values`` whose longer side has ``side`` pixels, with what is known, the hole, and how much
+    of each pixel is in shadow (h, w)."""
     scale = min(1.0, side / max(known.shape))
     size = (max(8, round(known.shape[1] * scale)), max(8, round(known.shape[0] * scale)))
-    share, cut = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) for mask in (known, inner))
+    share, cut, dim = (
+        cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) for mask in (known, inner, dark)
+    )
     sums = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     small = np.asarray(sums / np.maximum(share, 1e-6)[..., None], dtype=np.float32)
-    return small, np.asarray(share > 0.9), np.asarray(cut > 0.5)
+    return small, np.asarray(share > 0.9), np.asarray(cut > 0.5), np.asarray(dim, dtype=np.float32)
 
 
 MOST_EDGES = 4
@@ -113,24 +159,23 @@ ground, whose lines are its pattern."""
 
 
 def _further_lines(
-    values: Picture, known: Mask, inner: Mask, found: list[tuple[float, float]], strongest: float
+    values: Picture, known: Mask, inner: Mask, dark: Mask, found: list[tuple[float, float]], strongest: float
 ) -> list[tuple[float, float]]:
     """``found`` and more lines, by the rows where they enter the window at the left and leave it at the right.
 
     Across each, the mean colours of narrow bands differ alike on both sides of the hole. strongest: jump of those
     found.
     """
-    small, seen, cut = _copy(values, known, inner, FINE)
+    small, seen, cut, dim = _copy(values, known, inner, dark, FINE)
     height, width = seen.shape
     ratio = known.shape[0] / height
     rows, columns = np.flatnonzero(cut.any(axis=1)), np.flatnonzero(cut.any(axis=0))
     if not len(rows) or height < 4 * BAND:
         return found
-    over, under, valid = _bands(small, seen)
+    over, under, valid = _bands(small, seen, dim)
     usual = float(np.median(np.linalg.norm(under - over, axis=-1)[valid])) if valid.any() else 0.0
     least = max(2.0 * STEP, UNUSUAL * usual)
-    reach = max(4, round(BESIDE * (columns[-1] + 1 - columns[0])))
-    x = np.arange(max(0, columns[0] - reach), min(width, columns[-1] + 1 + reach))
+    x = np.flatnonzero(_beside(cut, BESIDE))
     ends = np.arange(0.0, height + 0.5, 1.0)
     left, right = (grid.ravel() for grid in np.meshgrid(ends, ends, indexing="ij"))
     fits = np.abs(right - left) <= STEEP * width
@@ -172,18 +217,20 @@ def _further_lines(
         taken.append((float(left[index]), float(right[index])))
         step = (means[0][index] + means[1][index]).astype(np.float64) / 2.0
         ends_here = (float(left[index]) * ratio, float(right[index]) * ratio)
-        result.append(_settled(values, known, ends_here, step, ratio))
+        result.append(_settled(values, known, inner, ends_here, step, ratio))
     return result
 
 
-def _bands(small: Picture, seen: Mask) -> tuple[Picture, Picture, Mask]:
-    """Mean colours (h + 1, w, 3) of the bands over and under each line between rows, and whether both are known."""
+def _bands(small: Picture, seen: Mask, dim: Picture) -> tuple[Picture, Picture, Mask]:
+    """Mean colours (h + 1, w, 3) of the bands over and under each line between rows, and whether both are known and
+    alike in shadow."""
     height, width = seen.shape
     total = np.concatenate([np.zeros((1, width, 3)), np.cumsum(np.where(seen[..., None], small, 0.0), axis=0)])
     count = np.concatenate([np.zeros((1, width)), np.cumsum(seen, axis=0)])
     rows = np.arange(height + 1)
     top, bottom = np.maximum(rows - BAND, 0), np.minimum(rows + BAND, height)
     full = (count[rows] - count[top] == BAND) & (count[bottom] - count[rows] == BAND)
+    full &= np.abs(dim[np.maximum(rows - 1, 0)] - dim[np.minimum(rows, height - 1)]) < ALIKE_DIM
     over, under = (total[rows] - total[top]) / BAND, (total[bottom] - total[rows]) / BAND
     return over.astype(np.float32), under.astype(np.float32), np.asarray(full)
 
@@ -197,30 +244,40 @@ def _window(part: Mask) -> tuple[slice, slice]:
     )
 
 
-def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, NDArray[np.float64]] | None:
-    """Rows at which the best line enters at the left and leaves at the right, and the colour step down across it."""
+def _best_line(
+    small: Picture, known: Mask, cut: Mask, dim: Picture, steps: Steps
+) -> tuple[float, float, NDArray[np.float64]] | None:
+    """Rows at which the best of ``steps`` enters at the left and leaves at the right, and the colour step down across
+    it.
+
+    Surfaces are compared on this copy (h, w, 3), which is coarser than that of ``steps``.
+    """
     height, width = known.shape
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
-    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=-1)[known]
+    terms = [np.ones_like(x), x, y, x * y, x * x, y * y]
+    if dim[known].any():
+        # A surface's light is smooth but for its shadow.
+        terms.append(dim.astype(np.float64))
+    basis = np.stack(terms, axis=-1)[known]
     target = small[known].astype(np.float64)
     if len(basis) < 60 or not cut.any():
         return None
     at_y, at_x = (axis + 0.5 for axis in np.nonzero(known))
     cut_y, cut_x = (axis + 0.5 for axis in np.nonzero(cut))
     # Weak regularisation, so that a side of few pixels is not explained by an oscillating polynomial.
-    ridge = RIDGE * len(basis) * np.diag([0.0, 1, 1, 1, 1, 1])
+    ridge = RIDGE * len(basis) * np.diag([0.0] + [1.0] * (len(terms) - 1))
     powers = np.square(target).sum(axis=1)
     squares, products, power = basis.T @ basis, basis.T @ target, float(powers.sum())
 
     def left_over(squares: NDArray[np.float64], products: NDArray[np.float64]) -> float:
-        solved = np.linalg.solve(squares + ridge + 1e-9 * np.eye(6), products)
+        solved = np.linalg.solve(squares + ridge + 1e-9 * np.eye(len(terms)), products)
         return -float((products * solved).sum())
 
     def cost(error: float, count: int) -> float:
         """Negative log likelihood of ``count`` pixels with squared ``error`` in total."""
         return 0.5 * count * float(np.log(max(error, 0.0) / count + 3 * LEAST_ERROR**2))
 
-    changes = _changes(small, known, cut)
+    changes = steps.strongest(height)
     whole = cost(power + left_over(squares, products), len(basis))
     best: tuple[float, float, float] | None = None
     for left in range(1, height):
@@ -253,50 +310,94 @@ def _best_line(small: Picture, known: Mask, cut: Mask) -> tuple[float, float, ND
     near_below, near_above = (distance > 0.5) & (distance < 4), (distance < -0.5) & (distance > -4)
     if not near_below.any() or not near_above.any():
         return None
-    return best[1], best[2], target[near_below].mean(axis=0) - target[near_above].mean(axis=0)
+    ends = steps.within(height, int(best[1]), int(best[2]))
+    return *ends, target[near_below].mean(axis=0) - target[near_above].mean(axis=0)
 
 
-def _changes(small: Picture, known: Mask, cut: Mask) -> NDArray[np.float32]:
-    """Colour change (h, h) across lines, by the rows where they enter and leave, on the side of the hole where it is
-    smaller; negative if insufficient for an edge."""
+def _beside(cut: Mask, share: float) -> Mask:
+    """Columns (w,) of the hole ``cut`` (h, w) and ``share`` of its width beside it.
+
+    Farther away an edge may end, or bend in a wide lens.
+    """
+    columns = np.flatnonzero(cut.any(axis=0))
+    reach = max(4, round(share * (columns[-1] + 1 - columns[0])))
+    at = np.arange(cut.shape[1])
+    return np.asarray((at >= columns[0] - reach) & (at <= columns[-1] + reach))
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Lines (n,) by the rows where they enter and leave a copy of height ``height``, and the colour change (n,) across
+    each, on the side of the hole where it is smaller."""
+
+    left: NDArray[np.float64]
+    right: NDArray[np.float64]
+    change: NDArray[np.float64]
+    height: int
+
+    def _cells(self, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        ratio = height / self.height
+        return np.rint(self.left * ratio).astype(np.intp), np.rint(self.right * ratio).astype(np.intp)
+
+    def strongest(self, height: int) -> NDArray[np.float64]:
+        """The largest change (height + 1, height + 1) by the rows of a copy of ``height``; -1 without a line."""
+        result = np.full((height + 1, height + 1), -1.0)
+        np.maximum.at(result, self._cells(height), self.change)
+        return result
+
+    def within(self, height: int, left: int, right: int) -> tuple[float, float]:
+        """The line of the largest change that ``strongest`` counts there."""
+        rows = self._cells(height)
+        index = int(np.argmax(np.where((rows[0] == left) & (rows[1] == right), self.change, -1.0)))
+        return float(self.left[index]), float(self.right[index])
+
+
+def _steps(small: Picture, known: Mask, cut: Mask, dim: Picture) -> Steps:
+    """Lines across which the colours change on both sides of the hole ``cut`` (h, w)."""
     height, width = known.shape
+    left, right = (grid.ravel() for grid in np.meshgrid(np.arange(height), np.arange(height), indexing="ij"))
+    level = np.abs(right - left) <= STEEPEST * width
+    left, right = left[level].astype(np.float64), right[level].astype(np.float64)
+    near = np.flatnonzero(_beside(cut, NEAR))
     middle = float(np.nonzero(cut)[1].mean()) + 0.5
-    x = np.arange(width) + 0.5
-    rows = np.arange(height, dtype=np.float64)
-    y = rows[:, None, None] + (rows[None, :, None] - rows[:, None, None]) / width * x
-    across = np.broadcast_to(np.arange(width), y.shape)
+    x = near + 0.5
+    y = left[:, None] + (right - left)[:, None] / width * x
     above, below = np.floor(y - 1.0).astype(int), np.floor(y + 1.0).astype(int)
     inside = (above >= 0) & (below < height)
     above, below = np.clip(above, 0, height - 1), np.clip(below, 0, height - 1)
-    seen = inside & known[above, across] & known[below, across]
+    seen = inside & known[above, near] & known[below, near]
+    seen &= np.abs(dim[above, near] - dim[below, near]) < ALIKE_DIM
     # Changes that occur everywhere, such as wood grain, separate nothing.
     both = known[2:] & known[:-2]
     usual = np.median(np.linalg.norm(small[2:] - small[:-2], axis=-1)[both]) if both.any() else 0.0
-    change = np.where(seen[..., None], small[below, across] - small[above, across], 0.0)
+    change = np.where(seen[..., None], small[below, near] - small[above, near], 0.0)
     step = np.linalg.norm(change, axis=-1) > max(STEP, 1.2 * usual)
-    least = np.full((height, height), MOST_STEP)
-    some = np.zeros((height, height), dtype=bool)
+    least = np.full(len(left), MOST_STEP)
+    some = np.zeros(len(left), dtype=bool)
+    fewest = max(3, round(FEWEST * width))
     for side in (x < middle, x >= middle):
-        count = seen[..., side].sum(axis=-1)
-        share = step[..., side].sum(axis=-1) / np.maximum(count, 1)
+        count = seen[:, side].sum(axis=1)
+        share = step[:, side].sum(axis=1) / np.maximum(count, 1)
         # Steps of both signs along a line, as over spots, are not an edge either.
-        mean = np.linalg.norm(change[:, :, side].sum(axis=2), axis=-1) / np.maximum(count, 1)
+        mean = np.linalg.norm(change[:, side].sum(axis=1), axis=-1) / np.maximum(count, 1)
         # A hole that reaches the border of the picture is open there.
-        open_side = int((side & ~cut.any(axis=0)).sum()) < 2
-        enough = count >= 3
+        open_side = int((side & ~cut.any(axis=0)[near]).sum()) < fewest
+        enough = count >= fewest
         clear = enough & (share >= STEPS) & (mean >= max(STEP, UNUSUAL * usual))
         least = np.minimum(least, np.where(clear, mean, np.where(open_side & ~enough, least, -1.0)))
         some |= clear
-    return np.asarray(np.where(some, least, -1.0), dtype=np.float32)
+    kept = some & (least >= 0.0)
+    return Steps(left[kept], right[kept], least[kept], height)
 
 
 def _settled(
-    logs: Picture, known: Mask, ends: tuple[float, float], step: NDArray[np.float64], ratio: float
+    logs: Picture, known: Mask, cut: Mask, ends: tuple[float, float], step: NDArray[np.float64], ratio: float
 ) -> tuple[float, float]:
-    """``ends`` refined to where the colours change by ``step`` most suddenly."""
+    """``ends`` refined to where the colours change by ``step`` most suddenly beside the hole ``cut``."""
     size = max(float(np.linalg.norm(step)), 1e-6)
     plane = np.asarray(logs @ (step / size).astype(np.float32), dtype=np.float32)
-    seen = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
+    usable = known & _beside(cut, NEAR)
+    seen = cv2.erode(usable.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
     x = np.linspace(0.5, known.shape[1] - 0.5, min(known.shape[1], 400))
     # A wide comparison cannot locate a sharp step within it: the last pass is narrow.
     for spacing, reach in ((max(ratio / 3.0, 0.5), 1.5), (max(ratio / 12.0, 0.25), 1.5), (0.25, 0.5)):
@@ -312,7 +413,7 @@ def _settled(
         weight = np.minimum(at(seen, y - 3.0), at(seen, y + 3.0))
         change = np.clip(at(plane, y + reach) - at(plane, y - reach), -size, size)
         total = weight.sum(axis=1)
-        score = np.where(total > 0.1 * len(x), (weight * change).sum(axis=1) / np.maximum(total, 1e-6), -np.inf)
+        score = np.where(total > 0.05 * len(x), (weight * change).sum(axis=1) / np.maximum(total, 1e-6), -np.inf)
         # Break ties by the smallest move.
         score = score - 1e-6 * np.abs(shift).sum(axis=1)
         index = int(np.argmax(score))
