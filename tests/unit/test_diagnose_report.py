@@ -28,6 +28,7 @@ from physgen.sim.diagnose.diagnosis import (
     Verdict,
 )
 from physgen.sim.diagnose.report import diagnosis_figures, parameter_text, write_report
+from physgen.sim.diagnose.report.diagnosis_charts import bands, timeline_picture
 from physgen.sim.diagnose.report.diagnosis_figures import growth
 from physgen.sim.diagnose.report.diagnosis_page import scene_effects
 from physgen.sim.diagnose.report.object_heatmaps import object_scores
@@ -360,6 +361,15 @@ def test_the_error_grows_as_the_drag_that_is_missing():
     data = growth(diagnosis, capture)
     np.testing.assert_allclose(data.nominal[-1], 0.8 * 0.59**2, rtol=0.02)
     assert np.nanmax(data.found) < 0.004
+
+
+def test_a_trial_in_which_no_force_is_missing_has_no_worst_moment():
+    """The page named 0.000 s and 0 m/s² for a single point that flies as believed."""
+    name, arrays = take()
+    still = dataclasses.replace(arrays, frame_score=np.zeros_like(arrays.frame_score))
+    diagnosis, capture = case((name, still))
+    assert bands(diagnosis, capture)[0].worst is None
+    assert "nowhere above zero" in timeline_picture(diagnosis, capture, width=900.0).description
 
 
 def test_scores_of_points_come_from_all_takes_of_their_object():

@@ -174,7 +174,7 @@ class Moment:
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """One trial in the timeline. times, scores: (T,) s and m/s². worst: None without scores."""
+    """One trial in the timeline. times, scores: (T,) s and m/s². worst: None where no force is missing."""
 
     name: str
     role: str
@@ -195,7 +195,7 @@ def bands(diagnosis: Diagnosis, capture: Capture) -> list[Band]:
         times, scores = np.asarray(arrays.times[:count], float), np.asarray(arrays.frame_score[:count], float)
         good = np.isfinite(times) & np.isfinite(scores)
         worst = None
-        if good.any():
+        if good.any() and scores[good].max() > 0:
             at = int(np.flatnonzero(good)[scores[good].argmax()])
             worst = Moment(time=float(times[at]), score=float(scores[at]))
         intervals = tuple(
@@ -223,15 +223,15 @@ def timeline_picture(diagnosis: Diagnosis, capture: Capture, *, width: float) ->
         parts.append(label("There are no trials to show.", left, y + 16, class_="quiet"))
         y += 30
     parts.append(translated(0, y - 6, _time_axis(time)))
-    overall = max((b.worst.score for b in shown if b.worst), default=math.nan)
+    overall = max((b.worst.score for b in shown if b.worst), default=0.0)
+    most = f"up to {number_text(overall)} m/s²" if overall > 0 else "nowhere above zero"
     return Picture(
         width=width,
         height=y + 34,
         title="Discrepancy over time",
         description=(
             f"{counted(len(shown), 'trial')} over recorded time, coloured by phase; the curve is the force per mass "
-            f"missing from the nominal model, up to {number_text(overall)} m/s²."
-            + (" The scale is a square root." if score.root else "")
+            f"missing from the nominal model, {most}." + (" The scale is a square root." if score.root else "")
         ),
         body=join(parts),
     )
