@@ -11,12 +11,13 @@ import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.mesh_raster import rasterise
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured
+from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, seen_vertices, textured
 from physgen.sim.reconstruct.shape.even_light import light_on
 from physgen.sim.reconstruct.shape.object_bodies import build_body
 from physgen.sim.reconstruct.shape.plain_matter import plain_matter, synthesised_grain
 from physgen.sim.reconstruct.shape.texture_atlas import textured_body
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 WIDTH, HEIGHT = 320, 280
 VIEW = camera_above_ground(WIDTH, HEIGHT, 380.0, math.radians(12.0))
@@ -111,6 +112,20 @@ def test_a_stripe_that_reaches_the_outline_goes_round():
         assert blue[:, inner].any(axis=0).mean() > 0.95, turn
         # It stays a stripe.
         assert 0.05 < blue.sum() / (image[..., 3] > 0).sum() < 0.3, turn
+
+
+def test_what_goes_round_stays_at_its_height():
+    """Half way up, where light, marks and the way inwards from the outline leave heights as they are."""
+    mesh = body()
+    height = float(np.ptp(mesh.vertices[:, 2]))
+    seen = seen_vertices(VIEW, mesh)
+    middle = np.abs(mesh.vertices[:, 2] / height - 0.5) < 0.1
+    behind = ~seen & middle & (mesh.vertices[:, 1] > np.percentile(mesh.vertices[~seen & middle][:, 1], 50))
+    front = cKDTree(mesh.pixels[seen])
+    distance, nearest = front.query(mesh.colours[behind])
+    found = mesh.vertices[seen][nearest, 2]
+    assert behind.sum() > 50 and np.median(distance) < 4.0
+    assert np.median(np.abs(found - mesh.vertices[behind, 2])) < 0.04 * height
 
 
 def test_well_seen_texels_are_the_photo_bit_for_bit():
@@ -217,6 +232,33 @@ def test_islands_are_marks_and_stripes_are_not():
     matter = plain_matter(picture(TOY, stripe=True), TOY)
     assert not matter.marks[np.abs(ROWS - 150) < 8].any()
     assert np.abs(matter.colours[150, 120:200] - BLUE).max() < 30
+
+
+def test_a_ribbon_goes_round_without_its_bow():
+    """As wide as at its narrower end: the bow reaches the outline on the left, and lies in shade on the right."""
+    ribbon = TOY & (np.abs(ROWS - 150) < 9)
+    bow = TOY & (np.abs(ROWS - 150) < 26) & (COLUMNS < 190) & ~ribbon
+    pixels = picture(TOY).astype(np.float64)
+    pixels[ribbon | bow] = (190, 40, 45)
+    pixels[COLUMNS > 195] *= 0.6
+    found = plain_matter(pixels.astype(np.uint8), TOY)
+    well_inside = bow & (np.abs(ROWS - 150) > 13) & (np.abs(COLUMNS - 150) < 45)
+    assert found.marks[well_inside].mean() > 0.95
+    # Nearer to fur than to the bow in green, which tells them apart.
+    assert (found.colours[well_inside][:, 1] > (130 + 40) / 2).mean() > 0.95
+    assert found.marks[ribbon & (np.abs(ROWS - 150) < 4) & (np.abs(COLUMNS - 160) < 60)].mean() < 0.05
+
+
+def test_what_touches_the_outline_with_a_corner_is_a_mark():
+    """A patch that is mostly in front, on fur; one of which half may be behind is none."""
+    below = (COLUMNS - 160) ** 2 + (ROWS - 150) ** 2 < 60**2
+    for middle, mark in ((88, True), (76, False)):
+        patch = TOY & ((COLUMNS - 160) ** 2 + (ROWS - middle) ** 2 < 18**2)
+        pixels = picture(TOY)
+        pixels[patch] = BLUE
+        found = plain_matter(pixels, TOY)
+        assert found.marks[patch].mean() > 0.95 if mark else not found.marks.any()
+        assert not found.marks[below & (ROWS > 110)].any()
 
 
 def test_a_mark_is_filled_from_what_it_lies_on():

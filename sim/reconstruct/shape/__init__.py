@@ -11,5 +11,6 @@ surface_mesh.py        marching cubes at a wanted number of vertices
 stability.py           how safely a body stands, and a broader base
 object_placement.py    supports, what hangs, and bodies apart
 body_texture.py        pixels of the photo on a body; even_light.py without their light
-texture_atlas.py       texture for all sides; surface_charts.py its layout, plain_matter.py what no pixel shows
+texture_atlas.py       texture for all sides; surface_charts.py its layout, plain_matter.py what no pixel shows,
+                       stripes.py what goes round
 """

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from trimesh.visual.material import PBRMaterial
 
 from ...scene.model import Camera, Matrix4
+from ..mesh_raster import rasterise
 from .inflate import Crop
 from .inflated_mesh import BodyMesh
 from .plain_matter import inner_colours
@@ -43,6 +44,10 @@ NEAR = 0.06
 INSET = (0.05, 0.4)
 """Least distance of source colours from the edges of a box' face, over the box' longest side, and at most over half of
 the face's own: along its edges the photo shows what lies around the corner, and a warped outline."""
+FRONT_CELLS = 256
+"""Cells along the longer side of the picture that tells what is in front of a hidden vertex."""
+EVENED = 6
+"""Rounds of averaging of how far a counterpart moves to its vertex' height."""
 STEPS = 24
 """Steps of the inward march."""
 
@@ -70,6 +75,7 @@ def colour_pixels(camera: Camera, mesh: BodyMesh, crop: Crop, primitive: Primiti
         look[on_it] = camera.project(_counterparts(camera, primitive, mesh.vertices[on_it]))[:, :2]
         free = hidden & ~on_it
     if free.any():
+        look[free] = _level(camera, mesh, look, hidden)[free]
         behind = np.minimum(distance_behind(mesh, ~hidden, size), DEEPEST * float(crop.distance.max()))
         target[free] = np.maximum(target[free], behind[free])
     look[hidden] = _inwards(crop, look[hidden], target[hidden])
@@ -215,6 +221,35 @@ def distance_behind(mesh: BodyMesh, seen: NDArray[np.bool_], size: float) -> Poi
     graph = sparse.coo_matrix((np.maximum(lengths * extent, 1e-9), (ends[:, 0], ends[:, 1])), (count, count)).tocsr()
     distance = dijkstra(graph, directed=False, indices=np.flatnonzero(seen), min_only=True)
     return np.asarray(np.nan_to_num(distance, posinf=size))
+
+
+def _level(camera: Camera, mesh: BodyMesh, look: Points, hidden: NDArray[np.bool_]) -> Points:
+    """``look`` (V, 2) with those of ``hidden`` vertices where the visible side in front of them is as high as they are.
+
+    What goes round a body, such as a ribbon, does so at one height; a camera that looks down sees the far side of it
+    higher up in the photo. Where nothing is in front, ``look``.
+    """
+    at = camera.project(mesh.vertices)
+    low, high = at[:, :2].min(axis=0), at[:, :2].max(axis=0)
+    cells = FRONT_CELLS / max(float((high - low).max()), 1.0)
+    size = (int((high - low)[0] * cells) + 1, int((high - low)[1] * cells) + 1)
+    cell = np.column_stack([(at[:, :2] - low) * cells, at[:, 2]])
+    shown = rasterise(cell, mesh.faces, size)
+    front = np.full(size[::-1], np.inf)
+    front[shown.rows, shown.columns] = shown.interpolated(mesh.faces, at[:, 2:])[:, 0]
+    column, row = (cell[:, i].astype(np.int64).clip(0, size[i] - 1) for i in (0, 1))
+    depth = np.minimum(front[row, column], at[:, 2])
+    before = camera.position + depth[:, None] * camera.rays(at[:, :2])
+    before[:, 2] = mesh.vertices[:, 2]
+    moved = np.where(hidden[:, None], camera.project(before)[:, :2] - at[:, :2], 0.0)
+    # Along the rim, where the depth in front is a steep slope, neighbours would differ.
+    count = np.maximum(np.bincount(mesh.faces.ravel(), minlength=len(moved)), 1)[:, None]
+    for _ in range(EVENED):
+        total = np.zeros_like(moved)
+        for corner in range(3):
+            np.add.at(total, mesh.faces[:, corner], moved[mesh.faces].mean(axis=1))
+        moved = total / count
+    return np.asarray(np.where(hidden[:, None], look + moved, look))
 
 
 def _inwards(crop: Crop, pixels: Points, target: Points) -> Points:

@@ -3,7 +3,8 @@
 
 Marks (eyes, letters, bows, highlights) are what the outline does not reach: darker or lighter islands, found as the
 difference from a picture whose islands are levelled by greyscale reconstruction from the outline (Vincent, IEEE
-Transactions on Image Processing 2(2), 1993). A stripe or ribbon that reaches the outline is none.
+Transactions on Image Processing 2(2), 1993). A stripe or ribbon that reaches the outline is none, but what lies on it
+is (`stripes.py`).
 
 Grain is synthesised by blending patches at random places (Deliot & Heitz, GPU Zen 2, 2019): the weights' squares sum
 to one, so the contrast stays.
@@ -20,6 +21,7 @@ from scipy import ndimage
 from skimage.morphology import reconstruction
 
 from ...composite.pull_push import fill_gaps
+from .stripes import beside_stripes
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -129,6 +131,10 @@ def _levelled(filled: Picture, mask: Mask, size: float) -> tuple[Picture, Mask]:
     if (inside & ~marks).any():
         # A channel alone may have a way to the outline through a shadow: what is a mark in one goes in all.
         plain = _filled(plain, marks, inside)
+    for region, beside in beside_stripes(plain, inside, max(2.0, RIM_SHARE * size * scale)):
+        if (inside & ~region & ~marks).any():
+            plain[beside] = _without_gaps(plain, inside & ~region & ~marks)[beside]
+            marks = marks | beside
     colours: Picture = np.asarray(cv2.cvtColor(plain.astype(np.float32), cv2.COLOR_LAB2RGB), dtype=np.float32) * 255.0
     colours = inner_colours(colours, inside) if inside.any() else colours
     # Edges between colours stay sharp.
