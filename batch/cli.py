@@ -7,12 +7,13 @@ Its parser has commands in groups, one short usage line, and errors without the 
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import re
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -48,6 +49,9 @@ HELP_WIDTH = 100
 """Widest line of a help text, in characters."""
 MOST_USAGE_FLAGS = 6
 """A command with more optional flags shows ``[options]`` in their place."""
+INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)' \(choose from (.*)\)", re.DOTALL)
+"""What argparse says of a command that is none; its list of all of them hides what matters."""
+NAME = re.compile(r"[a-z][a-z-]*")
 COMMAND_COLUMN = 16
 """Column at which the commands' texts begin."""
 
@@ -88,8 +92,22 @@ class CommandParser(argparse.ArgumentParser):
         finally:
             self.usage = given
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Return what was given; flags that no command knows are an error of the command, with the likeliest meant."""
+        found, extra = super().parse_known_args(args, namespace)
+        if extra:
+            self.error(f"unrecognized arguments: {' '.join(extra)}{self._meant(extra[0], self._option_string_actions)}")
+        return found, extra
+
+    def _meant(self, given: str, known: Iterable[str]) -> str:
+        near = difflib.get_close_matches(given.split("=")[0], list(known), n=1)
+        return f"; did you mean {near[0]}?" if near else ""
+
     def error(self, message: str) -> NoReturn:
         """Exit with code 2: the usage, where flags are listed, and last what is wrong: farms record the last line."""
+        choice = INVALID_COMMAND.match(message)
+        if choice is not None:
+            message = f"no command {choice[1]!r}{self._meant(choice[1], NAME.findall(choice[2]))}"
         text = f"{self.format_usage()}all options: {self.prog} --help\n{self.prog}: error: {message}\n"
         self.exit(2, text)
 

@@ -309,3 +309,21 @@ def test_a_bake_is_of_the_scene_that_was_asked_for(ball_scene, tmp_path):
     command = [sys.executable, "-m", "physgen.sim.app.bake_worker", str(tmp_path / "job.json")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 3 and "changed by another run" in json.loads(result.stdout.splitlines()[-1])["message"]
+
+
+@pytest.mark.parametrize(
+    ("given", "last"),
+    [
+        (["compos"], "physgen: error: no command 'compos'; did you mean compose?"),
+        (["xyzzy"], "physgen: error: no command 'xyzzy'"),
+        (
+            ["evaluate", "a.mp4", "--againts", "b.mp4"],
+            "physgen evaluate: error: unrecognized arguments: --againts b.mp4; did you mean --against?",
+        ),
+    ],
+)
+def test_a_typing_error_is_answered_by_what_was_meant(given, last, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1] == last
