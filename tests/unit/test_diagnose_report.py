@@ -31,9 +31,10 @@ from physgen.sim.diagnose.report import diagnosis_figures, parameter_text, write
 from physgen.sim.diagnose.report.diagnosis_charts import bands, timeline_picture
 from physgen.sim.diagnose.report.diagnosis_figures import growth
 from physgen.sim.diagnose.report.diagnosis_page import scene_effects
+from physgen.sim.diagnose.report.number_format import number_text, percent_text, quantity_text
 from physgen.sim.diagnose.report.object_heatmaps import object_scores
 from physgen.sim.diagnose.report.trajectory_plots import camera_plane
-from physgen.sim.diagnose.report.wording import headline, number_text, percent_text, quantity_text
+from physgen.sim.diagnose.report.wording import headline
 from physgen.sim.diagnose.verification_run import VerificationRun
 from physgen.sim.effects.registry import effects
 from physgen.sim.html import Picture, clean, element, text

@@ -16,6 +16,7 @@ from ..capture import Capture
 from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
 from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
 from .diagnosis_figures import Pictures, draw_pictures, gap_bars
+from .number_format import estimate_text, number_text, percent_text, quantity_text
 from .object_heatmaps import VIEWS
 from .wording import (
     DIRECTIONS,
@@ -25,14 +26,10 @@ from .wording import (
     closure_sentence,
     control_sentences,
     effect_label,
-    estimate_text,
     found_effects,
     headline,
     listed,
     meaning,
-    number_text,
-    percent_text,
-    quantity_text,
     remains,
     shares_sentence,
 )

@@ -21,7 +21,7 @@ from ...html import Markup, Picture, element, join, label, shortened
 from ..capture import Capture, CaptureObject
 from ..diagnosis import Diagnosis
 from .diagnosis_charts import round_up
-from .wording import counted, number_text, percent_text, tick_text
+from .number_format import counted, number_text, percent_text, tick_text
 
 Array = NDArray[np.float64]
 
