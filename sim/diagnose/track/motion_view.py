@@ -8,27 +8,28 @@ seen from the side, and motion on a level surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from .box_pose import GroundCamera
+from .path_pieces import (
+    LEAST_PIECE,
+    PUSH_SHARE,
+    REST_SHARE,
+    Piece,
+    jumps,
+    longest,
+    most_curved,
+    moving_from,
+    noise_px,
+    pieces_between,
+)
 from .pose_estimation import Array
 
 GRAVITY = 9.81
-LEAST_PIECE = 6
-"""Frames of the shortest piece between two impacts."""
-JUMP_SHARE, PUSH_SHARE, JUMP_SIGMAS = 0.3, 0.6, 7.0
-"""Change of velocity that is an impact: as a share of the largest speed, on a surface (where an outline that turns
-wobbles), and in standard deviations."""
-GAP = 3.5
-"""Time between two samples over the usual one from which the body was out of sight between them."""
 CRUDE = 7.0
 """Residual of a piece over that of its parts from which it hides a push."""
-STILL = 0.05
-"""Share of the greatest speed below which a body lies still before or after its motion."""
 DOWN_COSINE = 0.8
 """Cosine to the picture's downward axis of an acceleration that may be gravity: phones are held upright."""
 FLIGHT_SHARE = (0.55, 1.7)
@@ -39,10 +40,6 @@ SIZE_PX = 0.5
 """Standard deviation of a diameter in px; a fiftieth of the diameter comes on top."""
 FLIGHT_SPREAD = 0.03
 """Relative standard deviation of the scale that a flight gives: drag and a tilted picture plane."""
-LET_GO = 5.0
-"""Distance from the later motion, in its own scatter, up to which a body counts as let go."""
-REST_SHARE = 0.12
-"""Time at rest after a stop that is kept, as a share of the motion."""
 BESIDE_SHARE, BESIDE_FRAMES = 0.5, 16
 """Rest before and after a motion that is looked at, as a share of it and at least, in frames: in a long video the
 widths over which velocities are taken would else outgrow a short motion."""
@@ -85,121 +82,6 @@ class MotionView:
         if self.camera is not None and self.start is not None:
             return self.camera.pixels(points + self.start)
         return np.asarray(self.origin + points @ self.matrix.T)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Piece:
-    """Samples ``first`` to ``last`` with one acceleration (px/s²); begin, end: velocities px/s. stops: the sample after
-    which it lies still; ``last`` if it does not."""
-
-    first: int
-    last: int
-    stops: int
-    acceleration: Array
-    begin: Array
-    end: Array
-    miss: float
-
-
-def _parabola(times: Array, places: Array) -> tuple[Array, float]:
-    """Return coefficients (3, 2), highest power first, and the residual of a coordinate; robust to few outliers."""
-    t = times - times.mean()
-    weights = np.ones(len(t))
-    fit = np.zeros((3, 2))
-    off = np.zeros(len(t))
-    for _ in range(3):
-        fit = np.polyfit(t, places, 2, w=weights)
-        off = np.linalg.norm(places - (np.vander(t, 3) @ fit), axis=1)
-        usual = max(float(np.median(off)), 1e-6)
-        weights = 1.0 / np.maximum(1.0, off / (2.5 * usual))
-    return fit, float(np.sqrt(np.mean(np.minimum(off, 4 * np.median(off) + 1e-9) ** 2) / 2))
-
-
-def _piece(times: Array, places: Array, first: int, last: int) -> _Piece:
-    """Return the piece; its acceleration is that of its motion, less the rest before and after."""
-    begins, ends = _moving_part(times[first : last + 1], places[first : last + 1])
-    part = slice(first + begins, first + ends + 1)
-    t = times[part]
-    fit, miss = _parabola(t, places[part])
-    middle = t.mean()
-
-    def speed(at: float) -> Array:
-        return np.asarray(2 * fit[0] * (at - middle) + fit[1])
-
-    return _Piece(
-        first=first, last=last, stops=first + ends, acceleration=2 * fit[0],
-        begin=speed(t[0]), end=speed(t[-1]), miss=miss,
-    )  # fmt: skip
-
-
-def _moving_part(times: Array, places: Array) -> tuple[int, int]:
-    """Return the first and last sample of the motion, where a body lies still before or afterwards."""
-    width = max(2, len(times) // 40)
-    speed = np.linalg.norm(places[width:] - places[:-width], axis=1) / (times[width:] - times[:-width])
-    moves = np.flatnonzero(speed > STILL * float(np.percentile(speed, 97))) if len(speed) else np.array([], np.int64)
-    if len(moves) < LEAST_PIECE:
-        return 0, len(times) - 1
-    return int(moves[0]), int(moves[-1]) + width
-
-
-def jumps(times: Array, places: Array, share: float = JUMP_SHARE) -> list[int]:
-    """Return the samples of impacts: where the straight lines before and after disagree in velocity."""
-    count = len(times)
-    width = int(np.clip(count // 24, 4, 9))
-    steps = np.zeros((count, 2))
-    sigma = noise_px(places)
-    for k in range(width, count - width):
-        before, after = slice(k - width, k + 1), slice(k, k + width + 1)
-        a = np.polyfit(times[before] - times[k], places[before], 2 if width > 5 else 1)
-        b = np.polyfit(times[after] - times[k], places[after], 2 if width > 5 else 1)
-        steps[k] = b[-2] - a[-2]
-    if width <= 5 and count > 2 * width:
-        # Straight lines through a curved path disagree by its steady acceleration everywhere.
-        steps[width : count - width] -= np.median(steps[width : count - width], axis=0)
-    for k in _gaps(times):
-        # Fits across frames in which it was not seen, as where another body touched it, would smooth an impact away.
-        steps[max(0, k - width + 1) : k + width + 1] = 0.0
-        sides = slice(max(0, k - width), k + 1), slice(k + 1, k + 2 + width)
-        if all(len(times[side]) >= LEAST_PIECE for side in sides):
-            a, b = (np.polyfit(times[side] - times[k], places[side], 1)[0] for side in sides)
-            steps[k] = b - a
-    change = np.linalg.norm(steps, axis=1)
-    paces = np.linalg.norm(places[width:] - places[:-width], axis=1) / np.maximum(times[width:] - times[:-width], 1e-9)
-    usual = float(np.percentile(paces, 97)) if len(paces) else 0.0
-    span = float(np.median(np.diff(times))) * width
-    blur = (4.0 if width > 5 else 1.8) * sigma / max(span, 1e-9) / np.sqrt(width)
-    limit = max(share * usual, JUMP_SIGMAS * blur)
-    found: list[int] = []
-    for k in (int(v) for v in np.argsort(-change)):
-        if change[k] < limit:
-            break
-        if all(abs(int(k) - f) > width for f in found):
-            found.append(int(k))
-    return sorted(found)
-
-
-def _gaps(times: Array) -> NDArray[np.int64]:
-    """Return the samples after which frames are missing."""
-    steps = np.diff(times)
-    return np.flatnonzero(steps > GAP * float(np.median(steps))) if len(steps) else np.zeros(0, np.int64)
-
-
-def wobble_px(times: Array, places: Array) -> float:
-    """Return the residual of a coordinate about a smooth path: the outline of a body that turns swings about its
-    centre, which third differences do not see."""
-    begins, ends = _moving_part(times, places)
-    part = slice(begins, ends + 1)
-    if ends - begins < 3 * LEAST_PIECE:
-        return 0.0
-    t = (times[part] - times[part].mean()) / max(float(np.ptp(times[part])), 1e-9)
-    left = places[part] - np.vander(t, 4) @ np.polyfit(t, places[part], 3)
-    return float(np.sqrt(np.mean(left**2) * len(left) / (len(left) - 4)))
-
-
-def noise_px(places: Array) -> float:
-    """Return the noise of a coordinate from third differences, which smooth motion hardly has."""
-    third = np.abs(np.diff(places, 3, axis=0)).ravel()
-    return max(float(np.median(third)) / 0.6745 / np.sqrt(20), 0.02) if len(third) else 0.1
 
 
 def understand_motion(
@@ -269,18 +151,18 @@ def _setting(
 ) -> MotionView:
     """Return the view as ``understand_motion`` does, of a path that is mostly motion. scale: px/m by the size."""
     impacts = jumps(times, places)
-    pieces = _pieces(times, places, impacts)
+    pieces = pieces_between(times, places, impacts)
     flights = [p for p in pieces if _flies(p, scale)]
-    if flights and _longest(pieces, places) in flights:
+    if flights and longest(pieces, places) in flights:
         return _flight(times, places, pieces, flights, impacts, scale, diameter_px, clearance, where)
-    pieces = _pieces(times, places, jumps(times, places, PUSH_SHARE))
-    finer = _pieces(times, places, impacts)
+    pieces = pieces_between(times, places, jumps(times, places, PUSH_SHARE))
+    finer = pieces_between(times, places, impacts)
     if not pieces:
         raise InputError(f"{where}: the body is followed for {len(times)} frames, too few between its impacts")
-    best = _most_curved(times, pieces)
-    if finer and best.miss > CRUDE * max(_most_curved(times, finer).miss, noise_px(places)):
+    best = most_curved(times, pieces)
+    if finer and best.miss > CRUDE * max(most_curved(times, finer).miss, noise_px(places)):
         # A push that is weak beside the fastest motion is one all the same if nothing smooth fits across it.
-        best = _most_curved(times, finer)
+        best = most_curved(times, finer)
     if _curves_down(best, times, places) and _flies(best, scale):
         # Impacts at a wall had cut the flight into pieces shorter than something else.
         known = pieces if any(p is best for p in pieces) else finer
@@ -306,7 +188,7 @@ def _setting(
     return _surface(times, places, best, scale, clearance, elevation)
 
 
-def _curves_down(piece: _Piece, times: Array, places: Array) -> bool:
+def _curves_down(piece: Piece, times: Array, places: Array) -> bool:
     """Return whether the path bends downwards, all of it by one acceleration that friction cannot have."""
     size = float(np.linalg.norm(piece.acceleration))
     middle = 0.5 * (piece.begin + piece.end)
@@ -319,7 +201,7 @@ def _curves_down(piece: _Piece, times: Array, places: Array) -> bool:
     return across > ACROSS_SHARE * size and sag > max(10 * piece.miss, 0.04 * length)
 
 
-def _strange_fall(piece: _Piece, times: Array, scale: float, where: str) -> InputError:
+def _strange_fall(piece: Piece, times: Array, scale: float, where: str) -> InputError:
     fall = float(np.linalg.norm(piece.acceleration)) / scale
     rate = 1.0 / float(np.median(np.diff(times)))
     return InputError(
@@ -329,26 +211,7 @@ def _strange_fall(piece: _Piece, times: Array, scale: float, where: str) -> Inpu
     )
 
 
-def _pieces(times: Array, places: Array, impacts: list[int]) -> list[_Piece]:
-    edges = [0, *impacts, len(times) - 1]
-    return [
-        _piece(times, places, a + (a > 0), b - (b < len(times) - 1)) for a, b in pairwise(edges) if b - a >= LEAST_PIECE
-    ]
-
-
-def _longest(pieces: list[_Piece], places: Array) -> _Piece:
-    return max(pieces, key=lambda p: float(np.linalg.norm(places[p.last] - places[p.first])))
-
-
-def _most_curved(times: Array, pieces: list[_Piece]) -> _Piece:
-    """Return the piece that shows most of what slows or speeds it up: the way that its acceleration takes it."""
-    return max(
-        pieces,
-        key=lambda p: float(np.linalg.norm(p.acceleration)) * float(times[p.stops] - times[p.first]) ** 2,
-    )
-
-
-def _flies(piece: _Piece, scale: float) -> bool:
+def _flies(piece: Piece, scale: float) -> bool:
     size = float(np.linalg.norm(piece.acceleration))
     if piece.last - piece.first < LEAST_PIECE or size <= 0 or piece.acceleration[1] / size < DOWN_COSINE:
         return False
@@ -361,7 +224,7 @@ def _flies(piece: _Piece, scale: float) -> bool:
     return straight < ALONG_COSINE or piece.acceleration[1] / size > 0.985
 
 
-def _runs_down(piece: _Piece, scale: float, places: Array) -> bool:
+def _runs_down(piece: Piece, scale: float, places: Array) -> bool:
     way = places[piece.last] - places[piece.first]
     way = way / max(float(np.linalg.norm(way)), 1e-9)
     along = float(piece.acceleration @ way) / scale / GRAVITY
@@ -380,8 +243,8 @@ def _frame(down: Array) -> Array:
 def _flight(
     times: Array,
     places: Array,
-    pieces: list[_Piece],
-    flights: list[_Piece],
+    pieces: list[Piece],
+    flights: list[Piece],
     impacts: list[int],
     scale: float,
     diameter_px: float,
@@ -444,15 +307,15 @@ def _flight(
     )  # fmt: skip
 
 
-def _bounce(before: _Piece, after: _Piece, down: Array) -> bool:
+def _bounce(before: Piece, after: Piece, down: Array) -> bool:
     """Return whether the velocity changes mostly upwards: a wall or a hand pushes sideways."""
     change = after.begin - before.end
     up = -float(change @ down)
     return up > 0.75 * float(np.linalg.norm(change))
 
 
-def _slope(times: Array, places: Array, piece: _Piece, scale: float, clearance: float) -> MotionView:
-    first = _moving_from(times, places, piece)
+def _slope(times: Array, places: Array, piece: Piece, scale: float, clearance: float) -> MotionView:
+    first = moving_from(times, places, piece)
     part = places[first : piece.last + 1]
     way = np.linalg.svd(part - part.mean(axis=0), full_matrices=False)[2][0]
     way = way if way[1] > 0 else -way
@@ -472,10 +335,8 @@ def _slope(times: Array, places: Array, piece: _Piece, scale: float, clearance: 
     )  # fmt: skip
 
 
-def _surface(
-    times: Array, places: Array, piece: _Piece, scale: float, clearance: float, elevation: float
-) -> MotionView:
-    first = _moving_from(times, places, piece)
+def _surface(times: Array, places: Array, piece: Piece, scale: float, clearance: float, elevation: float) -> MotionView:
+    first = moving_from(times, places, piece)
     last = min(piece.last, piece.stops + max(2, round(REST_SHARE * (piece.stops - first))))
     matrix = np.array([[1.0, 0.0, 0.0], [0.0, -np.sin(elevation), -np.cos(elevation)]]) * scale
     origin = places[first]
@@ -487,47 +348,3 @@ def _surface(
         kind="surface", first=first, last=last, scale=scale, origin=origin, matrix=matrix, points=world,
         normal=np.array([0.0, 0.0, 1.0]), point=np.array([0.0, 0.0, -clearance]), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _moving_from(times: Array, places: Array, piece: _Piece) -> int:
-    """Return the sample from which the body of ``piece`` is left alone: after the last push, at its greatest
-    acceleration along the way; on a slope, after it has begun to move."""
-    part: NDArray[np.int64] = np.arange(piece.first, piece.stops + 1)
-    width = max(3, len(part) // 16)
-    if len(part) < 3 * width:
-        return piece.first
-    speed = np.linalg.norm(places[part[width:]] - places[part[:-width]], axis=1) / (
-        times[part[width:]] - times[part[:-width]]
-    )
-    top = float(np.percentile(speed, 97))
-    wide = max(width, len(part) // 8)
-    if speed[-1] <= 0.8 * top and wide > width:
-        # It slows down: the outline of a body that turns wobbles, and a mean over a longer time tells its speed.
-        width = wide
-        speed = np.linalg.norm(places[part[width:]] - places[part[:-width]], axis=1) / (
-            times[part[width:]] - times[part[:-width]]
-        )
-        top = float(np.percentile(speed, 97))
-    if speed[-1] > 0.8 * top:  # it gains speed: from where a tenth of it is reached
-        first = int(np.argmax(speed > 0.1 * top))
-    else:
-        first = min(int(np.argmax(speed > 0.93 * top)) + width // 2, len(part) - LEAST_PIECE)
-    # A hand lets go gradually: what the motion of the later three quarters does not go back to is left out.
-    kept = part[first:]
-    later = kept[len(kept) // 4 :]
-    if len(later) >= 2 * LEAST_PIECE and speed[-1] > 0.8 * top:
-        fit, miss = _parabola(times[later], places[later])
-        off = np.linalg.norm(places[kept] - np.vander(times[kept] - times[later].mean(), 3) @ fit, axis=1)
-        wrong = np.flatnonzero(off[: len(kept) // 2] > LET_GO * max(miss, noise_px(places[later])))
-        first += int(wrong[-1]) + 1 if len(wrong) else 0
-    return int(part[min(first, len(part) - LEAST_PIECE)])
-
-
-def stopped_at(times: Array, points: Array) -> int:
-    """Return the last sample worth keeping: shortly after the body has come to rest."""
-    left = np.linalg.norm(points - points[-1], axis=1)
-    moving = np.flatnonzero(left > 0.01 * max(float(left.max()), 1e-9))
-    if len(moving) == 0:
-        return len(points) - 1
-    end = times[moving[-1]] + REST_SHARE * (times[moving[-1]] - times[0])
-    return int(np.searchsorted(times, end, side="right")) - 1

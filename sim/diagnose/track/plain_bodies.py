@@ -15,8 +15,9 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, CaptureObject, Ground, Trial
 from ..capture_checks import check_capture
 from .box_pose import BoxMotion, follow_box
-from .motion_view import MotionView, noise_px, stopped_at, understand_motion, wobble_px
+from .motion_view import MotionView, understand_motion
 from .moving_regions import MovingRegions, Region, find_moving_regions
+from .path_pieces import noise_px, stopped_at, wobble_px
 from .pose_estimation import Array
 from .region_track import link_regions, true_times, with_missing_frames
 from .track_input import BodyRequest, VideoTrial
