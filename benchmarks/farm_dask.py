@@ -15,7 +15,7 @@ from pathlib import Path
 
 from physgen.batch.farm.planning.plan import Plan, Task
 from physgen.batch.farm.runners import FarmOptions, find_runner
-from physgen.batch.farm.task_execution import Record, produced_hashes, save_record
+from physgen.batch.farm.task_records import Record, produced_hashes, save_record
 from physgen.benchmarks.common import benchmark_parser
 from physgen.sim.events import never
 from physgen.sim.version import VERSION

@@ -25,7 +25,7 @@ from ...sim.events import Event, OnEvent, StageProgress
 from ...sim.files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 from ...sim.html import render
 from .planning.plan import STAGES, Outcome, Plan, Task
-from .task_execution import log_end, log_path
+from .task_records import log_end, log_path
 
 SUMMARY_FORMAT = "physgen-summary/1"
 STATES = ("done", "kept", "running", "waiting", "failed", "skipped", "cancelled")

@@ -17,7 +17,7 @@ from physgen.batch.farm.planning.job_file import load_job
 from physgen.batch.farm.planning.plan import load_plan, save_plan
 from physgen.batch.farm.planning.task_graph import make_plan
 from physgen.batch.farm.run_task import listed_task
-from physgen.batch.farm.task_execution import Record, load_record, record_path, save_record
+from physgen.batch.farm.task_records import Record, load_record, record_path, save_record
 from physgen.sim.app import bake_worker
 from physgen.sim.app.preview_server import parse_request, request_id
 from physgen.sim.app.stage_process import parse_event

@@ -10,7 +10,7 @@ import quickjs
 from physgen.batch.farm.flamenco_export import TASK_TYPES, export_flamenco
 from physgen.batch.farm.planning.plan import STAGES, Plan, Task
 from physgen.batch.farm.runners import FarmOptions
-from physgen.batch.farm.task_execution import record_path
+from physgen.batch.farm.task_records import record_path
 from physgen.sim.errors import InputError
 from physgen.sim.version import VERSION
 

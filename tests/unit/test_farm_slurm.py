@@ -16,7 +16,7 @@ from physgen.batch.farm.planning.plan import STAGES, Plan, Task, load_plan, save
 from physgen.batch.farm.run_task import listed_task, main
 from physgen.batch.farm.runners import ClusterOptions, FarmOptions
 from physgen.batch.farm.slurm_export import MOST_IN_ARRAY, array_indices, dependency, export_slurm, task_arrays
-from physgen.batch.farm.task_execution import record_path
+from physgen.batch.farm.task_records import record_path
 from physgen.sim.errors import InputError
 from physgen.sim.version import VERSION
 

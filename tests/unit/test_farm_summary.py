@@ -20,7 +20,7 @@ from physgen.batch.farm.job_monitor import (
 )
 from physgen.batch.farm.planning.plan import Outcome, Plan, Task
 from physgen.batch.farm.runners import ended_event, started_event
-from physgen.batch.farm.task_execution import log_path
+from physgen.batch.farm.task_records import log_path
 from physgen.physgen_addon.frames.frame_files import Part, write_exr
 from physgen.sim.version import VERSION
 

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from physgen.batch.farm.local_runner import _Board, run_local
 from physgen.batch.farm.planning.plan import Outcome, Plan, Task, is_worth_retrying
 from physgen.batch.farm.runners import FarmOptions, find_runner
-from physgen.batch.farm.task_execution import (
+from physgen.batch.farm.task_execution import execute_task
+from physgen.batch.farm.task_records import (
     EARLIER_BYTES,
     HEAD_BYTES,
     TAIL_BYTES,
     Record,
     TaskLog,
-    execute_task,
     input_hashes,
     load_record,
     log_end,
