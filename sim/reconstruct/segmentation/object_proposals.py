@@ -24,8 +24,17 @@ from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
 from .outline_sharpness import in_focus
+from .proposal_features import (
+    Mask,
+    contrast_of,
+    cut_share,
+    extent_of,
+    features_of,
+    score_of,
+    share_on_edges,
+    solidity_of,
+)
 
-Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 
@@ -62,7 +71,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    found = [(item, _score(item.features)) for item in examined_candidates(small)]
+    found = [(item, score_of(item.features)) for item in examined_candidates(small)]
     # A whole goes before its parts, which often have the clearer outline.
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
     sharp = in_focus([item.mask for item, _ in found], small)
@@ -71,7 +80,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
     for item, value in sorted(_distinct(found), key=lambda pair: -pair[1])[:most]:
-        x0, y0, x1, y1 = _loose(_extent(item.mask), size)
+        x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
     return result
@@ -93,7 +102,7 @@ def proposals_from_alpha(alpha: NDArray[np.floating], *, most: int = MOST) -> li
         part = labels == index
         if stats[index, cv2.CC_STAT_AREA] < LEAST_AREA * value.size:
             continue
-        x0, y0, x1, y1 = _loose(_extent(part), size)
+        x0, y0, x1, y1 = _loose(extent_of(part), size)
         result.append((int(part.sum()), Proposal((x0, y0, x1, y1), round(float(value[part].mean()), 3))))
     return [item for _, item in sorted(result, key=lambda pair: -pair[0] * pair[1].score)][:most]
 
@@ -117,11 +126,6 @@ def _share_inside(box: Box, other: Box) -> float:
     width, height = (min(box[i + 2], other[i + 2]) - max(box[i], other[i]) for i in (0, 1))
     area = min((b[2] - b[0]) * (b[3] - b[1]) for b in (box, other))
     return max(0.0, width) * max(0.0, height) / max(area, 1e-9)
-
-
-def _extent(mask: Mask) -> tuple[int, int, int, int]:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def _loose(box: tuple[int, int, int, int], size: tuple[int, int]) -> Box:
@@ -250,19 +254,11 @@ def _plausible(mask: Mask, height: int, width: int) -> bool:
     area = int(mask.sum())
     if not LEAST_AREA * mask.size <= area <= MOST_AREA * mask.size:
         return False
-    x0, y0, x1, y1 = _extent(mask)
+    x0, y0, x1, y1 = extent_of(mask)
     if min(x1 - x0, y1 - y0) < LEAST_SIDE * min(height, width) or (x1 - x0) * (y1 - y0) > 0.85 * mask.size:
         return False
     # What touches three sides of the photo is its background.
     return (x0 == 0) + (y0 == 0) + (x1 == width) + (y1 == height) <= 2
-
-
-FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
-"""Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
-its outline on the photo's border; IoU of the candidate with what its box yields; height of its middle in the photo;
-share of its convex hull; logarithm of its share of the photo; share of it that could be ground, lit or shaded; share of
-the pixels below it that look like those beside it, as under something that stands on a floor; whether it may be nothing
-but shade on what surrounds it."""
 
 
 def examined_candidates(pixels: Pixels) -> list[Examined]:
@@ -275,7 +271,7 @@ def examined_candidates(pixels: Pixels) -> list[Examined]:
     rough.sort(key=lambda pair: -pair[1])
     chosen: list[tuple[Mask, tuple[int, int, int, int]]] = []
     for mask, _ in rough:
-        box = _extent(mask)
+        box = extent_of(mask)
         if all(_box_iou(box, other) < 0.75 for _, other in chosen):
             chosen.append((mask, box))
         if len(chosen) == EXAMINED:
@@ -284,17 +280,17 @@ def examined_candidates(pixels: Pixels) -> list[Examined]:
     for mask, box in chosen:
         found, value, ground = _segmented(pixels, _loose(box, (width, height)), mask)
         if found is not None and _plausible(found, height, width):
-            result.append(Examined(found, _features(found, mask, (value, ground), lab, edges)))
+            result.append(Examined(found, features_of(found, mask, (value, ground), lab, edges)))
     return result
 
 
 def _promise(mask: Mask, lab: NDArray[np.float32], edges: NDArray[np.float32]) -> float:
     """A quick judgement of a candidate, larger is better."""
     return (
-        1.0 * _on_edges(mask, edges)
-        + 0.6 * min(1.0, _contrast(mask, lab) / 30.0)
-        - 1.0 * _cut(mask)
-        + 0.4 * _solid(mask)
+        1.0 * share_on_edges(mask, edges)
+        + 0.6 * min(1.0, contrast_of(mask, lab) / 30.0)
+        - 1.0 * cut_share(mask)
+        + 0.4 * solidity_of(mask)
         + 0.08 * float(np.log(mask.mean()))
     )
 
@@ -323,127 +319,10 @@ def _segmented(pixels: Pixels, box: Box, start: Mask) -> tuple[Mask | None, floa
     return result, float(values[best]), float(ground[guesses[best]].mean())
 
 
-def _features(
-    mask: Mask, start: Mask, judged: tuple[float, float], lab: NDArray[np.float32], edges: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    rows = np.flatnonzero(mask.any(axis=1))
-    union = float((mask | start).sum())
-    return np.array(
-        [
-            judged[0],
-            min(1.5, _contrast(mask, lab) / 30.0),
-            _on_edges(mask, edges),
-            _cut(mask),
-            float((mask & start).sum()) / union,
-            1.0 - float(rows.mean()) / mask.shape[0],
-            _solid(mask),
-            float(np.log(mask.mean())),
-            judged[1],
-            _ground_below(mask, lab),
-            float(_like_shade(mask, lab)),
-        ]
-    )
-
-
-def _ring(mask: Mask, reach: int) -> Mask:
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
-
-
-def _contrast(mask: Mask, lab: NDArray[np.float32]) -> float:
-    """Distance of the mean colours of ``mask`` and of a ring around it, CIELAB."""
-    around = _ring(mask, max(3, round(0.12 * float(np.sqrt(mask.sum())))))
-    if not around.any():
-        return 0.0
-    return float(np.linalg.norm(lab[mask].mean(axis=0) - lab[around].mean(axis=0)))
-
-
-def _outline(mask: Mask) -> Mask:
-    binary = mask.astype(np.uint8)
-    kernel = np.ones((3, 3), np.uint8)
-    return np.asarray((cv2.dilate(binary, kernel) > 0) & ~(cv2.erode(binary, kernel, borderValue=0) > 0))
-
-
-def _on_edges(mask: Mask, edges: NDArray[np.float32]) -> float:
-    outline = _outline(mask)
-    # An outline may be a pixel beside its edge.
-    crest = cv2.dilate(edges, np.ones((3, 3), np.uint8))
-    return float((crest[outline] > 2.5).mean()) if outline.any() else 0.0
-
-
-def _cut(mask: Mask) -> float:
-    """Share of the box' outline along which ``mask`` lies on the photo's border."""
-    x0, y0, x1, y1 = _extent(mask)
-    touching = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())
-    return min(1.0, touching / float(x1 - x0 + y1 - y0))
-
-
-def _solid(mask: Mask) -> float:
-    points = np.argwhere(mask)[:, ::-1].astype(np.int32)
-    hull = np.zeros(mask.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
-    return float(mask.sum()) / max(1.0, float(hull.sum()))
-
-
-def _like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:
-    """Whether ``mask`` may be nothing but shade: darker than the ring around it, of its hue, and as even."""
-    size = float(np.sqrt(mask.sum()))
-    around = _ring(mask, max(4, round(0.2 * size)))
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    if around.sum() < 20 or inner.sum() < 20:
-        return False
-    own, near = np.median(lab[inner], axis=0), np.median(lab[around], axis=0)
-    # CIELAB scales with the cube root of light but for the offset of L*.
-    factor = (own[0] + 16.0) / (near[0] + 16.0)
-    if not 0.5 < factor < 0.97:
-        return False
-    hue = float(np.linalg.norm(own[1:] - factor * near[1:]))
-    own_spread, near_spread = (lab[part][:, 0].std() for part in (inner, around))
-    return bool(hue < 6.0 + 0.12 * np.linalg.norm(near[1:]) and own_spread < 1.5 * near_spread + 5.0)
-
-
-def _ground_below(mask: Mask, lab: NDArray[np.float32]) -> float:
-    """Share of the pixels just below the lower outline whose colour, in light or shade, is that of pixels left and
-    right of the object at its base: 1 on an even floor."""
-    height, width = mask.shape
-    x0, y0, x1, y1 = _extent(mask)
-    size = max(x1 - x0, y1 - y0)
-    reach = max(2, round(0.06 * size))
-    columns = np.flatnonzero(mask.any(axis=0))
-    lowest = height - 1 - mask[::-1, columns].argmax(axis=0)
-    below = lowest + reach
-    good = below < height
-    if good.sum() < 0.5 * len(columns):
-        return 0.0
-    under = lab[below[good], columns[good]]
-    rows = slice(max(0, y1 - size // 4), min(height, y1 + reach))
-    sides = np.concatenate(
-        [
-            lab[rows, max(0, x0 - size // 2) : max(0, x0 - reach)].reshape(-1, 3),
-            lab[rows, min(width, x1 + reach) : min(width, x1 + size // 2)].reshape(-1, 3),
-        ]
-    )
-    if len(sides) < 10:
-        return 0.5
-    typical = np.median(sides, axis=0)
-    spread = max(6.0, 2.0 * float(np.median(np.linalg.norm(sides - typical, axis=1))))
-    apart = under - typical
-    # Shade changes lightness more than hue.
-    apart[:, 0] = np.where(apart[:, 0] < 0, 0.35 * apart[:, 0], apart[:, 0])
-    return float((np.linalg.norm(apart, axis=1) < spread).mean())
-
-
-WEIGHTS = np.array([2.5, 1.2, 2.0, -5.0, 1.0, -2.0, 1.5, 0.35, -3.0, 1.5, -4.0])
-OFFSET = -2.0
-"""Logistic regression of ``FEATURES`` on whether a candidate is an object."""
 WHOLE = 0.12
 """Score that e times the area is worth when two candidates overlap."""
 LEAST_SCORE = 0.5
 """Score below which a candidate is not proposed."""
-
-
-def _score(features: NDArray[np.float64]) -> float:
-    return float(1.0 / (1.0 + np.exp(-(features @ WEIGHTS + OFFSET))))
 
 
 def _box_iou(first: Sequence[float], second: Sequence[float]) -> float:
@@ -468,7 +347,7 @@ def _same_or_part(mask: Mask, better: Mask) -> bool:
     common = float((mask & better).sum())
     if common > 0.5 * float(min(mask.sum(), better.sum())):
         return True
-    x0, y0, x1, y1 = _extent(better)
+    x0, y0, x1, y1 = extent_of(better)
     inside = float(mask[y0:y1, x0:x1].sum()) / float(mask.sum())
     kernel = np.ones((7, 7), np.uint8)
     return inside > 0.7 and bool(((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & better).any())

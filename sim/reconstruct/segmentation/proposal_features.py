@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Features of a candidate for an object, measured on its mask, and their score."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
+"""Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
+its outline on the photo's border; IoU of the candidate with what its box yields; height of its middle in the photo;
+share of its convex hull; logarithm of its share of the photo; share of it that could be ground, lit or shaded; share of
+the pixels below it that look like those beside it, as under something that stands on a floor; whether it may be nothing
+but shade on what surrounds it."""
+WEIGHTS = np.array([2.5, 1.2, 2.0, -5.0, 1.0, -2.0, 1.5, 0.35, -3.0, 1.5, -4.0])
+OFFSET = -2.0
+"""Logistic regression of ``FEATURES`` on whether a candidate is an object."""
+
+
+def extent_of(mask: Mask) -> tuple[int, int, int, int]:
+    """Return the box x0, y0, x1, y1 of ``mask`` (H, W), the last pixel exclusive."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def features_of(
+    mask: Mask, start: Mask, judged: tuple[float, float], lab: NDArray[np.float32], edges: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Return the ``FEATURES`` of ``mask``.
+
+    start: the candidate that ``mask`` was segmented from. judged: its objectness, and the share of it that may be
+    ground. lab: (H, W, 3) CIELAB. edges: (H, W), as of ``edge_strength``.
+    """
+    rows = np.flatnonzero(mask.any(axis=1))
+    union = float((mask | start).sum())
+    return np.array(
+        [
+            judged[0],
+            min(1.5, contrast_of(mask, lab) / 30.0),
+            share_on_edges(mask, edges),
+            cut_share(mask),
+            float((mask & start).sum()) / union,
+            1.0 - float(rows.mean()) / mask.shape[0],
+            solidity_of(mask),
+            float(np.log(mask.mean())),
+            judged[1],
+            _ground_below(mask, lab),
+            float(_is_like_shade(mask, lab)),
+        ]
+    )
+
+
+def _ring(mask: Mask, reach: int) -> Mask:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
+
+
+def contrast_of(mask: Mask, lab: NDArray[np.float32]) -> float:
+    """Distance of the mean colours of ``mask`` and of a ring around it, CIELAB."""
+    around = _ring(mask, max(3, round(0.12 * float(np.sqrt(mask.sum())))))
+    if not around.any():
+        return 0.0
+    return float(np.linalg.norm(lab[mask].mean(axis=0) - lab[around].mean(axis=0)))
+
+
+def _outline(mask: Mask) -> Mask:
+    binary = mask.astype(np.uint8)
+    kernel = np.ones((3, 3), np.uint8)
+    return np.asarray((cv2.dilate(binary, kernel) > 0) & ~(cv2.erode(binary, kernel, borderValue=0) > 0))
+
+
+def share_on_edges(mask: Mask, edges: NDArray[np.float32]) -> float:
+    """Return the share of the outline of ``mask`` that lies on ``edges``."""
+    outline = _outline(mask)
+    # An outline may be a pixel beside its edge.
+    crest = cv2.dilate(edges, np.ones((3, 3), np.uint8))
+    return float((crest[outline] > 2.5).mean()) if outline.any() else 0.0
+
+
+def cut_share(mask: Mask) -> float:
+    """Share of the box' outline along which ``mask`` lies on the photo's border."""
+    x0, y0, x1, y1 = extent_of(mask)
+    touching = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())
+    return min(1.0, touching / float(x1 - x0 + y1 - y0))
+
+
+def solidity_of(mask: Mask) -> float:
+    """Return the share of its convex hull that ``mask`` fills."""
+    points = np.argwhere(mask)[:, ::-1].astype(np.int32)
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
+    return float(mask.sum()) / max(1.0, float(hull.sum()))
+
+
+def _is_like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:
+    """Whether ``mask`` may be nothing but shade: darker than the ring around it, of its hue, and as even."""
+    size = float(np.sqrt(mask.sum()))
+    around = _ring(mask, max(4, round(0.2 * size)))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    if around.sum() < 20 or inner.sum() < 20:
+        return False
+    own, near = np.median(lab[inner], axis=0), np.median(lab[around], axis=0)
+    # CIELAB scales with the cube root of light but for the offset of L*.
+    factor = (own[0] + 16.0) / (near[0] + 16.0)
+    if not 0.5 < factor < 0.97:
+        return False
+    hue = float(np.linalg.norm(own[1:] - factor * near[1:]))
+    own_spread, near_spread = (lab[part][:, 0].std() for part in (inner, around))
+    return bool(hue < 6.0 + 0.12 * np.linalg.norm(near[1:]) and own_spread < 1.5 * near_spread + 5.0)
+
+
+def _ground_below(mask: Mask, lab: NDArray[np.float32]) -> float:
+    """Share of the pixels just below the lower outline whose colour, in light or shade, is that of pixels left and
+    right of the object at its base: 1 on an even floor."""
+    height, width = mask.shape
+    x0, y0, x1, y1 = extent_of(mask)
+    size = max(x1 - x0, y1 - y0)
+    reach = max(2, round(0.06 * size))
+    columns = np.flatnonzero(mask.any(axis=0))
+    lowest = height - 1 - mask[::-1, columns].argmax(axis=0)
+    below = lowest + reach
+    good = below < height
+    if good.sum() < 0.5 * len(columns):
+        return 0.0
+    under = lab[below[good], columns[good]]
+    rows = slice(max(0, y1 - size // 4), min(height, y1 + reach))
+    sides = np.concatenate(
+        [
+            lab[rows, max(0, x0 - size // 2) : max(0, x0 - reach)].reshape(-1, 3),
+            lab[rows, min(width, x1 + reach) : min(width, x1 + size // 2)].reshape(-1, 3),
+        ]
+    )
+    if len(sides) < 10:
+        return 0.5
+    typical = np.median(sides, axis=0)
+    spread = max(6.0, 2.0 * float(np.median(np.linalg.norm(sides - typical, axis=1))))
+    apart = under - typical
+    # Shade changes lightness more than hue.
+    apart[:, 0] = np.where(apart[:, 0] < 0, 0.35 * apart[:, 0], apart[:, 0])
+    return float((np.linalg.norm(apart, axis=1) < spread).mean())
+
+
+def score_of(features: NDArray[np.float64]) -> float:
+    """Return the probability, 0 to 1, that a candidate with these ``features`` is an object."""
+    return float(1.0 / (1.0 + np.exp(-(features @ WEIGHTS + OFFSET))))
