@@ -10,6 +10,7 @@ import numpy as np
 
 from .multiple_shooting import Fit, solve
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, CandidateEffect
+from .rigid_misfit import misfit
 from .rigid_search import (
     BEHIND,
     BEHIND_SHARE,
@@ -21,7 +22,6 @@ from .rigid_search import (
     finish,
     followed,
     keep,
-    misfit,
 )
 from .shooting_problem import Model
 

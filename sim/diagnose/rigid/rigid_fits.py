@@ -28,6 +28,7 @@ from .rigid_candidates import (
     CandidateEffect,
 )
 from .rigid_localisation import localise_discrepancies
+from .rigid_misfit import misfit
 from .rigid_prediction import (
     HeldOutScore,
     Points,
@@ -50,7 +51,6 @@ from .rigid_search import (
     finish_best,
     fit_camera_pose,
     fit_nominal,
-    misfit,
     reconsider_nominal,
     refine_promising,
     refit_beliefs,
