@@ -50,7 +50,7 @@ HELP_WIDTH = 100
 MOST_USAGE_FLAGS = 6
 """A command with more optional flags shows ``[options]`` in their place."""
 INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)' \(choose from (.*)\)", re.DOTALL)
-"""What argparse says of a command that is none; its list of all of them hides what matters."""
+"""Argparse's message for an unknown command; its list of all of them hides what matters."""
 NAME = re.compile(r"[a-z][a-z-]*")
 COMMAND_COLUMN = 16
 """Column at which the commands' texts begin."""

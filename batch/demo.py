@@ -28,7 +28,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "presets" / "demo" / "coffee.toml
 
 @dataclass(frozen=True, kw_only=True)
 class ClipConfig:
-    """How the demo is rendered. samples, light_scale, orbit, motion_blur: as of ``RenderOptions``."""
+    """Render options of the demo. samples, light_scale, orbit, motion_blur: as of ``RenderOptions``."""
 
     samples: int
     light_scale: float | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a command does before its modules are imported: heed signals, and have somebody who says how it was killed.
+"""First steps of a command, before its modules are imported: heed signals, and watch for how it is killed.
 
 Importing NumPy and the rest takes a second, on a busy machine many. Nothing is written before ``cli.main`` takes
 the signals over (``terminal.stop_signals``), so ending at once loses nothing. Imported first, and light; what has

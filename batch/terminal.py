@@ -64,7 +64,7 @@ def stop_signals(on_timeout: Callable[[], object] | None = None) -> Iterator[IsC
 
 
 SLOWEST = 20.0
-"""How many times slower than guessed a machine is taken to be at most."""
+"""Most times that a machine is taken to be slower than guessed."""
 
 
 class RemainingTime:

@@ -53,7 +53,7 @@ ASKED = 130
 REFUSED = re.compile(
     r"already exists; choose another|is there already; (name a new|choose another)|is not empty; choose"
 )
-"""What commands that never replace anything say."""
+"""Messages of commands that never replace anything."""
 
 QUICK = ("variant", "light", "capture", "collect")
 

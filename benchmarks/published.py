@@ -56,7 +56,7 @@ PUBLISHED: tuple[Row, ...] = (
     {"system": "Part123", "of": "PhyCAGE, table 1", "psnr_reference_view": 17.52, "clip_novel_views": 79.60},
     {"system": "ComboVerse", "of": "PhyCAGE, table 1", "psnr_reference_view": 16.22, "clip_novel_views": 85.23},
 )
-"""What the papers at hand say: dB, and CLIP scores in percent. No figure of theirs is here that is not in their text
+"""Figures of the papers at hand: dB, and CLIP scores in percent. No figure of theirs is here that is not in their text
 or was not measured on their own files."""
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a .blend file from somebody else names outside its own folder is left alone until the user agreed.
+"""Paths outside its own folder that somebody else's .blend file names are left alone until the user agrees.
 
 Properties that hold a path are found by their subtype, so that none is forgotten. Values that were set in this session
 are the user's word, and so are files that they saved. Of a file that is opened, every path that leads out of its folder

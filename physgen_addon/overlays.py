@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is drawn over Blender's editors: the bar of cached frames in timelines, the ground in 3D viewports.
+"""Drawn over Blender's editors: the bar of cached frames in timelines, the ground in 3D viewports.
 
 The bar is at the lower edge, as Blender draws it for its own point caches. The ground is a piece of the plane below the
 objects, as lines: the plane is no object, so nothing else shows where things will land. A photo has its own table, and
@@ -91,7 +91,7 @@ GROUND_CELLS = 8
 
 Lines = list[tuple[float, float, float]]
 _known_ground: list[tuple[Any, Lines]] = []
-"""What it was made for, and the ends of the lines; at most one, since only the shown scene is drawn."""
+"""Lines that show the ground, with what they were made for; at most one, since only the shown scene is drawn."""
 
 
 def ground_lines(scene: bpy.types.Scene) -> Lines:

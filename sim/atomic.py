@@ -36,7 +36,7 @@ _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK}
 _SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
 
 MOST_DEPTH, MOST_ENTRIES = 3, 100_000
-"""How deep, and at how many names, ``recover`` looks in a folder: ours are not deeper."""
+"""Depth, and number of names, to which ``recover`` looks in a folder: ours are not deeper."""
 
 _unfinished: set[Path] = set()
 """Files that this process is writing, to be removed by an exit that skips ``finally`` blocks."""

@@ -81,7 +81,7 @@ TABLE = 1 << 14
 
 @dataclass(frozen=True, kw_only=True)
 class GrainSize:
-    """How finely a body is drawn.
+    """Resolution at which a body is drawn.
 
     diameter: of the mean grain, m. children: per particle, 1 to ``MOST_CHILDREN``.
     """

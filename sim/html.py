@@ -124,8 +124,8 @@ _HARMLESS = re.compile(
     rb"style-src &#x27;sha256-[A-Za-z0-9+/=]{44}&#x27;; img-src data:; base-uri &#x27;none&#x27;; "
     rb"form-action &#x27;none&#x27;\" />"
 )
-"""How a page of ``page_head`` without a script begins. Nothing precedes the policy, so a browser holds all that follows
-to it, whoever wrote that."""
+"""Beginning of a page of ``page_head`` without a script. Nothing precedes the policy, so a browser holds all that
+follows to it, whoever wrote that."""
 MOST_PAGE_BYTES = 2**28
 
 

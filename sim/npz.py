@@ -19,7 +19,7 @@ from .files import open_file
 MAX_MEMBERS = 1024
 """Most arrays of an archive; no vision model writes more."""
 ARCHIVE_BYTES = 2**20
-"""What an archive may be longer than its arrays: headers and the list of members."""
+"""Bytes by which an archive may be longer than its arrays: headers and the list of members."""
 _NUMBERS, _TEXT = "biuf", "biufU"
 _PIECE = 2**20
 _MOST_SIDE = 2**48
@@ -27,7 +27,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 class ArrayHeader(NamedTuple):
-    """What a ``.npy`` file says of itself: shape, whether in Fortran's order, type."""
+    """Header of a ``.npy`` file: shape, whether in Fortran's order, type."""
 
     shape: tuple[int, ...]
     fortran: bool

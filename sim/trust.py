@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What came with a file counts only after the user's word, where it reaches beyond the file's own folder.
+"""The user's word for what came with a file and reaches beyond the file's own folder.
 
 Everything in a file that starts a program, imports a module, calls an endpoint or reads outside its folder is a
 ``Claim``. A reader of such a file returns it as ``Untrusted``, which nothing but ``opened`` opens: for content without

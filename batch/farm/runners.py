@@ -113,7 +113,7 @@ MOST_RETRIES = 100
 
 @dataclass(frozen=True, kw_only=True)
 class FarmOptions:
-    """How to run a plan.
+    """Options of running a plan.
 
     farm: ``local``, ``dask`` (on this machine), ``slurm`` (Dask workers as SLURM's jobs), or the address of a Dask
         scheduler, ``tcp://…`` or ``tls://…``.

@@ -59,7 +59,7 @@ LOOK_S = 0.1
 
 @dataclass(kw_only=True)
 class _Ended:
-    """How a command ended. code: negative for a signal. final: its ``done`` or ``error`` event. words: last line.
+    """End of a command. code: negative for a signal. final: its ``done`` or ``error`` event. words: last line.
 
     cancelled: whether it was asked to stop. kills_before: ``memory_kills`` when it began.
     """

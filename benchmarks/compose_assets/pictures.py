@@ -86,7 +86,7 @@ def cameras(asset: Asset, size: int) -> dict[str, Camera]:
 
 
 def _reach(seen: Camera, points: Array) -> float:
-    """How far out ``points`` (N, 3) get, 1 at the edge of the frame."""
+    """Return how far out ``points`` (N, 3) get, 1 at the edge of the frame."""
     pixels = seen.project(points)
     if pixels[:, 2].min() <= 0:
         return math.inf
@@ -101,7 +101,8 @@ SIZE, QUICK_SIZE = 256, 128
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How assets are lit. The emitted share knows nothing of neighbours: what O1 looks like alone, it does in company.
+    """Lighting of the assets. The emitted share knows nothing of neighbours: what O1 looks like alone, it does in
+    company.
 
     samples: light paths a pixel. ambient: share of the colour that comes from a white sky of even brightness, which
     neighbours hide; the rest is emitted, between ``shade`` (where the surface is turned from ``key``) and 1.

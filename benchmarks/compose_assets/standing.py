@@ -37,7 +37,7 @@ WANTED_DRIFT, WANTED_DEPTH, WANTED_SHARE = 0.02, 0.005, 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """What became of objects under gravity.
+    """Result of dropping objects under gravity.
 
     drift: the largest distance that any object's centre of mass moved from its start, over the largest extent of all.
     depth: the deepest contact at any check, over the same. seconds: simulated; fewer than asked for once something has

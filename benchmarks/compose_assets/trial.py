@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How far parts are in each other, by counting: for judging the assets themselves.
+"""Depth of parts in each other, by counting: for judging the assets themselves.
 
 One asset through the whole of it: splats fitted to its pictures, the start distorted, composed, judged.
 
@@ -115,7 +115,7 @@ Picture = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """How a part's splats are fitted: ``count`` of them."""
+    """Options of fitting a part's splats: ``count`` of them."""
 
     count: int
     options: FitOptions

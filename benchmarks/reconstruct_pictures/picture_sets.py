@@ -18,7 +18,7 @@ from .painted_bodies import KINDS, make_painted
 
 
 class Shot(NamedTuple):
-    """How a painted thing is photographed.
+    """Setting in which a painted thing is photographed.
 
     turn: how far it is turned to the left from facing the camera; pitch, view: of the camera, all degrees.
     """

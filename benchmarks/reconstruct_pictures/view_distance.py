@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How different two views of a body look: statistics of colour and gradients at several scales, no learned weights.
+"""Distance between two views of a body: statistics of colour and gradients at several scales, no learned weights.
 
 Two furs of one colour have no pixel in common and look alike; a mirrored face differs from fur in few pixels and looks
 wrong. So not pixels are compared but what small neighbourhoods have in common (as metamers have: Portilla and

@@ -34,7 +34,7 @@ START = {
     "flamenco": "submit job.json there to Flamenco (docs/farm.md)",
     "slurm": "run submit.sh there on the cluster",
 }
-"""What to do with a job that was written for another machine."""
+"""Next step with a job that was written for another machine."""
 VARIANT = "base"
 """Of the only variant, as the job file calls it."""
 

@@ -201,7 +201,7 @@ def _draw_number(layout: bpy.types.UILayout, material: Any, name: str) -> None:
 
 
 class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
-    """What few materials need: fibres, stiffness that gives way, and numbers to be animated"""
+    """Settings that few materials need: fibres, stiffness that gives way, and numbers to be animated"""
 
     bl_parent_id = "PHYSGEN_PT_material"
     bl_label = "Advanced"

@@ -38,7 +38,7 @@ LAST_FRAME = 1_048_574
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How an object is shown.
+    """Display of an object.
 
     name: of the object in the bake.
     shape: ``mesh`` (its own mesh, deformed), ``grains`` (its particles), ``surface`` (a surface around them).
@@ -60,7 +60,7 @@ class Look:
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRecord:
-    """How a bake belongs to a Blender scene; ``folder`` is the absolute path of the bake, and is not stored."""
+    """Link of a bake to a Blender scene; ``folder`` is the absolute path of the bake, and is not stored."""
 
     folder: str = ""
     fingerprints: tuple[str, ...] = ()

@@ -75,7 +75,7 @@ class OpenedBake:
 
     @property
     def unfinished(self) -> str:
-        """How to complete an incomplete bake, in words; empty for a complete one."""
+        """Return how to complete an incomplete bake, in words; empty for a complete one."""
         whole = self.manifest.frame_start + self.manifest.frames - 1
         if self.last_frame >= whole:
             return ""

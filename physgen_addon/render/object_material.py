@@ -146,7 +146,7 @@ def show_highlights(data: bpy.types.Mesh, camera: Camera, found: Highlights, mat
 
 
 def _turned(tree: bpy.types.NodeTree, normal: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """How far, 0 to 1, the surface has turned from its normal at rest; 0 where it has none."""
+    """Node output: how far, 0 to 1, the surface has turned from its normal at rest; 0 where it has none."""
     rest = tree.nodes.new("ShaderNodeAttribute")
     rest.attribute_name = REST_NORMAL
     unit = _maths(tree, "ShaderNodeVectorMath", "NORMALIZE", rest.outputs["Vector"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What shows in the photo once a body's matter parts: grains of sand or snow, and torn skins.
+"""Matter that shows in the photo once a body parts: grains of sand or snow, and torn skins.
 
 Grains are computed for each frame (``sim/grains.py``), in the photo's colours. Light falls on a smooth hull around
 them: balls would be half as bright as the skin was from which they come, and their shades belong to their colours,
@@ -39,7 +39,7 @@ SKIN_SAMPLES, FEW_SAMPLES, SHALLOW, NEARLY = 150_000, 2_000, 3.0, 0.25
 and how much farther than the nearest, in shares, the one taken may be."""
 KEPT_STATES = 3
 GROWN_S, FADING_S = 0.25, (0.17, 0.5)
-"""How many seconds of the clip after the skin tears the last grain has come, and in which the skin goes where nothing
+"""Seconds of the clip after the skin tears at which the last grain has come, and in which the skin goes where nothing
 tears it: grains break through one by one before it does, so that no single frame changes everything."""
 PARTED = 1.3
 """Stretch between neighbouring particles above which their grains do not wait. The skin there is about to tear."""

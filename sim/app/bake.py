@@ -63,7 +63,7 @@ KEEP_SECONDS = 2.0
 """About this much computing, and a part of a frame besides, is lost when a run is cancelled."""
 
 MANIFEST_SECONDS = 0.5
-"""How often ``frames_done`` in the manifest is brought up to date."""
+"""Interval at which ``frames_done`` in the manifest is brought up to date."""
 
 LEAST_PARTS, MOST_PARTS = 4, 1000
 PART_WORK = 2e7
@@ -287,7 +287,7 @@ class _Run:
         return self.save("complete")
 
     def _write_metrics(self) -> None:
-        """How long frames took is apart from what they are, so that the same bake has the same bytes."""
+        """Times that frames took are kept apart from the frames, so that the same bake has the same bytes."""
         frames = [{key: value for key, value in frame.items() if key != "seconds"} for frame in self.metrics]
         write_json(self.out / METRICS_FILE, {"frames": frames})
         write_json(self.out / TIMES_FILE, {"seconds": [frame.get("seconds") for frame in self.metrics]})

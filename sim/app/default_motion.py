@@ -74,13 +74,13 @@ SLIDE = 0.6
 """Way of a push over the extent along it; shorter ones are tried in the shares of ``LOWER``."""
 
 UPRIGHT = 1.3
-"""What a thing bears before it tips over its leading edge, over the friction of the ground, at least."""
+"""Least push that a thing bears before it tips over its leading edge, over the friction of the ground."""
 
 PUSHES = tuple((math.cos(n * math.pi / 8), math.sin(n * math.pi / 8)) for n in (0, 8, 1, 7, 15, 9, 14, 10, 13, 11, 12))
 """Ways of pushes, to the right of and away from the camera."""
 
 HOLD_S = 0.3
-"""How long the clip goes on after the last motion, so that it is seen to be over."""
+"""Time that the clip goes on after the last motion, so that it is seen to be over."""
 
 
 @dataclass(frozen=True, kw_only=True)

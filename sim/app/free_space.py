@@ -76,7 +76,7 @@ def outside_frame(camera: Camera, points: Array, margin: float) -> NDArray[np.fl
 
 
 class Clearance:
-    """How near a thing may come to others: as near as it rests, or a twentieth of its size."""
+    """Least distance of a thing to others: as near as it rests, or a twentieth of its size."""
 
     def __init__(self, thing: Thing, others: Sequence[Array]) -> None:
         from scipy.spatial import cKDTree

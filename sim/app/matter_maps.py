@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 PICTURES = (".png", ".jpg", ".jpeg")
 
 ROUNDED = 1e-3
-"""How far outside 0 to 1 weights may lie, as programs store them; they are cut off."""
+"""Distance outside the range 0 to 1 that weights may have, as programs store them; they are cut off."""
 
 
 def nearest_on_surface(mesh: ObjectMesh, places: Array, spacing: float) -> tuple[NDArray[np.int64], Array]:

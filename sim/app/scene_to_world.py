@@ -134,7 +134,7 @@ def surface(item: SceneObject, ground: SurfaceContact) -> SurfaceContact:
 
 
 def mix(a: SurfaceContact, b: SurfaceContact) -> SurfaceContact:
-    """How two surfaces meet that were each judged alone."""
+    """Return the contact of two surfaces that were each judged alone."""
     static = None
     friction = math.sqrt(a.friction * b.friction)
     if a.static_friction is not None or b.static_friction is not None:

@@ -335,7 +335,7 @@ def body_overlap(a: BodyParticles, b: BodyParticles, spacing: float) -> float:
 
 
 def _thickness(positions: Array, marked: NDArray[np.bool_]) -> float:
-    """How far the marked particle that is deepest among the marked is from the others."""
+    """Return how far the marked particle that is deepest among the marked is from the others."""
     if marked.all():
         return float(np.ptp(positions, axis=0).max())
     return float(cKDTree(positions[~marked]).query(positions[marked])[0].max())

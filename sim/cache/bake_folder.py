@@ -45,12 +45,12 @@ SPACES = (WORLD_SPACE, MESH_SPACE)
 """Coordinates of samples: world metres, or those of the object's mesh file."""
 
 GRAINS, SURFACE = "grains", "surface"
-"""How particles are shown: as grains, or as the surface that encloses them."""
+"""Display of particles: as grains, or as the surface that encloses them."""
 
 
 MOST_FRAMES, MOST_START, MOST_RATE = 100_000, 10**7, 1e6
 MOST_FILES = 1_000_000
-"""What a manifest may claim: frames, the number of the first one, frames per second, files in all."""
+"""Most that a manifest may claim: frames, the number of the first one, frames per second, files in all."""
 
 SPLAT_POINTS = 4
 """Points per splat in its cache: centre, and the ends of three half axes."""

@@ -123,7 +123,7 @@ INK, FAINT, BEFORE, AFTER = (35, 35, 35), (170, 170, 170), (60, 60, 215), (60, 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SimulatedBody:
-    """How a simulated body looks: its own pixels. sprite: (h, w, 3) BGR. cover: (h, w) opacity 0 to 1. anchor: (2,) px
+    """Look of a simulated body: its own pixels. sprite: (h, w, 3) BGR. cover: (h, w) opacity 0 to 1. anchor: (2,) px
     of its centre in the sprite."""
 
     sprite: Picture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a trial observed of world points: projections, distances, means of what is known."""
+"""Observations of world points in a trial: projections, distances, means of what is known."""
 
 from __future__ import annotations
 

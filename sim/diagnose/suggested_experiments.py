@@ -21,8 +21,8 @@ NEAR_GROUND = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedSetting:
-    """What an experiment can repeat. dropped: nothing moved sideways. lands: the ground was reached. turns: the points
-    show how the body turns. lone: one complete trial is all."""
+    """Parts of a motion that an experiment can repeat. dropped: nothing moved sideways. lands: the ground was reached.
+    turns: the points show how the body turns. lone: one complete trial is all."""
 
     dropped: bool = False
     lands: bool = True
@@ -123,7 +123,7 @@ _DROPPED: Mapping[frozenset[str], str] = {
         "air_drag+magnus": "Drop the object once without spin and once with much: only lift follows the spin.",
     }.items()
 }
-"""What a recording of drops can repeat: no throw, and no greater height."""
+"""Limits of what a recording of drops can repeat: no throw, and no greater height."""
 
 _SINGLE: Mapping[str, str] = {
     "force": "Repeat the motion with a heavier object of the same shape.",

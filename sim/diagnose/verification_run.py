@@ -38,7 +38,7 @@ SOFT_CONTACT_S = 0.08
 """Simulated duration for a deformable body after first contact: its first impact."""
 
 SOFT_LEAD_S = 0.02
-"""How long before that touch the engine takes over, where the verdict concerns contact or material."""
+"""Time before that touch at which the engine takes over, where the verdict concerns contact or material."""
 
 CELLS_ACROSS = (8.0, 12.0)
 """Cells along a deforming body's longest side: coarse and fine."""

@@ -41,7 +41,7 @@ MOST_SSIM = 60
 
 @dataclass
 class _Pass:
-    """What one pass over the frames collects."""
+    """Figures that one pass over the frames collects."""
 
     first: Frame | None = None
     count: int = 0

@@ -63,7 +63,7 @@ EXPLANATIONS = {
     ),
 }
 _SUFFIXES = {".mp4": b"ftyp", ".m4v": b"ftyp", ".webm": b"\x1a\x45\xdf\xa3"}
-"""What browsers play, and what such a file begins with, within its first bytes."""
+"""Formats that browsers play, with what such a file has among its first bytes."""
 
 _PAGE, _START = (Path(__file__).with_name(f"questionnaire_{name}.html") for name in ("page", "start"))
 _SCRIPT, _STYLE = (Path(__file__).with_name(f"questionnaire_page.{kind}") for kind in ("js", "css"))

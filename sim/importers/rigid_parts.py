@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What MJCF and URDF have in common: bodies with shapes and inertia, and the reader of numbers and meshes.
+"""Common parts of MJCF and URDF: bodies with shapes and inertia, and the reader of numbers and meshes.
 
 Formulas of volumes and inertia are those of homogeneous solids.
 """
@@ -78,7 +78,7 @@ class RigidModel:
 
 @dataclass(kw_only=True)
 class BodyParts:
-    """What belongs to one body while the file is read, in world coordinates."""
+    """Parts of one body while the file is read, in world coordinates."""
 
     name: str
     free: bool
@@ -102,7 +102,7 @@ class BodyParts:
 
 
 class ModelReader:
-    """What both formats share."""
+    """State of reading that both formats share."""
 
     def __init__(self, path: Path, root: ElementTree.Element) -> None:
         self.path, self.root, self.notes = path, root, list[str]()

@@ -216,7 +216,7 @@ class BlockLists:
 
     @property
     def flow(self) -> FlowArrays:
-        """What laws that flow need of the nodes besides; single elements where none does."""
+        """Fields of the nodes that only laws that flow need; single elements where none does."""
         return FlowArrays(
             self._past_window,
             self._past_scattered,

@@ -299,7 +299,7 @@ def particles(
 
 
 def modulus_shares(body: BodyParticles, choice: NDArray[np.int32], cells: Similarity) -> NDArray[np.float32]:
-    """What 2 mu V0 and lambda V0 of each particle (N,) are over its material's numbers in Pa; -1 for those that are not
+    """Return 2 mu V0 and lambda V0 of each particle (N,) over its material's numbers in Pa; -1 for those that are not
     of the body's own ``material``, whose tracks they do not follow."""
     factor = np.ones(body.count) if body.stiffness_scale is None else body.stiffness_scale
     shares = cells.modulus(1.0) * body.volumes * cells.scale**3 * factor

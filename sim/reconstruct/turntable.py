@@ -22,7 +22,7 @@ AZIMUTHS = tuple(range(0, 360, 45))
 SIDE = 360
 """Pixels along a side of a view."""
 RISE_DEG = 12.0
-"""How far above the horizontal the views lie."""
+"""Angle of the views above the horizontal."""
 ANGLE_DEG = 18.0
 """Angle within which the body lies, whatever its size."""
 FINER = 2

@@ -88,7 +88,7 @@ FOLDER_KINDS = {
     "manifest.json": "a bake",
     "capture.json": "a capture",
 }
-"""What a folder is that holds a file of this name."""
+"""Kind of a folder that holds a file of this name."""
 
 
 def folder_kind(folder: Path, files: Iterable[str] = tuple(FOLDER_KINDS)) -> str | None:

@@ -66,7 +66,7 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a task ended.
+    """End of a task.
 
     state: ``done``; ``kept``, if it was up to date; ``failed``; ``skipped``, because a dependency failed;
         ``cancelled``.

@@ -233,7 +233,7 @@ class ObservedBody:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointMoments:
-    """What chi² of a pose needs of F frames' points: weighted by 1/sigma², about their means.
+    """Sums over F frames' points for the chi² of a pose: weighted by 1/sigma², about their means.
 
     count: (F,) points seen. middle: (F, 3) m, mean seen. center: (F, 3) m, mean place, body axes. square: (F,) sum of
     squared distances seen. both, spread: (F, 3, 3) sums of place times seen, and of place times place.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What moves in a video of a still scene: the background without it, and its regions in every frame.
+"""Moving regions in every frame of a video of a still scene.
 
 The background is the median over time. Where something covers a pixel for long, the value is taken that fits the
 surroundings, so that a slow body leaves no ghost. A camera that drifts is stabilised on the background's corners.

@@ -42,7 +42,8 @@ MISSHAPEN = 0.35
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoMotion:
-    """What was followed. capture: of one trial. view: where the motion lies in the picture. found: the video's regions.
+    """Result of following a plain body. capture: of one trial. view: where the motion lies in the picture. found: the
+    video's regions.
 
     frames: (T,) of the video, for the capture's samples. places: (T, 2) px of the centre. regions: those of the body.
     box: the body as a box that turns, at the same samples, where its faces tell the camera. others: regions of other

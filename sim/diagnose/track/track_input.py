@@ -138,7 +138,7 @@ def parse_body(text: str) -> BodyRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
-    """How points are selected, tracked and dropped. Pixels are those of the video.
+    """Options of selecting, tracking and dropping points. Pixels are those of the video.
 
     density: target number of points per object, 6 to 500.
     min_contrast: grey levels per pixel, 0.1 to 50; RMS gradient of a patch along its weakest direction below which it

@@ -322,7 +322,7 @@ REACH = 4.0
 spacings of a mesh, else the groove has no wall."""
 
 HEAD_ON = 1.2
-"""How much longer than the air a vertex's way to the other part may be where that faces it. Beyond, it met an edge."""
+"""Longest way of a vertex to another part that faces it, over the air there. Beyond, it met an edge."""
 
 ITERATIONS = 30
 """Of the search for how far a vertex may move: each goes as far as the distance to the other part is."""

@@ -106,7 +106,7 @@ def share_beyond(d: ti.f32):
 
 @ti.func
 def slope_beyond(d: ti.f32):
-    """How fast ``share_beyond`` falls with the distance, 1/cell, 0 or more."""
+    """Rate at which ``share_beyond`` falls with the distance, 1/cell, 0 or more."""
     a = ti.abs(d)
     slope = 0.0
     if a <= 0.5:
@@ -239,7 +239,7 @@ def push_apart(
     shapes: ShapeArrays,
     coupling: CouplingArrays,
 ):
-    """What the crowding at node ``i`` of grid block ``g`` does in a substep to ground and rigid bodies that take room
+    """Apply the crowding at node ``i`` of grid block ``g`` in a substep to ground and rigid bodies that take room
     there: the derivative of its energy by their place; and to the node, the opposite. strength: impulse (kg cells/s)
     on the cell² of a surface that leaves the room that there is."""
     n = g * BLOCK_NODES + i

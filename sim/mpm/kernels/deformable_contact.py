@@ -138,7 +138,7 @@ def distance_from_middle(share: ti.f32, slope: ti.f32, thickness: ti.f32):
 
 @ti.func
 def slope_along(slope: vec3, other: vec3, thick: ti.i32):
-    """How steeply a thin body's share changes across its face: along the other body's slope where that one is thick."""
+    """Slope of a thin body's share across its face: along the other body's slope where that one is thick."""
     steep = slope.norm()
     if thick == 1 and other.norm() > LEAST_SLOPE:
         steep = ti.abs(slope.dot(other)) / other.norm()

@@ -2,7 +2,8 @@
 # ruff: noqa: ANN201
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
-"""How many threads share a block of particles or nodes: one on the CPU, a group of them, *lanes*, on a graphics card.
+"""Number of threads that share a block of particles or nodes: one on the CPU, a group of them, *lanes*, on a graphics
+card.
 
 On the CPU a thread takes a whole block and its private window of nodes without atomics. A graphics card wants some
 hundred thousand threads and has a fast memory shared by a group: there the lanes of a group take the particles of one
@@ -53,7 +54,7 @@ def lanes_of(arch: str) -> Lanes:
 
 
 class Pads(NamedTuple):
-    """What the lanes of a block share: SharedArrays on a card, otherwise the block's part of global arrays."""
+    """Memory that the lanes of a block share: SharedArrays on a card, otherwise the block's part of global arrays."""
 
     window: Any
     """Nodes to read with ``node_of``: (4 WINDOW_NODES,) f32 in shared memory, component by component (Taichi has no

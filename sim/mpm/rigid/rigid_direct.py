@@ -62,7 +62,7 @@ from .rigid_layout import (
 from .rigid_math import dvec3, load3, load33, store3
 
 STIFFNESS = 1e5
-"""What a wrong velocity at a contact weighs against a change of the bodies' motion: contacts give by a hundred
+"""Weight of a wrong velocity at a contact against a change of the bodies' motion: contacts give by a hundred
 thousandth of the velocity that their impulse makes."""
 
 ROUNDS = 3
@@ -269,7 +269,7 @@ def solve(n, scratch, contacts: RigidContacts):
 
 @func
 def height(size, limit, stiffness):
-    """What an impulse without limit of ``size`` adds to the function that is made least."""
+    """Return what an impulse of ``size`` without limit adds to the minimised function."""
     return ti.select(size > limit, limit * (size - limit / 2), size * size / 2) / stiffness
 
 

@@ -91,7 +91,7 @@ def edges_behind(logs: Picture, part: Mask, hidden: Mask, shaded: Mask | None = 
 
 
 def _things(part: Mask, hidden: Mask) -> list[Mask]:
-    """What hides edges in ``part``, largest first; all of it where nothing does."""
+    """Return what hides edges in ``part``, largest first; all of it where nothing does."""
     covered = part & hidden
     count, labels, stats, _ = cv2.connectedComponentsWithStats(covered.astype(np.uint8), connectivity=8)
     if count < 2:

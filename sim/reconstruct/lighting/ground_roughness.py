@@ -51,8 +51,8 @@ FEWEST = 60
 MOST_DEVIATING = 10.0
 """Standard deviations beyond which a band counts as that far: glints and scratches."""
 ASIDE, UP, TALLER = 0.04, 0.06, 0.1
-"""How far a mirror image may lie off, over its width and height, and by how much it may be taller or lower: horizon and
-bodies are estimates."""
+"""Distance by which a mirror image may lie off, over its width and height, and by how much it may be taller or lower:
+horizon and bodies are estimates."""
 
 
 @dataclass(frozen=True, eq=False)

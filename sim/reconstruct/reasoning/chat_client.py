@@ -84,7 +84,7 @@ class ChatRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Wording:
-    """What messages call the pictures that are sent, and what did not happen where no answer arrives."""
+    """Words of messages for the pictures that are sent, and for what did not happen where no answer arrives."""
 
     sent: str = "photo"
     lost: str = "the objects were not identified"

@@ -94,8 +94,8 @@ def _log_light(pixels: NDArray[np.uint8]) -> Light:
 
 
 def _unlike_ground(view: BoxCrop, mask: Mask) -> tuple[Light, Light]:
-    """How unlike the ground each pixel (h, w) is, lit or shaded: squared distance from the line in standard deviations;
-    and how much brighter than the ground around it, as a natural logarithm."""
+    """Return how unlike the ground each pixel (h, w) is, lit or shaded: squared distance from the line in standard
+    deviations; and how much brighter than the ground around it, as a natural logarithm."""
     light = _log_light(view.pixels)
     size = float(np.sqrt(mask.sum()))
     free = ~(cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~view.others
@@ -182,7 +182,8 @@ def _cut(view: BoxCrop, mask: Mask, unlike: Light, brighter: Light) -> Mask | No
 
 
 def _texture(light: Light, where: Mask) -> Light:
-    """How far each pixel (h, w) of ``where`` lies from the mean of those around it, natural logarithm of ``light``."""
+    """Return how far each pixel (h, w) of ``where`` lies from the mean of those around it, natural logarithm of
+    ``light``."""
     weight = where.astype(np.float32)
     total = np.maximum(cv2.GaussianBlur(weight, (0, 0), 2.0), 1e-3)[..., None]
     mean = cv2.GaussianBlur(light * weight[..., None], (0, 0), 2.0) / total

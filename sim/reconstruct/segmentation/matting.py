@@ -173,7 +173,7 @@ def soft_alpha(pixels: Pixels, mask: Mask, *, width: float | None = None, others
 
 
 def _apart(pixels: Pixels, trimap: Trimap, reach: float) -> Alpha:
-    """How far (h, w), 0 to 1, the local mean colours of both sides can be told apart."""
+    """Return how far (h, w), 0 to 1, the local mean colours of both sides can be told apart."""
     lab = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
     means = []
     for side in (trimap.own, trimap.other):

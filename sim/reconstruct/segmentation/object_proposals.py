@@ -193,7 +193,8 @@ def _neighbours(segments: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def _unlike_border(pixels: Pixels) -> NDArray[np.float32]:
-    """How little each pixel (h, w) looks like the photo's border, lit or shaded; log likelihood, larger is rarer."""
+    """Return how little each pixel (h, w) looks like the photo's border, lit or shaded; log likelihood, larger is
+    rarer."""
     height, width = pixels.shape[:2]
     view = crop_around_box(pixels, (0, 0, width, height), np.zeros((height, width), dtype=bool))
     rim = np.ones((height, width), dtype=bool)

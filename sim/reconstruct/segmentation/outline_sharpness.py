@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How sharp outlines are: who photographs a thing focuses on it, and what is out of focus is its background.
+"""Sharpness of outlines: who photographs a thing focuses on it, and what is out of focus is its background.
 
 The width of an edge is the step of colour across it over its steepest slope, as in edge-based measures of defocus
 (Elder & Zucker, "Local scale control for edge detection and blur estimation", PAMI 1998).
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 REACH = 8
-"""How far in pixels of the copy the colours across an outline are followed, inwards and outwards."""
+"""Distance in pixels of the copy to which the colours across an outline are followed, inwards and outwards."""
 
 LEAST_STEP = 10.0
 """Step of colour in CIELAB across an outline below which a point of it tells nothing."""

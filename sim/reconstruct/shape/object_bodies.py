@@ -165,7 +165,7 @@ def _deeper(camera: Camera, box: BodyMesh, full: Mask, fit: float) -> BodyMesh:
 
 @dataclass(frozen=True)
 class _Inflation:
-    """How to inflate one object."""
+    """Options of inflating one object."""
 
     camera: Camera
     full: Mask

@@ -40,7 +40,7 @@ Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
 
 SEEN_FROM_DEG = 15.0
-"""How far below the horizontal the foot lies in the turned view: things that hang are seen nearly level."""
+"""Angle below the horizontal of the foot in the turned view: things that hang are seen nearly level."""
 ALONE = 3.0
 """Distance of what hangs alone, in heights of the camera."""
 CLEAR = 0.05

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How safely a body stands, and a broader base for it: the side that the photo does not show is made thicker.
+"""Stability of a standing body, and a broader base for it: the side that the photo does not show is made thicker.
 
 The margin is that of the centre of mass inside the base. What lies on the ground as a film thinner than half a grid
 cell holds no particle and carries nothing; it is no base.
@@ -43,7 +43,7 @@ ON_BASE = 1e-6
 
 @dataclass(frozen=True)
 class SupportMargin:
-    """How a closed body of uniform density stands on the level through its lowest vertex; lengths in the mesh's unit.
+    """Stand of a closed body of uniform density on the level through its lowest vertex; lengths in the mesh's unit.
 
     margin: from the foot of its centre of mass to the edge of the convex hull of its base, negative outside, -inf
     without a base. inradius: the same of the hull's own centre. height; volume; longest: largest extent along an axis.
@@ -131,7 +131,7 @@ STEPS = 30
 COST = 1.0
 """Share of the wanted margin that a body has to gain for twice its volume; less is not worth its looks."""
 SAFE = 1.5
-"""What standing as safely as wanted counts, where less counts as the share that is reached."""
+"""Score of standing as safely as wanted; less counts as the share that is reached."""
 WEDGE = 0.25
 """By how much more an addition low down alone has to gain: the back slopes to the ground."""
 WHOLE = 0.3

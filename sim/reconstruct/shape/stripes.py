@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What of a coloured region that reaches an object's outline goes on round the body, and what is a mark beside it.
+"""Stripes: the part of a coloured region at an object's outline that goes on round the body, and marks beside it.
 
 A ribbon reaches the outline at both ends and goes on behind; the bow on it does not. So along the way from one end to
 the other a region goes on as wide as it is at the outline. One that touches the outline with a corner, such as a heart
