@@ -8,7 +8,6 @@ open: a diagnosis, and Install from a folder of wheels (``run.py --wheels``).
 
 from __future__ import annotations
 
-import importlib
 import sys
 import time
 from pathlib import Path
@@ -23,16 +22,6 @@ import session
 
 TASK = session.task()
 OUT, SCREENS = Path(TASK["out"]), Path(TASK["out"]) / "odd"
-
-
-def extension(module: str):
-    """A module of the installed extension."""
-    return importlib.import_module(f"{TASK['addon']}.{module}")
-
-
-def running():
-    """The job that is running, or None."""
-    return extension("physgen_addon.background_jobs").running()
 
 
 def arranged():
@@ -63,18 +52,13 @@ def bake(seconds: float = 200):
     """Bake live, to its end."""
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the bake", seconds)
+    yield from session.ended("the bake", seconds)
     yield 0.7
 
 
 def state():
     """Of the bake of the scene, as the panel shows it."""
-    return extension("physgen_addon.bake_state").state(bpy.context.scene)
-
-
-def ended(what: str, seconds: float = 900):
-    """Wait until no job runs."""
-    yield from session.until(lambda: running() is None, seconds, what)
+    return session.extension("physgen_addon.bake_state").state(bpy.context.scene)
 
 
 def middle(item: bpy.types.Object) -> Vector:
@@ -190,8 +174,10 @@ def meanwhile():
     assert call("quick_jelly") == {"FINISHED"}
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from session.until(lambda: running() is None or (running().done or 0) > 1, 200, "the first frame")
-    assert running() is not None, "the bake was too short for this"
+    yield from session.until(
+        lambda: session.running() is None or (session.running().done or 0) > 1, 200, "the first frame"
+    )
+    assert session.running() is not None, "the bake was too short for this"
     cube = bpy.data.objects["Cube"]
     cube.name = "Würfel"
     with screens.focus():
@@ -203,7 +189,7 @@ def meanwhile():
     yield 1.0
     yield from screens.shoot(SCREENS, "10_renamed_and_deleted_while_baking")
     bpy.ops.wm.save_as_mainfile(filepath=str(OUT / "meanwhile.blend"))
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     yield 1.2
     yield from screens.shoot(SCREENS, "11_baked_without_one")
     first = state()
@@ -236,7 +222,9 @@ def switched_off():
     bpy.context.scene.physgen.simulation.frame_end = 24
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from session.until(lambda: running() is None or (running().done or 0) > 1, 200, "the first frame")
+    yield from session.until(
+        lambda: session.running() is None or (session.running().done or 0) > 1, 200, "the first frame"
+    )
     addon_utils.disable(TASK["addon"])
     yield 1.5
     addon_utils.enable(TASK["addon"])
@@ -292,7 +280,7 @@ def placed():
 def diagnose():
     """A recording that is loaded and diagnosed, and the panel for a video, which is refused without one."""
     yield from home()
-    session.a_capture(extension("sim.diagnose.capture"), OUT / "capture")
+    session.a_capture(session.extension("sim.diagnose.capture"), OUT / "capture")
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     names = tuple(f"PHYSGEN_PT_diagnose{part}" for part in ("", "_show", "_causes", "_add"))
     with screens.only(names):
@@ -303,7 +291,7 @@ def diagnose():
             assert bpy.ops.physgen.diagnose("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
         yield 4.0
         yield from screens.shoot(SCREENS, "41_diagnosing")
-        yield from ended("the diagnosis")
+        yield from session.ended("the diagnosis")
         yield from screens.shoot(SCREENS, "42_diagnosed")
         assert bpy.context.scene.physgen_diagnose.has_report, "there is no diagnosis"
     with screens.only(("PHYSGEN_PT_diagnose", "PHYSGEN_PT_diagnose_video")):
@@ -328,7 +316,7 @@ def installed():
     with screens.focus():
         bpy.ops.physgen.add_bodies()
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from ended("the refusal")
+    yield from session.ended("the refusal")
     yield 0.5
     yield from screens.shoot(SCREENS, "50_no_python")
     began = time.monotonic()
@@ -337,7 +325,7 @@ def installed():
     yield 6.0
     yield from screens.shoot(SCREENS, "51_installing")
     yield from screens.shoot_preferences(SCREENS, "52_installing_preferences", TASK["addon"])
-    yield from ended("the installation")
+    yield from session.ended("the installation")
     took = time.monotonic() - began
     yield from screens.shoot(SCREENS, "53_installed")
     yield from screens.shoot_preferences(SCREENS, "54_installed_preferences", TASK["addon"])
@@ -345,9 +333,9 @@ def installed():
     bpy.context.scene.physgen.simulation.frame_end = 6
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     yield from screens.shoot(SCREENS, "55_baked_by_it")
-    assert extension("physgen_addon.bake_state").state(bpy.context.scene).status == "baked"
+    assert session.extension("physgen_addon.bake_state").state(bpy.context.scene).status == "baked"
     return {"installed_s": round(took, 1)}
 
 

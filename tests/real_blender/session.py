@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
@@ -21,6 +22,21 @@ Step = Generator[float, None, dict | None]
 def task() -> dict[str, str]:
     """What run.py asks for: ``out``, ``python``, ``addon``, ``photo``, ``scene``, ``wheels``, ``only``."""
     return json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8"))
+
+
+def extension(module: str) -> Any:
+    """Return a module of the installed extension."""
+    return importlib.import_module(f"{task()['addon']}.{module}")
+
+
+def running() -> Any:
+    """Return the job that is running, or None."""
+    return extension("physgen_addon.background_jobs").running()
+
+
+def ended(what: str, seconds: float = 900) -> Generator[float, None, float]:
+    """Wait until no job runs."""
+    return (yield from until(lambda: running() is None, seconds, what))
 
 
 def until(condition: Callable[[], bool], seconds: float, what: str) -> Generator[float, None, float]:

@@ -7,7 +7,6 @@ default cube to a playing bake, and from the sample photo to a still, are counte
 
 from __future__ import annotations
 
-import importlib
 import shutil
 import sys
 import time
@@ -21,21 +20,6 @@ import session
 
 TASK = session.task()
 OUT, SCREENS = Path(TASK["out"]), Path(TASK["out"]) / "tour"
-
-
-def extension(module: str):
-    """A module of the installed extension."""
-    return importlib.import_module(f"{TASK['addon']}.{module}")
-
-
-def running():
-    """The job that is running, or None."""
-    return extension("physgen_addon.background_jobs").running()
-
-
-def ended(what: str, seconds: float = 900):
-    """Wait until no job runs."""
-    yield from session.until(lambda: running() is None, seconds, what)
 
 
 WIDTHS = (431, 292)
@@ -73,12 +57,14 @@ def first_bake():
     yield from screens.press("shift+p")
     # The pie opens at the mouse.
     yield from screens.click(x - 130, y - 110)
-    assert running() is not None, "the pie's upper entry did not bake"
-    until_playing = session.until(lambda: (running() is None) or (running().done or 0) > 1, 900, "the first frame")
+    assert session.running() is not None, "the pie's upper entry did not bake"
+    until_playing = session.until(
+        lambda: (session.running() is None) or (session.running().done or 0) > 1, 900, "the first frame"
+    )
     yield from until_playing
     first = time.monotonic() - began
     yield from screens.shoot(SCREENS, "04_baking")
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     whole = time.monotonic() - began
     before = bpy.context.scene.frame_current
     yield from screens.point(x, y)
@@ -99,7 +85,7 @@ def by_panel():
     scene.physgen.simulation.quality, scene.physgen.simulation.frame_end = "preview", 12
     with screens.focus():
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     yield from screens.shoot(SCREENS, "06_baked")
     bpy.data.objects["Cube"].physgen.material.density = 321.0
     yield 1.5
@@ -130,7 +116,7 @@ def refused():
     with screens.focus():
         bpy.ops.physgen.add_bodies()
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from ended("the failure")
+    yield from session.ended("the failure")
     yield 0.5
     yield from screens.shoot(SCREENS, "10_failed")
     screens.aim()
@@ -161,7 +147,7 @@ def menus():
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
     area = next(area for area in screens.window().screen.areas if area.type == "PROPERTIES")
     area.spaces.active.context = "PHYSICS"
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     yield from screens.drawn(4)
     screens.picture(screens.window(), SCREENS / "13_physics_tab_and_timeline.png")
 
@@ -174,9 +160,9 @@ def sample_meshes():
     yield from screens.shoot(SCREENS, "14_sample_meshes")
     with screens.focus():
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from session.until(lambda: running() is None or (running().done or 0) > 6, 900, "some frames")
+    yield from session.until(lambda: session.running() is None or (session.running().done or 0) > 6, 900, "some frames")
     yield from screens.shoot(SCREENS, "15_sample_baking")
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     bpy.context.scene.frame_set(14)
     yield from screens.shoot(SCREENS, "16_sample_baked")
 
@@ -193,11 +179,11 @@ def sample_photo():
         assert bpy.ops.physgen.reconstruct("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
     yield 2.0
     yield from screens.shoot(SCREENS, "18_reconstructing")
-    yield from ended("the reconstruction")
+    yield from session.ended("the reconstruction")
     yield from screens.shoot(SCREENS, "19_reconstructed")
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     bpy.context.scene.frame_set(9)
     yield from screens.shoot(SCREENS, "20_photo_baked")
     windows = set(bpy.context.window_manager.windows)
@@ -205,7 +191,7 @@ def sample_photo():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
     yield 2.0
     yield from screens.shoot(SCREENS, "21_rendering")
-    yield from ended("the still")
+    yield from session.ended("the still")
     took = time.monotonic() - began
     result = bpy.context.scene.physgen.rendering.result
     assert result.endswith("0009.png") and Path(result).is_file(), f"no still: {result!r}"
@@ -229,7 +215,7 @@ def a_photo():
     bpy.context.scene.physgen.simulation.quality, bpy.context.scene.physgen.simulation.frame_end = "preview", 3
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     bpy.context.scene.frame_set(2)
 
 
@@ -244,7 +230,7 @@ def farm():
         rendering.farm, rendering.farm_folder = "slurm", str(folder)
         with screens.focus():
             assert bpy.ops.physgen.farm("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-        yield from ended("the job to be written")
+        yield from session.ended("the job to be written")
         yield from screens.shoot(SCREENS, "32_farm_written")
     assert (folder / "slurm").is_dir(), "no job was written"
 
@@ -257,7 +243,7 @@ def nodes():
     windows = set(bpy.context.window_manager.windows)
     with screens.focus():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from ended("the layers")
+    yield from session.ended("the layers")
     yield 1.0
     for shown in set(bpy.context.window_manager.windows) - windows:
         with bpy.context.temp_override(window=shown):
@@ -349,7 +335,7 @@ def strange():
     shutil.copyfile(mine, theirs)
     bpy.ops.wm.open_mainfile(filepath=str(theirs))
     yield from screens.drawn()
-    assert extension("physgen_addon.blend_trust").pending(bpy.context.scene), "a stranger's path does not wait"
+    assert session.extension("physgen_addon.blend_trust").pending(bpy.context.scene), "a stranger's path does not wait"
     yield from screens.shoot(SCREENS, "26_strange_file")
     screens.aim()
     with screens.focus():
@@ -364,7 +350,7 @@ def dropped():
     yield from home()
     folder = OUT / "to drop"
     folder.mkdir()
-    samples = Path(extension("physgen_addon.operators.asset_ops").DEMO)
+    samples = Path(session.extension("physgen_addon.operators.asset_ops").DEMO)
     shutil.copyfile(samples / "coffee.jpg", folder / "coffee.jpg")
     before = set(screens.window().screen.areas)
     view = screens.viewport()
@@ -423,7 +409,7 @@ def documented():
             bpy.ops.physgen.open_sample(sample=sample)
         yield 1.0
         yield from page({"PHOTO": "blender_photo", "MESHES": "blender_objects"}[sample])
-    preview = extension("physgen_addon.preview.live_preview")
+    preview = session.extension("physgen_addon.preview.live_preview")
     with screens.focus():
         bpy.ops.physgen.toggle_preview()
     yield from session.until(lambda: preview.session().clip is not None, 900, "the preview")
@@ -432,7 +418,7 @@ def documented():
     with screens.focus():
         bpy.ops.physgen.toggle_preview()
         bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from ended("the bake")
+    yield from session.ended("the bake")
     bpy.context.scene.frame_set(16)
     yield from page("blender_baked")
 

@@ -6,7 +6,6 @@ More steps: write a generator function and name it in STEPS.
 
 from __future__ import annotations
 
-import importlib
 import sys
 import time
 from pathlib import Path
@@ -24,11 +23,6 @@ LAST = 16
 """Frames that are baked."""
 SHOWN = 12
 """The frame that is rendered before and after."""
-
-
-def extension(module: str):
-    """A module of the installed extension."""
-    return importlib.import_module(f"{TASK['addon']}.{module}")
 
 
 def preferences():
@@ -71,7 +65,7 @@ def python_found():
     preferences().python = TASK["python"]
     with screens.focus():
         assert bpy.ops.physgen.check_python("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.background_jobs").running
+    running = session.extension("physgen_addon.background_jobs").running
     yield from session.until(lambda: running() is None, 120, "the check of the interpreter")
     assert preferences().check == "YES", preferences().check_text
     yield from screens.shoot_preferences(SCREENS, "2_preferences_found", TASK["addon"])
@@ -110,7 +104,7 @@ def bake(name: str) -> session.Step:
     """Bake live, with a picture in the middle and one at the end; the longest time without an answer, in seconds."""
     with screens.focus():
         assert bpy.ops.physgen.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.background_jobs").running
+    running = session.extension("physgen_addon.background_jobs").running
     job = running()
     yield from session.until(lambda: running() is None or (job.fraction or 0) > 0.2, 200, "the bake to begin")
     if running() is not None:
@@ -190,7 +184,7 @@ def photographed():
     cube.scale, cube.location, cube.rotation_euler = (0.1, 0.1, 0.1), (0.0, 0.0, 0.1), (0.0, 0.0, 0.5)
     for name, colour in (("red", (0.7, 0.05, 0.03, 1.0)), ("grey", (0.6, 0.6, 0.55, 1.0))):
         material = bpy.data.materials.new(name)
-        extension("physgen_addon.compat").node_tree(material)
+        session.extension("physgen_addon.compat").node_tree(material)
         material.node_tree.nodes.clear()
         shader = material.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
         shader.inputs["Color"].default_value = colour
@@ -206,8 +200,11 @@ def photographed():
     scene.render.resolution_x, scene.render.resolution_y = 480, 360
     render(OUT / "photo.png")
     bpy.ops.wm.read_homefile()
-    jobs, interpreter = extension("physgen_addon.background_jobs"), extension("physgen_addon.interpreter")
-    python, stage = preferences().python, extension("sim.app.stage_process").run_stage
+    jobs, interpreter = (
+        session.extension("physgen_addon.background_jobs"),
+        session.extension("physgen_addon.interpreter"),
+    )
+    python, stage = preferences().python, session.extension("sim.app.stage_process").run_stage
     words = ["reconstruct", str(OUT / "photo.png"), "--box", "150,60,330,260", "--size", "0.3"]
 
     def work(on_event, cancelled):
@@ -228,7 +225,7 @@ def opened():
         assert bpy.ops.physgen.open_photo(filepath=TASK["photo"] or str(OUT / "photo.png")) == {"FINISHED"}
     yield 1.5
     yield from screens.shoot(SCREENS, "5_photo_opened")
-    running = extension("physgen_addon.background_jobs").running
+    running = session.extension("physgen_addon.background_jobs").running
     with screens.focus():
         assert bpy.ops.physgen.find_objects("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
     job = running()
@@ -270,7 +267,7 @@ def rendered():
     windows = set(bpy.context.window_manager.windows)
     with screens.focus():
         assert bpy.ops.physgen.render_still("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    running = extension("physgen_addon.background_jobs").running
+    running = session.extension("physgen_addon.background_jobs").running
     job = running()
     yield from session.until(lambda: running() is None, 300, "the still")
     job.result()
@@ -288,7 +285,7 @@ def capture_loaded():
     """A recording in the Diagnose panel."""
     bpy.ops.wm.read_homefile()
     yield from screens.show_sidebar()
-    session.a_capture(extension("sim.diagnose.capture"), OUT / "capture")
+    session.a_capture(session.extension("sim.diagnose.capture"), OUT / "capture")
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     with screens.focus():
         assert bpy.ops.physgen.load_capture() == {"FINISHED"}
