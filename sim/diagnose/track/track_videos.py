@@ -62,12 +62,15 @@ class Frame:
 
 
 MAX_VIDEO_BYTES = 2**40
+LOG_ERRORS = 2
+"""OpenCV's level of messages that are errors: 4.x has no name for it in Python."""
 
 
 def _quiet() -> None:
     """Keep OpenCV and FFmpeg from writing to the terminal what is wrong with a file: our message says it."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    # In a module of its own since OpenCV 5.
+    getattr(cv2.utils, "logging", cv2).setLogLevel(LOG_ERRORS)
 
 
 class Video:
