@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender, with the extension: what artists do that nobody planned for, in a window, where undo and timers live.
+"""Inside Blender, with the extension: odd things that artists do, in a window, where undo and timers live.
 
 Objects that are no plain meshes, odd placements and units, undo after every operator, and a bake during which objects
 are renamed and deleted, settings change, the file is saved and the extension is switched off. Then two panels that few

@@ -334,7 +334,7 @@ def exchange(
 
 
 @func
-def thickness_of(row: ti.i32, worlds: WorldArrays):
+def field_thickness(row: ti.i32, worlds: WorldArrays):
     """Cells across the body whose field's numbers start at ``row``; 0 where it is not thin."""
     t = 0.0
     if worlds.field_numbers[row + FULL_MASS] == 0.0:
@@ -359,7 +359,7 @@ def exchange_thin(
     """As ``exchange`` where bodies may be thin; ``fa`` and ``fb``: where the rows of both fields start."""
     if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE:
         slope_a, slope_b = vec3(sa[0], sa[1], sa[2]), vec3(sb[0], sb[1], sb[2])
-        ta, tb = thickness_of(fa, worlds), thickness_of(fb, worlds)
+        ta, tb = field_thickness(fa, worlds), field_thickness(fb, worlds)
         da, db, middle_a, middle_b = 0.0, 0.0, 1e9, 1e9
         if ta > 0.0:
             middle_a = distance_from_middle(sa[3], slope_along(slope_a, slope_b, ti.cast(tb == 0.0, ti.i32)), ta)

@@ -3,7 +3,7 @@
 
 A ribbon reaches the outline at both ends and goes on behind; the bow on it does not. So along the way from one end to
 the other a region goes on as wide as it is at the outline. One that touches the outline with a corner, such as a heart
-on a narrow board, does not go on at all. Regions are told by colour alone: light and shade divide none.
+on a narrow board, does not go on at all. Regions are distinguished by colour alone: light and shade divide none.
 """
 
 from __future__ import annotations
