@@ -191,7 +191,7 @@ def _body(request: ImportRequest) -> CaptureObject:
         from ..scene.meshes import read_mesh
 
         assert request.mesh is not None
-        mesh = read_mesh(request.mesh)
+        mesh = read_mesh(request.mesh, textures=False)
         volume = abs(float(trimesh.Trimesh(mesh.vertices, mesh.faces).volume))
     density = request.density if request.density is not None else (request.mass or 0.0) / max(volume, 1e-12)
     if not 0.01 < density < 30000:

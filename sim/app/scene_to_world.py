@@ -182,7 +182,8 @@ class PreparedWorld:
     """Input of the engine, with notices for the user.
 
     body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
-    cost: of the whole bake, estimated for ``arch`` from ``stable_step`` and ``duration``, s.
+    cost: of the whole bake, estimated for ``arch`` from ``stable_step``, ``duration``, s, and ``file_bytes``, of the
+        largest mesh file.
     """
 
     setup: WorldSetup
@@ -195,6 +196,7 @@ class PreparedWorld:
     stable_step: float
     duration: float
     arch: str
+    file_bytes: int = 0
 
     @property
     def particle_count(self) -> int:
@@ -208,7 +210,8 @@ class PreparedWorld:
 
     def on(self, arch: str) -> PreparedWorld:
         """Return the same, with the cost on another architecture."""
-        cost = estimate(self.particle_count, len(self.setup.bodies), self.stable_step, self.duration, arch)
+        bodies, step = len(self.setup.bodies), self.stable_step
+        cost = estimate(self.particle_count, bodies, step, self.duration, arch, file_bytes=self.file_bytes)
         return dataclasses.replace(self, arch=arch, cost=cost)
 
 
@@ -262,6 +265,7 @@ def prepare_world(
     step = stable_step(setup.bodies, cell, solver)
     duration = (options.frames - 1) / options.rate
     count = _soft_count(setup)
+    files = max(_file_bytes(folder, item) for item in scene.objects)
     body_index = {scene_index: index for index, scene_index in enumerate(moving)}
     collider_index = {scene_index: index for index, scene_index in enumerate(still)}
     return PreparedWorld(
@@ -271,11 +275,19 @@ def prepare_world(
         body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
         collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
         warnings=tuple(warnings),
-        cost=estimate(count, len(setup.bodies), step, duration, options.arch),
+        cost=estimate(count, len(setup.bodies), step, duration, options.arch, file_bytes=files),
         stable_step=step,
         duration=duration,
         arch=options.arch,
+        file_bytes=files,
     )
+
+
+def _file_bytes(folder: Scene, item: SceneObject) -> int:
+    try:
+        return folder.file(item.mesh).stat().st_size
+    except OSError:  # The meshes were given, and their files are gone.
+        return 0
 
 
 def _soft_count(setup: WorldSetup) -> int:

@@ -257,7 +257,7 @@ def load_capture(root: str | Path) -> Capture:
         mesh_file = inside(root, belief.mesh)
         left -= mesh_file.stat().st_size if mesh_file.is_file() else 0
         _require_room(left, path, "meshes")
-        mesh = read_mesh(mesh_file)
+        mesh = read_mesh(mesh_file, textures=False)
         objects.append(
             CaptureObject(
                 belief=belief,

@@ -138,7 +138,7 @@ class ModelReader:
         """Return vertices (V, 3) and faces (T, 3) of a mesh file in the model's folder, times ``scale`` (3,)."""
         if name not in self.read_meshes:
             try:
-                mesh = read_mesh(inside(self.path.parent, name))
+                mesh = read_mesh(inside(self.path.parent, name), textures=False)
             except InputError as error:
                 raise InputError(f"{self.path}: {error}") from None
             self.read_meshes[name] = np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64)

@@ -53,7 +53,7 @@ class ObjectMesh:
 
 def load_object_mesh(folder: Scene, item: SceneObject) -> ObjectMesh:
     """Return the mesh of ``item`` in world metres. Raises InputError as ``read_mesh`` does."""
-    mesh = read_mesh(folder.file(item.mesh))
+    mesh = read_mesh(folder.file(item.mesh), textures=False)
     matrix = np.asarray(item.world_from_mesh)
     in_file = np.asarray(mesh.vertices, dtype=np.float64)
     vertices = in_file @ matrix[:3, :3].T + matrix[:3, 3]
@@ -63,8 +63,11 @@ def load_object_mesh(folder: Scene, item: SceneObject) -> ObjectMesh:
     return ObjectMesh(vertices=vertices, faces=faces, in_file=in_file)
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path, *, textures: bool = True) -> trimesh.Trimesh:
     """Return one mesh file as it is: no vertex is merged, moved or reordered.
+
+    textures: False leaves pictures unread, and decodes none: 4096 x 4096 pixels take up to 290 MiB. Vertices and faces
+    are the same; ``visual`` is then of no use.
 
     Raises InputError when the file is missing, too large, of an unknown format, unreadable, holds no triangles or
     coordinates that are not finite, or when trimesh is not installed.
@@ -80,11 +83,16 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: mesh files are {', '.join(MESH_SUFFIXES)}, not {path.suffix or 'without suffix'!r}")
     try:
         content = read_bytes(path, MAX_MESH_BYTES, what="mesh")
-        kind, beside = path.suffix.lower().removeprefix("."), _files_beside(path.parent)
+        kind, beside = path.suffix.lower().removeprefix("."), _files_beside(path.parent, pictures=textures)
+        options: dict[str, Any] = {}
         if kind in ("glb", "gltf"):
             _require_bounded(content, path)
+            # Of an OBJ, trimesh calls the parts by their materials: there, only the pictures are missing.
+            options = {"skip_materials": not textures}
         with _without_postscript():
-            mesh = trimesh.load(io.BytesIO(content), file_type=kind, resolver=beside, process=False, force="mesh")
+            mesh = trimesh.load(
+                io.BytesIO(content), file_type=kind, resolver=beside, process=False, force="mesh", **options
+            )
     except InputError:
         raise
     except FileNotFoundError:
@@ -205,9 +213,13 @@ def _checked_mesh(mesh: Any, path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _files_beside(folder: Path) -> Any:
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".ppm", ".tga")
+"""Endings of textures beside a mesh; one that is called otherwise is read, needed or not."""
+
+
+def _files_beside(folder: Path, *, pictures: bool = True) -> Any:
     """Return trimesh's way to the files that a mesh names (buffers, materials, textures): regular files in ``folder``
-    or below, whatever the version of trimesh itself would open.
+    or below, whatever the version of trimesh itself would open. pictures: False hides an OBJ's and a PLY's.
     """
     from trimesh.resolvers import Resolver
 
@@ -218,6 +230,8 @@ def _files_beside(folder: Path) -> Any:
 
         def get(self, name: str) -> bytes:
             wanted = unquote(str(name)).replace("\\", "/").removeprefix("./").strip()
+            if not pictures and wanted.lower().endswith(PICTURE_SUFFIXES):
+                raise FileNotFoundError(wanted)
             # As programs on other machines wrote it, with folders that are not here: the file of that name beside.
             for candidate in (wanted, wanted.rpartition("/")[2]):
                 with contextlib.suppress(InputError, FileNotFoundError):
@@ -235,7 +249,7 @@ def _files_beside(folder: Path) -> Any:
             raise InputError(f"{folder}/{name}: is not written while a mesh is read")
 
         def namespaced(self, namespace: str) -> Any:
-            return _files_beside(inside(folder, namespace))
+            return _files_beside(inside(folder, namespace), pictures=pictures)
 
     return Beside()
 

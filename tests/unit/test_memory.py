@@ -15,9 +15,13 @@ import pytest
 import trimesh
 from physgen.batch.cli import main
 from physgen.sim import memory
+from physgen.sim.app.bake_options import BakeOptions
+from physgen.sim.app.scene_to_world import prepare_world
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.memory import available_memory, ran_out, require_memory
+from physgen.sim.mpm.cost_estimate import FILE_COPIES, estimate
+from physgen.sim.scene.meshes import load_object_mesh, read_mesh
 from physgen.sim.scene.textured_mesh import texture_pixels
 from physgen.sim.version import VERSION
 from PIL import Image
@@ -208,6 +212,85 @@ def test_textures_count_for_rendering(tmp_path, capsys, ball_scene):
     assert texture_pixels(path) == 64 * 32
     few, many = (memory.rendering_bytes(480 * 360, 642, texels) for texels in (0, 4096**2))
     assert abs(many / (1528 * MIB) - 1) < 0.25 and few < 0.4 * many
+
+
+def textured(side, *, noise=False, shift=0.0):
+    """A ball with a texture of ``side`` pixels a side."""
+    mesh = trimesh.creation.icosphere(2, 0.05)
+    mesh.apply_translation((shift, 0, 0))
+    shape = (side, side, 3)
+    pixels = np.random.default_rng(0).integers(0, 255, shape, np.uint8) if noise else np.full(shape, 90, np.uint8)
+    material = trimesh.visual.material.PBRMaterial(name=f"m{shift}", baseColorTexture=Image.fromarray(pixels))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=5 * mesh.vertices[:, :2] + 0.5, material=material)
+    return mesh
+
+
+READS = """
+import sys
+from pathlib import Path
+import trimesh
+from PIL import Image
+from physgen.sim.scene.meshes import read_mesh
+
+def now(field):
+    return next(int(line.split()[1]) << 10 for line in open("/proc/self/status") if line.startswith(field))
+
+read_mesh(Path(sys.argv[1]), textures=False)  # what is imported late
+for name in sys.argv[2:]:
+    before = now("VmRSS")
+    open("/proc/self/clear_refs", "w").write("5")  # the peak counts from here
+    mesh = read_mesh(Path(name), textures=False)
+    print(now("VmHWM") - before)
+"""
+
+
+def growth_of_reading(*paths):
+    """Bytes that a process grows by while it reads each of the meshes, at most at a time."""
+    command = [sys.executable, "-c", READS, *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return list(map(int, done.stdout.split()))
+
+
+@pytest.fixture
+def several_textures(tmp_path):
+    """A GLB, a glTF and an OBJ, two balls with a texture each; a PLY with one."""
+    both = trimesh.Scene([textured(1024), textured(1024, shift=0.2)])
+    paths = []
+    for kind in ("glb", "gltf", "obj"):
+        paths.append(tmp_path / kind / f"two.{kind}")
+        paths[-1].parent.mkdir()
+        found = both.export(None, file_type=kind, **({"return_texture": True} if kind == "obj" else {}))
+        found = found if kind != "obj" else {paths[-1].name: found[0].encode(), **found[1]}
+        for name, content in (found if isinstance(found, dict) else {paths[-1].name: found}).items():
+            (paths[-1].parent / (paths[-1].name if name == "model.gltf" else name)).write_bytes(content)
+    paths.append(tmp_path / "one.ply")
+    textured(8).export(paths[-1])
+    return paths
+
+
+def test_without_their_textures_meshes_are_the_same(several_textures):
+    for path in several_textures:
+        whole, bare = read_mesh(path), read_mesh(path, textures=False)
+        assert np.array_equal(whole.vertices, bare.vertices) and np.array_equal(whole.faces, bare.faces), path.name
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peaks as Linux tells them")
+def test_a_bake_decodes_no_texture_and_its_estimate_counts_the_file(tmp_path, several_textures, ball_scene):
+    """4096 x 4096 pixels took 455 MiB, of which 271 were estimated."""
+    scene = ball_scene(ground=None)
+    path = scene.file(scene.objects[0].mesh)
+    textured(2048, noise=True).export(path)
+    *bare, noise = growth_of_reading(several_textures[0], *several_textures[:3], path)
+    assert max(bare) < 1024**2 * 3, bare
+    size = path.stat().st_size
+    assert size > 12e6 and 0.6 < noise / (FILE_COPIES * size) < 1.05, noise
+    few, many = (estimate(9, 1, 1e-4, 1.0, "cpu", file_bytes=n * size).bytes for n in (0, 16))
+    assert many - few > 15 * noise - 96 * MIB
+
+    prepared = prepare_world(
+        scene, [load_object_mesh(scene, item) for item in scene.objects], BakeOptions(quality="preview")
+    )
+    assert prepared.file_bytes == size and prepared.on("cpu").cost == prepared.cost
 
 
 @pytest.mark.long

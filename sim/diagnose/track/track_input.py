@@ -91,7 +91,7 @@ class BodyRequest:
             from ...scene.meshes import read_mesh
 
             assert self.file is not None
-            read = read_mesh(self.file)
+            read = read_mesh(self.file, textures=False)
             mesh = trimesh.Trimesh(read.vertices, read.faces, process=False)
             volume = abs(float(mesh.volume))
         density = self.density or (USUAL_DENSITY if self.mass is None else self.mass / max(volume, 1e-12))
