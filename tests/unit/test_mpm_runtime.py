@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What this project changes in Taichi is given up, never insisted on, where Taichi is another."""
+"""What this project changes in Taichi is given up, never insisted on, where Taichi is another; it calls nobody."""
 
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -30,3 +33,32 @@ def test_a_taichi_without_it_starts_all_the_same(monkeypatch):
     monkeypatch.delattr(ASTTransformerContext, "get_pos_info")
     runtime._leave_source_lines_out()
     assert not hasattr(ASTTransformerContext, "get_pos_info")
+
+
+CALLS = """
+import sys, threading
+calls = []
+sys.addaudithook(lambda event, arguments: calls.append(event) if event.startswith(("socket.", "urllib.")) else None)
+%s
+for thread in threading.enumerate():
+    if thread is not threading.current_thread():
+        thread.join(20)
+print(" ".join(calls))
+"""
+OURS = """
+from physgen.sim.mpm.kernels.runtime import ensure_started
+from physgen.sim.mpm.solver_options import SolverOptions
+ensure_started(SolverOptions())
+"""
+TAICHI = "import taichi; taichi.init(arch=taichi.cpu)"
+
+
+@pytest.mark.parametrize(("start", "asks"), [(OURS, False), (TAICHI, True)])
+def test_the_engine_asks_nobody_for_a_newer_version(tmp_path, start, asks):
+    """Taichi does, once a day: with a new home it is due. The second case shows that this test would notice."""
+    away = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path), "https_proxy": "http://127.0.0.1:9"}
+    kept = {key: value for key, value in os.environ.items() if key != "TI_SKIP_VERSION_CHECK"}
+    result = subprocess.run(
+        [sys.executable, "-c", CALLS % start], env={**kept, **away}, capture_output=True, text=True, check=True
+    )
+    assert ("urllib.Request" in result.stdout.splitlines()[-1]) == asks, result.stdout

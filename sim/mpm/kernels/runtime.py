@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import os
 from typing import Any
 
 import taichi as ti
@@ -64,7 +65,9 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
 
 
 def _start(arguments: dict[str, object]) -> None:
-    """``ti.init`` without its line on standard output, which belongs to the caller's own results."""
+    """``ti.init`` without its line on standard output, which belongs to the caller's own results, and without its
+    question for a newer version: once a day it would send its makers this system's kind and an identifier."""
+    os.environ["TI_SKIP_VERSION_CHECK"] = "ON"
     _leave_source_lines_out()
     _leave_call_stacks_out()
     with contextlib.redirect_stdout(io.StringIO()) as output:

@@ -39,6 +39,8 @@ def open_session(path: Path, where: str) -> Any:
         import onnxruntime
     except ImportError as error:
         raise InputError(f"{where}: needs onnxruntime ({error}); install physgen[models]") from None
+    # Its builds for Windows report to their maker otherwise.
+    onnxruntime.disable_telemetry_events()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     try:
