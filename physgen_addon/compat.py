@@ -18,6 +18,8 @@ PROBE_PIXELS = 8
 """Side of the picture that tells whether the denoiser works."""
 OBJECT_INDEX = "Object Index.X" if bpy.app.version >= (5, 0) else "IndexOB.X"
 """Channel of the object index pass."""
+HEADLESS = ("--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1")
+"""Arguments of every Blender that we start: no window, nobody's preferences, and no script of any file."""
 
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from ...sim.scene.camera_path import CameraPath, save_camera_path
 from ...sim.scene.folder import SCENE_FILE, load_scene
 from .. import bake_state, paths
 from ..background_jobs import Job, JobOperator, Work
-from ..compat import OperatorMixin
+from ..compat import HEADLESS, OperatorMixin
 from ..context import replace_shown, show_result
 from ..frames.frame_index import FRAME_NAME, folder_for, frame_name
 from ..interpreter import find_python, missing_modules, require_renderer
@@ -58,7 +58,7 @@ def render_command(preferred: str = "") -> list[str]:
         return [sys.executable, str(SCRIPT)]
     # A factory start-up does not load extensions, hence not their wheels.
     paths = f"import sys; sys.path += [p for p in {[p for p in sys.path if p]!r} if p not in sys.path]"
-    blender = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
+    blender = [bpy.app.binary_path, *HEADLESS]
     return [*blender, "--python-expr", paths, "--python", str(SCRIPT), "--"]
 
 

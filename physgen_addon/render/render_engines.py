@@ -111,10 +111,7 @@ def require_graphics() -> str:
     Blender crashes if there is neither, so a separate process draws a tiny image, once per rendering process, as
     drivers may be updated meanwhile. Raises RenderError with a remedy.
     """
-    if bpy.app.binary_path:
-        start = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1", "--python-expr"]
-    else:
-        start = [sys.executable, "-c"]
+    start = [bpy.app.binary_path, *compat.HEADLESS, "--python-expr"] if bpy.app.binary_path else [sys.executable, "-c"]
     # Blender leaves its crash report in the temporary folder.
     with tempfile.TemporaryDirectory(prefix=scratch_prefix()) as folder:
         try:

@@ -2,21 +2,25 @@
 """A .blend from somebody else reads, writes and deletes nothing outside its folder before the user agreed; one's own
 needs no word."""
 
+import ast
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
-from physgen.physgen_addon import bake_state, blend_trust, paths
+from physgen.physgen_addon import bake_state, blend_trust, compat, paths
 from physgen.physgen_addon.operators.photo_ops import add_box, set_photo
+from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
 from physgen.sim.errors import InputError
 from physgen.sim.trust import NotTrusted
 from physgen.sim.version import VERSION
 
 from . import checked_layout
+from .export_scenes import add, exported
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -250,3 +254,91 @@ def test_no_button_opens_what_the_system_would_run(tmp_path):
             (tmp_path / name).write_bytes(b"a video")
         video.comparison = str(tmp_path / name)
         assert buttons(bpy.types.PHYSGEN_PT_diagnose_video) == expected, name
+
+
+REGISTERED = """
+import bpy, pathlib
+
+@bpy.app.handlers.persistent
+def ran(*_):
+    pathlib.Path({marker!r}).open("a").write("handler ")
+
+for handlers in (bpy.app.handlers.frame_change_post, bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.save_pre):
+    handlers.append(ran)
+pathlib.Path({marker!r}).open("a").write("text ")
+"""
+
+
+@pytest.fixture
+def scripted(tmp_path):
+    """A file of somebody else with a registered text, a driver in Python and a property that looks like code, and the
+    file that each of them would write."""
+    marker = tmp_path / "ran"
+    ball = add("ball")
+    text = bpy.data.texts.new("setup.py")
+    text.write(REGISTERED.format(marker=str(marker)))
+    text.use_module = True
+    curve = ball.driver_add("hide_render")
+    curve.driver.expression = f"bool(open({str(marker)!r}, 'a').write('driver '))"
+    ball["physgen_run"] = f"__import__('pathlib').Path({str(marker)!r}).touch()"
+    path = saved(tmp_path)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    marker.unlink(missing_ok=True)
+    yield path, marker
+    # No test after this one may have its handlers, or Blender's leave to run them.
+    for name in ("frame_change_post", "depsgraph_update_post", "save_pre"):
+        handlers = getattr(bpy.app.handlers, name)
+        for handler in [h for h in handlers if h.__name__ == "ran"]:
+            handlers.remove(handler)
+    bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=False)
+
+
+def test_no_script_of_a_file_runs_while_we_work_on_it(scripted, tmp_path):
+    path, marker = scripted
+    bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=False)
+    scene = bpy.context.scene
+    before = fingerprint(scene)
+    exported(scene, tmp_path)
+    scene.frame_set(5)
+    bpy.context.view_layer.update()
+    assert fingerprint(scene) == before and blend_trust.pending(scene) == []
+    bpy.ops.wm.save_mainfile()
+    for link in (False, True):
+        bpy.ops.wm.read_homefile(use_empty=True)
+        (bpy.ops.wm.link if link else bpy.ops.wm.append)(directory=f"{path}/Scene/", filename=scene_name(path))
+        [found] = [scene for scene in bpy.data.scenes if scene.objects]
+        bpy.context.window.scene = found
+        found.frame_set(3)
+        if not link:
+            exported(found, tmp_path, "appended")
+    assert not marker.exists()
+    # Where the user lets Blender run a file's scripts, it runs them: the file is as hostile as it has to be.
+    bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=True)
+    bpy.context.scene.frame_set(7)
+    assert set(marker.read_text().split()) == {"text", "handler", "driver"}
+
+
+def scene_name(path):
+    with bpy.data.libraries.load(str(path)) as (found, _):
+        return found.scenes[0]
+
+
+OPENS = {"open_mainfile", "revert_mainfile", "recover_last_session", "recover_auto_save", "append", "link", "libraries"}
+
+
+def test_we_open_no_blend_ourselves_and_start_blender_without_scripts():
+    """Another file's content comes only by Blender's own menus, which ask its user's preference."""
+    root = Path(compat.__file__).parents[1]
+    found = []
+    for path in (path for part in ("sim", "batch", "physgen_addon", "presets") for path in (root / part).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and node.attr in OPENS:
+                owner = ast.unparse(node.value)
+                if owner.endswith(("ops.wm", "bpy.data")):
+                    found.append(f"{path.name}: {owner}.{node.attr}")
+            elif isinstance(node, ast.Constant) and node.value in ("--background", "-b", "--enable-autoexec"):
+                found.append(f"{path.name}: {node.value}")
+            elif isinstance(node, ast.Attribute) and node.attr == "use_scripts_auto_execute":
+                found.append(f"{path.name}: {node.attr}")
+    assert found == ["compat.py: --background"]
+    assert "--disable-autoexec" in compat.HEADLESS
