@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...sim.cache.bake_folder import BakedObject
 from ...sim.cache.pc2 import Pc2Reader
-from ...sim.cache.torn_skins import TornSkin, read_torn_skin
+from ...sim.cache.torn_skin_file import TornSkin, read_torn_skin
 from .. import compat, paths
 from . import point_caches
 from .bake_record import BakeRecord

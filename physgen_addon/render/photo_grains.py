@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...sim.cache.torn_skins import TornSkin, read_torn_skin
+from ...sim.cache.torn_skin_file import TornSkin, read_torn_skin
 from ...sim.composite.srgb import srgb_to_linear
 from ...sim.grains import CloudState, GrainCloud, ShownGrains, grain_size
 from ...sim.scene.model import Camera, Ground

@@ -85,7 +85,7 @@ def _complete(scene: Scene, out: Path, options: BakeOptions) -> BakeManifest | N
             cache = Pc2Reader(out / name)
             if cache.sample_count < manifest.frames or cache.vertex_count != count:
                 return None
-        names = (*manifest.splat_frames(manifest.frames), *manifest.torn_skins)
+        names = (*manifest.splat_frames(manifest.frames), *manifest.torn_skin_file)
         if not all((out / name).is_file() for name in names):
             return None
         if damage_of(out, manifest):

@@ -217,7 +217,7 @@ def find_mendable(out: Path, manifest: BakeManifest) -> Mendable | None:
     except (InputError, OSError):
         return None
     # Torn skins follow from all samples together.
-    torn = {item.torn_file for item in before.objects} | set(before.torn_skins)
+    torn = {item.torn_file for item in before.objects} | set(before.torn_skin_file)
     if not found or any(damage.file in torn for damage in found):
         return None
     metrics = any(damage.file == METRICS_FILE for damage in found)

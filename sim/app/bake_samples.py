@@ -20,7 +20,7 @@ from ..atomic import replacing
 from ..cache.bake_folder import GRAINS, MATTER_FILES, MESH_SPACE, SURFACE, BakedObject, BakeManifest
 from ..cache.checksums import Checksum, file_sum, span_for
 from ..cache.pc2 import Pc2Reader, Pc2Writer
-from ..cache.torn_skins import write_torn_skin
+from ..cache.torn_skin_file import write_torn_skin
 from ..constitutive import FLUID, SHAPED, RigidMaterial
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled
@@ -40,7 +40,7 @@ from ..scene.meshes import ObjectMesh
 from ..scene.model import SceneObject
 from ..skinning import bind, deform
 from ..tearing.blocks import OPENING, Blocks, make_blocks, opening_times, regrouped, stretches
-from ..tearing.torn_skin import TornMotion, tear
+from ..tearing.cut_skin import TornMotion, tear
 from .bake_options import BakeOptions
 from .scene_to_world import PreparedWorld
 

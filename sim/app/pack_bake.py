@@ -231,7 +231,7 @@ def pack_bake(bake: Bake, *, out: Path, cancelled: IsCancelled = never) -> int:
 
 
 def _others(root: Path, manifest: BakeManifest) -> list[str]:
-    return [name for name in (METRICS_FILE, *manifest.torn_skins) if is_file(root / name)]
+    return [name for name in (METRICS_FILE, *manifest.torn_skin_file) if is_file(root / name)]
 
 
 def unpack_bake(folder: Path, *, out: Path, cancelled: IsCancelled = never) -> Bake:
@@ -244,8 +244,8 @@ def unpack_bake(folder: Path, *, out: Path, cancelled: IsCancelled = never) -> B
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("sums"), dict):
         raise InputError(f"{path}: is no packed bake ({FORMAT}); pack the bake again")
     manifest = parse(BakeManifest, data.get("manifest"), str(path))
-    wanted = [*(f"{name}{SUFFIX}" for name in manifest.files), *manifest.torn_skins]
-    others = [name for name in (METRICS_FILE, *manifest.torn_skins) if name in data["sums"]]
+    wanted = [*(f"{name}{SUFFIX}" for name in manifest.files), *manifest.torn_skin_file]
+    others = [name for name in (METRICS_FILE, *manifest.torn_skin_file) if name in data["sums"]]
     for name in {*wanted, *others}:
         try:
             good = file_sum(inside(folder, name)) == data["sums"].get(name)

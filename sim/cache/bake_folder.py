@@ -165,7 +165,7 @@ class BakeManifest:
         return {name: count for item in self.objects for name, count in item.files.items()}
 
     @property
-    def torn_skins(self) -> list[str]:
+    def torn_skin_file(self) -> list[str]:
         """Files with the triangles of torn skins."""
         return [item.torn_skin for item in self.objects if item.torn_skin is not None]
 
@@ -266,7 +266,7 @@ def load_manifest(folder: Path) -> BakeManifest:
         raise InputError(
             f"{error}; PhysGen {author} wrote it, this is {VERSION}: use that one, or bake again"
         ) from None
-    for name in (*manifest.files, *manifest.torn_skins, *manifest.splat_frames(1)):
+    for name in (*manifest.files, *manifest.torn_skin_file, *manifest.splat_frames(1)):
         inside(folder, name)
     return manifest
 
@@ -285,7 +285,7 @@ _PARTIAL_SPLATS = re.compile(r"\.\d{4,}\.partial-\d+(?:-[0-9a-f]+){0,2}\.ply")
 def listed_files(manifest: BakeManifest) -> list[str]:
     """Return the names of all files of a bake, whether they exist or not."""
     single = [CHECKPOINT_FILE, METRICS_FILE, TIMES_FILE, MANIFEST_FILE]
-    return [*manifest.files, *manifest.torn_skins, *manifest.splat_frames(manifest.frames), *single]
+    return [*manifest.files, *manifest.torn_skin_file, *manifest.splat_frames(manifest.frames), *single]
 
 
 def disk_usage(folder: Path) -> int:

@@ -13,11 +13,11 @@ from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.physgen_addon.render.renderer import Renderer
 from physgen.sim.cache.bake_folder import Bake, BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
-from physgen.sim.cache.torn_skins import read_torn_skin, write_torn_skin
+from physgen.sim.cache.torn_skin_file import read_torn_skin, write_torn_skin
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.skinning import bind, deform
 from physgen.sim.tearing.blocks import make_blocks, opening_times, regrouped
-from physgen.sim.tearing.torn_skin import tear
+from physgen.sim.tearing.cut_skin import tear
 
 from ..conftest import complete_manifest
 

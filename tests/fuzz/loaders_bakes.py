@@ -26,7 +26,7 @@ from physgen.sim.cache.bake_folder import (
     load_bake,
 )
 from physgen.sim.cache.pc2 import Pc2Reader
-from physgen.sim.cache.torn_skins import TornSkin, read_torn_skin, write_torn_skin
+from physgen.sim.cache.torn_skin_file import TornSkin, read_torn_skin, write_torn_skin
 from physgen.sim.reconstruct import stage_cache
 from physgen.sim.reconstruct.stage_cache import StageCache
 from physgen.sim.scene.folder import load_scene

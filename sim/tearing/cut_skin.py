@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cache.torn_skins import TornSkin
+from ..cache.torn_skin_file import TornSkin
 from ..skinning import Binding, bind, deform
 from .blocks import NEVER, Blocks, Refined, refine, touched_near
 

@@ -10,13 +10,13 @@ from physgen.sim.app.bake import bake, is_up_to_date
 from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.cache.bake_folder import free_bake, load_bake
 from physgen.sim.cache.pc2 import Pc2Reader
-from physgen.sim.cache.torn_skins import read_torn_skin, write_torn_skin
+from physgen.sim.cache.torn_skin_file import read_torn_skin, write_torn_skin
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.scene_object import Box
 from physgen.sim.skinning import bind, deform
 from physgen.sim.tearing.blocks import NEVER, make_blocks, opening_times, regrouped
-from physgen.sim.tearing.torn_skin import tear
+from physgen.sim.tearing.cut_skin import tear
 
 CUBE = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
 AXIS = (np.arange(16) + 0.5) / 16 - 0.5
