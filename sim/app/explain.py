@@ -28,7 +28,7 @@ from ..diagnose import run_diagnosis
 from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
-from ..diagnose.report.wording import found_effects
+from ..diagnose.report.wording import found_effects, remains
 from ..diagnose.run_diagnosis import DiagnoseOptions
 from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError
@@ -158,7 +158,7 @@ def title_of_cause(diagnosis: Diagnosis) -> str:
     """Return the verdict with its numbers in a few words, in plain ASCII for drawing."""
     verdict = diagnosis.verdict
     if verdict.effect == NONE:
-        return "nothing is missing"
+        return "no effect stands out" if remains(diagnosis.gap) else "nothing is missing"
     if verdict.effect == UNKNOWN:
         return "no known effect; contacts re-fitted"
     words = []

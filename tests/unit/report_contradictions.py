@@ -65,6 +65,12 @@ def _gap(report, page):
             yield f"explained down to its noise, with an error of {before} beside noise and grain of {grain}"
         if "no gap to close" in page or "No discrepancy above the noise" in page:
             yield f"no gap, with an error of {before} beside noise and grain of {grain}"
+        for words in ("Nothing is missing", "that nothing is missing", "No effect needs", "keep the scene as it is"):
+            if words in page:
+                yield f"“{words}”, with an error of {before} beside noise and grain of {grain}"
+    found = verdict not in ("none", "unknown") and gap["resolvable"]
+    if found and after > 1.50001 * grain and "not the whole cause" not in page:
+        yield f"a cause with an error of {after} left, beside noise and grain of {grain}, unsaid"
     errors = [before, after, gap["refitted_rms_m"], *report["controls"].values()]
     errors += [row["heldout_rms_m"] for row in report["effects"]]
     if any(e is not None and e < floor - TOLERANCE for e in errors) and "below it is so by chance" not in page:

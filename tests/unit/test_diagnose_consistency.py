@@ -259,6 +259,14 @@ DOCTORED = {
             before_rms_m=2 * np.hypot(r["gap"]["noise_floor_rms_m"], r["gap"]["grain_rms_m"]), resolvable=True
         ),
     ),
+    "“Nothing is missing”, with": doctored(
+        "plain",
+        lambda r, p: r["gap"].update(before_rms_m=2 * np.hypot(r["gap"]["noise_floor_rms_m"], r["gap"]["grain_rms_m"])),
+    ),
+    "a cause with an error of 0.031": doctored(
+        "drag",
+        lambda r, p: r["gap"].update(after_rms_m=0.031) or p.replace("not the whole cause", ""),
+    ),
     "below the noise floor, unexplained": doctored(
         "drag", lambda r, p: r["controls"].update(wrong_effect_rms_m=0.0) or p.replace("below it is so by chance", "")
     ),

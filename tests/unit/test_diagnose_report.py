@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from physgen.sim.app.explain import title_of_cause
 from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.diagnosis import (
     Diagnosis,
@@ -307,6 +308,31 @@ def test_a_verdict_without_effect_adds_nothing(effect, tmp_path):
     assert "Add found effect" not in text and '"effects"' not in text
     wanted = {"none": "Nothing is missing", "unknown": "none of the known effects"}[effect]
     assert wanted in text
+
+
+def _gap(before, after, floor):
+    return Gap(
+        before_rms_m=before, refitted_rms_m=before, after_rms_m=after, noise_floor_rms_m=floor, noise_rms_m=floor,
+        grain_rms_m=0.0, closed_fraction=(before - after) / (before - floor), closed_fraction_ci95=(NAN, NAN),
+        resolvable=True,
+    )  # fmt: skip
+
+
+def test_an_error_far_above_noise_is_never_called_nothing(tmp_path):
+    """28 mm stood below “Nothing is missing” beside a floor of 9 mm."""
+    diagnosis, capture = case(verdict=Verdict(effect="none", probability=0.9), gap=_gap(0.028, 0.028, 0.009))
+    text = said(written(diagnosis, capture, tmp_path)[0])
+    assert "No known effect stands out, and an error of 28\u00a0mm is left" in text
+    assert title_of_cause(diagnosis) == "no effect stands out"
+    for words in ("Nothing is missing", "that nothing is missing", "No effect needs", "keep the scene as it is"):
+        assert words not in text
+
+
+@pytest.mark.parametrize(("after", "times"), [(0.086, "2.0"), (0.045, None)])
+def test_a_cause_that_leaves_much_is_not_the_whole_one(after, times, tmp_path):
+    text = said(written(*case(gap=_gap(0.179, after, 0.043)), tmp_path)[0])
+    assert ("not the whole cause" in text) == (times is not None)
+    assert times is None or f"is {times} times what noise" in text
 
 
 def test_a_verification_run_is_a_table_with_units(tmp_path):

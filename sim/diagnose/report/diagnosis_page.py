@@ -114,7 +114,7 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         pictures=pictures,
         version=VERSION,
         headline=title,
-        explanation=[s for s in (meaning(verdict), alternatives_sentence(verdict)) if s],
+        explanation=[s for s in (meaning(diagnosis), alternatives_sentence(verdict)) if s],
         facts=_facts(diagnosis),
         notes=list(dict.fromkeys(notes)),
         shares=_shares(diagnosis, several=len(capture.objects) > 1),
@@ -160,7 +160,8 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Return (name, value, detail) of the numbers at the top."""
     verdict, gap = diagnosis.verdict, diagnosis.gap
-    probability = {NONE: "Probability that nothing is missing", UNKNOWN: "Probability of an unknown cause"}
+    explained = "Probability that no known effect is missing" if remains(gap) else "Probability that nothing is missing"
+    probability = {NONE: explained, UNKNOWN: "Probability of an unknown cause"}
     chances = {item.name: item.probability for item in diagnosis.effects}
     others = (f"{effect_label(n)} {percent_text(chances[n])}" for n in verdict.alternatives[:3] if n in chances)
     name = probability.get(verdict.effect, "Probability of this cause")
@@ -220,6 +221,8 @@ def _next_experiment(diagnosis: Diagnosis) -> str:
 
 
 def _nothing_to_add(diagnosis: Diagnosis) -> str:
+    if diagnosis.verdict.effect == NONE and remains(diagnosis.gap):
+        return "There is nothing to add: no effect stands out. Do not tune one until it fits."
     return {
         NONE: "There is nothing to add: keep the scene as it is.",
         UNKNOWN: "There is nothing to add: no known effect is right. Do not tune one until it fits.",

@@ -120,6 +120,8 @@ def found_label(verdict: Verdict) -> str:
 def headline(diagnosis: Diagnosis) -> str:
     """Return the verdict on one line."""
     verdict = diagnosis.verdict
+    if verdict.effect == NONE and remains(diagnosis.gap):
+        return f"No known effect stands out, and an error of {_length(diagnosis.gap.before_rms_m)} is left"
     if verdict.effect == NONE:
         return "Nothing is missing that this recording could show"
     if verdict.effect == UNKNOWN:
@@ -138,8 +140,14 @@ def _sureness(probability: float) -> str:
     return "only the best guess"
 
 
-def meaning(verdict: Verdict) -> str:
+def meaning(diagnosis: Diagnosis) -> str:
     """Return what the verdict means physically, in a sentence or two."""
+    verdict = diagnosis.verdict
+    if verdict.effect == NONE and remains(diagnosis.gap):
+        return (
+            "The simulation differs from the recording by more than noise, and no effect describes how: the recording "
+            "may be off in a way that is not modelled, such as its scale, its view or a body that is not as assumed."
+        )
     names = found_effects(verdict) or (verdict.effect,)
     return " ".join(_MEANING[n] for n in names if n in _MEANING)
 
@@ -185,7 +193,17 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
     spread = f" (95 %: {percent_text(low)} to {percent_text(high)})" if math.isfinite(low + high) else ""
     return (
         f"On held-out motion the error changes from {_length(gap.before_rms_m)} to "
-        f"{_length(gap.after_rms_m)}: {_closed(gap)}{spread}.{_floor(gap)}"
+        f"{_length(gap.after_rms_m)}: {_closed(gap)}{spread}.{_rest(gap)}{_floor(gap)}"
+    )
+
+
+def _rest(gap: Gap) -> str:
+    """Return a sentence on an error with the cause that is clearly more than noise and grain make, or ""."""
+    if not gap.after_rms_m > EXPLAINED * _expected(gap):
+        return ""
+    return (
+        f" What is left is {number_text(gap.after_rms_m / _expected(gap), digits=2)} times what noise and the "
+        "simulator's own uncertainty make: this is not the whole cause."
     )
 
 
@@ -204,7 +222,7 @@ def _floor(gap: Gap) -> str:
 
 
 EXPLAINED = 1.5
-"""Error of the nominal model over noise and grain together up to which these explain it."""
+"""Error over noise and grain together up to which these explain it."""
 
 
 def _expected(gap: Gap) -> float:
