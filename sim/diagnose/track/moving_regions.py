@@ -33,6 +33,8 @@ LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
 """Difference from the background that counts as moving: grey levels, and standard deviations of the pixel."""
 SHADOW = (0.45, 0.97, 0.09)
 """A shadow: least and largest brightness over the background's, and largest difference between the channels."""
+STRONG = 0.55
+"""Share of a frame's largest difference from which even what looks like a shadow counts as a body."""
 LEAST_AREA = 7
 """Pixels of the smallest region."""
 MOST_REGIONS = 12
@@ -47,7 +49,8 @@ class Region:
 
     middle: (2,) weighted centre. area: px. axes: (2,) standard deviations along its principal axes, larger first.
     angle: rad, of the larger axis, from x towards y. outline: (N, 2) its convex hull. colour: (3,) BGR.
-    cut: whether it touches the picture's border. solid: its area over its hull's.
+    cut: whether it touches the picture's border. solid: its area over its hull's. shade: share of it that looks like a
+    shadow, the background made darker in all colours alike. contrast: of its inner part to the background, grey levels.
     """
 
     frame: int
@@ -59,17 +62,21 @@ class Region:
     colour: Array
     cut: bool
     solid: float
+    shade: float = 0.0
+    contrast: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingRegions:
-    """Everything that moves. regions: by frame. stamps: (T,) s of the container. change: (T,) mean difference from the
+    """Everything that moves. regions: by frame. faint: by frame, those that are shadows, or bodies so blurred that they
+    look like one. stamps: (T,) s of the container. change: (T,) mean difference from the
     frame before, grey levels. background: (H, W, 3) BGR. scale: working pixels per pixel of the video. drift: largest
     motion of the background, video px. to_background: (T, 2, 3) maps of frames onto the background; None: a still
     camera."""
 
     background: Picture
     regions: list[list[Region]]
+    faint: list[list[Region]]
     stamps: list[float]
     change: Array
     scale: float
@@ -89,7 +96,8 @@ def find_moving_regions(
     if len(samples) < 5:
         return MovingRegions(
             background=samples[0] if samples else np.zeros((1, 1, 3), np.uint8),
-            regions=[[] for _ in samples], stamps=[float("nan")] * len(samples), change=np.zeros(len(samples)),
+            regions=[[] for _ in samples], faint=[[] for _ in samples],
+            stamps=[float("nan")] * len(samples), change=np.zeros(len(samples)),
             scale=scale, drift=0.0, to_background=None, first=start,
         )  # fmt: skip
     height, width = samples[0].shape[:2]
@@ -107,6 +115,7 @@ def find_moving_regions(
     del stack
     limit = np.maximum(LEAST_CONTRAST, NOISE_FACTOR * cv2.GaussianBlur(noise, (5, 5), 0))
     regions: list[list[Region]] = []
+    faint: list[list[Region]] = []
     stamps: list[float] = []
     change: list[float] = []
     found_maps: list[Array] = []
@@ -122,10 +131,13 @@ def find_moving_regions(
             change.append(0.0 if before is None else _change(picture, before))
             before = picture
             stamps.append(frame.time)
-            regions.append(list(_regions(picture, background, limit, index)))
+            clear, dim = _regions(picture, background, limit, index)
+            regions.append(clear)
+            faint.append(dim)
     return MovingRegions(
         background=background,
         regions=regions,
+        faint=faint,
         stamps=stamps,
         change=np.array(change),
         scale=scale,
@@ -142,16 +154,37 @@ def _change(picture: Picture, before: Picture) -> float:
     return float(cv2.norm(picture, cv2.convertScaleAbs(before, alpha=gain), cv2.NORM_L1)) / picture.size
 
 
-def _regions(picture: Picture, background: Picture, limit: Array, index: int) -> Iterator[Region]:
+def _regions(picture: Picture, background: Picture, limit: Array, index: int) -> tuple[list[Region], list[Region]]:
+    """Return the regions of frame ``index``, largest first, and those that shadows make, apart from them."""
     away = difference(picture, background)
     mask = (away > limit).astype(np.uint8)
     if not mask.any():
-        return
+        return [], []
+    shade = np.zeros_like(mask)
+    faint = np.zeros_like(mask)
     if mask.mean() < 0.5:
         x, y, w, h = cv2.boundingRect(mask)
         near = slice(max(0, y - 2), y + h + 2), slice(max(0, x - 2), x + w + 2)
-        mask[near] &= ~_shadows(picture[near], background[near], away[near], float(away.max()))
-    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+        shade[near] = _shadows(picture[near], background[near])
+        weak = shade & (away <= STRONG * float(away.max()))
+        faint = mask & weak
+        mask &= ~weak
+    square = np.ones((3, 3), np.uint8)
+    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square), np.uint8)
+    clear = list(_outlined(mask, picture, away, shade, index))
+    if not faint.any():
+        return clear, []
+    # A shadow beside its body is no thing of its own.
+    _, labels = cv2.connectedComponents(cv2.dilate(faint, square))
+    faint[np.isin(labels, np.unique(labels[mask > 0]))] = 0
+    return clear, list(_outlined(faint, picture, away, shade, index))
+
+
+def _outlined(
+    mask: NDArray[np.uint8], picture: Picture, away: NDArray[np.float32], shade: NDArray[np.uint8], index: int
+) -> Iterator[Region]:
+    """Yield the largest regions of ``mask`` (H, W), largest first. away: (H, W) difference from the background. shade:
+    (H, W) what looks like a shadow."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     height, width = mask.shape
     for outline in sorted(outlines, key=cv2.contourArea, reverse=True)[:MOST_REGIONS]:
@@ -189,20 +222,18 @@ def _regions(picture: Picture, background: Picture, limit: Array, index: int) ->
             colour=np.asarray(cv2.mean(picture[y : y + h, x : x + w], inside)[:3]),
             cut=bool(x <= 1 or y <= 1 or x + w >= width - 1 or y + h >= height - 1),
             solid=min(1.0, float(inside.sum()) / hull_area),
+            shade=float(shade[y : y + h, x : x + w][inside > 0].mean()),
+            contrast=strength,
         )
 
 
-def _shadows(picture: Picture, background: Picture, away: NDArray[np.float32], most: float) -> NDArray[np.uint8]:
-    """Return (H, W): where the background is only darker, all colours alike; never all of what moves.
-
-    away: (H, W) difference from the background. most: its largest value in the frame."""
+def _shadows(picture: Picture, background: Picture) -> NDArray[np.uint8]:
+    """Return (H, W): where the background is only darker, all colours alike."""
     low, high, apart = SHADOW
     ratio = (picture.astype(np.float32) + 4) / (background.astype(np.float32) + 4)
     ratio = np.asarray(cv2.blur(ratio, (3, 3)), np.float32)
     top, bottom = largest_channel(ratio), least_channel(ratio)
-    dark = (top < high) & (bottom > low) & (top - bottom < apart)
-    strong = away > 0.55 * most
-    return (dark & ~strong).astype(np.uint8)
+    return ((top < high) & (bottom > low) & (top - bottom < apart)).astype(np.uint8)
 
 
 def aligned_frames(path: Path, found: MovingRegions, wanted: NDArray[np.int64]) -> Iterator[Picture]:

@@ -18,6 +18,7 @@ from .box_pose import BoxMotion, follow_box
 from .motion_view import MotionView, understand_motion
 from .moving_regions import MovingRegions, Region, find_moving_regions
 from .path_pieces import noise_px, stopped_at, wobble_px
+from .path_relations import bodies
 from .pose_estimation import Array
 from .region_track import link_regions, true_times, with_missing_frames
 from .track_input import BodyRequest, VideoTrial
@@ -92,7 +93,7 @@ def follow_plain_body(
         raise InputError(
             f"{path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
         )
-    paths = link_regions(found)
+    paths = bodies(link_regions(found), found.faint)
     if not any(found.regions):
         raise InputError(f"{path}: nothing moves in it; check --start-frame and --end-frame")
     chosen = [p for p in paths if p.freedom() > 0]
