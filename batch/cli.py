@@ -170,7 +170,7 @@ def build_parser() -> CommandParser:
     many = "job file → scenes, bakes and videos of all variants, on one or many machines"
     farm_command.add_batch(command("batch", farm_command.run_batch, many))
 
-    groups["From a recording to the cause of its gap"] = []
+    groups["From a recording to the missing effect"] = []
     why = "video of one plain body → why its simulation differs, with a video of both side by side"
     diagnosis_commands.add_explain(command("explain", diagnosis_commands.run_explain, why))
     diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))

@@ -27,7 +27,7 @@ def add_compose(parser: argparse.ArgumentParser) -> None:
     add_anyway_flag(parser)
     chosen = "from the fixed one to the deformable ones (default: all that touch another, frontmost first)"
     parser.add_argument("--objects", type=parse_names, default=(), metavar="A,B,…", help=chosen)
-    method = f"what moves them (default {DEFAULTS.method}; ppps with --no-picture)"
+    method = f"what moves the objects (default {DEFAULTS.method}; ppps with --no-picture)"
     parser.add_argument("--method", choices=METHODS, help=method)
     for flag, name, text in (
         ("--steps", "steps", "optimiser steps"),
@@ -43,7 +43,7 @@ def add_compose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-strain", type=float, default=default, metavar="F", help=f"{strain} (default {default:g})"
     )
-    seat = "how far parts bulge beside contacts, so that they stand, over their size, 0 to 0.02"
+    seat = "bulge beside contacts, over an object's size, so that objects stand, 0 to 0.02"
     parser.add_argument(
         "--seat", type=float, default=DEFAULTS.seat, metavar="F", help=f"{seat} (default {DEFAULTS.seat:g})"
     )

@@ -67,22 +67,22 @@ def parse_column(text: str) -> tuple[str, str]:
 
 
 _IMPORT_FIELDS: tuple[tuple[str, Any, str], ...] = (
-    ("diameter", float, "of a ball, m"),
-    ("mesh", Path, "of a rigid body, m"),
-    ("density", float, "kg/m³"),
-    ("mass", float, "kg"),
-    ("name", str, "of the body (default: body)"),
-    ("rest", Path, "CSV name,x,y,z: places of the markers on the mesh, m"),
-    ("time-unit", str, "s, ms, us or ns"),
-    ("length-unit", str, "m, cm, mm or px"),
+    ("diameter", float, "diameter of a ball, m"),
+    ("mesh", Path, "mesh of a rigid body, in m"),
+    ("density", float, "density, kg/m³"),
+    ("mass", float, "mass, kg"),
+    ("name", str, "name of the body (default: body)"),
+    ("rest", Path, "CSV name,x,y,z: positions of the markers on the mesh, m"),
+    ("time-unit", str, "unit of times: s, ms, us or ns"),
+    ("length-unit", str, "unit of lengths: m, cm, mm or px"),
     ("up", str, "axis that points up: z, y, -y or -z (write --up=-y)"),
-    ("scale", float, "m per pixel"),
-    ("fps", float, "frames per second, where rows are frames"),
+    ("scale", float, "metres per pixel"),
+    ("fps", float, "frames per second, if rows are frames"),
     ("ground", float, "height of the ground, m (default: 0)"),
-    ("friction", float, "of the ground (default: 0.5)"),
-    ("restitution", float, "of the ground, if known"),
+    ("friction", float, "friction of the ground (default: 0.5)"),
+    ("restitution", float, "restitution of the ground, if known"),
     ("noise", float, "standard deviation of a coordinate, m (default: measured)"),
-    ("hold-out", float, "share of the last take that is shown; the rest is withheld"),
+    ("hold-out", float, "share of the last take that the diagnosis sees; the rest is withheld"),
 )
 
 
@@ -91,9 +91,9 @@ def add_capture(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("import",), help="what to do")
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="CSV, .trk, C3D, MCAP, a bag's folder")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="new folder for the capture")
-    mapped = "our name and the table's heading, such as time=Zeit x=X"
+    mapped = "PhysGen's name and the table's heading, such as time=Zeit x=X"
     parser.add_argument("--column", nargs="+", type=parse_column, default=[], metavar="OURS=THEIRS", help=mapped)
-    chosen = "points to use; of a bag the frame or topic that is the body (default: all)"
+    chosen = "points to use; for a bag the frame or topic of the body (default: all)"
     parser.add_argument("--points", nargs="+", default=[], metavar="NAME", help=chosen)
     for name, kind, text in _IMPORT_FIELDS:
         parser.add_argument(f"--{name}", type=kind, metavar="VALUE", help=text)
@@ -129,12 +129,12 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
     budget = "time for the fits on two idle cores, such as 90s or 5min, counted as simulated work (default 5min)"
     parser.add_argument("--budget", type=parse_duration, default=300.0, metavar="TIME", help=budget)
-    work = "the same as simulated steps, such as 3e8, instead of --budget"
+    work = "budget in simulated steps, such as 3e8, instead of --budget"
     parser.add_argument("--work", type=parse_steps, metavar="STEPS", help=work)
     only = "candidate effects, such as air_drag,wind (default: all that can act on the objects)"
     parser.add_argument("--effects", type=parse_names, metavar="NAMES", help=only)
     parser.add_argument("--no-confirm", action="store_true", help="skip the verification run in the particle engine")
-    export = "also write what was found as a model for MuJoCo (found.xml) or a layer of USD Physics (found.usda)"
+    export = "also write the result as a model for MuJoCo (found.xml) or a layer of USD Physics (found.usda)"
     parser.add_argument("--export", nargs="+", choices=("mjcf", "usd"), default=[], help=export)
 
 
@@ -186,7 +186,7 @@ def _verdict_event(out: Path, verdict: Verdict) -> dict[str, Any]:
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen explain``."""
-    parser.add_argument("video", type=Path, metavar="VIDEO", help="one body that moves before a still background")
+    parser.add_argument("video", type=Path, metavar="VIDEO", help="video of one moving body before a still background")
     known = "the body, such as ball:diameter=0.04,mass=0.0027, cylinder:diameter=0.03,height=0.01 or box:x=…,y=…,z=…"
     parser.add_argument("--object", required=True, metavar="BODY", help=known)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for video and report")
@@ -230,7 +230,7 @@ def run_explain(options: argparse.Namespace, terminal: Terminal, cancelled: IsCa
 
 def add_blind_check(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen blind-check``."""
-    number = "how many captures, 4 or more (default 30)"
+    number = "number of captures, 4 or more (default 30)"
     parser.add_argument("--cases", type=int, default=30, metavar="N", help=number)
     seed = "repeats an earlier check (default: a fresh one each time; it is printed with the score)"
     parser.add_argument("--seed", type=int, metavar="S", help=seed)

@@ -23,14 +23,14 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen evaluate``."""
     video = ".mp4, .webm or a folder of pictures; or a bake folder"
     parser.add_argument("video", type=Path, nargs="?", metavar="VIDEO", help=video)
-    many = "videos for the Physics-IQ benchmark, in the place of VIDEO: its table (--against: the benchmark)"
+    many = "score a folder of videos for the Physics-IQ benchmark instead of VIDEO (--against: the benchmark)"
     parser.add_argument("--physics-iq", type=Path, metavar="DIR", help=many)
     real = "recording of the real event from the same camera; twice: two takes of it"
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="REAL", help=real)
     out = "folder for report.html, evaluation.json and tables (default: VIDEO_evaluation beside the video)"
     parser.add_argument("--out", type=Path, metavar="DIR", help=out)
     parser.add_argument("--seconds", type=float, metavar="S", help="only the first so many seconds (Physics-IQ: 5)")
-    rate = "frames per second of a folder of pictures, or instead of what a video file says"
+    rate = "frame rate of a folder of pictures, or to override a video file's"
     parser.add_argument("--fps", type=float, metavar="F", help=rate)
     photo = "the photo that the video was made from, which its first frame should equal"
     parser.add_argument("--photo", type=Path, metavar="FILE", help=photo)
@@ -47,7 +47,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--prompt", metavar="TEXT", help="what should happen in the video, for --judge")
     beside = "video of the same photo and prompt that is judged together with VIDEO; may be repeated"
     parser.add_argument("--beside", type=Path, action="append", default=[], metavar="VIDEO", help=beside)
-    text = f"questions, each with another order of the videos (default {REPETITIONS})"
+    text = f"how often to ask, each time with the videos in another order (default {REPETITIONS})"
     parser.add_argument("--repetitions", type=int, default=REPETITIONS, metavar="N", help=text)
     text = f"environment variable with the API key (default {DEFAULT_KEY_VARIABLE})"
     parser.add_argument("--key-variable", metavar="NAME", default=DEFAULT_KEY_VARIABLE, help=text)
@@ -124,7 +124,7 @@ def add_questionnaire(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", nargs="+", type=Path, metavar="CASE", help=case)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the pages, or of the results")
     parser.add_argument("--title", metavar="TEXT", help="title of the pages")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of anonymous names, or of the bootstrap")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of anonymous names, or of the bootstrap")
     parser.add_argument("--collect", action="store_true", help="evaluate the answers that the pages saved")
     parser.add_argument("--key", type=Path, metavar="FILE", help="key.json of the questionnaire, for --collect")
 

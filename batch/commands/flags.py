@@ -103,7 +103,7 @@ OBJECT_FLAGS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
 
 def add_anyway_flag(parser: argparse.ArgumentParser) -> None:
     """Add the flag that lets a stage begin for which memory is estimated to be too little (``cli.main`` acts on it)."""
-    parser.add_argument("--anyway", action="store_true", help="begin although memory is estimated to be too little")
+    parser.add_argument("--anyway", action="store_true", help="start even if memory is estimated to be too small")
 
 
 def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> None:
@@ -113,7 +113,7 @@ def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> 
     if boxes:
         text = "bounding box x0,y0,x1,y1 in pixels of the upright photo, one per object (default: objects are found)"
         group.add_argument("--box", type=parse_box, nargs="+", action="extend", default=[], metavar="BOX", help=text)
-        text = "numbers of the objects to use, of those that are found without a box (physgen propose lists them)"
+        text = "numbers of the proposed objects to use, instead of boxes (physgen propose lists them)"
         group.add_argument("--pick", type=int, nargs="+", action="extend", default=[], metavar="N", help=text)
         text = "object names, in the order of the boxes"
         group.add_argument("--name", nargs="+", action="extend", default=[], help=text)
@@ -146,8 +146,8 @@ def add_object_flags(parser: argparse.ArgumentParser, *, boxes: bool = True) -> 
         "--mesh-point", dest="mesh_points", type=_named(_mesh_point, "x,y,z@u,v"), nargs="+", action="extend",
         default=[], metavar="OBJECT=x,y,z@u,v", help=text,
     )  # fmt: skip
-    for flag, what in (("keep", "belongs to it"), ("drop", "is background, such as what shows through a hole")):
-        text = f"stroke in its box over what {what}: a line through pixels of the upright photo; may be repeated"
+    for flag, what in (("keep", "a part of the object"), ("drop", "background, such as the ground in a hole,")):
+        text = f"stroke over {what} inside its box: a line through pixels of the upright photo; may be repeated"
         group.add_argument(
             f"--{flag}", type=_named(parse_stroke, "x,y,x,y,…"), nargs="+", action="extend", default=[],
             metavar="OBJECT=x,y,x,y,…", help=text,
@@ -182,9 +182,9 @@ def add_reconstruction_flags(parser: argparse.ArgumentParser) -> None:
     ):
         text = f"adapter for {what} (docs/extending.md; default: built-in)"
         group.add_argument(f"--{stage}", metavar="ADAPTER", help=text)
-    text = f"folder with the weights of {', '.join(FOLDERS)}, which --segmenter, --depth or --inpainter names"
+    text = f"folder with the weights of the network ({', '.join(FOLDERS)}) named by --segmenter, --depth or --inpainter"
     group.add_argument("--weights", type=Path, metavar="DIR", help=text)
-    text = "fetch the weights that --segmenter, --depth or --inpainter names, after showing size, source and licence"
+    text = "download the weights named by --segmenter, --depth or --inpainter, after showing size, source and licence"
     group.add_argument("--download", action="store_true", help=text)
     text = "also write SCENE/report.html, with images of every stage"
     group.add_argument("--report", action="store_true", help=text)
@@ -205,7 +205,7 @@ def add_environment_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_reasoning_flags(parser: argparse.ArgumentParser) -> None:
     """Add the chat endpoint that is asked for the objects' materials."""
-    group = parser.add_argument_group("a model that names the materials")
+    group = parser.add_argument_group("materials from a vision-language model")
     text = "OpenAI-compatible chat endpoint about the objects, such as https://host/v1 (docs/reconstruction-stages.md)"
     group.add_argument("--ask", metavar="URL", help=text)
     text = "name of the endpoint's model; it must accept images"

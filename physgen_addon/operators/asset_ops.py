@@ -36,7 +36,7 @@ LAST_FRAME = 40
 
 
 class PHYSGEN_OT_open_sample(bpy.types.Operator):
-    """Open a sample to try PhysGen with: the next click is Bake, or Reconstruct"""
+    """Open a sample to try PhysGen; the next click is Bake, or Reconstruct"""
 
     bl_idname = "physgen.open_sample"
     bl_label = "Open Sample"
@@ -44,7 +44,7 @@ class PHYSGEN_OT_open_sample(bpy.types.Operator):
 
     sample: EnumProperty(
         name="Sample",
-        description="What to open",
+        description="Sample to open",
         items=[
             ("MESHES", "Meshes", "Jelly, sand, wood and a ramp; press Bake. What is in the scene is hidden"),
             ("PHOTO", "Photo", "A cup of coffee with a box around it; press Reconstruct"),

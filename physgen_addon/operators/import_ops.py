@@ -118,7 +118,10 @@ class PHYSGEN_OT_import_physgen3d(_OfPhysgen3d, JobOperator, bpy.types.Operator)
     job_title = "Import"
 
     directory: StringProperty(
-        name="Folder", description="With transform.json, meshes, mask and inpaint", subtype="DIR_PATH", options=SKIP
+        name="Folder",
+        description="Folder with transform.json, meshes, mask and inpaint",
+        subtype="DIR_PATH",
+        options=SKIP,
     )
 
     def request(self, context: bpy.types.Context) -> Work:

@@ -87,7 +87,7 @@ class _Consent(OperatorMixin):
 
     agreed: BoolProperty(
         name="Agreed",
-        description="Agreement to what the dialog says, for scripts; pressing Install agrees as well",
+        description="Agreement to the dialog, for scripts; pressing Install agrees as well",
         options={"HIDDEN", "SKIP_SAVE"},
     )
 
@@ -127,7 +127,7 @@ class _Consent(OperatorMixin):
 
 
 class PHYSGEN_OT_install_python(_Consent, bpy.types.Operator):
-    """Make a Python environment with all that simulates; shows size, folder and source first"""
+    """Create a Python environment for the simulation; shows size, folder and source first"""
 
     bl_idname = "physgen.install_python"
     bl_label = "Install"

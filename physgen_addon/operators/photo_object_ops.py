@@ -191,7 +191,7 @@ CUTOUTS = "physgen_cutouts"
 
 
 class PHYSGEN_OT_draw_strokes(PhotoTool, bpy.types.Operator):
-    """Draw strokes over what belongs to the active object, and over what does not: a lost part, the floor in a hole"""
+    """Draw strokes over lost parts of the active object, or over background, such as the floor in a hole"""
 
     bl_idname = "physgen.draw_strokes"
     bl_label = "Draw Strokes"

@@ -314,7 +314,7 @@ def unregister_box_drawing() -> None:
 
 
 class PHYSGEN_OT_trust_file(bpy.types.Operator):
-    """Agree to what this file names outside its folder: each path is shown first"""
+    """Agree to the paths outside its folder that this file names; each is shown first"""
 
     bl_idname = "physgen.trust_file"
     bl_label = "This File Asks for Others"

@@ -133,7 +133,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     own_wall: switch("shell_thickness", "Own Wall", "Choose its thickness; off: the thinnest that is resolved", 0.01)
     stiffness_group: StringProperty(
         name="Stiffness Weights",
-        description="Vertex group (or attribute) whose weights change the stiffness from place to place",
+        description="Vertex group (or attribute) whose weights vary the stiffness across the object",
     )
     stiffness_factor: from_field(
         FactorMap,
@@ -146,7 +146,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     )
     density_group: StringProperty(
         name="Density Weights",
-        description="Vertex group (or attribute) whose weights change the density from place to place",
+        description="Vertex group (or attribute) whose weights vary the density across the object",
     )
     density_factor: from_field(
         FactorMap,
@@ -163,7 +163,7 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
     own_surface: BoolProperty(name="Own Surface", description="Use own friction and bounce instead of the ground's")
     surface: EnumProperty(
         name="Friction and Bounce",
-        description="Whose friction and bounce count",
+        description="Friction and bounce of the ground, or the object's own",
         items=SURFACES,
         get=_get_surface,
         set=_set_surface,

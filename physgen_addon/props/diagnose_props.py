@@ -137,7 +137,7 @@ class PHYSGEN_PG_video(bpy.types.PropertyGroup):
     mesh: StringProperty(name="Mesh", description="File in metres, z up", subtype="FILE_PATH", options=RELATIVE)
     fps: FloatProperty(
         name="True Frame Rate",
-        description="Frames a second of the recording, where it plays slower; 0: as the file says",
+        description="True frame rate of a slow-motion recording; 0: as the file says",
         default=0.0,
         min=0.0,
         soft_max=1000.0,
@@ -247,7 +247,7 @@ class PHYSGEN_PG_diagnose(bpy.types.PropertyGroup):
         name="Frames", description="Number of frames to bake", default=BakeOptions.frames, min=1, soft_max=500
     )
     fps: FloatProperty(
-        name="Frame Rate", description="Frames a second of the bake", default=BakeOptions.fps, min=1, soft_max=120
+        name="Frame Rate", description="Frames per second of the bake", default=BakeOptions.fps, min=1, soft_max=120
     )
     quality: from_field(
         BakeOptions,

@@ -85,12 +85,12 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
     )
     keep: StringProperty(
         name="Keep",
-        description="Strokes over what belongs to the object: x,y,x,y,… in pixels of the upright photo",
+        description="Strokes over parts of the object: x,y,x,y,… in pixels of the upright photo",
         update=_on_box,
     )
     drop: StringProperty(
         name="Drop",
-        description="Strokes over what does not belong to the object, such as the floor in a hole",
+        description="Strokes over background, such as the floor in a hole",
         update=_on_box,
     )
     preset: EnumProperty(
@@ -200,7 +200,7 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
     )
     segmenter: EnumProperty(
         name="Cut-outs",
-        description="What cuts out the objects in boxes without a mask",
+        description="Method that segments objects in boxes without a mask",
         items=[
             ("auto", "Automatic", "The installed model (Improve Cut-outs), without one colour and texture"),
             *_models("segmenter", ("none", "Without a Model", "Colour and texture")),
@@ -208,17 +208,17 @@ class PHYSGEN_PG_photo(bpy.types.PropertyGroup):
     )
     depth_estimator: EnumProperty(
         name="Depth",
-        description="What estimates the photo's depth, which tells ground and order",
+        description="Model that estimates the photo's depth, used for ground and order",
         items=_models("depth_estimator", ("none", "Without a Model", "Ground and order by the objects' outlines")),
     )
     inpainter: EnumProperty(
         name="Background",
-        description="What fills the place behind the objects",
+        description="Method that inpaints the background behind the objects",
         items=_models("inpainter", ("none", "Without a Model", "The background's own texture and edges")),
     )
     depth: StringProperty(
         name="Depth Map",
-        description="Of the photo, made elsewhere: .npy, .npz, .exr, .pfm, or .png of 16 bits. Tells ground and order",
+        description="Depth map of the photo, made elsewhere: .npy, .npz, .exr, .pfm, 16-bit .png. For ground and order",
         subtype="FILE_PATH",
         options=RELATIVE,
     )

@@ -74,7 +74,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     size: percentage("scale", "Size", "Share of the photo's resolution", low=5.0, high=400.0)
     format: EnumProperty(
         name="Format",
-        description="Of the frames' files. PNG and EXR do not mix: the second goes to a folder beside the first",
+        description="File format of the frames. PNG and EXR do not mix: the second goes to a folder beside the first",
         items=[
             ("png", "PNG", "8 bits a channel, as in the photo"),
             ("png16", "PNG 16 Bit", "For later colour grading"),
@@ -88,7 +88,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     )
     video: EnumProperty(
         name="Video",
-        description="What Render Video writes beside the frames",
+        description="Video format that Render Video writes beside the frames",
         items=[("mp4", "MP4", "H.264: plays everywhere"), ("webm", "WebM", "VP9: for web pages")],
     )
     output: StringProperty(
@@ -131,7 +131,7 @@ class PHYSGEN_PG_rendering(bpy.types.PropertyGroup):
     )
     farm: EnumProperty(
         name="Where",
-        description="What the job is run by",
+        description="Program that runs the job",
         items=[
             ("local", "This Machine", "Baked and rendered here, several tasks at a time; resumed when run again"),
             ("flamenco", "Flamenco", "Written as a job of Blender Studio's render farm"),

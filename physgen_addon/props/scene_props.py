@@ -115,7 +115,7 @@ class PHYSGEN_PG_effect_entry(bpy.types.PropertyGroup):
     """An entry of the effect stack."""
 
     enabled: BoolProperty(name="On", description="Enable the effect", default=True)
-    effect: EnumProperty(name="Effect", description="What acts", items=EFFECT_ITEMS, update=_on_effect)
+    effect: EnumProperty(name="Effect", description="Kind of effect", items=EFFECT_ITEMS, update=_on_effect)
     parameters: CollectionProperty(type=PHYSGEN_PG_number)
     targets: CollectionProperty(type=PHYSGEN_PG_target)
     """Empty: all objects that it can act on."""

@@ -105,7 +105,7 @@ class RenderOptions:
     engine: render engine; ``cycles`` traces rays, ``eevee`` rasterises on the graphics card.
     device: where Cycles renders; ``auto`` selects a graphics card if there is one; unavailable devices fall back to the
     CPU. It affects nothing but noise.
-    samples: rays and light samples a pixel, 1 to 4096.
+    samples: rays and light samples per pixel, 1 to 4096.
     scale: width of the frames over the photo's, above 0 to 4.
     light_scale: resolution of light over the frames', above 0 to 1; outlines and colours are not affected. None: half,
     and less for large frames, down to a quarter.
@@ -131,9 +131,11 @@ class RenderOptions:
 
     engine: str = option("cycles", "render engine", choices=ENGINES)
     device: str = option("cpu", "Cycles device; falls back to cpu", choices=DEVICES)
-    samples: int = option(16, "rays and light samples a pixel", metavar="N", limits=(1, 4096))
+    samples: int = option(16, "samples per pixel", metavar="N", limits=(1, 4096))
     scale: float = option(1.0, "scale of the photo's resolution", metavar="F", limits=(0.0, 4.0))
-    light_scale: float | None = option(None, "resolution of light over the frames' (default: by size)", metavar="F")
+    light_scale: float | None = option(
+        None, "resolution of light layers relative to the frames (default: by size)", metavar="F"
+    )
     crop: bool = option(True, "render only regions that can change")
     denoise: bool = option(True, "denoise light if Blender can")
     seed: int = 0
@@ -141,9 +143,9 @@ class RenderOptions:
     format: str = option(
         "png", "file format of frames; exr-layers is multi-part with all layers", choices=tuple(FRAME_KINDS)
     )
-    bits: int | None = option(None, "a channel: PNG 8 or 16, EXR 16 or 32 (default: 8 and 16)", metavar="N")
-    compression: str = option("zip", "of EXR frames", choices=COMPRESSIONS)
-    camera: str | None = option(None, "path of the camera: a physgen-camera/1 file", metavar="FILE")
+    bits: int | None = option(None, "bits per channel: PNG 8 or 16, EXR 16 or 32 (default: 8 and 16)", metavar="N")
+    compression: str = option("zip", "compression of EXR frames", choices=COMPRESSIONS)
+    camera: str | None = option(None, "camera path: a physgen-camera/1 file", metavar="FILE")
     orbit: float = option(0.0, "camera orbit around the objects to the right, over the clip", metavar="DEGREES")
     rise: float = option(0.0, "camera rise around the objects, over the clip", metavar="DEGREES")
     dolly: float = option(0.0, "relative change of the camera's distance over the clip; -0.1 approaches", metavar="F")
