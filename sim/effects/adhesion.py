@@ -2,6 +2,7 @@
 """A surface attracts a body that separates from it.
 
 Equation: a = -p n within the reach r of the surface, n its normal; parting takes the work p r per mass.
+    Of two bodies, p is the pull over their reduced mass, m_a m_b / (m_a + m_b).
 Source: Maugis, Adhesion of spheres: the JKR–DMT transition using a Dugdale model, J. Colloid Interface Sci. 150 (1992):
     a constant pull up to a largest distance, here per mass of the body and not per area of contact.
 Bodies: all; every contact of theirs.
@@ -43,7 +44,7 @@ EFFECT = Effect(
             low=0.0,
             high=1e5,
             default=30.0,
-            description="p, pull over the body's mass",
+            description="p, pull over the body's mass; of two bodies, over their reduced mass",
         ),
         Parameter(
             name="reach", unit="m", low=0.0, high=1.0, default=0.005, description="r, distance within which it pulls"

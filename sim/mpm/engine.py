@@ -16,6 +16,7 @@ from .block_lists import BlockLists, block_keys, bytes_of
 from .kernels import layout, parallel_sorting, runtime, sorting
 from .kernels.constitutive_response import law_set
 from .kernels.kernel_arrays import (
+    AdhesionArrays,
     CouplingArrays,
     ParticleArrays,
     ParticleState,
@@ -114,6 +115,18 @@ class Engine:
         self._fields = upload_new(numbers.fields)
         self._touches = upload_new(numbers.touches)
         self._pairs = upload_new(numbers.pairs)
+        self._adheres = numbers.adheres
+        touches, pairs = numbers.touch_adhesion, numbers.pair_adhesion
+        if not self._adheres:
+            touches, pairs = touches[:0], pairs[:0]
+        self._adhesion = AdhesionArrays(
+            touch_count=len(touches),
+            pair_count=len(pairs),
+            touches=upload_new(touches),
+            pairs=upload_new(pairs),
+            touch_sums=ti.ndarray(ti.i64, max(1, len(touches))),
+            pair_sums=ti.ndarray(ti.i64, max(1, len(pairs))),
+        )
         self._means = ti.ndarray(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
         self._control = ti.ndarray(ti.f64, self.world_count * layout.CONTROL_ROW)
         control = np.zeros((self.world_count, layout.CONTROL_ROW))
@@ -157,7 +170,7 @@ class Engine:
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
         arrays = [a for group in self._particles for a in group.values()]
-        arrays += [a for a in vars(self).values() if isinstance(a, ti.Ndarray)]
+        arrays += [a for a in (*vars(self).values(), *self._adhesion) if isinstance(a, ti.Ndarray)]
         return self._blocks.device_bytes + sum(bytes_of(a) for a in arrays)
 
     def control(self) -> Array:
@@ -413,6 +426,7 @@ class Engine:
             self._mean_fields > 0,
             self._blocks.any_overlap,
             self._thin,
+            self._adheres,
             self.rigid_bodies.count > 0,
             self.rigid_bodies.solved_together,
             self._blocks.any_near,
@@ -438,6 +452,7 @@ class Engine:
             "coupling": CouplingArrays(
                 self.rigid_bodies.count, self._most_rigid_bodies, self._touching, self._blocks.pushes
             ),
+            "adhesion": self._adhesion,
             "running": self._running,
         }
 

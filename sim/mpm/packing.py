@@ -16,6 +16,7 @@ from ..constitutive import FLUID, ROW, SHAPED, DeformableMaterial, ElasticMateri
 from ..scene.units import Similarity
 from .bodies import THIN_CELLS, BodyParticles
 from .kernels import layout
+from .kernels.adhesion import LEAST_REACH, MOST_REACH
 from .kernels.particle_transfer import GOAL, PIN
 from .rigid.rigid_bodies import LEAST_RECOVERY, RECOVERY_HEIGHT
 from .surface_contact import GROUND_NAME, MODES, SurfaceContact
@@ -28,6 +29,7 @@ Array = NDArray[np.float64]
 class PackedWorlds:
     """Parameters of worlds and fields as the kernels read them; ``layout`` names the columns.
 
+    touch_adhesion, pair_adhesion: rows of ``layout.ADHESION_ROW`` for those of touches and pairs.
     thin: whether a world needs the kernel for bodies that are thin all over.
     """
 
@@ -39,7 +41,14 @@ class PackedWorlds:
     fields: NDArray[np.float32]
     touches: NDArray[np.float32]
     pairs: NDArray[np.float32]
+    touch_adhesion: NDArray[np.float32]
+    pair_adhesion: NDArray[np.float32]
     thin: bool
+
+    @property
+    def adheres(self) -> bool:
+        """Whether a field adheres to another one, to a rigid body or to a collider."""
+        return bool((self.touch_adhesion[:, :1] > 0).any() or (self.pair_adhesion[:, :1] > 0).any())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,12 +136,16 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
     laws = functools.reduce(operator.or_, (laws_of(place.setup) for place in all_places))
     touches: list[tuple[float, ...]] = []
     pairs: list[tuple[float, ...]] = []
+    touch_adhesion: list[tuple[float, ...]] = []
+    pair_adhesion: list[tuple[float, ...]] = []
     world_integers = np.zeros((len(all_places), layout.WORLD_INTEGERS), dtype=np.int32)
     field_integers = np.zeros((len(bodies), layout.FIELD_INTEGERS), dtype=np.int32)
     first_body = 0
     for place in all_places:
         setup, soft = place.setup, place.soft
         obstacles = collider_names(setup)
+        rigid = [body for body in setup.bodies if body.rigid]
+        solids = list(zip(obstacles, [*rigid, *[None] * len(setup.colliders)], strict=True))
         row = world_integers[place.world]
         row[layout.FIRST_RIGID_BODY], row[layout.RIGID_BODIES] = first_body, len(obstacles)
         row[layout.FIRST_FIELD], row[layout.FIELDS] = place.first_field, len(soft)
@@ -145,10 +158,16 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
             integers[layout.FIRST_TOUCH] = len(touches)
             integers[layout.WANTS_MEANS] = int(body.forces.lift != 0 or body.forces.tether_stiffness > 0)
             integers[layout.HAS_ANCHORS] = int(body.pins is not None or body.goal_stiffness > 0)
+            touch_adhesion.append(NO_ADHESION)
             for name in (GROUND_NAME, *obstacles):
                 touches.append(contact_row(setup.contact(body.name, name), place.cells))
+            for name, partner in solids:
+                touch_adhesion.append(adhesion_row(place, body, setup.contact(body.name, name), partner))
             for j in soft:
                 pairs.append(contact_row(setup.contact(body.name, setup.bodies[j].name), place.cells))
+                other = setup.bodies[j]
+                row = adhesion_row(place, body, setup.contact(body.name, other.name), other)
+                pair_adhesion.append(NO_ADHESION if i == j else row)
     return PackedWorlds(
         laws=laws,
         table=material_table(all_places, [0.0] * len(all_places)),
@@ -158,6 +177,8 @@ def pack(all_places: Sequence[WorldSlot]) -> PackedWorlds:
         fields=field_rows(all_places, [0.0] * len(all_places), [0.0] * len(all_places)),
         touches=np.asarray(touches, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
         pairs=np.asarray(pairs, dtype=np.float32).reshape(-1, layout.TOUCH_ROW),
+        touch_adhesion=np.asarray(touch_adhesion, dtype=np.float32).reshape(-1, layout.ADHESION_ROW),
+        pair_adhesion=np.asarray(pair_adhesion, dtype=np.float32).reshape(-1, layout.ADHESION_ROW),
         thin=any(has_thin(place.setup, place.cells.scale) for place in all_places),
     )
 
@@ -175,6 +196,29 @@ def contact_row(contact: SurfaceContact, cells: Similarity) -> tuple[float, ...]
         float(MODES.index(contact.mode)),
         contact.restitution,
     )
+
+
+NO_ADHESION = (0.0, -layout.FAR, 0.0)
+"""Row of ``layout.ADHESION_ROW``: the ground pulls whole bodies instead, by their rows of forces."""
+
+
+def adhesion_row(
+    place: WorldSlot, body: BodyParticles, contact: SurfaceContact, partner: BodyParticles | None
+) -> tuple[float, ...]:
+    """Adhesion of ``body``, which deforms, to its ``partner``, None for a collider: ``layout.ADHESION_ROW`` numbers.
+
+    The pull of the pair is the adhesion times the reduced mass; ``kernels.adhesion`` says over which mass it is spread.
+    """
+    if not (contact.adhesion > 0 and contact.adhesion_reach > 0):
+        return NO_ADHESION
+    scale = place.cells.scale
+    mass = reduced = float(body.masses.sum())
+    if partner is not None:
+        reduced *= float(partner.masses.sum()) / (mass + float(partner.masses.sum()))
+        if not partner.rigid:
+            mass = reduced
+    reach = min(max(contact.adhesion_reach * scale, LEAST_REACH), MOST_REACH)
+    return contact.adhesion * scale * reduced / mass, reach, 1.0 / mass
 
 
 def world_row(place: WorldSlot, start: float, end: float) -> NDArray[np.float32]:

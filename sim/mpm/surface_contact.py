@@ -40,7 +40,8 @@ class SurfaceContact:
     """Lever arm in metres of the normal force against rolling, of rigid bodies, 0 to 1."""
 
     adhesion: float = 0.0
-    """Pull towards the surface in m/s² (force over the body's mass) within ``adhesion_reach``, 0 to 1e5."""
+    """Pull of the surfaces towards each other within ``adhesion_reach`` in m/s², 0 to 1e5: force over the reduced mass
+    m_a m_b / (m_a + m_b) of the bodies, which is the mass of one where the other is the ground or a collider."""
 
     adhesion_reach: float = 0.0
     """Distance in metres within which the adhesion pulls, 0 to 1."""

@@ -157,7 +157,8 @@ class Contact:
     mode: ``separate`` (friction, free to separate), ``slip`` (no separation, no friction), ``sticky`` (no separation,
         no sliding).
     rolling_resistance: lever arm in m of the normal force against rolling, rigid bodies only, 0 to 1.
-    adhesion: attraction in m/s² (force over mass) within ``adhesion_reach`` m; 0 to 1e5 and 0 to 1.
+    adhesion: attraction in m/s² (force over the reduced mass of the two) within ``adhesion_reach`` m; 0 to 1e5 and
+        0 to 1.
     """
 
     between: tuple[str, str]

@@ -49,6 +49,9 @@ from .layout import (
 PUSH = 8
 """Numbers that a block of particles adds to a body: impulse (3), about its centre (3), mass at the body, spare."""
 
+REACH_FACTOR = 1.5
+"""Steps of the fastest particle within which a particle takes part in the contact."""
+
 
 @func
 def outside_box(shape, point, shapes: ShapeArrays):

@@ -32,11 +32,23 @@ its other side: its distance is -(s + t/2), its normal the other way round.
 
 import taichi as ti
 
+from .adhesion import counted, largest_pull, least_speed
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
-from .kernel_arrays import GridBlocks, NodeArrays, OverlapBlocks, ParticleArrays, ParticleBlocks, WorldArrays
+from .kernel_arrays import (
+    AdhesionArrays,
+    GridBlocks,
+    NodeArrays,
+    OverlapBlocks,
+    ParticleArrays,
+    ParticleBlocks,
+    WorldArrays,
+)
 from .kernel_bundles import func
 from .lanes import meet, pads_of
 from .layout import (
+    ADHESION_REACH,
+    ADHESION_ROW,
+    ADHESION_UNIT,
     BLOCK_NODES,
     CONTROL_ROW,
     FIELD_INTEGERS,
@@ -67,82 +79,17 @@ from .layout import (
     vec4,
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
+from .surface_shares import LEAST_SLOPE, distance_from_middle, distance_of_share, slope_along
 from .windows import add_to, clear_window, gathered, store_window, sum_chosen_windows, weights
 
 SWEEPS = 8
 """Passes over the pairs of bodies at a node where three or more meet and some are thin."""
-
-BISECTIONS = 10
-"""Halvings of 2 cells or so: to 0.002 cells."""
-
-LEAST_SLOPE = 0.05
-"""Gradient (1/cell) of a share below which it tells no direction: that of a half-space 1.2 cells away."""
 
 MOST_SHARE = 0.6
 """Share of a thick body at a node that may lie behind a thin one which touches it; 0.5 where nothing overlaps."""
 
 LEAST_SHARE = 0.0026
 """Share below which a body is too far from the node (1.25 cells) for a distance."""
-
-
-@ti.func
-def distance_of_share(share: ti.f32):
-    """Distance in cells outside a plane face at which a body fills ``share`` of a node's surroundings; see above."""
-    q = ti.min(ti.max(share, 1e-6), 1.0 - 1e-6)
-    outside = ti.min(q, 1.0 - q)
-    d = 0.0
-    if outside < 1.0 / 6.0:
-        d = 1.5 - ti.pow(6.0 * outside, 1.0 / 3.0)
-    else:
-        d = (0.5 - outside) / 0.75
-        for _ in ti.static(range(3)):
-            d -= (0.5 - 0.75 * d + d * d * d / 3.0 - outside) / (d * d - 0.75)
-    return ti.select(q > 0.5, -d, d)
-
-
-@ti.func
-def share_of_distance(d: ti.f32):
-    """The share f(d) of a node's surroundings that a half-space fills whose face is ``d`` cells away; see above."""
-    outside = ti.min(ti.abs(d), 1.5)
-    far = 1.5 - outside
-    q = far * far * far / 6.0
-    if outside < 0.5:
-        q = 0.5 - 0.75 * outside + outside * outside * outside / 3.0
-    return ti.select(d < 0.0, 1.0 - q, q)
-
-
-@ti.func
-def slope_of_distance(d: ti.f32):
-    """-f'(d) (1/cell), how steeply that share falls."""
-    outside = ti.abs(d)
-    slope = 0.75 - outside * outside
-    if outside > 0.5:
-        slope = 0.5 * ti.max(1.5 - outside, 0.0) ** 2
-    return slope
-
-
-@ti.func
-def distance_from_middle(share: ti.f32, slope: ti.f32, thickness: ti.f32):
-    """Distance in cells from the middle of a thin body whose share at a node is ``share`` and falls by ``slope``."""
-    near, far = 0.0, 1.5 + 0.5 * thickness
-    for _ in range(BISECTIONS):
-        s = 0.5 * (near + far)
-        g = share_of_distance(s - 0.5 * thickness) - share_of_distance(s + 0.5 * thickness)
-        falls = slope_of_distance(s - 0.5 * thickness) - slope_of_distance(s + 0.5 * thickness)
-        if g * slope > share * falls:
-            near = s
-        else:
-            far = s
-    return 0.5 * (near + far)
-
-
-@ti.func
-def slope_along(slope: vec3, other: vec3, thick: ti.i32):
-    """Slope of a thin body's share across its face: along the other body's slope where that one is thick."""
-    steep = slope.norm()
-    if thick == 1 and other.norm() > LEAST_SLOPE:
-        steep = ti.abs(slope.dot(other)) / other.norm()
-    return steep
 
 
 @func
@@ -225,32 +172,59 @@ def gather_shares(
 @func
 def separate(
     thin: ti.template(),
+    adheres: ti.template(),
     lanes: ti.template(),
     worlds: WorldArrays,
     grid: GridBlocks,
     overlap: OverlapBlocks,
     nodes: NodeArrays,
+    adhesion: AdhesionArrays,
 ):
     """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``; ``thin``: some
-    fields are thin bodies."""
+    fields are thin bodies; ``adheres``: some adhere to others."""
+    if ti.static(adheres):
+        for n in range(adhesion.pair_count):
+            adhesion.pair_sums[n] = 0
+        visit_leads(thin, True, True, lanes, worlds, grid, overlap, nodes, adhesion)
+    visit_leads(thin, adheres, False, lanes, worlds, grid, overlap, nodes, adhesion)
+
+
+@func
+def visit_leads(
+    thin: ti.template(),
+    adheres: ti.template(),
+    summing: ti.template(),
+    lanes: ti.template(),
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
+    adhesion: AdhesionArrays,
+):
+    """The impulses of ``separate``, or, if ``summing``, the sums of mass in reach that they need."""
     share = ti.static(BLOCK_NODES if lanes.parallel else SPREAD)
     for ss in range(overlap.lead_count * share):
         if ti.static(lanes.parallel):
-            separate_node(thin, overlap.leads[ss // share], ss % share, worlds, grid, overlap, nodes)
+            lead = overlap.leads[ss // share]
+            separate_node(thin, adheres, summing, lead, ss % share, worlds, grid, overlap, nodes, adhesion)
         elif ss % share == 0:
             for i in range(BLOCK_NODES):
-                separate_node(thin, overlap.leads[ss // share], i, worlds, grid, overlap, nodes)
+                lead = overlap.leads[ss // share]
+                separate_node(thin, adheres, summing, lead, i, worlds, grid, overlap, nodes, adhesion)
 
 
 @func
 def separate_node(
     thin: ti.template(),
+    adheres: ti.template(),
+    summing: ti.template(),
     lead: ti.i32,
     i: ti.i32,
     worlds: WorldArrays,
     grid: GridBlocks,
     overlap: OverlapBlocks,
     nodes: NodeArrays,
+    adhesion: AdhesionArrays,
 ):
     """The same at node ``i`` of the fields' blocks in the place of the block ``lead``."""
     f = grid.field[lead]
@@ -261,20 +235,59 @@ def separate_node(
         recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
         first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
         count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
-        if ti.static(thin):
+        if ti.static(thin and not summing):
             # What is light between heavy bodies takes one push and the other in turn.
             sweeps = 1
             if overlap.mate[lead] >= 0 and overlap.mate[overlap.mate[lead]] >= 0:
                 sweeps = SWEEPS
+            part = 1.0
+            if ti.static(adheres):
+                part /= sweeps
             for _ in range(sweeps):
-                separate_pairs(thin, lead, i, w, first, count, dt, recovery, worlds, grid, overlap, nodes)
+                separate_pairs(
+                    thin,
+                    adheres,
+                    summing,
+                    lead,
+                    i,
+                    w,
+                    first,
+                    count,
+                    dt,
+                    recovery,
+                    worlds,
+                    grid,
+                    overlap,
+                    nodes,
+                    part,
+                    adhesion,
+                )
         else:
-            separate_pairs(thin, lead, i, w, first, count, dt, recovery, worlds, grid, overlap, nodes)
+            separate_pairs(
+                thin,
+                adheres,
+                summing,
+                lead,
+                i,
+                w,
+                first,
+                count,
+                dt,
+                recovery,
+                worlds,
+                grid,
+                overlap,
+                nodes,
+                1.0,
+                adhesion,
+            )
 
 
 @func
 def separate_pairs(
     thin: ti.template(),
+    adheres: ti.template(),
+    summing: ti.template(),
     lead: ti.i32,
     i: ti.i32,
     w: ti.i32,
@@ -286,8 +299,10 @@ def separate_pairs(
     grid: GridBlocks,
     overlap: OverlapBlocks,
     nodes: NodeArrays,
+    part: ti.f32,
+    adhesion: AdhesionArrays,
 ):
-    """Pass once over all pairs of fields at node ``i``."""
+    """Pass once over all pairs of fields at node ``i``; ``part``: of the largest pull, for one of several passes."""
     a = lead
     while overlap.mate[a] >= 0:
         b = overlap.mate[a]
@@ -296,41 +311,48 @@ def separate_pairs(
                 worlds.integers[w * WORLD_INTEGERS + FIRST_PAIR]
                 + (grid.field[a] - first) * count
                 + (grid.field[b] - first)
-            ) * TOUCH_ROW
+            )
             na, nb = a * BLOCK_NODES + i, b * BLOCK_NODES + i
             if nodes.mass[na] > 0.0 and nodes.mass[nb] > 0.0:
                 sa, sb = (
                     nodes.sums[overlap.slot[a] * BLOCK_NODES + i],
                     nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
                 )
+                found, normal, gap = False, vec3(0.0), 0.0
                 if ti.static(thin):
-                    fa, fb = grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW
-                    exchange_thin(fa, fb, na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
+                    found, normal, gap = facing_thin(
+                        grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW, sa, sb, worlds
+                    )
                 else:
-                    exchange(na, nb, sa, sb, pair, dt, recovery, worlds, nodes)
+                    found, normal, gap = facing(sa, sb)
+                if found:
+                    if ti.static(summing):
+                        row = pair * ADHESION_ROW
+                        if gap < adhesion.pairs[row + ADHESION_REACH]:
+                            ma, mb = nodes.mass[na], nodes.mass[nb]
+                            share = ma * mb / (ma + mb) * adhesion.pairs[row + ADHESION_UNIT]
+                            ti.atomic_add(adhesion.pair_sums[pair], counted(share))
+                    else:
+                        pull = 0.0
+                        if ti.static(adheres):
+                            pull = part * largest_pull(pair, gap, dt, adhesion.pairs, adhesion.pair_sums)
+                        push_apart(adheres, na, nb, normal, gap, pair * TOUCH_ROW, pull, dt, recovery, worlds, nodes)
             b = overlap.mate[b]
         a = overlap.mate[a]
 
 
 @func
-def exchange(
-    na: ti.i32,
-    nb: ti.i32,
-    sa: vec4,
-    sb: vec4,
-    pair: ti.i32,
-    dt: ti.f32,
-    recovery: ti.f32,
-    worlds: WorldArrays,
-    nodes: NodeArrays,
-):
-    """Apply the impulse between node ``na`` of one field and the coinciding node ``nb`` of another."""
+def facing(sa: vec4, sb: vec4):
+    """Whether two fields meet at a node, by the slopes and shares ``sa`` and ``sb`` of both there; the normal from the
+    first to the second, and the gap in cells."""
+    found, gap = False, 0.0
     normal = vec3(sb[0] - sa[0], sb[1] - sa[1], sb[2] - sa[2])
     length = normal.norm()
     if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE and length > 1e-6:
         normal /= length
         gap = distance_of_share(sa[3]) + distance_of_share(sb[3])
-        push_apart(na, nb, normal, gap, pair, dt, recovery, worlds, nodes)
+        found = True
+    return found, normal, gap
 
 
 @func
@@ -343,20 +365,9 @@ def field_thickness(row: ti.i32, worlds: WorldArrays):
 
 
 @func
-def exchange_thin(
-    fa: ti.i32,
-    fb: ti.i32,
-    na: ti.i32,
-    nb: ti.i32,
-    sa: vec4,
-    sb: vec4,
-    pair: ti.i32,
-    dt: ti.f32,
-    recovery: ti.f32,
-    worlds: WorldArrays,
-    nodes: NodeArrays,
-):
-    """As ``exchange`` where bodies may be thin; ``fa`` and ``fb``: where the rows of both fields start."""
+def facing_thin(fa: ti.i32, fb: ti.i32, sa: vec4, sb: vec4, worlds: WorldArrays):
+    """As ``facing`` where bodies may be thin; ``fa`` and ``fb``: where the rows of both fields start."""
+    found, direction, gap = False, vec3(0.0), 0.0
     if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE:
         slope_a, slope_b = vec3(sa[0], sa[1], sa[2]), vec3(sb[0], sb[1], sb[2])
         ta, tb = field_thickness(fa, worlds), field_thickness(fb, worlds)
@@ -382,22 +393,26 @@ def exchange_thin(
         normal = slope_b - slope_a
         length = normal.norm()
         if length > 1e-6:
-            push_apart(na, nb, normal / length, da + db, pair, dt, recovery, worlds, nodes)
+            found, direction, gap = True, normal / length, da + db
+    return found, direction, gap
 
 
 @func
 def push_apart(
+    adheres: ti.template(),
     na: ti.i32,
     nb: ti.i32,
     normal: vec3,
     gap: ti.f32,
     pair: ti.i32,
+    pull: ti.f32,
     dt: ti.f32,
     recovery: ti.f32,
     worlds: WorldArrays,
     nodes: NodeArrays,
 ):
-    """Apply the impulse between nodes of surfaces ``gap`` cells apart; ``normal``: from the first to the second."""
+    """Apply the impulse between nodes of surfaces ``gap`` cells apart; ``normal``: from the first to the second;
+    ``pull``: the relative speed (cells/s) that they can hold back where they adhere."""
     ua, ub = nodes.velocity[na], nodes.velocity[nb]
     relative = vec3(ua[0] - ub[0], ua[1] - ub[1], ua[2] - ub[2])
     closing = relative.dot(normal)
@@ -406,6 +421,11 @@ def push_apart(
     elastic = worlds.pairs[pair + RESTITUTION]
     push = (1.0 - elastic) * ti.max(0.0, closing + wanted) + elastic * (SPRING * ti.max(0.0, -gap) / dt)
     touching = push > 0.0
+    pressing = push
+    if ti.static(adheres):
+        push += ti.max(-pull, ti.min(0.0, closing + least_speed(gap, wanted, dt)))
+        pressing = push + pull
+        touching = push != 0.0
     if mode != SEPARATE and gap < HOLD:
         push = closing
         touching = True
@@ -414,7 +434,7 @@ def push_apart(
         if mode == SLIP:
             rub *= 0.0
         elif mode == SEPARATE:
-            rub = coulomb(rub, push, worlds.pairs[pair + STICKING], worlds.pairs[pair + SLIDING])
+            rub = coulomb(rub, pressing, worlds.pairs[pair + STICKING], worlds.pairs[pair + SLIDING])
         change = push * normal + rub
         ma, mb = nodes.mass[na], nodes.mass[nb]
         part = mb / (ma + mb)

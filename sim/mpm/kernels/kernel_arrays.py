@@ -217,6 +217,25 @@ class ParticleArrays(NamedTuple):
     """(N,) strain of the branch that relaxes, as a left Cauchy–Green tensor; the identity at rest."""
 
 
+class AdhesionArrays(NamedTuple):
+    """Adhesion of fields to rigid bodies and colliders, and to one another; of length 1 where nothing adheres."""
+
+    touch_count: ti.i32
+    pair_count: ti.i32
+
+    touches: Scalars
+    """(touch_count, ADHESION_ROW) in the order of ``WorldArrays.contacts``."""
+
+    pairs: Scalars
+    """(pair_count, ADHESION_ROW) in the order of ``WorldArrays.pairs``."""
+
+    touch_sums: Keys
+    """(touch_count,) share of the field's mass in reach, see ``adhesion.WHOLE``."""
+
+    pair_sums: Keys
+    """(pair_count,) reduced masses of the nodes in reach over that of both fields."""
+
+
 class NodeArrays(NamedTuple):
     """Grid nodes, and the private windows between particles and nodes."""
 

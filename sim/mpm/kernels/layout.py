@@ -84,6 +84,11 @@ TOUCH_ROW = 4
 SEPARATE, SLIP, STICKY = range(3)
 """Numbers of ``contacts.MODES``."""
 
+# Adhesion of the same pairs: acceleration (cells/s²) that the whole pull gives the field's mass (of two fields, their
+# reduced mass), reach (cells, below all gaps where nothing adheres), and 1 over that mass (1/kg).
+ADHESION_PULL, ADHESION_REACH, ADHESION_UNIT = range(3)
+ADHESION_ROW = 3
+
 # Progress of a world through a segment of time, float64. Seconds, cells, cells/s.
 REMAINING, ELAPSED, STEP, NEXT_STEP, PHASE, SCATTER, STORE, SPEED, WAVE_SPEED, MARGIN = range(10)
 CFL_SCALE, SUBSTEPS, STATUS = range(10, 13)

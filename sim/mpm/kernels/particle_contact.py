@@ -26,8 +26,17 @@ the particle), which makes it exact for even contact and stable for any, by Gers
 
 import taichi as ti
 
-from .collider_distance import PUSH, add_push, body_compliance, body_distance, body_velocity
+from .adhesion import MOST_REACH, largest_pull, least_speed
+from .collider_distance import (
+    PUSH,
+    REACH_FACTOR,
+    add_push,
+    body_compliance,
+    body_distance,
+    body_velocity,
+)
 from .kernel_arrays import (
+    AdhesionArrays,
     CouplingArrays,
     GridBlocks,
     NearBlocks,
@@ -41,6 +50,8 @@ from .kernel_arrays import (
 from .kernel_bundles import func
 from .lanes import lane_maxima, meet, pads_of
 from .layout import (
+    ADHESION_REACH,
+    ADHESION_ROW,
     BLOCK_NODES,
     CONTROL_ROW,
     ELAPSED,
@@ -105,9 +116,6 @@ AHEAD = 3.0
 """Reaches from a rigid body within which a particle's mass counts as touching it: known one substep ahead, so that the
 first impact on a light body is not solved as if nothing else touched it."""
 
-REACH_FACTOR = 1.5
-"""Steps of the fastest particle within which a particle takes part in the contact."""
-
 HOLD = 0.1
 """Cells within which surfaces that must not part count as touching."""
 
@@ -133,6 +141,7 @@ def coulomb(wanted: vec3, normal_size: ti.f32, sticking: ti.f32, sliding: ti.f32
 
 @func
 def press(
+    adheres: ti.template(),
     old: vec3,
     velocity: vec3,
     phi: ti.f32,
@@ -141,9 +150,11 @@ def press(
     dt: ti.f32,
     recovery: ti.f32,
     touch: ti.i32,
+    pull: ti.f32,
     worlds: WorldArrays,
 ):
-    """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away."""
+    """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away,
+    which pulls with at most ``pull`` (cells/s) where it ``adheres``."""
     v_n = velocity.dot(normal)
     wanted = parting_speed(phi, dt, recovery)
     old_n = old.dot(normal)
@@ -152,8 +163,13 @@ def press(
     new_t = old - old_n * normal - (velocity - v_n * normal) / share
     mode = ti.cast(worlds.contacts[touch + MODE], ti.i32)
     if mode == SEPARATE or phi > HOLD:
-        new_n = ti.max(0.0, new_n)
-        new_t = coulomb(new_t, new_n, worlds.contacts[touch + STICKING], worlds.contacts[touch + SLIDING])
+        pressing = ti.max(0.0, new_n)
+        new_n = pressing
+        if ti.static(adheres):
+            if pressing == 0.0:
+                new_n = ti.max(-pull, ti.min(0.0, old_n + (least_speed(phi, wanted, dt) - v_n) / share))
+            pressing = new_n + pull
+        new_t = coulomb(new_t, pressing, worlds.contacts[touch + STICKING], worlds.contacts[touch + SLIDING])
     elif mode == SLIP:
         new_t *= 0.0
     return new_n * normal + new_t
@@ -162,6 +178,7 @@ def press(
 @func
 def solve_contact(
     lanes: ti.template(),
+    adheres: ti.template(),
     worlds: WorldArrays,
     blocks: ParticleBlocks,
     near: NearBlocks,
@@ -170,8 +187,12 @@ def solve_contact(
     bodies: RigidArrays,
     shapes: ShapeArrays,
     coupling: CouplingArrays,
+    adhesion: AdhesionArrays,
 ):
-    """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass."""
+    """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
+
+    adheres: whether some fields adhere to rigid bodies or colliders.
+    """
     if ti.static(lanes.shared):
         ti.loop_config(block_dim=ti.static(lanes.threads))
     for ss in range(near.particle_count * ti.static(lanes.span)):
@@ -228,11 +249,16 @@ def solve_contact(
                     if has_plane:
                         phi = level + plane.dot(gp) - fixed[3]
                     for o in range(body_count):
-                        found, along, rate = body_distance(
-                            first_body + o, first_node + gp, MOST_SLACK + AHEAD * reach + fixed[3], bodies, shapes
-                        )
+                        farthest = MOST_SLACK + AHEAD * reach + fixed[3]
+                        around = AHEAD * reach
+                        if ti.static(adheres):
+                            farthest += MOST_REACH
+                            around = ti.max(
+                                around, adhesion.touches[(first_touch + o + 1) * ADHESION_ROW + ADHESION_REACH]
+                            )
+                        found, along, rate = body_distance(first_body + o, first_node + gp, farthest, bodies, shapes)
                         found -= fixed[3]
-                        if found < AHEAD * reach:
+                        if found < around:
                             coupling.pushes[(s * coupling.most_bodies + o) * PUSH + 6] += fixed[0]
                         if found < phi:
                             second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
@@ -243,7 +269,11 @@ def solve_contact(
                     if has_anchors:
                         pinned = particles.anchors[p][3] == PIN
                     least = ti.min(least, phi)
-                    if phi < reach or old.norm_sqr() > 0.0 or pinned:
+                    held = False
+                    if ti.static(adheres):
+                        least = ti.min(least, phi - MOST_REACH)
+                        held = phi < adhesion.touches[(first_touch + obstacle) * ADHESION_ROW + ADHESION_REACH]
+                    if phi < reach or held or old.norm_sqr() > 0.0 or pinned:
                         least = 0.0
                         if ti.static(not lanes.parallel):
                             if touched == 0.0:
@@ -277,7 +307,13 @@ def solve_contact(
                                 i = first_body + obstacle - 1
                                 surface += body_velocity(i, here, bodies)
                                 give = coupling.touching[i] * body_compliance(i, here, normal, bodies)
+                            pull = 0.0
+                            if ti.static(adheres):
+                                pull = largest_pull(
+                                    first_touch + obstacle, phi, dt, adhesion.touches, adhesion.touch_sums
+                                )
                             new = press(
+                                adheres,
                                 old,
                                 velocity - surface,
                                 phi,
@@ -286,6 +322,7 @@ def solve_contact(
                                 dt,
                                 recovery,
                                 (first_touch + obstacle) * TOUCH_ROW,
+                                pull,
                                 worlds,
                             )
                             if second < reach:

@@ -20,12 +20,14 @@ import functools
 import taichi as ti
 
 from ..rigid.rigid_motion import predict, rigid_substep
+from .adhesion import sum_reached
 from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
 from .crowding import add_pushes, find_crowding, leave_room, push_fields
 from .deformable_contact import gather_shares, scatter_shares, separate
 from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
+    AdhesionArrays,
     CouplingArrays,
     FlowArrays,
     GridBlocks,
@@ -66,9 +68,9 @@ def advance_grid_of(flowing: bool, parallel: bool, means: bool) -> BundledKernel
 
 
 @functools.cache
-def part_bodies_of(laws: int, lanes: Lanes, thin: bool) -> BundledKernel:
+def part_bodies_of(laws: int, lanes: Lanes, thin: bool, adheres: bool) -> BundledKernel:
     """Kernel of contact between deformable bodies for the set ``laws`` of constitutive models; ``thin``: some are thin
-    all over."""
+    all over; ``adheres``: some adhere to others."""
     models = law_set(laws)
 
     @kernel
@@ -80,13 +82,14 @@ def part_bodies_of(laws: int, lanes: Lanes, thin: bool) -> BundledKernel:
         particles: ParticleArrays,
         nodes: NodeArrays,
         flow: FlowArrays,
+        adhesion: AdhesionArrays,
     ):
         """Impulses between coinciding nodes of different bodies."""
         scatter_shares(models, lanes, worlds, blocks, overlap, particles, nodes)
         gather_shares(lanes, worlds, grid, overlap, nodes)
         if ti.static(len(models.volumetric) > 0):
             leave_room(worlds, grid, overlap, nodes, flow)
-        separate(thin, lanes, worlds, grid, overlap, nodes)
+        separate(thin, adheres, lanes, worlds, grid, overlap, nodes, adhesion)
 
     return part_bodies
 
@@ -126,9 +129,9 @@ def plan_bodies(worlds: WorldArrays, bodies: RigidArrays):
 
 
 @functools.cache
-def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool) -> BundledKernel:
+def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool, adheres: bool) -> BundledKernel:
     """Kernel of contact with what is no deformable body; ``pushed``: there are rigid bodies or colliders; ``fluid``:
-    there are fluids, whose crowding pushes rigid bodies, too."""
+    there are fluids, whose crowding pushes rigid bodies, too; ``adheres``: some matter adheres to those."""
 
     @kernel
     def resolve_contact(
@@ -142,9 +145,12 @@ def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool) -> BundledKernel
         bodies: RigidArrays,
         shapes: ShapeArrays,
         coupling: CouplingArrays,
+        adhesion: AdhesionArrays,
     ):
         """Contact impulses between particles and plane, rigid bodies, colliders and pins."""
-        solve_contact(lanes, worlds, blocks, near, particles, nodes, bodies, shapes, coupling)
+        if ti.static(adheres):
+            sum_reached(worlds, blocks, near, particles, bodies, shapes, adhesion)
+        solve_contact(lanes, adheres, worlds, blocks, near, particles, nodes, bodies, shapes, coupling, adhesion)
         apply_contact(lanes, worlds, grid, near, nodes)
         if ti.static(lanes.parallel and pushed):
             gather_pushes_in_parallel(worlds, blocks, near, bodies, coupling)
@@ -198,6 +204,7 @@ def substep_launcher(
     means: bool,
     overlap: bool,
     thin: bool,
+    adheres: bool,
     bodies: bool,
     together: bool,
     near: bool,
@@ -205,20 +212,21 @@ def substep_launcher(
     """Launcher of a substep for worlds of these ``laws``, with the kernels that they need.
 
     generation: of the compute runtime; a launcher ends with it. means: some fields' means are wanted; overlap: several
-    fields overlap; thin: some are thin all over; bodies: there are rigid bodies or colliders; together: contacts of
-    some worlds may be solved at once; near: some particles are near the plane, a body or a collider, or are held.
+    fields overlap; thin: some are thin all over; adheres: some adhere to others, to rigid bodies or to colliders;
+    bodies: there are rigid bodies or colliders; together: contacts of some worlds may be solved at once; near: some
+    particles are near the plane, a body or a collider, or are held.
     """
     # The serial kernels leave out by themselves what is not there; compiling them twice would cost more.
     kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
     if overlap:
-        kernels.append(part_bodies_of(laws, lanes, thin))
+        kernels.append(part_bodies_of(laws, lanes, thin, adheres))
     fluid = bool(law_set(laws).volumetric)
     if fluid:
         kernels.append(crowd_fluids_of(overlap))
     if bodies:
         kernels.append(plan_bodies)
     if near:
-        kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel, fluid))
+        kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel, fluid, adheres and bodies))
     if bodies:
         kernels += rigid_substep(together=together)
     kernels.append(advance_matter_of(laws, lanes))
