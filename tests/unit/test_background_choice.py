@@ -277,3 +277,43 @@ def test_the_border_of_a_shadow_is_no_edge():
     hole = cv2.dilate((thing | shade).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     assert len(edges_behind(logarithms(photo), hole, thing)) == 1
     assert edges_behind(logarithms(photo), hole, thing, hole) == []
+
+
+def test_brighter_on_one_side_of_the_hole_and_darker_on_the_other_is_no_edge():
+    # As the mirror images of a door on a floor of boards are; opposed by 0.2 in logarithms.
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    opposed = cv2.GaussianBlur(((y < 78) == (x < 100)).astype(np.float32), (0, 0), 1.0)[..., None]
+    colour = 150.0 * np.array([1.0, 0.8, 0.5])
+    noise = np.random.default_rng(0).normal(scale=3.0, size=(HEIGHT, WIDTH, 1))
+    thing = disc(100, 75, 24)
+    assert edges_behind(logarithms((colour * np.exp(-0.2 * opposed) + noise).astype(np.float32)), thing, thing) == []
+    # The same step alike on both sides is one.
+    alike = cv2.GaussianBlur((y < 78).astype(np.float32), (0, 0), 1.0)[..., None]
+    (edge,) = edges_behind(logarithms((colour * np.exp(-0.2 * alike) + noise).astype(np.float32)), thing, thing)
+    assert abs((edge.c - edge.a * 100.0) / edge.b - 78.0) < 1.0
+
+
+def test_grain_is_laid_without_what_lies_beyond_the_edge():
+    rng = np.random.default_rng(6)
+    photo = np.repeat(120.0 + rng.normal(scale=12.0, size=(420, 620, 1)), 3, axis=2).astype(np.float32)
+    hole, known = np.zeros((2, 420, 620), dtype=bool)
+    hole[80:340, 180:420], known[80:] = True, True
+    known &= ~hole
+    seen = np.where((hole | known)[..., None], photo, np.float32(15.0))
+    laid = lay_grain(seen, hole, known)
+    assert (laid[:80] == 15.0).all()
+    # The mean of 3 rows of 240 pixels: 0.45 by chance.
+    assert abs(laid[80:83, 180:420].mean() - 120.0) < 3.0
+
+
+def test_a_floor_filled_from_above_takes_nothing_from_beyond_its_edge():
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    below = y - (50.0 + 0.05 * x)
+    noise = np.random.default_rng(1).normal(scale=2.0, size=(HEIGHT, WIDTH, 1))
+    thing = disc(100, 56, 26)
+    photo = np.where(((below > 0) & ~thing)[..., None], 150.0, 20.0) + noise
+    task = InpaintingTask(
+        np.repeat(photo, 3, axis=2).astype(np.float32), thing & (below > 0), below <= 0, camera(), FillOptions()
+    )
+    filled = METHODS["as ground"](task)
+    assert abs(filled[thing & (below > 0) & (below <= 1)].mean() - 150.0) < 2.0

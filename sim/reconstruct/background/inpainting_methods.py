@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...scene.model import Camera
+from .relit_ground import near_any, smoothed
 from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
 from .texture_prediction import shift_to_known, shifted
 from .top_view import to_photo, to_top_view, top_views, visible_in_photo
@@ -89,6 +90,21 @@ def lay_grain(picture: Picture, hole: Mask, known: Mask) -> Picture:
     """
     side = float(np.sqrt(hole.sum()))
     blur = FINE * side / SOLVE_SIDE
+    given, picture = picture, _continued_outside(picture, hole | known, max(blur, BANDS[-1]))
+    laid = _with_grain(picture, hole, known, side, blur)
+    return np.asarray(np.where((hole | known)[..., None], laid, given), dtype=np.float32)
+
+
+def _continued_outside(picture: Picture, surface: Mask, blur: float) -> Picture:
+    """Return ``picture`` (h, w, 3) with ``surface`` (h, w) continued beyond its border, as far as a ``blur`` reaches.
+
+    What is there, such as the object or the other side of an edge, would mix with the surface in blurs.
+    """
+    there = ~surface & near_any(surface, blur)
+    return np.asarray(np.where(there[..., None], smoothed(picture, surface, blur), picture), dtype=np.float32)
+
+
+def _with_grain(picture: Picture, hole: Mask, known: Mask, side: float, blur: float) -> Picture:
     inner = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 5) > blur
     if side <= SOLVE_SIDE or inner.sum() < 0.2 * hole.sum():
         return match_grain(picture, hole, known)
@@ -120,6 +136,8 @@ MIN_KNOWN = 0.06
 """Least visible share of the photo's part to inpaint the rest from."""
 MIN_KNOWN_GROUND = 0.02
 """The same of a top view, much of which lies beside the photo: a trial hole between objects leaves 0.06 of it."""
+BLEED = 1.5
+"""Pixels of a top view within which others mix on the way back to the photo."""
 MARGIN = 0.8
 """Margin of the photo around a hole, over the size of the hole."""
 CONTRAST = 45.0
@@ -173,6 +191,7 @@ def as_ground(task: InpaintingTask) -> Picture:
         if known.mean() < MIN_KNOWN_GROUND or not hole.any():
             continue
         filled = fill_surface(to_top_view(result, view), hole, ~known & ~hole, task.options)
+        filled = _continued_outside(filled, hole | known, BLEED)
         rows, columns = box(part, 0)
         back = to_photo(filled, view, rows, columns)
         inner = part[rows, columns]

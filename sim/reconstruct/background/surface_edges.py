@@ -374,18 +374,23 @@ def _steps(small: Picture, known: Mask, cut: Mask, dim: Picture) -> Steps:
     step = np.linalg.norm(change, axis=-1) > max(STEP, 1.2 * usual)
     least = np.full(len(left), MOST_STEP)
     some = np.zeros(len(left), dtype=bool)
+    means = []
     fewest = max(3, round(FEWEST * width))
     for side in (x < middle, x >= middle):
         count = seen[:, side].sum(axis=1)
         share = step[:, side].sum(axis=1) / np.maximum(count, 1)
         # Steps of both signs along a line, as over spots, are not an edge either.
-        mean = np.linalg.norm(change[:, side].sum(axis=1), axis=-1) / np.maximum(count, 1)
+        means.append(change[:, side].sum(axis=1) / np.maximum(count, 1)[:, None])
+        mean = np.linalg.norm(means[-1], axis=-1)
         # A hole that reaches the border of the picture is open there.
         open_side = int((side & ~cut.any(axis=0)[near]).sum()) < fewest
         enough = count >= fewest
         clear = enough & (share >= STEPS) & (mean >= max(STEP, UNUSUAL * usual))
         least = np.minimum(least, np.where(clear, mean, np.where(open_side & ~enough, least, -1.0)))
         some |= clear
+    # A line that is brighter below on one side of the hole and darker on the other, as boards and mirror images are,
+    # is an edge only if the surfaces alone say so.
+    least = np.where((means[0] * means[1]).sum(axis=1) < 0.0, np.minimum(least, 0.0), least)
     kept = some & (least >= 0.0)
     return Steps(left[kept], right[kept], least[kept], height)
 
