@@ -66,6 +66,17 @@ def replacing(path: Path) -> Iterator[Path]:
         _unfinished.discard(partial)
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an OSError that names no file, as those of writing and flushing, name ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
 def final_path(path: Path) -> Path:
     """Return ``path`` with every temporary name replaced by the one that it becomes, for messages."""
     found = [_TEMPORARY.fullmatch(part) for part in path.parts]

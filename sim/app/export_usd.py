@@ -23,6 +23,7 @@ from ..cache.pc2 import Pc2Reader
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file
+from ..memory import ran_out
 from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
 from ..rigid_alignment import nearest_pose
@@ -86,7 +87,9 @@ def export_usd(
         raise InputError(f"{file}: is there already; choose another name")
     try:
         from pxr import Tf, Usd, UsdGeom
-    except ImportError:
+    except ImportError as error:
+        if ran_out(error):
+            raise
         raise InputError("export to USD needs usd-core: pip install 'physgen[usd]'") from None
     if bake is not None and bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
         raise InputError(f"{bake.root}: is the bake of another scene than {scene.root}; bake this one")

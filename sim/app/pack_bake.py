@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import replacing_tree, write_json
+from ..atomic import naming, replacing_tree, write_json
 from ..cache.bake_check import require_intact
 from ..cache.bake_folder import METRICS_FILE, Bake, BakeManifest, load_bake, save_manifest
 from ..cache.checksums import Checksum, file_sum, span_for
@@ -60,7 +60,7 @@ def pack_cache(source: Pc2Reader, target: Path, samples: int) -> None:
     extent = float(np.ptp(first, axis=0).max())
     step = max(extent * ERROR * 2.0 / math.sqrt(3.0), 1e-12)
     origin = first.min(axis=0).astype(np.float64)
-    with target.open("wb") as file:
+    with naming(target), target.open("wb") as file:
         start = _HEADER.pack(_MAGIC, len(first), samples, source.start_frame, *origin, step)
         file.write(start)
         before = last = _whole(first, origin, step, source.path)

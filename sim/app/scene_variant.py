@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..atomic import replacing
-from ..cache.folder_lock import folder_lock
+from ..cache.folder_lock import LOCK_FILE, folder_lock
 from ..effects.registry import effect
 from ..errors import InputError
 from ..scene.folder import (
@@ -69,15 +70,28 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
             raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
     if (kind := folder_kind(out, NEVER_REPLACED)) is not None:
         raise InputError(f"{out}: is {kind}, which the variant would replace; choose another folder")
+    new = not out.exists()
     with folder_lock(out):
-        for name in source.with_model(scene).files():
-            _link_or_copy(source.file(name), inside(out, name))
         try:
-            if load_scene(out).model == scene:
-                return Scene(root=out, model=scene)
-        except InputError:
-            pass
-        return save_scene(out, scene)
+            for name in source.with_model(scene).files():
+                _link_or_copy(source.file(name), inside(out, name))
+            with contextlib.suppress(InputError):
+                if load_scene(out).model == scene:
+                    return Scene(root=out, model=scene)
+            return save_scene(out, scene)
+        except BaseException:
+            if new:
+                _clear(out)
+            raise
+
+
+def _clear(out: Path) -> None:
+    """Remove what is in the folder ``out``, but for its lock, which is not this function's."""
+    for path in out.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.name != LOCK_FILE:
+            path.unlink(missing_ok=True)
 
 
 def _with_effects(scene: SceneModel, text: str) -> SceneModel:

@@ -19,6 +19,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic import naming
 from ..errors import InputError
 from ..files import open_file
 from .checksums import Checksum, RunningSums, sync
@@ -118,12 +119,14 @@ class Pc2Writer:
         try:
             # The header first: readers, and a resume after a kill between the two, always find the samples it promises.
             self._write_header()
-            self._file.truncate(_HEADER.size + max(keep, over) * vertex_count * 12)
+            with naming(path):
+                self._file.truncate(_HEADER.size + max(keep, over) * vertex_count * 12)
             self._file.seek(_HEADER.size)
             for _ in range(keep):
                 self._sums.add(self._file.read(vertex_count * 12))
         except BaseException:
-            self._file.close()
+            with naming(path):
+                self._file.close()
             raise
 
     def append(self, positions: NDArray[np.floating]) -> None:
@@ -134,16 +137,18 @@ class Pc2Writer:
         if not np.isfinite(sample).all():
             raise InputError(f"{self.path}: sample {self.sample_count} has positions that are not finite")
         content = sample.tobytes()
-        self._file.seek(_HEADER.size + self.sample_count * len(content))
-        self._file.write(content)
+        with naming(self.path):
+            self._file.seek(_HEADER.size + self.sample_count * len(content))
+            self._file.write(content)
         self._sums.add(content)
         self.sample_count += 1
         self._write_header()
 
     def _write_header(self) -> None:
-        self._file.seek(0)
-        self._file.write(header(self.vertex_count, int(self._start_frame), max(self.sample_count, self._over)))
-        self._file.flush()
+        with naming(self.path):
+            self._file.seek(0)
+            self._file.write(header(self.vertex_count, int(self._start_frame), max(self.sample_count, self._over)))
+            self._file.flush()
 
     def checksum(self, file: str, *, ended: bool) -> Checksum:
         """Return the checksum, for the manifest, of the samples so far; of whole ranges alone unless ``ended``."""
@@ -160,11 +165,13 @@ class Pc2Writer:
     def close(self) -> None:
         """Flush to disk and close."""
         if not self._file.closed:
-            try:
-                self._file.flush()
-                os.fsync(self._file.fileno())
-            finally:
-                self._file.close()
+            with naming(self.path):
+                try:
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
+                finally:
+                    # What could not be written is tried again, and fails again.
+                    self._file.close()
 
     def __enter__(self) -> Pc2Writer:
         return self
