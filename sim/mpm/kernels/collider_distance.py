@@ -19,6 +19,7 @@ from ..rigid.rigid_layout import (
     KIND,
     KINDS,
     LAYERS,
+    MOTION,
     NUMBERS,
     RADIUS,
     SHAPE,
@@ -101,6 +102,47 @@ def sample_distance(shape, point, shapes: ShapeArrays):
         gradient += away / far
         gradient /= ti.max(gradient.norm(), 1e-12)
     return ti.Vector([gradient[0], gradient[1], gradient[2], phi])
+
+
+@func
+def sample_motion(first, shape, point, shapes: ShapeArrays):
+    """Velocity of the surface of ``shape``, which deforms, at ``point``, trilinear; those of its lattice begin at
+    ``first``."""
+    away = outside_box(shape, point, shapes)
+    inverse = 1.0 / shapes.lattices[4 * shape + 3]
+    low = point
+    for c in ti.static(range(3)):
+        low[c] = shapes.lattices[4 * shape + c]
+    g = (point - away - low) * inverse
+    n = ivec3(shapes.dims[4 * shape], shapes.dims[4 * shape + 1], shapes.dims[4 * shape + 2])
+    i = ti.max(ti.min(ti.cast(g, ti.i32), n - 2), 0)
+    f = g - i
+    velocity = point * 0
+    for corner in range(8):
+        at = ivec3(corner >> 2, corner >> 1 & 1, corner & 1)
+        weight = 1.0
+        for c in ti.static(range(3)):
+            weight *= ti.cast(ti.select(at[c] == 1, f[c], 1 - f[c]), ti.f32)
+        place = i + at
+        row = first + 3 * ((place[0] * n[1] + place[1]) * n[2] + place[2])
+        for c in ti.static(range(3)):
+            velocity[c] += weight * shapes.motions[row + c]
+    return velocity
+
+
+@func
+def surface_slide(i, local, normal, bodies: RigidArrays, shapes: ShapeArrays):
+    """Velocity (cells/s) along itself of the surface of ``i``, where that is a collider that deforms, at ``local``, its
+    frame; ``normal``: there. Such a collider neither turns nor moves as a whole, so its axes are the world's."""
+    slide = normal * 0
+    if bodies.kinds[i * KINDS + LAYERS] == 2:
+        shape, first = bodies.kinds[i * KINDS + SHAPE], bodies.kinds[i * KINDS + MOTION]
+        nodes = shapes.dims[4 * shape] * shapes.dims[4 * shape + 1] * shapes.dims[4 * shape + 2]
+        slide = sample_motion(first, shape, local, shapes)
+        later = sample_motion(first + 3 * nodes, shape + 1, local, shapes)
+        slide += ti.cast(bodies.state[i * STATE + BLEND], ti.f32) * (later - slide)
+        slide -= slide.dot(normal) * normal
+    return slide
 
 
 @ti.func

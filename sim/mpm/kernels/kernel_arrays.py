@@ -330,6 +330,9 @@ class ShapeArrays(NamedTuple):
     distances: Scalars
     """Signed distances of all lattices, cells; C order, z fastest."""
 
+    motions: Scalars
+    """(., 3) velocities (cells/s) of the surface at the points of the two lattices of colliders that deform."""
+
 
 class RigidContacts(NamedTuple):
     """Contacts between rigid bodies, colliders and the ground plane."""

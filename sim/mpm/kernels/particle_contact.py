@@ -26,6 +26,7 @@ the particle), which makes it exact for even contact and stable for any, by Gers
 
 import taichi as ti
 
+from ..rigid.rigid_layout import STATE, X
 from .adhesion import MOST_REACH, largest_pull, least_speed
 from .collider_distance import (
     PUSH,
@@ -34,6 +35,8 @@ from .collider_distance import (
     body_compliance,
     body_distance,
     body_velocity,
+    single3,
+    surface_slide,
 )
 from .kernel_arrays import (
     AdhesionArrays,
@@ -306,6 +309,8 @@ def solve_contact(
                             if obstacle > 0:
                                 i = first_body + obstacle - 1
                                 surface += body_velocity(i, here, bodies)
+                                local = here - single3(bodies.state, i * STATE + X)
+                                surface += surface_slide(i, local, normal, bodies, shapes)
                                 give = coupling.touching[i] * body_compliance(i, here, normal, bodies)
                             pull = 0.0
                             if ti.static(adheres):

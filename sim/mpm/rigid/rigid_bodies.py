@@ -23,6 +23,7 @@ from ..world_setup import WorldSetup
 from . import rigid_layout as at
 from .collision_shapes import NO_POINTS, PointSet, lattice_of, points_of, reach_of, tables
 from .rigid_motion import rigid_substep
+from .surface_motion import Footing, footing_of
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,7 @@ class _RigidBody:
     lattices: list[DistanceLattice]
     points: PointSet
     shape: int = 0
+    motions: tuple[NDArray[np.float32], ...] = ()
 
 
 class RigidBodies:
@@ -92,7 +94,7 @@ class RigidBodies:
         self.scales = tuple(float(scale) for scale in scales)
         self.origins = np.asarray(origins, dtype=np.float64)
         self._rigid_bodies: list[_RigidBody] = []
-        self._baked: dict[tuple[int, float], DistanceLattice] = {}
+        self._baked: dict[tuple[int, float], tuple[DistanceLattice, Footing]] = {}
         self._segments: dict[int, tuple[float, float]] = {}
         self._keys_done = np.full(len(setups), -np.inf)
         self.asleep: set[tuple[int, str]] = set()
@@ -199,6 +201,7 @@ class RigidBodies:
         self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
         self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
         self._put("systems", np.zeros(size), ti.f64)
+        self._put("motions", np.zeros(1), ti.f32)
         self._put_shapes({i: [rigid.lattices[0]] for i, rigid in enumerate(self._rigid_bodies) if rigid.lattices})
 
     def _systems(self, spans: list[tuple[int, int]]) -> tuple[list[int], list[int], int]:
@@ -290,6 +293,15 @@ class RigidBodies:
         self._put("shape_dims", np.append(table.dims, np.int32(2)), ti.i32)
         self._put("distances", table.distances, ti.f32)
 
+    def _put_motions(self, kinds: NDArray[np.generic]) -> None:
+        """Velocities of the surfaces that deform, and where those of each begin, in its row of ``kinds``."""
+        parts, offset = [np.zeros(1, dtype=np.float32)], 1
+        for i, rigid in enumerate(self._rigid_bodies):
+            kinds[i, at.MOTION] = offset
+            parts += [np.ravel(motion) * np.float32(self.scales[rigid.world]) for motion in rigid.motions]
+            offset += sum(motion.size for motion in rigid.motions)
+        self._put("motions", np.concatenate(parts), ti.f32)
+
     # ---- finding ------------------------------------------------------------------------------------------------
 
     def index(self, w: int, name: str) -> int:
@@ -317,7 +329,7 @@ class RigidBodies:
     @property
     def shapes(self) -> ShapeArrays:
         """Surfaces of all bodies as the kernels take them."""
-        names = ("clusters", "cluster_starts", "points", "shape_numbers", "shape_dims", "distances")
+        names = ("clusters", "cluster_starts", "points", "shape_numbers", "shape_dims", "distances", "motions")
         return ShapeArrays(*(self.arrays[name] for name in names))
 
     @property
@@ -358,11 +370,12 @@ class RigidBodies:
             self._keys_done[w] = start + SAME_TIME
             self._segments[w] = (start, end)
         self._put("world_numbers", world, ti.f64)
+        if changed:
+            self._put_shapes(changed)
+            self._put_motions(kinds)
         self._put("solid_kinds", kinds, ti.i32)
         self._put("solid_numbers", numbers, ti.f64)
         self._put("solids", state, ti.f64)
-        if changed:
-            self._put_shapes(changed)
 
     def _set_body(
         self, rigid: _RigidBody, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
@@ -414,16 +427,21 @@ class RigidBodies:
             span = track.times[n] - track.times[k]
             state[at.BLEND] = np.clip((start - track.times[k]) / span, 0, 1)
             numbers[at.BLEND_RATE] = 1 / span
-        lattices = []
+        baked = []
         for key, other in ((k, n), (n, k)):
             if (i, float(key)) not in self._baked:
                 way = float(np.abs(track.values[key] - track.values[other]).max())
                 surface = Surface(vertices=track.values[key], faces=collider.surface.faces)
-                self._baked[(i, float(key))] = lattice_of(surface, margin=way)
-            lattices.append(self._baked[(i, float(key))])
+                lattice = lattice_of(surface, margin=way)
+                self._baked[(i, float(key))] = lattice, footing_of(lattice, surface)
+            baked.append(self._baked[(i, float(key))])
         self._baked = {key: value for key, value in self._baked.items() if key[0] != i or key[1] in (k, n)}
         old = self._rigid_bodies[i].lattices
-        return {} if len(old) == 2 and all(a is b for a, b in zip(old, lattices, strict=True)) else {i: lattices}
+        if len(old) == 2 and all(a is b for a, (b, _) in zip(old, baked, strict=True)):
+            return {}
+        velocities = numbers[at.BLEND_RATE] * (track.values[n] - track.values[k])
+        self._rigid_bodies[i].motions = tuple(footing.velocities(velocities) for _, footing in baked)
+        return {i: [lattice for lattice, _ in baked]}
 
     def advance(self, dt: float | Sequence[float], substeps: int = 1) -> None:
         """``substeps`` substeps of ``dt`` seconds (one number, or one a world) of worlds without particles."""

@@ -11,7 +11,7 @@ side and the deepest. Those carry the same load as all of them would, and the so
 
 import taichi as ti
 
-from ..kernels.collider_distance import outside_box, sample_distance
+from ..kernels.collider_distance import outside_box, sample_distance, surface_slide
 from ..kernels.kernel_arrays import RigidArrays, RigidContacts, ShapeArrays
 from ..kernels.kernel_bundles import func
 from .rigid_layout import (
@@ -288,7 +288,10 @@ def find_contacts(w, p, bodies: RigidArrays, shapes: ShapeArrays, contacts: Rigi
                     store3(contacts.rows, row + PLACE, local)
                     contacts.rows[row + GAP] = gap
                     rate = bodies.numbers[ti.max(b, 0) * NUMBERS + BLEND_RATE]
-                    store3(contacts.rows, row + DRIFT, -change * rate * normal)
+                    drift = -change * rate * normal
+                    if b >= 0:
+                        drift += surface_slide(b, local, normal, bodies, shapes)
+                    store3(contacts.rows, row + DRIFT, drift)
                     recall(p, row, local, spacing, contacts)
                     count += 1
                     if certain:

@@ -59,6 +59,7 @@ LAYERS = 2  # 1, or 2 of a collider that deforms
 CLUSTERS = 3  # its first cluster of surface points
 HULL_END = 4  # clusters up to here hold the corners of the convex hull, which are all that a plane can touch
 CLUSTERS_END = 5
+MOTION = 6  # where the velocities of the first lattice of a collider that deforms begin in ``motions``
 
 # ---- surface points: ``clusters`` f32 (4 a cluster: centre, radius), ``cluster_starts`` i32, ``points`` f32 ---------
 POINT = 12
