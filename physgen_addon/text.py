@@ -56,13 +56,18 @@ def report_errors(execute: Execute) -> Execute:
 
 def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE") -> None:
     """Draw ``text`` on as many lines as the sidebar's width requires."""
-    scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
-    width = context.region.width if context.region is not None else 300
-    room = max(int((width - (70 if icon == "NONE" else 95) * scale) / (5.8 * scale)), 16)
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for index, line in enumerate(textwrap.wrap(text.replace(" %", "\N{NO-BREAK SPACE}%"), room)):
+    most = max(room(context, 70 if icon == "NONE" else 95), 16)
+    for index, line in enumerate(textwrap.wrap(text.replace(" %", "\N{NO-BREAK SPACE}%"), most)):
         column.label(text=line, icon=icon if index == 0 else ("NONE" if icon == "NONE" else "BLANK1"))
+
+
+def room(context: bpy.types.Context, sides: float) -> int:
+    """Return how many characters fit beside each other in the region but for ``sides``, px at the usual scale."""
+    scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
+    width = context.region.width if context.region is not None else 300
+    return int((width - sides * scale) / (5.8 * scale))
 
 
 def brief(message: str, most: int = 300) -> str:

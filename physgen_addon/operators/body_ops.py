@@ -33,7 +33,7 @@ def _unfit(item: bpy.types.Object) -> str | None:
     elif item.type == "MESH" and not item.data.polygons and not item.modifiers:
         return f"{item.name!r} has no faces"
     if not item.is_editable:
-        return f"{item.name!r} is linked from another file: make it local first"
+        return f"{item.name!r} is linked from another file: Object > Relations > Make Local first"
     return None
 
 
@@ -44,6 +44,15 @@ def add(operator: bpy.types.Operator, context: bpy.types.Context, role: str | No
         trouble = _unfit(item)
         if trouble is not None:
             operator.report({"WARNING"}, trouble)
+            continue
+        if stand_ins.is_set_up(item):
+            name = item.name
+            items = stand_ins.unpack(context.scene, item)
+            words = "its objects are in the scene now, and take part as they were set up"
+            operator.report({"INFO"}, f"{name!r} is an instance of a collection: {words}")
+            for made in items:
+                made.physgen.role = role or made.physgen.role
+            added += items
             continue
         wanted = role or item.physgen.role
         why = "" if is_body(item) and item.physgen.original is not None else stand_ins.reason(item, wanted)

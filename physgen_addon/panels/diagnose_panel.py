@@ -23,7 +23,7 @@ from ..operators.diagnose_ops import (
     PHYSGEN_OT_show_overlay,
 )
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
-from .sidebar import DIAGNOSE, Sidebar, draw_job
+from .sidebar import DIAGNOSE, Sidebar, draw_job, optional
 
 WORTH_SAYING = 0.01
 """Least share of the largest error at which the simulator's own is mentioned."""
@@ -109,8 +109,11 @@ class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
         column.prop(video, "file")
         column.prop(video, "kind")
         sizes = {"ball": ("diameter",), "cylinder": ("diameter", "height"), "box": ("edges",), "mesh": ("mesh",)}
-        for name in (*sizes[video.kind], "fps", "start", "end"):
+        for name in sizes[video.kind]:
             column.prop(video, name)
+        optional(column, video, "own_fps", "fps", "True Frame Rate")
+        column.prop(video, "start")
+        optional(column, video, "own_end", "end", "Last Frame")
         if not draw_job(layout, context, "Explanation"):
             row = layout.row()
             row.scale_y = 1.4

@@ -43,6 +43,8 @@ from .sidebar import (
 )
 
 ROLE_ICONS = {"dynamic": "PHYSICS", "collider": "MOD_PHYSICS"}
+LIST_SIDES = 150
+"""px of the sidebar that a row of the list has for neither name nor material: icons, buttons, margins."""
 SURFACE = ("friction", "static_friction", "restitution", "contact_mode")
 
 
@@ -71,10 +73,10 @@ class PHYSGEN_UL_bodies(bpy.types.UIList):
         words = "Collider" if body.role == "collider" else material_props.preset_title(chosen)
         if body.role == "dynamic" and chosen == material_props.CUSTOM:
             words = material_props.own_title(body.material.likeness)
-        # A narrow list has no room for the bracket.
-        row.label(
-            text=words.partition(" (")[0] + ("*" if body.role == "dynamic" and is_modified(body.material) else "")
-        )
+        # A narrow list has no room for the bracket, nor for the material of what has a long name.
+        words = words.partition(" (")[0] + ("*" if body.role == "dynamic" and is_modified(body.material) else "")
+        if len(item.name) + len(words) <= text.room(context, LIST_SIDES):
+            row.label(text=words)
         row.prop(item, "hide_viewport", text="", emboss=False)
 
     def filter_items(self, context: bpy.types.Context, data: Any, prop: str) -> tuple[list[int], list[int]]:

@@ -23,7 +23,7 @@ from ..playback import capture_view
 from ..playback import capture_view as overlay
 from ..playback.capture_scene import LAYERS
 from ..text import readable
-from .generated_properties import from_field
+from .generated_properties import from_field, switch
 
 NOT_KNOWN = -1.0
 """Stands for a missing number; Blender's properties have no null."""
@@ -137,13 +137,16 @@ class PHYSGEN_PG_video(bpy.types.PropertyGroup):
     mesh: StringProperty(name="Mesh", description="File in metres, z up", subtype="FILE_PATH", options=RELATIVE)
     fps: FloatProperty(
         name="True Frame Rate",
-        description="True frame rate of a slow-motion recording; 0: as the file says",
+        description="True frame rate of a slow-motion recording",
         default=0.0,
         min=0.0,
+        soft_min=1.0,
         soft_max=1000.0,
     )
+    own_fps: switch("fps", "Slow Motion", "The video plays slower than it was recorded; off: as the file says", 120.0)
     start: IntProperty(name="First Frame", description="First frame to use, from 0", default=0, min=0)
-    end: IntProperty(name="Last Frame", description="Last frame to use; 0: the file's last", default=0, min=0)
+    end: IntProperty(name="Last Frame", description="Last frame to use", default=0, min=0, soft_min=2)
+    own_end: switch("end", "Stop Early", "Leave out the end of the video; off: up to its last frame", 100)
     comparison: StringProperty(subtype="FILE_PATH", options=RELATIVE)
 
 

@@ -2,14 +2,15 @@
 """Stand-ins: meshes that are simulated in place of what has none of its own, or another shape than it shows.
 
 Text, curves, metaballs, modifiers that change the shape, shape keys, collection instances, and objects that something
-else moves: the evaluated mesh becomes an object of its own, and the original is kept, hidden.
+else moves: the evaluated mesh becomes an object of its own, and the original is kept, hidden. A collection that was
+set up for the simulation, such as the sample of the asset library, is unpacked instead.
 """
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...sim.errors import InputError
 from .export_animation import channels, clock, rotation_vectors, view_layer, why_it_moves
@@ -44,6 +45,39 @@ def reason(item: bpy.types.Object, role: str) -> str:
 def is_instance(item: bpy.types.Object) -> bool:
     """Return whether ``item`` shows a collection."""
     return item.type == "EMPTY" and item.instance_type == "COLLECTION" and item.instance_collection is not None
+
+
+def is_set_up(item: bpy.types.Object) -> bool:
+    """Return whether ``item`` shows a collection some of whose objects take part in a simulation already."""
+    return is_instance(item) and any(part.physgen.enabled for part in item.instance_collection.all_objects)
+
+
+def unpack(scene: bpy.types.Scene, item: bpy.types.Object) -> list[bpy.types.Object]:
+    """Replace ``item``, for which ``is_set_up``, by local copies of what it shows; return those that take part.
+
+    They keep role, material, motion and pins, with velocities and spins turned as ``item`` is. What does not take part,
+    such as lamps and floors, is copied, too.
+    """
+    source = item.instance_collection
+    shift = item.matrix_world @ Matrix.Translation(-source.instance_offset)
+    # One scene of a file has what another has without copying: copies are of this one alone.
+    group = bpy.data.collections.new(source.name)
+    (item.users_collection or (scene.collection,))[0].children.link(group)
+    copies = {part: part.copy() for part in source.all_objects}
+    for part, copy in copies.items():
+        group.objects.link(copy)
+        if part.type == "MESH":
+            # Bakes are attached to the object, but weights, materials and edits are the mesh's.
+            copy.data = part.data.copy()
+        copy.parent = copies.get(part.parent)
+        if copy.parent is None:
+            copy.matrix_world = shift @ part.matrix_world
+        body, turn = copy.physgen, shift.to_quaternion()
+        body.velocity, body.spin = turn @ Vector(body.velocity), turn @ Vector(body.spin)
+        for pin in body.pins:
+            pin.box = copies.get(pin.box, pin.box)
+    bpy.data.objects.remove(item)
+    return [copy for copy in copies.values() if copy.physgen.enabled]
 
 
 def make(scene: bpy.types.Scene, item: bpy.types.Object) -> list[bpy.types.Object]:

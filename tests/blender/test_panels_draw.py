@@ -173,6 +173,29 @@ def test_every_diagnosis_is_drawn(numbers, resolvable, verdict):
         draw_all("diagnose_video")
 
 
+def test_a_long_name_takes_the_place_of_its_material_in_a_narrow_list():
+    bpy.ops.mesh.primitive_cube_add()
+    item = bpy.context.object
+    item.physgen.enabled = True
+    item.physgen.material.preset = "wood"
+    item.name = "Cube"
+    assert "Wood" in draw_all("objects")["PHYSGEN_PT_objects"].words
+    item.name = "Collection Cube simulated"
+    assert "Wood" not in draw_all("objects")["PHYSGEN_PT_objects"].words
+
+
+def test_numbers_of_a_video_that_it_knows_itself_are_switches():
+    """Not "0: as the file says"."""
+    video = bpy.context.scene.physgen_diagnose.video
+    for switched, number in (("own_fps", "fps"), ("own_end", "end")):
+        assert not getattr(video, switched) and getattr(video, number) == 0
+        setattr(video, switched, True)
+        assert getattr(video, number) > 0
+        setattr(video, switched, False)
+        assert getattr(video, number) == 0
+        assert "0" not in video.bl_rna.properties[number].description
+
+
 @pytest.mark.parametrize(("error", "is_said"), [(7.6e-17, False), (2e-6, True)])
 def test_the_simulators_own_error_is_said_where_it_counts(error, is_said):
     """Not "7.6e-11 µm of it"."""

@@ -108,6 +108,43 @@ def test_every_mesh_of_a_collection_instance_takes_part(tmp_path):
     assert len(export_scene(scene, tmp_path / "scene").model.objects) == 2
 
 
+def test_a_collection_that_was_set_up_takes_part_as_it_was():
+    scene = bpy.context.scene
+    group = bpy.data.collections.new("set up")
+    moving, ramp, box = (a_cube(location=(3 * index, 0, 0)) for index in range(3))
+    bpy.ops.mesh.primitive_plane_add(location=(0, 0, -1))
+    floor = bpy.context.object
+    for item in (moving, ramp, floor, box):
+        scene.collection.objects.unlink(item)
+        group.objects.link(item)
+    for item in (moving, ramp):
+        item.physgen.enabled = True
+    moving.physgen.material.preset, moving.physgen.velocity, moving.physgen.spin = "sand", (1, 0, 0), (0, 2, 0)
+    moving.physgen.pins.add().box = box
+    ramp.physgen.role, ramp.parent = "collider", moving
+    empty = bpy.data.objects.new("instance", None)
+    scene.collection.objects.link(empty)
+    empty.instance_type, empty.instance_collection = "COLLECTION", group
+    empty.location, empty.rotation_euler = (0, 0, 5), (0, 0, math.pi / 2)
+    bpy.context.view_layer.update()
+    bpy.context.view_layer.objects.active = empty
+    empty.select_set(True)
+    # The plane has no inside: as a body of its own it would be refused, and the whole collection with it.
+    assert bpy.ops.physgen.add_bodies() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    assert "instance" not in scene.objects and len(scene.objects) == 4
+    found = {item.physgen.role: item for item in bodies(scene)}
+    assert set(found) == {"dynamic", "collider"} and moving not in found.values()
+    body = found["dynamic"]
+    assert body.physgen.material.preset == "sand" and body.data != moving.data
+    assert tuple(body.physgen.velocity) == pytest.approx((0, 1, 0), abs=1e-6)
+    assert tuple(body.physgen.spin) == pytest.approx((-2, 0, 0), abs=1e-6)
+    assert tuple(body.matrix_world.translation) == pytest.approx((0, 0, 5), abs=1e-6)
+    assert found["collider"].parent == body and body.physgen.pins[0].box in tuple(scene.objects)
+    # The ramp stood 3 to the right; turned a quarter it stands 3 to the back.
+    assert tuple(found["collider"].matrix_world.translation) == pytest.approx((0, 3, 5), abs=1e-5)
+
+
 def test_an_animation_hands_over_at_the_current_frame(tmp_path):
     scene, item = bpy.context.scene, a_cube(location=(0, 0, 2))
     item.keyframe_insert("location", frame=1)

@@ -106,7 +106,12 @@ class Run:
         words["wheels"] = str(self.options.wheels.resolve()) if self.options.wheels else ""
         words["only"] = self.options.only
         task.write_text(json.dumps(words), encoding="utf-8")
-        for name, size in (("tour", TOUR_SIZE), ("odd", TOUR_SIZE), ("work", self.options.size)):
+        for name, size in (
+            ("tour", TOUR_SIZE),
+            ("library", TOUR_SIZE),
+            ("odd", TOUR_SIZE),
+            ("work", self.options.size),
+        ):
             if self.options.script not in ("", name):
                 continue
             window = ("--window-geometry", "0", "0", *size.split("x"))
@@ -114,7 +119,7 @@ class Run:
                 script = ("--python-exit-code", "1", "-P", str(HERE / f"{name}.py"), "--", str(task))
                 self.start(name, *window, *script, timeout=self.options.timeout, **screen)
             self.require(f"{name}.json")
-        if self.options.only or self.options.script in ("tour", "odd"):
+        if self.options.only or self.options.script not in ("", "work"):
             return
         # Another user, who has never heard of the extension.
         script = ("--python-exit-code", "1", "-P", str(HERE / "reopen.py"), "--", str(task))
@@ -148,7 +153,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="steps of the scripts, by commas; nothing is opened again then")
     parser.add_argument("--scene", type=Path, help="scene.json of a photo, for the steps farm and nodes alone")
     parser.add_argument("--wheels", type=Path, help="folder of wheels of all that simulates, to try Install with")
-    names = ["", "tour", "odd", "work"]
+    names = ["", "tour", "library", "odd", "work"]
     parser.add_argument("--script", default="", choices=names, help="only this one (default: all)")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")

@@ -97,11 +97,12 @@ def only(names: Sequence[str]) -> Iterator[None]:
             bpy.utils.register_class(kind)
 
 
-def on_screen(place: Any, shown: bpy.types.Region) -> tuple[int, int]:
-    """Where a point of the world is in a viewport's region, in pixels of the screen from its upper left corner."""
+def on_screen(place: Any, area: bpy.types.Area) -> tuple[int, int]:
+    """Where a point of the world is in the viewport ``area``, in pixels of the screen from its upper left corner."""
     from bpy_extras.view3d_utils import location_3d_to_region_2d
 
-    found = location_3d_to_region_2d(shown, viewport().spaces.active.region_3d, place)
+    shown = region(area, "WINDOW")
+    found = location_3d_to_region_2d(shown, area.spaces.active.region_3d, place)
     return round(shown.x + found.x), round(window().height - (shown.y + found.y))
 
 
@@ -160,6 +161,21 @@ def click(x: int, y: int) -> Generator[float, None, None]:
     yield from point(x, y)
     xdotool("click", 1)
     yield from drawn()
+
+
+def drag(start: tuple[int, int], goal: tuple[int, int], path: Path) -> Generator[float, None, None]:
+    """Drag what lies at ``start`` to ``goal`` and drop it there; ``path``: a picture just before it is let go."""
+    yield from point(*start)
+    xdotool("mousedown", 1)
+    yield 0.5
+    for share in (0.05, 0.1, 0.4, 0.8, 1.0):
+        xdotool("mousemove", *(round(a + share * (b - a)) for a, b in zip(start, goal, strict=True)))
+        yield 0.4
+    yield from drawn(3)
+    picture(window(), path)
+    xdotool("mouseup", 1)
+    yield 1.0
+    yield from drawn(3)
 
 
 def press(key: str) -> Generator[float, None, None]:

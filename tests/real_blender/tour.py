@@ -264,49 +264,6 @@ def nodes():
     screens.picture(screens.window(), SCREENS / "34_nodes.png")
 
 
-def dragged_material():
-    """A material of the asset library, dragged by the mouse on the cube, which then has its matter."""
-    assets = Path(__file__).resolve().parents[2] / "dist" / "assets"
-    if not assets.is_dir():
-        return {"skipped": "make assets has not been run"}
-    yield from home()
-    bpy.ops.physgen.add_assets(directory=str(assets))
-    with screens.focus():
-        bpy.ops.physgen.add_bodies()
-    before = set(screens.window().screen.areas)
-    view = screens.viewport()
-    with bpy.context.temp_override(window=screens.window(), area=view, region=screens.region(view, "WINDOW")):
-        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.6)
-    browser = min(set(screens.window().screen.areas) - before, key=lambda area: area.height)
-    browser.ui_type = "ASSETS"
-    yield from screens.drawn(4)
-    parameters = browser.spaces.active.params
-    parameters.asset_library_reference = "PhysGen"
-    parameters.filter_search = "Sand"
-    yield 4.0
-    yield from screens.drawn(6)
-    listed, onto = screens.region(browser, "WINDOW"), screens.region(screens.viewport(), "WINDOW")
-    high = screens.window().height
-    x, y = listed.x + 60, high - (listed.y + listed.height - 60)
-    yield from screens.point(x, y)
-    screens.picture(screens.window(), SCREENS / "35_assets.png")
-    goal = screens.on_screen(bpy.data.objects["Cube"].location, onto)
-    screens.xdotool("mousedown", 1)
-    yield 0.5
-    for share in (0.1, 0.4, 0.8, 1.0):
-        screens.xdotool("mousemove", round(x + share * (goal[0] - x)), round(y + share * (goal[1] - y)))
-        yield 0.4
-    yield from screens.drawn(3)
-    screens.picture(screens.window(), SCREENS / "36_dragging_material.png")
-    screens.xdotool("mouseup", 1)
-    yield 1.0
-    yield from screens.drawn(3)
-    yield from screens.shoot(SCREENS, "37_dropped_material")
-    preset = bpy.data.objects["Cube"].physgen.material.preset
-    assert preset == "sand", f"the cube is of {preset!r} after Sand was dropped on it"
-    return {}
-
-
 def material():
     """The panels of the material and of what few need, open: with units, in metric and imperial, and recognised."""
     yield from home()
@@ -437,5 +394,5 @@ def wanted(step) -> bool:
 
 
 STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, farm, nodes]
-STEPS += [dropped, dragged_material, documented, material, strange]
+STEPS += [dropped, documented, material, strange]
 session.run("tour", [step for step in STEPS if wanted(step)])
