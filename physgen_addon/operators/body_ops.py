@@ -34,6 +34,9 @@ def _unfit(item: bpy.types.Object) -> str | None:
         return f"{item.name!r} has no faces"
     if not item.is_editable:
         return f"{item.name!r} is linked from another file: Object > Relations > Make Local first"
+    if item.override_library is not None and not item.physgen.enabled:
+        # One that took part in its own file does here; new settings would be grey, and gone when this one is opened.
+        return f"{item.name!r} is a library override, which keeps no physics: Object > Relations > Make Local first"
     return None
 
 

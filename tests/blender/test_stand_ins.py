@@ -145,6 +145,29 @@ def test_a_collection_that_was_set_up_takes_part_as_it_was():
     assert tuple(found["collider"].matrix_world.translation) == pytest.approx((0, 3, 5), abs=1e-5)
 
 
+def test_what_is_linked_or_overridden_takes_part_when_it_is_local(tmp_path):
+    """An override would lose its physics when the file is opened again, and its settings would be grey before."""
+    a_cube().name = "theirs"
+    bpy.data.libraries.write(str(tmp_path / "theirs.blend"), {bpy.context.object})
+    bpy.data.objects.remove(bpy.context.object)
+    with bpy.data.libraries.load(str(tmp_path / "theirs.blend"), link=True) as (_, wanted):
+        wanted.objects = ["theirs"]
+    item = wanted.objects[0]
+    bpy.context.scene.collection.objects.link(item)
+
+    def add():
+        bpy.context.view_layer.objects.active = item
+        item.select_set(True)
+        bpy.ops.physgen.add_bodies()
+        return [body.name for body in bodies(bpy.context.scene)]
+
+    assert add() == []
+    item = item.override_create(remap_local_usages=True)
+    assert add() == []
+    item = item.make_local()
+    assert add() == ["theirs"]
+
+
 def test_an_animation_hands_over_at_the_current_frame(tmp_path):
     scene, item = bpy.context.scene, a_cube(location=(0, 0, 2))
     item.keyframe_insert("location", frame=1)
