@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Accuracy of the reconstruction on rendered photos of known truth. Needs bpy.
 
-    python -m physgen.benchmarks.reconstruct [--set test|dev|turntable|held_out] [--sample] [--only CASE …]
+    python -m physgen.benchmarks.reconstruct [--set test|dev|turntable|held_out|fresh] [--sample] [--only CASE …]
                                              [--pictures DIR] [--scenes DIR] [--report FILE]
                                              [--sheet FILE.png] [--turntables DIR]
 
@@ -20,7 +20,7 @@ within 3° where there are vanishing points.
 is known all around. Views of the reconstruction at ±90° and 180° are compared with the true ones
 (``reconstruct_pictures/view_distance.py``), and marks seen from behind that are not there are counted
 (``salient_marks.py``; required: none). A failed case counts as a distance of 100. ``--turntables`` writes the true body
-beside the found one. ``--set held_out`` is the same for five other bodies on which nothing is tuned.
+beside the found one. ``held_out`` and ``fresh`` are the same for five and two other bodies.
 
 ``--quick`` is one case of ``turntable`` with one sample per pixel.
 """

@@ -12,6 +12,8 @@ from physgen.sim.scene.model import Camera
 
 from . import cases, thin_bodies
 from .cases import Case, Item
+from .fresh_bodies import KINDS as FRESH
+from .fresh_bodies import make_fresh
 from .held_out_bodies import KINDS as HELD_OUT
 from .held_out_bodies import make_held_out
 from .painted_bodies import KINDS, make_painted
@@ -49,17 +51,23 @@ SHOTS = {
         Shot("sock", -20.0, "plain", "window", 0.3, pitch=26.0, view=60.0, size_px=(480, 640)),
         Shot("radio", 22.0, "cloth", "sun", 0.3, pitch=16.0, view=38.0, roughness=0.45),
     ),
+    "fresh": (
+        Shot("boot", -10.0, "boards", "window", 0.3, pitch=14.0, view=45.0, roughness=0.6, size_px=(480, 360)),
+        Shot("kettle", 12.0, "plain", "two", 0.28, pitch=19.0, view=42.0, roughness=0.5, size_px=(480, 360)),
+    ),
 }
-"""Pictures of single painted things, one set for changes to be guided by, one kept aside."""
+"""Pictures of single painted things, one set for changes to be guided by, two kept aside."""
+MAKERS = {"turntable": make_painted, "held_out": make_held_out, "fresh": make_fresh}
 SETS = {
     **cases.SETS,
     "turntable": (len(KINDS), 900),
     "held_out": (len(HELD_OUT), 930),
+    "fresh": (len(FRESH), 970),
     "thin": (len(thin_bodies.KINDS), 950),
 }
-"""Pictures of a set, and the first of their seeds. ``turntable`` and ``held_out`` have one painted thing each
-(``painted_bodies.py``, ``held_out_bodies.py``), ``thin`` one with holes and thin parts, or of its ground's tone
-(``thin_bodies.py``)."""
+"""Pictures of a set, and the first of their seeds. ``turntable``, ``held_out`` and ``fresh`` have one painted thing
+each (``painted_bodies.py``, ``held_out_bodies.py``, ``fresh_bodies.py``), ``thin`` one with holes and thin parts, or of
+its ground's tone (``thin_bodies.py``)."""
 
 
 def draw(set_name: str, number: int) -> Case:
@@ -75,7 +83,7 @@ def _painted(set_name: str, number: int) -> Case:
         raise ValueError(f"picture {number}: the set {set_name} has 0 to {count - 1}")
     shot, seed = SHOTS[set_name][number], first + number
     rng = np.random.default_rng(seed)
-    body = (make_painted if set_name == "turntable" else make_held_out)(shot.kind, shot.size_m)
+    body = MAKERS[set_name](shot.kind, shot.size_m)
     paint = np.full((2, 3), 0.3)
     item = Item(f"{shot.kind}_1", shot.kind, body, _turned(shot.turn), paint, "painted", shot.roughness)
     camera = _aimed(item, shot.size_px, shot.view, shot.pitch, rng)

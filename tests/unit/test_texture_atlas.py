@@ -277,6 +277,33 @@ def test_a_mark_is_filled_from_what_it_lies_on():
     assert np.abs(found.colours[(ROWS > 140) & (ROWS < 200) & (np.abs(COLUMNS - 160) < 60)] - (190, 140, 80)).max() < 20
 
 
+def test_a_badge_that_touches_a_wing_is_a_mark():
+    """White as light as the belly and as colourless as the wing is an island in no channel alone."""
+    pixels = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.uint8)
+    pixels[TOY] = (205, 170, 60)
+    wing = TOY & (COLUMNS < 150) & (np.abs(ROWS - 150) < 40)
+    badge = ((COLUMNS - 166) / 18) ** 2 + ((ROWS - 150) / 24) ** 2 < 1
+    pixels[wing], pixels[badge] = (95, 95, 100), (178, 175, 172)
+    found = plain_matter(pixels, TOY)
+    assert found.marks[badge].mean() > 0.95
+    assert found.marks[wing & (COLUMNS < 140)].mean() < 0.02
+    # How far the wing goes on behind it is not known; next to the belly there is belly.
+    assert np.abs(found.colours[badge & (COLUMNS > 172)] - (205, 170, 60)).max() < 20
+
+
+def test_stripes_go_on_behind_a_mark_as_stripes():
+    pixels = np.full((HEIGHT, WIDTH, 3), (120, 120, 125), np.uint8)
+    mask = (np.abs(COLUMNS - 160) < 60) & (np.abs(ROWS - 150) < 110)
+    red = mask & ((ROWS - 40) % 40 < 20)
+    pixels[mask], pixels[red] = (215, 210, 195), (190, 60, 55)
+    plain = plain_matter(pixels, mask).colours
+    pixels[((COLUMNS - 165) / 24) ** 2 + ((ROWS - 155) / 22) ** 2 < 1] = (35, 45, 120)
+    found = plain_matter(pixels, mask)
+    assert found.marks[155, 165]
+    # Each pixel is as where there is no mark, but where the wavering edge of a stripe runs.
+    assert (np.abs(found.colours - plain).max(axis=-1)[mask] > 40).mean() < 0.02
+
+
 def test_synthesised_grain_keeps_its_contrast_and_does_not_repeat():
     swatch = np.random.default_rng(0).normal(0, 10, (48, 48, 3)).astype(np.float32)
     rows, columns = np.mgrid[:300, :300]

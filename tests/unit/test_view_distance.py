@@ -135,9 +135,12 @@ def test_distance_ignores_exposure_and_scale():
     assert numbers["unseen_views"] < 2.0
 
 
-@pytest.mark.parametrize("number", range(SETS["turntable"][0]))
-def test_each_painted_thing_stands_in_its_picture(number):
-    case = draw("turntable", number)
+PAINTED = [(name, number) for name in ("turntable", "fresh") for number in range(SETS[name][0])]
+
+
+@pytest.mark.parametrize(("name", "number"), PAINTED)
+def test_each_painted_thing_stands_in_its_picture(name, number):
+    case = draw(name, number)
     item = case.items[0]
     assert item.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-9)
     assert item.body.colours.shape == item.body.mesh.vertices.shape

@@ -4,7 +4,7 @@
 Marks (eyes, letters, bows, highlights) are what the outline does not reach: darker or lighter islands, found as the
 difference from a picture whose islands are levelled by greyscale reconstruction from the outline (Vincent, IEEE
 Transactions on Image Processing 2(2), 1993). A stripe or ribbon that reaches the outline is none, but what lies on it
-is (`stripes.py`).
+is, and so is what an edge encloses (`stripes.py`). Behind a mark goes on what it lies on, stripes as stripes.
 
 Grain is synthesised by blending patches at random places (Deliot & Heitz, GPU Zen 2, 2019): the weights' squares sum
 to one, so the contrast stays.
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.morphology import reconstruction
 
+from ...composite.inpaint import FillOptions, inpaint_once
 from ...composite.pull_push import fill_gaps
-from .stripes import beside_stripes
+from .stripes import beside_stripes, enclosed
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -38,11 +39,13 @@ NEXT = 3
 """Width of a mark's rim in pixels of that picture."""
 LEAST_RIM = 12
 """Pixels of a rim that tell what the mark lies on."""
-MOST_OF_RIM = 2.0 / 3.0
+MOST_OF_RIM = 0.85
 """Share of a mark's rim of one colour above which the mark lies on that."""
 UNLIKE = 16.0
 """Difference in CIELAB, lightness at half weight, from most of its rim from which something around a mark is not what
 the mark lies on."""
+LEAST_SOURCES = 1.0
+"""Pixels without marks over those with, from which patches can be had."""
 SMOOTH = 0.02
 """Standard deviation of the plain colours' smoothing over the square root of the area; what is finer is grain."""
 EDGE_STEP = 60.0
@@ -131,7 +134,12 @@ def _levelled(filled: Picture, mask: Mask, size: float) -> tuple[Picture, Mask]:
     if (inside & ~marks).any():
         # A channel alone may have a way to the outline through a shadow: what is a mark in one goes in all.
         plain = _filled(plain, marks, inside)
-    for region, beside in beside_stripes(plain, inside, max(2.0, RIM_SHARE * size * scale)):
+    rim = max(2.0, RIM_SHARE * size * scale)
+    islands = enclosed(plain, inside, rim) & ~marks
+    if islands.any() and (inside & ~marks & ~islands).any():
+        marks = marks | islands
+        plain = _filled(plain, marks, inside)
+    for region, beside in beside_stripes(plain, inside, rim):
         if (inside & ~region & ~marks).any():
             plain[beside] = _without_gaps(plain, inside & ~region & ~marks)[beside]
             marks = marks | beside
@@ -150,9 +158,11 @@ def _filled(plain: NDArray[np.float64], marks: Mask, inside: Mask) -> NDArray[np
     """``plain`` (h, w, 3), CIELAB, with the ``marks`` (h, w) filled from around.
 
     Where a part of what is around a mark has another colour than most of its rim, it has no share in it: a patch on a
-    cushion that touches the stool's wood is cushion below.
+    cushion that touches the stool's wood is cushion below. What lies on several colours, such as a heart on stripes, is
+    filled with patches of them.
     """
     result = _without_gaps(plain, inside & ~marks)
+    several = np.zeros_like(marks)
     labels, _ = ndimage.label(marks)
     for number, (rows, columns) in enumerate(ndimage.find_objects(labels), 1):
         reach = NEXT + round(0.5 * float(np.sqrt((labels[rows, columns] == number).sum())))
@@ -169,8 +179,16 @@ def _filled(plain: NDArray[np.float64], marks: Mask, inside: Mask) -> NDArray[np
         difference = (plain[window] - np.median(plain[window][rim], axis=0)) * (0.5, 1.0, 1.0)
         like = around & (np.linalg.norm(difference, axis=-1) <= UNLIKE)
         # Stripes of two colours go on behind it.
-        if (like & rim).sum() > MOST_OF_RIM * rim.sum() and (around & ~like).any():
+        if (like & rim).sum() <= MOST_OF_RIM * rim.sum():
+            several[window] |= own
+        elif (around & ~like).any():
             result[window][own] = _without_gaps(plain[window], like)[own]
+    if several.any() and (inside & ~marks).sum() >= LEAST_SOURCES * marks.sum():
+        colours = cv2.cvtColor(result.astype(np.float32), cv2.COLOR_LAB2RGB)
+        patched = inpaint_once(
+            np.rint(colours * 255.0).astype(np.uint8), several, ~inside | marks, FillOptions(radius=3)
+        )
+        result[several] = cv2.cvtColor(patched.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[several]
     return result
 
 

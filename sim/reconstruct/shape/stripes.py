@@ -37,6 +37,10 @@ AWAY = 3.0
 """Cost of a way along a region's border over that along its middle."""
 EDGE = 2
 """Pixels by which a mark is grown: its border is mixed with what is around."""
+STEP = 9.0
+"""Difference in CIELAB, lightness at half weight, within ``EDGE`` pixels on both sides that makes an edge."""
+WHOLE = 0.2
+"""Share of the object from which what an edge encloses is no mark, but what the object consists of."""
 
 
 def beside_stripes(lab: NDArray[np.floating], inside: Mask, rim: float) -> list[tuple[Mask, Mask]]:
@@ -57,6 +61,27 @@ def beside_stripes(lab: NDArray[np.floating], inside: Mask, rim: float) -> list[
             grown = ndimage.binary_dilation(mark, iterations=EDGE) & inside
             found.append((ndimage.binary_dilation(region, iterations=EDGE) & inside, grown & (~region | mark)))
     return found
+
+
+def enclosed(lab: NDArray[np.floating], inside: Mask, rim: float) -> Mask:
+    """Return the pixels (h, w) that an edge separates from the outline on all sides, as a badge that touches a wing.
+
+    Arguments as for ``beside_stripes``. In no channel alone need they be an island: a white badge between a grey wing
+    and a yellow belly is as light as the belly and as colourless as the wing.
+    """
+    weighted = (lab * (0.5, 1.0, 1.0)).astype(np.float32)
+    window = np.ones((2 * EDGE + 1, 2 * EDGE + 1), np.uint8)
+    step = np.linalg.norm(cv2.dilate(weighted, window) - cv2.erode(weighted, window), axis=-1)
+    labels, _ = ndimage.label(inside & (step < STEP))
+    depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
+    sizes = np.bincount(labels.ravel())
+    kept = (sizes >= SMALL) & (sizes <= WHOLE * inside.sum())
+    kept[labels[depth <= rim + 1.0 + EDGE]] = False
+    kept[0] = False
+    if not kept.any():
+        return np.zeros_like(inside)
+    # Up to the edge's other side.
+    return np.asarray(inside & (ndimage.distance_transform_edt(~kept[labels]) <= 2 * EDGE + 1))
 
 
 def _regions(lab: NDArray[np.floating], inside: Mask) -> tuple[NDArray[np.int32], int]:
