@@ -115,6 +115,12 @@ def run_evaluate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
         )
     terminal({"event": "done", "stage": "evaluate", "out": str(out), **evaluation_json(found)})
     terminal.line(f"{summary(found)}\n{out}")
+    if found.failures:
+        several = "a view is" if len(found.failures) == 1 else f"{len(found.failures)} views are"
+        terminal(
+            {"event": "notice", "stage": "evaluate", "message": f"{several} not compared, so the table is not whole"}
+        )
+        return InputError.exit_code
     return 0
 
 

@@ -29,6 +29,7 @@ from ..evaluate.model_judge import CRITERIA, TITLES, Judgement, JudgeOptions, ev
 from ..evaluate.no_reference import without_reference
 from ..evaluate.physics_iq import against as against_section
 from ..evaluate.physics_iq_folder import (
+    FailedView,
     ViewRow,
     physics_iq_section,
     read_benchmark,
@@ -243,7 +244,8 @@ def evaluate_physics_iq(
 
     benchmark: the folder physics-IQ-benchmark with the real videos; None only checks names, rates and lengths. ``out``
     also has ``physics_iq.csv``, a row for each view. What is wrong with a video is a notice; videos that cannot be read
-    or have no name of the benchmark's are left out, and the score then says of how many views it is.
+    or have no name of the benchmark's are left out, and the score then says of how many views it is. A view whose
+    recordings are damaged has an empty row, and is among ``failures``.
 
     Raises InputError where nothing can be compared; Cancelled on request.
     """
@@ -251,16 +253,19 @@ def evaluate_physics_iq(
     require_evaluation_folder(out)
     submission = read_submission(folder)
     rows: list[ViewRow] = []
+    failed: list[FailedView] = []
     if benchmark is not None:
         views = read_benchmark(Path(benchmark), submission.fps)
         progress = StageProgress(on_event, STAGE, max(1, len(set(views) & set(submission.videos))))
-        rows = score_views(submission, views, on_row=progress.report, cancelled=cancelled)
+        rows, failed = score_views(submission, views, on_row=progress.report, cancelled=cancelled)
+        if failed and not rows:
+            raise InputError(f"{folder}: no view can be compared; the first is {failed[0].reason}")
         if not rows:
             raise InputError(f"{folder}: none of its numbers is one of {benchmark}; name the same benchmark")
-    found = Evaluation(root=out, subject=folder.name, sections=(physics_iq_section(submission, rows, folder),))
+    found = Evaluation(root=out, subject=folder.name, sections=(physics_iq_section(submission, rows, folder, failed),))
     for notice in found.notices:
         on_event({"event": "notice", "stage": STAGE, "message": notice})
-    save(found, out, tables={VIEWS_FILE: table(view_table(rows))} if rows else {})
+    save(found, out, tables={VIEWS_FILE: table(view_table(rows, failed))} if rows else {})
     return found
 
 

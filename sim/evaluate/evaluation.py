@@ -68,7 +68,10 @@ class Curve:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """Figures of one kind. name: identifier. text: what was compared with what. notices: what to know before."""
+    """Figures of one kind. name: identifier. text: what was compared with what. notices: what to know before.
+
+    failures: those of the notices that name an input which could not be used although it should have been.
+    """
 
     name: str
     title: str
@@ -76,6 +79,7 @@ class Section:
     measures: tuple[Measure, ...]
     curves: tuple[Curve, ...] = ()
     notices: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +119,11 @@ class Evaluation:
         return tuple(dict.fromkeys(notice for section in self.sections for notice in section.notices))
 
     @property
+    def failures(self) -> tuple[str, ...]:
+        """Those of the notices that name an input which could not be used; a command then ends with exit code 3."""
+        return tuple(failure for section in self.sections for failure in section.failures)
+
+    @property
     def below_still(self) -> tuple[Measure, ...]:
         """Figures by which a video that stands still does better."""
         return tuple(measure for measure in self.measures if measure.below_still)
@@ -132,6 +141,7 @@ def evaluation_json(found: Evaluation) -> dict[str, Any]:
                 "title": section.title,
                 "text": section.text,
                 "notices": list(section.notices),
+                "failures": list(section.failures),
                 "measures": [
                     {
                         "name": item.name,

@@ -67,6 +67,14 @@ class ViewRow:
     takes: dict[str, float]
 
 
+@dataclass(frozen=True, kw_only=True)
+class FailedView:
+    """A view that could not be compared, and why."""
+
+    view: RealView
+    reason: str
+
+
 def read_submission(folder: Path) -> Submission:
     """Return the generated videos in ``folder``, looked at but for what they show.
 
@@ -150,39 +158,58 @@ def score_views(
     *,
     on_row: Callable[[int], None] = lambda done: None,
     cancelled: IsCancelled = never,
-) -> list[ViewRow]:
-    """Return the measures of each video that the benchmark has a view for, in the order of their numbers.
+) -> tuple[list[ViewRow], list[FailedView]]:
+    """Return the measures of each video that the benchmark has a view for, and the views without any, by number.
 
-    Raises InputError for a video that cannot be compared, Cancelled on request.
+    A damaged recording or video leaves its view without measures and the others as they are. Raises Cancelled on
+    request.
     """
     rows: list[ViewRow] = []
-    count = round(SECONDS * submission.fps)
+    failed: list[FailedView] = []
     for number in sorted(set(submission.videos) & set(benchmark)):
         if cancelled():
             raise Cancelled("the evaluation was cancelled; nothing was written")
-        view = benchmark[number]
-        real = [open_footage(path) for path in view.takes]
-        size = quarter(real[0].width, real[0].height)
-        ours = take(submission.videos[number].frames(count), size, name=submission.videos[number].name)
-        takes = [take(at_rate(item, submission.fps, count), size, name=item.name) for item in real]
-        common = min(map(len, (ours, *takes)))
-        ours, first, other = (item.first(common) for item in (ours, *takes))
-        rows.append(
-            ViewRow(
-                view=view,
-                ours=compare(first, ours).rounded(),
-                still=compare(first, first.still()).rounded(),
-                takes=compare(first, other).rounded(),
+        try:
+            rows.append(_score(submission, submission.videos[number], benchmark[number]))
+        except InputError as error:
+            failed.append(FailedView(view=benchmark[number], reason=str(error)))
+        on_row(len(rows) + len(failed))
+    return rows, failed
+
+
+SHORT = 2
+"""Frames by which a recording may be shorter than the benchmark's five seconds: rates do not divide evenly."""
+
+
+def _score(submission: Submission, video: Footage, view: RealView) -> ViewRow:
+    """Return the measures of ``video``. Raises InputError for what cannot be compared."""
+    count = round(SECONDS * submission.fps)
+    real = [open_footage(path) for path in view.takes]
+    size = quarter(real[0].width, real[0].height)
+    ours = take(video.frames(count), size, name=video.name)
+    takes = [take(at_rate(item, submission.fps, count), size, name=item.name) for item in real]
+    for item, found in zip(real, takes, strict=True):
+        if len(found) < count - SHORT:
+            raise InputError(
+                f"{item.name}: ends after {len(found) / submission.fps:.3g} of {SECONDS:g} s; download it again"
             )
-        )
-        on_row(len(rows))
-    return rows
+    common = min(map(len, (ours, *takes)))
+    ours, first, other = (item.first(common) for item in (ours, *takes))
+    return ViewRow(
+        view=view,
+        ours=compare(first, ours).rounded(),
+        still=compare(first, first.still()).rounded(),
+        takes=compare(first, other).rounded(),
+    )
 
 
-def physics_iq_section(submission: Submission, rows: Sequence[ViewRow], folder: Path) -> Section:
-    """Return the section of ``rows``; without any, of the check of names alone."""
+def physics_iq_section(
+    submission: Submission, rows: Sequence[ViewRow], folder: Path, failed: Sequence[FailedView] = ()
+) -> Section:
+    """Return the section of ``rows``; without any, of the check of names alone. failed: views that have no row."""
     complete = len(rows) == VIEWS and not submission.problems
-    notices = list(submission.problems)
+    failures = [f"{item.view.number:04d} is not compared: {item.reason}" for item in failed]
+    notices = [*failures, *submission.problems]
     if rows and not complete:
         notices.append(f"of {len(rows)} of {VIEWS} views: not the benchmark's score, which is of all")
     # A still video overlaps with a recording in which the masks find no motion, and with no other.
@@ -216,16 +243,31 @@ def physics_iq_section(submission: Submission, rows: Sequence[ViewRow], folder: 
         note = "" if value is not None else "the two takes have no motion in common"
         measures.append(Measure(name=name, title=titles[name], value=value, better=HIGHER, still=still, note=note))
     text = f"{len(rows)} of {VIEWS} views of {folder.name} at {submission.fps:g} frames a second"
-    return Section(name="physics_iq", title="Physics-IQ", text=text, measures=tuple(measures), notices=tuple(notices))
+    return Section(
+        name="physics_iq",
+        title="Physics-IQ",
+        text=text,
+        measures=tuple(measures),
+        notices=tuple(notices),
+        failures=tuple(failures),
+    )
 
 
 KINDS = ("ours", "still", "takes")
 
 
-def view_table(rows: Sequence[ViewRow]) -> Iterator[list[object]]:
-    """Yield the table of all views, headings first: each measure of the video, of a still one, and of the two takes."""
-    yield ["id", "scenario", "view", *(f"{kind}_{name}" for kind in KINDS for name in NAMES), "verified_score"]
+def view_table(rows: Sequence[ViewRow], failed: Sequence[FailedView] = ()) -> Iterator[list[object]]:
+    """Yield the table of all views, headings first: each measure of the video, of a still one, and of the two takes.
+
+    The row of a view in ``failed`` has no values, and says why.
+    """
+    columns = [f"{kind}_{name}" for kind in KINDS for name in NAMES]
+    yield ["id", "scenario", "view", *columns, "verified_score", "problem"]
+    values: dict[int, list[object]] = {
+        item.view.number: [*(None for _ in columns), None, item.reason] for item in failed
+    }
     for row in rows:
         score = 100.0 * float(np.mean(list(verified_scores(row.ours, row.takes).values())))
-        values = [getattr(row, kind)[name] for kind in KINDS for name in NAMES]
-        yield [f"{row.view.number:04d}", row.view.scenario, row.view.view, *values, score]
+        values[row.view.number] = [*(getattr(row, kind)[name] for kind in KINDS for name in NAMES), score, None]
+    for view in sorted([item.view for item in rows] + [item.view for item in failed], key=lambda view: view.number):
+        yield [f"{view.number:04d}", view.scenario, view.view, *values[view.number]]

@@ -126,3 +126,33 @@ def test_whatever_is_wrong_with_a_folder_is_said(folders, tmp_path, capsys):
         assert main(command) == 3
     assert "give VIDEO, or --physics-iq DIR" in capsys.readouterr().err
     assert not (tmp_path / "p").exists()
+
+
+def test_a_damaged_recording_costs_its_own_view_alone(folders, tmp_path, capsys):
+    ours, benchmark = folders
+    place = benchmark / "split-videos" / "testing" / "30FPS"
+    cut, broken = next(place.glob("0002_*take-1*")), next(place.glob("0011_*take-2*"))
+    clip(cut, 10, fps=30.0, seconds=2.0)
+    broken.write_bytes(broken.read_bytes()[:600])
+    out = tmp_path / "o"
+    assert main(["evaluate", "--physics-iq", str(ours), "--against", str(benchmark), "--out", str(out)]) == 3
+    said = capsys.readouterr()
+    assert "4 of 6 views of ours" in said.out and cut.name in said.out and broken.name in said.out
+    rows = {row["id"]: row for row in csv.DictReader((out / "physics_iq.csv").read_text().splitlines())}
+    assert sorted(rows) == [f"{i:04d}" for i in range(1, 7)]
+    for number, row in rows.items():
+        assert (row["ours_mse"] == "") == (row["verified_score"] == "") == (number in ("0002", "0005"))
+    assert cut.name in rows["0002"]["problem"] and "ends after 2 of 5 s" in rows["0002"]["problem"]
+    assert broken.name in rows["0005"]["problem"]
+    assert "0005 is not compared" in (out / "report.html").read_text()
+    # What is left is as without the damaged ones.
+    for path in (*place.glob("0002_*"), *place.glob("0008_*"), *place.glob("0005_*"), *place.glob("0011_*")):
+        path.unlink()
+    alone = evaluate_physics_iq(ours, benchmark=benchmark, out=tmp_path / "p")
+    found = json.loads((out / "evaluation.json").read_text())["sections"][0]
+    assert {item["name"]: item["value"] for item in found["measures"]} == {m.name: m.value for m in alone.measures}
+    assert len(found["failures"]) == 2 and not alone.failures
+    for path in place.iterdir():
+        path.write_bytes(path.read_bytes()[:600])
+    with pytest.raises(InputError, match="no view can be compared; the first is"):
+        evaluate_physics_iq(ours, benchmark=benchmark, out=tmp_path / "q")
