@@ -66,6 +66,14 @@ def shortened(value: object, length: int) -> str:
     return line if len(line) <= length else line[: max(length - 1, 1)] + "…"
 
 
+_FLAG = re.compile(r"(?<!\S)--[a-z][a-z-]*")
+
+
+def prose(value: object) -> Markup:
+    """Return ``value`` escaped, with command-line flags kept on one line: browsers break ``--flag`` at its hyphens."""
+    return Markup(_FLAG.sub(lambda flag: f'<span class="flag">{flag[0]}</span>', text(value)))
+
+
 def join(parts: Iterable[Markup | str | None]) -> Markup:
     """Return the parts concatenated; None is skipped."""
     return Markup("".join(text(part) for part in parts if part is not None))
@@ -363,6 +371,8 @@ figcaption{color:var(--quiet);font-size:14px;max-width:75ch;margin-top:8px}
 .notes ul{margin:6px 0 0;padding-left:20px}
 .notes li{margin:4px 0;max-width:75ch}
 .picture{display:block;max-width:100%;height:auto}
+.strip{display:grid;grid-template-columns:repeat(8,1fr);gap:2px}
+.strip img{display:block;width:100%;height:auto}
 .narrow{display:none}
 .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(270px,1fr));gap:24px 20px}
 .tiles+.tiles{margin-top:24px}
@@ -374,7 +384,9 @@ caption{text-align:left;color:var(--quiet);padding-bottom:6px}
 th,td{text-align:left;vertical-align:top;padding:8px 14px 8px 0;border-bottom:1px solid var(--rule)}
 thead th{color:var(--quiet);font-weight:500}
 tbody th{font-weight:600}
-.ranking .probability,.ranking .number{white-space:nowrap}
+.ranking .probability,.ranking .number,.flag{white-space:nowrap}
+.ranking .numbers{min-width:16em}
+.scroll{overflow-x:auto}
 .mark{display:block;color:var(--quiet);font-weight:400;font-size:13px}
 details{margin-top:14px}
 summary{cursor:pointer;color:var(--found);width:fit-content;padding:4px 0}
@@ -398,12 +410,13 @@ section{margin-top:40px}
 .wide{display:none}
 .narrow{display:block;width:100%;max-width:480px}
 .pair{grid-template-columns:1fr}
+.strip{grid-template-columns:repeat(4,1fr)}
 .ranking thead{position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%)}
 .ranking,.ranking caption,.ranking tbody,.ranking tr,.ranking th,.ranking td{display:block}
 .ranking tr{padding:12px 0;border-bottom:1px solid var(--rule)}
 .ranking th,.ranking td{border:0;padding:2px 0}
 .ranking td:not(.probability)::before{content:attr(data-label) ': ';color:var(--quiet)}
-.ranking td.numbers{padding-left:0}
+.ranking td.numbers{padding-left:0;min-width:0}
 }
 @media print{
 body{font-size:10pt;line-height:1.4}

@@ -203,8 +203,11 @@ def _reason(
     if gain < weighing.fee:
         return "gains too little for its parameters"
     top = max((f for f in best.values() if f.effects), key=lambda f: f.log_evidence)
+    better, verb = " and ".join(effect_label(n) for n in top.effects), "fits" if len(top.effects) == 1 else "fit"
     if top.log_evidence - fit.log_evidence > weighing.fee:
-        return f"{' and '.join(effect_label(n) for n in top.effects)} fits the trials far better"
+        return f"{better} {verb} the trials far better"
+    if fit.misfit <= 1 and top is not fit:
+        return f"{better} {verb} the trials better"
     return f"leaves {fit.misfit:.1f} times the noise unexplained"
 
 

@@ -172,7 +172,9 @@ def score_views(
         try:
             rows.append(_score(submission, submission.videos[number], benchmark[number]))
         except InputError as error:
-            failed.append(FailedView(view=benchmark[number], reason=str(error)))
+            # The table and its page are passed on, so they name the file and not where it lies.
+            place = f"{benchmark[number].takes[0].parent}/"
+            failed.append(FailedView(view=benchmark[number], reason=str(error).replace(place, "")))
         on_row(len(rows) + len(failed))
     return rows, failed
 
@@ -211,7 +213,7 @@ def physics_iq_section(
     failures = [f"{item.view.number:04d} is not compared: {item.reason}" for item in failed]
     notices = [*failures, *submission.problems]
     if rows and not complete:
-        notices.append(f"of {len(rows)} of {VIEWS} views: not the benchmark's score, which is of all")
+        notices.append(f"a score of {len(rows)} of {VIEWS} views: not the benchmark's score, which is of all")
     # A still video overlaps with a recording in which the masks find no motion, and with no other.
     calm = sum(row.still["spatial_iou"] == 1.0 for row in rows)
     if calm:

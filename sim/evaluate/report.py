@@ -13,7 +13,7 @@ import numpy as np
 
 from ..atomic import write_bytes
 from ..diagnose.report.diagnosis_charts import Scale, curve, round_up
-from ..html import Markup, Picture, element, join, label, page_head, page_style, render, shortened
+from ..html import Markup, Picture, element, join, label, page_head, page_style, prose, render, shortened
 from ..version import VERSION
 from .evaluation import HIGHER, LOWER, PAGE_FILE, Curve, Evaluation, Measure, Section, value_text
 from .footage import Footage, Frame, reduced
@@ -24,6 +24,8 @@ STRIP_SIDE = 240
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 440.0, 190.0, 52.0, 34.0, 12.0
 LINES = ("found", "nominal", "observed", "other")
 """Colours of a chart's curves, in their order; more curves share the last."""
+DASHES = (None, "6 3", "2 3", "8 3 2 3")
+"""Of the same curves, which so differ without their colours, too."""
 MOST_LABELS = 6
 
 _TEMPLATE = Path(__file__).with_name("evaluation_page.html")
@@ -54,7 +56,9 @@ def page(found: Evaluation, strip: Sequence[Frame]) -> str:
         sections=[(section, _charts(section)) for section in found.sections],
         facts=_facts(found),
         value=lambda item: value_text(item.value, item.unit),
-        still=lambda item: "" if item.still is None else value_text(item.still, item.unit),
+        prose=prose,
+        views=any(section.name == "physics_iq" and section.measures for section in found.sections),
+        still=lambda item: "–" if item.still is None else value_text(item.still, item.unit),
         better={HIGHER: "more", LOWER: "less"},
     )
 
@@ -63,13 +67,15 @@ def _facts(found: Evaluation) -> list[tuple[str, str, str]]:
     """Return (title, value, beside) of the figures at the top: of each section the first that are known."""
     chosen = {
         "against": ("physics_iq", "spatial_iou", "spatiotemporal_iou", "mse"),
+        "physics_iq": ("physics_iq", "physics_iq_verified", "spatial_iou"),
         "alone": ("interpolation_error", "background_psnr"),
         "bake": ("ground_penetration", "object_penetration", "energy_gain"),
     }
     facts: list[tuple[str, str, str]] = []
     for section in found.sections:
         names = chosen.get(section.name, tuple(item.name for item in section.measures[:2]))
-        known: list[Measure] = [item for item in section.measures if item.name in names and item.value is not None]
+        by_name = {item.name: item for item in section.measures if item.value is not None}
+        known: list[Measure] = [by_name[name] for name in names if name in by_name]
         for item in known[:3]:
             beside = "" if item.still is None else f"standing still: {value_text(item.still, item.unit)}"
             facts.append((item.title, value_text(item.value, item.unit), beside))
@@ -114,7 +120,7 @@ def chart(curves: Sequence[Curve]) -> Picture | None:
     for index, item in enumerate(known):
         colour = LINES[min(index, len(LINES) - 1)]
         xs, ys = [time(t) for t in item.times], [scale(v) if math.isfinite(v) else math.nan for v in item.values]
-        dash = None if index < len(LINES) else "4 3"
+        dash = DASHES[min(index, len(DASHES) - 1)]
         parts.append(
             element("path", d=curve(xs, ys), class_=f"line {colour}-line", stroke_width=1.6, stroke_dasharray=dash)
         )
@@ -128,9 +134,11 @@ def chart(curves: Sequence[Curve]) -> Picture | None:
     rows = -(-min(len(named), MOST_LABELS) // 2)
     for index, item in enumerate(named[:MOST_LABELS]):
         x, y = LEFT + (index % 2) * 190, HEIGHT + 16 + 17 * (index // 2)
-        colour = LINES[min(index, len(LINES) - 1)]
-        parts.append(element("rect", x=x, y=y - 9, width=14, height=4, class_=f"{colour}-fill"))
-        parts.append(label(shortened(item.label, 24), x + 20, y - 3, size=11))
+        colour, dash = LINES[min(index, len(LINES) - 1)], DASHES[min(index, len(DASHES) - 1)]
+        key = element(
+            "path", d=f"M{x:.0f} {y - 7:.0f}h22", class_=f"line {colour}-line", stroke_width=2, stroke_dasharray=dash
+        )
+        parts += [key, label(shortened(item.label, 24), x + 28, y - 3, size=11)]
     extra = f", {len(named) - MOST_LABELS} more not named" if len(named) > MOST_LABELS else ""
     unit = f", {known[0].unit}" if known[0].unit else ""
     described = f"{known[0].title} over time{unit}: {', '.join(i.label for i in named) or 'one curve'}{extra}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..errors import InputError
-from ..html import page_head, page_style, render
+from ..html import page_head, page_style, prose, render
 from ..scene.environment import read_environment
 from ..scene.folder import Scene
 from ..scene.meshes import read_mesh
@@ -99,6 +99,7 @@ def report_html(folder: Scene, data: ReportData) -> str:
             _light(folder),
             _physics(folder),
         ],
+        prose=prose,
         version=VERSION,
     )
 

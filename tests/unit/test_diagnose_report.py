@@ -9,9 +9,11 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import physgen
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,8 +30,9 @@ from physgen.sim.diagnose.diagnosis import (
     TrialArrays,
     Verdict,
 )
+from physgen.sim.diagnose.provenance import Provenance
 from physgen.sim.diagnose.report import diagnosis_figures, parameter_text, write_report
-from physgen.sim.diagnose.report.diagnosis_charts import bands, timeline_picture
+from physgen.sim.diagnose.report.diagnosis_charts import Scale, _apart, bands, timeline_picture
 from physgen.sim.diagnose.report.diagnosis_figures import growth
 from physgen.sim.diagnose.report.diagnosis_page import scene_effects
 from physgen.sim.diagnose.report.number_format import number_text, percent_text, quantity_text
@@ -246,7 +249,7 @@ def test_a_report_is_whole_and_says_the_verdict(tmp_path):
     assert "cannot distinguish it from wind" in text
     assert "drag per mass 0.0405\u00a01/m (95\u00a0%: 0.0381 to 0.0429)" in text
     assert '{"name": "air_drag", "parameters": {"drag_per_mass": 0.0405}}' in text
-    assert "Add found effect and bake" in text
+    assert "Add Effect and Bake" in text
 
 
 def test_the_page_may_load_and_run_nothing(tmp_path):
@@ -305,7 +308,7 @@ def test_a_verdict_without_effect_adds_nothing(effect, tmp_path):
     diagnosis, capture = case(verdict=verdict, gap=gap, next_experiment=None)
     text = said(written(diagnosis, capture, tmp_path)[0])
     assert "not resolvable" in text and "There is nothing to add" in text
-    assert "Add found effect" not in text and '"effects"' not in text
+    assert "Add Effect" not in text and '"effects"' not in text
     wanted = {"none": "Nothing is missing", "unknown": "none of the known effects"}[effect]
     assert wanted in text
 
@@ -578,3 +581,33 @@ def test_the_headline_is_no_surer_than_the_probability():
         True
     ] * 4
     assert "not known" in said_so[4]
+
+
+def test_alternatives_that_predict_better_are_named(tmp_path):
+    found, capture = case()
+    drag, wind, none = found.effects
+    text = said(written(found, capture, tmp_path / "a")[0])
+    assert "Closer on held-out motion" not in text
+    closer = dataclasses.replace(found, effects=(drag, dataclasses.replace(wind, heldout_rms_m=0.0011), none))
+    assert "Closer on held-out motion than its 2.7\u00a0mm: wind (1.1\u00a0mm)." in said(
+        written(closer, capture, tmp_path / "b")[0]
+    )
+
+
+def test_labels_of_an_axis_do_not_touch():
+    """On a square root scale 0 and 2 of 60 lay upon each other."""
+    scale = Scale(low=0.0, high=60.0, start=62.0, end=4.0, root=True)
+    assert scale.ticks() == [0.0, 2.0, 10.0, 50.0]
+    assert _apart(scale, scale.ticks()) == [0.0, 10.0, 50.0]
+    assert _apart(Scale(low=0.0, high=10.0, start=62.0, end=4.0), [0.0, 5.0, 10.0]) == [0.0, 5.0, 10.0]
+
+
+def test_the_page_names_its_capture_and_the_button_as_blender_does(tmp_path):
+    origin = Provenance(capture="bounces", content_sha256="0" * 64, command="physgen diagnose bounces --out DIR")
+    page, _ = written(*case(provenance=origin), tmp_path)
+    assert "<title>bounces: Air drag: very likely the cause</title>" in page
+    assert "bounces · Where simulation and recording diverge" in said(page)
+    assert '<span class="flag">--out</span>' in page
+    (label,) = re.findall("<kbd>(.*?)</kbd>", page)
+    operators = (Path(physgen.__file__).parent / "physgen_addon" / "operators" / "diagnose_ops.py").read_text()
+    assert f'bl_label = "{label}"' in operators

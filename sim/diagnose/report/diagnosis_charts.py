@@ -279,7 +279,7 @@ def _band(band: Band, time: Scale, score: Scale, wide: bool) -> Markup:
             f"{percent_text(interval.share)} of the discrepancy"
         )
         parts.append(_hinted(hint, start, max(end - start, 1.0), phase))
-    for tick in score.ticks(2):
+    for tick in _apart(score, score.ticks(2)):
         y = score(tick)
         parts.append(element("line", x1=left, x2=right, y1=y, y2=y, class_="rule", stroke_width=0.6))
         parts.append(label(tick_text(tick), left - 5, y + 4, class_="quiet", anchor="end", size=10.5))
@@ -292,6 +292,19 @@ def _band(band: Band, time: Scale, score: Scale, wide: bool) -> Markup:
     if band.worst is not None:
         parts.append(_mark(band.worst, time, score))
     return join(parts)
+
+
+_LINE = 11.5
+"""Height of a tick's label in CSS pixels."""
+
+
+def _apart(scale: Scale, ticks: list[float]) -> list[float]:
+    """Return the ticks, from the largest and zero on, whose labels do not touch one before."""
+    shown: list[float] = []
+    for tick in sorted(ticks, key=lambda t: (t > 0, -t)):
+        if all(abs(scale(tick) - scale(other)) >= _LINE for other in shown):
+            shown.append(tick)
+    return sorted(shown)
 
 
 def _hinted(hint: str, x: float, width: float, phase: str) -> Markup:

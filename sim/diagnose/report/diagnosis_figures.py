@@ -21,7 +21,7 @@ from .wording import found_effects, found_label
 
 Array = NDArray[np.float64]
 
-WIDTH = 440.0
+WIDTH = 400.0
 _ROW = 42.0
 _STEPS = 120
 
@@ -43,11 +43,7 @@ def gap_bars(diagnosis: Diagnosis) -> list[Bar]:
     bars = [
         Bar(caption="nominal model", value=gap.before_rms_m, class_="nominal-fill"),
         Bar(caption="nominal model, re-fitted", value=gap.refitted_rms_m, class_="other-fill"),
-        Bar(
-            caption=found_label(diagnosis.verdict),
-            value=gap.after_rms_m,
-            class_="found-fill" if found else "other-fill",
-        ),
+        *([Bar(caption=found_label(diagnosis.verdict), value=gap.after_rms_m, class_="found-fill")] if found else []),
         Bar(caption="noise floor of the recording", value=gap.noise_floor_rms_m, class_="rule-fill"),
         Bar(caption="numerical error of the simulator", value=gap.numerics_rms_m, class_="rule-fill", quiet=True),
     ]
@@ -166,7 +162,7 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
     factor, unit = axis_unit(y.high, data.unit)
     parts: list[Markup | None] = [
         label("Error growth during a trial", 0, 13, class_="ink strong"),
-        label(f"in {unit}; mean of the complete trials, which the fits used", 0, 31, class_="quiet"),
+        label(f"in {unit}, mean of the fitted trials; dotted: tracking noise", 0, 31, class_="quiet"),
     ]
     for tick in y.ticks(4):
         at = y(tick)
@@ -183,11 +179,10 @@ def growth_picture(diagnosis: Diagnosis, capture: Capture) -> Picture:
     parts.append(
         element("line", x1=left, x2=right, y1=noise, y2=noise, class_="tick", stroke_dasharray="2 3", stroke_width=1.2)
     )
-    parts.append(label("noise", right, noise - 4, class_="quiet halo", anchor="end", size=11))
     lines: list[tuple[Array, str, str, str | None]] = [(data.nominal, "nominal", "nominal model", "6 3")]
     if with_found:
         lines.append((data.found, "found", shortened(found_label(diagnosis.verdict), 30), None))
-    at = left
+    at = 0.0
     captions = []
     for values, class_, words, dashes in lines:
         path = curve([x(t) for t in data.times], [y(v) if math.isfinite(v) else math.nan for v in values])

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ...atomic import write_bytes
-from ...html import page_head, page_style, picture_style, render, short_number, shortened
+from ...html import page_head, page_style, picture_style, prose, render, short_number, shortened
 from ...version import VERSION
 from ..capture import Capture
 from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
 from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
 from .diagnosis_figures import Pictures, draw_pictures, gap_bars
-from .number_format import estimate_text, number_text, percent_text, quantity_text
+from .number_format import counted, estimate_text, number_text, percent_text, quantity_text
 from .object_heatmaps import VIEWS
 from .wording import (
     DIRECTIONS,
@@ -95,6 +95,7 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
     """Return the page as text."""
     verdict, effects = diagnosis.verdict, diagnosis.effects
     title = headline(diagnosis)
+    name = "" if diagnosis.provenance is None else shortened(diagnosis.provenance.capture or "", 60)
     alike = [item for item in effects if item.reason == SAME]
     others = [item for item in effects if item.reason != SAME]
     shown = [item for i, item in enumerate(others) if i < ALWAYS or _finite(item.probability) >= LEAST]
@@ -109,7 +110,10 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
     notes = [*control_sentences(diagnosis), *diagnosis.warnings, *capture.warnings]
     return render(
         _TEMPLATE,
-        head=page_head(f"Diagnosis: {title}", page_style()),
+        head=page_head(f"{name}: {title}" if name else title, page_style()),
+        capture=name,
+        counted=counted,
+        prose=prose,
         diagnosis=diagnosis,
         pictures=pictures,
         version=VERSION,

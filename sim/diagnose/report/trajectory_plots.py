@@ -318,7 +318,7 @@ def _scale_bar(place: _Placement, unit: str) -> Markup | None:
                 d=f"M10 {short_number(y - 4)}V{short_number(y)}H{short_number(10 + pixels)}V{short_number(y - 4)}",
                 class_="line tick",
             ),
-            label(bar_text(length, unit), 16 + pixels, y, class_="quiet", size=11),
+            label(bar_text(length, unit), 16 + pixels, y, class_="quiet halo", size=11),
         ]
     )
 
@@ -339,7 +339,7 @@ class _Placement:
             places = places[reach <= usual]
         self.low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.ones(2))
         extent = np.maximum(high - self.low, 1e-9)
-        room = np.array([WIDTH - 2 * _MARGIN, HEIGHT - _TOP - 2 * _MARGIN - 16])
+        room = np.array([WIDTH - 2 * _MARGIN, HEIGHT - _TOP - 2 * _MARGIN - 24])
         self.scale = float((room / extent).min())
         self.offset = (room - extent * self.scale) / 2 + (_MARGIN, _MARGIN)
         self.extent, self.down = extent, trial.unit == "px"

@@ -217,7 +217,8 @@ def _floor(gap: Gap) -> str:
         return ""
     return (
         f" The noise floor, {_length(gap.noise_floor_rms_m)}, is far above the tracking noise of "
-        f"{_length(gap.noise_rms_m)}: it is what that noise, in the first frames, makes of the prediction."
+        f"{_length(gap.noise_rms_m)} in all coordinates together: it is what that noise, in the first frames, makes of "
+        "the prediction."
     )
 
 
@@ -259,6 +260,22 @@ CLEARLY_BETTER = 0.9
 """Fraction of an error below which another one is better, not as good."""
 
 
+def _better_alternatives(diagnosis: Diagnosis) -> list[str]:
+    """Return a sentence on alternatives that predict held-out motion clearly better than the verdict; [] for none."""
+    after = diagnosis.gap.after_rms_m
+    better = [
+        f"{effect_label(item.name)} ({_length(item.heldout_rms_m)})"
+        for item in diagnosis.effects
+        if item.name in diagnosis.verdict.alternatives and item.heldout_rms_m < CLEARLY_BETTER * after
+    ]
+    if not better:
+        return []
+    return [
+        f"Closer on held-out motion than its {_length(after)}: {listed(better, 'and')}. The probabilities also weigh "
+        "how well the fitted motion is explained, and how common a cause is."
+    ]
+
+
 def control_sentences(diagnosis: Diagnosis) -> list[str]:
     """Return warnings from the controls about the found cause; [] without a cause."""
     if not found_effects(diagnosis.verdict):
@@ -267,7 +284,7 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
     said = []
     if gap.resolvable and _chaotic(gap):
         said.append(
-            f"Contacts make the held-out motion chaotic: the simulator's own uncertainty moves it by "
+            f"Contacts make the held-out motion chaotic: what a simulator cannot know there moves it by "
             f"{_length(gap.grain_rms_m)}, more than the gap of {_length(gap.before_rms_m)}. The share of the gap "
             "judges little here; the verdict rests on the fit."
         )
@@ -283,10 +300,13 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
             )
     if gap.refitted_rms_m <= after:
         how = "better" if gap.refitted_rms_m < CLEARLY_BETTER * after else "as well"
+        # A cause that corrects a parameter of the nominal model is among what was re-fitted.
+        own = set(found_effects(diagnosis.verdict)) & {"friction", "restitution", "stiffness"}
+        also = "with this one among them" if own else "without any new effect"
         said.append(
-            f"Re-fitting the nominal model's own parameters does {how} "
-            f"({_length(gap.refitted_rms_m)}), without any new effect."
+            f"Re-fitting the nominal model's own parameters does {how} ({_length(gap.refitted_rms_m)}), {also}."
         )
+    said += _better_alternatives(diagnosis)
     if gap.numerics_rms_m > max(0.25 * gap.before_rms_m, after):
         said.append(
             f"A finer simulation moves this prediction by {_length(gap.numerics_rms_m)}, more than the "
