@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
 """A body's shadow, its pieces and its blurred frames, and leaves behind it, in drawn videos and paths."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from physgen.sim.diagnose.track.moving_regions import Region, find_moving_regions
-from physgen.sim.diagnose.track.path_relations import bodies
+from physgen.sim.diagnose.track.path_relations import bodies, shown_share
 from physgen.sim.diagnose.track.region_track import RegionPath, link_regions
 
 SIZE = (320, 240)
@@ -66,6 +68,21 @@ def test_pieces_that_move_along_are_no_bodies():
     other = RegionPath([region(k, (90 + 2 * k, 160), area=60.0) for k in range(30)])
     left = bodies([piece, body, other], [[]] * 30)
     assert any(p is body for p in left) and any(p is other for p in left) and all(p is not piece for p in left)
+
+
+def test_a_body_in_pieces_shows_the_share_of_its_largest_one():
+    """A label of 40 x 40 px on a can whose rim above it is all else that is seen of it."""
+    label = RegionPath([square(k, 100 + 5 * k, 120, 40) for k in range(30)])
+    rim = RegionPath([square(k, 100 + 5 * k, 70, 16) for k in range(30)])
+    inside = RegionPath([square(k, 100 + 5 * k, 110, 16) for k in range(30)])
+    # The label, and a trapezoid of 38 px up to the top of the rim.
+    assert shown_share(label, [label, rim]) == pytest.approx(1600 / (1600 + 38 * 28), rel=0.01)
+    assert shown_share(label, [label, inside]) == shown_share(label, [label]) == 1.0
+
+
+def square(frame, x, y, side):
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * side / 2 + (x, y)
+    return replace(region(frame, (x, y), area=float(side**2)), outline=corners)
 
 
 def test_a_ball_that_blur_makes_faint_is_followed_and_its_shadow_is_not():

@@ -66,6 +66,20 @@ def _is_shadow(path: RegionPath, body: RegionPath) -> bool:
     return off < min(FOLLOWS * spread, max(FOLLOWS_SIZE * path.size, LEAST_PX))
 
 
+def shown_share(body: RegionPath, paths: list[RegionPath]) -> float:
+    """Return the share of a body's outline that its largest region fills: 1 where no piece of it lies beside that
+    region, less where the rest of the body looks like what is behind it. paths: all that were found."""
+    pieces = [q for q in paths if q is not body and _is_piece(q, body)]
+    shares = []
+    for region in body.regions:
+        beside = [r.outline for q in pieces for r in q.regions if r.frame == region.frame]
+        if beside:
+            whole = np.concatenate([region.outline, *beside]).astype(np.float32)
+            own = cv2.contourArea(region.outline.astype(np.float32))
+            shares.append(own / max(cv2.contourArea(cv2.convexHull(whole)), 1e-9))
+    return float(np.median(shares)) if len(shares) >= LEAST_COMMON else 1.0
+
+
 def _without_pieces(paths: list[RegionPath]) -> list[RegionPath]:
     return [q for q in paths if not any(_is_piece(q, p) for p in paths if p is not q)]
 

@@ -18,7 +18,7 @@ from .box_pose import BoxMotion, follow_box
 from .motion_view import MotionView, understand_motion
 from .moving_regions import MovingRegions, Region, find_moving_regions
 from .path_pieces import noise_px, stopped_at, wobble_px
-from .path_relations import bodies
+from .path_relations import bodies, shown_share
 from .pose_estimation import Array
 from .region_track import link_regions, true_times, with_missing_frames
 from .track_input import BodyRequest, VideoTrial
@@ -37,6 +37,8 @@ CENTRE_PX = 0.2
 changes along the way."""
 RIVAL = 0.4
 """Freedom of another body's path, over that of the chosen one, from which a warning names it."""
+LEAST_SHOWN = 0.75
+"""Share of its outline that one region of a body that is no ball has to fill; with less, lengths are off by 15 %."""
 MISSHAPEN = 0.35
 """Relative difference between an outline and the body's from which a warning is given."""
 
@@ -93,7 +95,8 @@ def follow_plain_body(
         raise InputError(
             f"{path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
         )
-    paths = bodies(link_regions(found), found.faint)
+    linked = link_regions(found)
+    paths = bodies(linked, found.faint)
     if not any(found.regions):
         raise InputError(f"{path}: nothing moves in it; check --start-frame and --end-frame")
     chosen = [p for p in paths if p.freedom() > 0]
@@ -114,6 +117,11 @@ def follow_plain_body(
     regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
     if len(regions) < LEAST_FRAMES:
         raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
+    if body.kind != "ball" and (shown := shown_share(chosen[0], linked)) < LEAST_SHOWN:
+        raise InputError(
+            f"{path}: one region shows {100 * shown:.0f} % of the body, the rest looks like the background or comes in "
+            "pieces, so that its size gives no scale: film it before a background of another colour, or paint it"
+        )
     seen_at = times[[r.frame for r in regions]]
     places = np.array([r.middle for r in regions]) / found.scale
     clock, missing = with_missing_frames(seen_at, places)
