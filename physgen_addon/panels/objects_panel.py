@@ -129,6 +129,9 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
         why = bake_state.state(scene).unfit.get(item.name)
         if why:
             text.sentences(layout, context, text.brief(why), icon="ERROR")
+        if item.override_library is not None:
+            words = "An override keeps the settings of its own file. To change them: Object > Relations > Make Local."
+            text.sentences(layout, context, words, icon="INFO")
         column = settings(layout, context, why=True)
         column.row().prop(item.physgen, "role", expand=True)
         if splat_clouds.find(item) is not None:

@@ -62,7 +62,7 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     if shows_photo and job.title in photo_panel.JOBS:
         # Drawn beside the button that has started it.
         return
-    row = draw_progress(layout, job)
+    row = draw_progress(layout, context, job)
     if bake_state.bake_job(context.scene) is not None:
         row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
     row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")

@@ -105,20 +105,20 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, *titles: st
     if job is None:
         return False
     if job.title in titles:
-        draw_progress(layout, job).operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+        draw_progress(layout, context, job).operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
     else:
         text.sentences(layout, context, f"{job.title} is running; go on when it is done.", icon="INFO")
     return True
 
 
-def draw_progress(layout: bpy.types.UILayout, job: Job) -> bpy.types.UILayout:
+def draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, job: Job) -> bpy.types.UILayout:
     """Draw a progress bar and the message of ``job``; return the bar's row, for a button beside it."""
     column = layout.column(align=True)
     row = column.row(align=True)
     row.scale_y = 1.4
     row.progress(factor=job.fraction or 0.0, text=progress_text(job))
     if job.message:
-        column.label(text=job.message)
+        text.sentences(column, context, job.message)
     return row
 
 

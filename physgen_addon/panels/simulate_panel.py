@@ -94,7 +94,7 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
             # A bake by another Blender, or one that was killed, is running.
             text.sentences(layout, context, found.message, icon="INFO")
             return
-        draw_progress(layout, job)
+        draw_progress(layout, context, job)
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="Pause", icon="PAUSE")
         row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="Cancel", icon="CANCEL")

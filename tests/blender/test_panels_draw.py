@@ -132,12 +132,14 @@ def test_a_job_that_runs_locks_what_it_reads_and_can_be_cancelled():
     a_body()
     go_on = threading.Event()
     job = background_jobs.Job("Bake", lambda on_event, cancelled: go_on.wait(60) and {"event": "done"})
-    job.message = "frame 3 of 12"
+    job.message = "frame 3 of 12, and a line that no sidebar has room for: it goes on below itself, in full, to its end"
     background_jobs._running.append(job)
     job.start()
     try:
         shown = draw_all()
         assert any("Bake is running" in " ".join(layout.words) for layout in shown.values())
+        words = shown["PHYSGEN_PT_scene"].words
+        assert job.message not in words and job.message in " ".join(words)
     finally:
         go_on.set()
         job.wait()

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
+from physgen.physgen_addon.panels.objects_panel import PHYSGEN_PT_objects
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.physgen_addon.scene_io.motion_fingerprint import fingerprint
+
+from . import checked_layout
 
 
 @pytest.fixture(autouse=True)
@@ -164,8 +167,14 @@ def test_what_is_linked_or_overridden_takes_part_when_it_is_local(tmp_path):
     assert add() == []
     item = item.override_create(remap_local_usages=True)
     assert add() == []
+    item.physgen.enabled = True  # as in a file of ours that somebody has overridden an object of
+    assert any("Make Local" in words for words in objects_panel().words)
     item = item.make_local()
-    assert add() == ["theirs"]
+    assert add() == ["theirs"] and not any("Make Local" in words for words in objects_panel().words)
+
+
+def objects_panel():
+    return checked_layout.draw(PHYSGEN_PT_objects)
 
 
 def test_an_animation_hands_over_at_the_current_frame(tmp_path):
