@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body's shadow, its pieces and its blurred frames, and leaves behind it, in drawn videos and paths."""
+"""A body's shadow, its pieces and its blurred frames, in drawn videos and paths."""
 
 from dataclasses import replace
 
@@ -98,24 +98,3 @@ def test_a_ball_that_blur_makes_faint_is_followed_and_its_shadow_is_not():
     # A shadow that is seen beside the body all the time does not go on in its place.
     beside = [[region(k, (118, height(k)), area=420.0, shade=1.0)] for k in range(24)]
     assert bodies([RegionPath(list(body))], beside)[0].frames.tolist() == list(range(6, 17))
-
-
-def test_leaves_in_the_wind_keep_their_median_behind_a_ball(tmp_path):
-    """A hole as large as the scene was filled from its rim: smears in place of the hedge, and no ball."""
-    rng, frames = np.random.default_rng(4), []
-    hedge = cv2.resize(rng.integers((10, 40, 10), (90, 200, 90), (60, 80, 3)).astype(np.uint8), SIZE)
-    rows, columns = np.mgrid[0:240, 0:320].astype(np.float32)
-    for k in range(26):
-        wind = rng.normal(0, 1.5, (40, 60, 2)).astype(np.float32)
-        sway = cv2.resize(wind, SIZE, interpolation=cv2.INTER_CUBIC)
-        frame = cv2.remap(hedge, columns + sway[..., 0], rows + sway[..., 1], cv2.INTER_LINEAR).astype(float)
-        frame[112:] = 60.0
-        cv2.circle(frame, (20 + 11 * k, 86), 26, (30, 30, 230), -1, cv2.LINE_AA)
-        frames.append(frame + rng.normal(0, 1.5, frame.shape))
-    found = write(tmp_path / "hedge.avi", frames)
-    away = np.abs(found.background[:108].astype(float) - hedge[:108]).max(axis=-1)
-    assert np.median(away) < 15
-    path = bodies(link_regions(found), found.faint)[0]
-    whole = [r for r in path.regions if not r.cut]
-    assert len(whole) >= 20
-    assert np.median([np.hypot(*(r.middle - (20.5 + 11 * r.frame, 86.5))) for r in whole]) < 3

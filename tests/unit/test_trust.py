@@ -282,4 +282,7 @@ def test_programs_that_are_started_import_nothing_from_the_working_folder():
         if re.search(r'"-[cm]"', line) and not re.search(r'"-[IP]"', line)
     }
     # It works in a temporary folder of its own.
-    assert starts == {"render_engines.py": 'start = [sys.executable, "-c"]'}
+    assert starts == {
+        "render_engines.py": 'start = [bpy.app.binary_path, *compat.HEADLESS, "--python-expr"] '
+        'if bpy.app.binary_path else [sys.executable, "-c"]'
+    }

@@ -32,8 +32,6 @@ PLAIN_SHARE, PLAIN_BESIDE, PLAIN_SPREAD = 0.4, 0.55, 8.0
 smooth course of colours, within three times its scatter, and that is at most so many grey levels."""
 LEAST_AROUND = 0.25
 """Share of a hole and its surroundings that has to lie outside of it to tell what is within."""
-MOST_HOLE = 1 / 3
-"""Share of the picture from which a hole is no body's way: leaves move in the wind, and their median is the best."""
 COMMON = 30
 """Grey levels about the commonest brightness around a hole that belong to the surface at first."""
 WIDE = 1.3
@@ -131,16 +129,13 @@ def _bare(median: Picture, noise: Array, holes: Picture, levels: NDArray[np.uint
 
     levels: (5, H, W, 3) percentiles over time. A value counts if its colour occurs around the hole, the median first;
     where none does, the body was there all the time, and the hole is filled from its rim. In a plain surface, a table
-    or a wall, the colour expected there decides, so that a body is kept apart from surfaces of similar colour. What is
-    restless in much of the picture keeps its median and noise.
+    or a wall, the colour expected there decides, so that a body is kept apart from surfaces of similar colour.
     """
     out, noise = median.copy(), noise.copy()
     empty = np.zeros_like(holes)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(holes)
     for k in range(1, count):
-        x, y, w, h, area = (int(v) for v in stats[k])
-        if area > MOST_HOLE * holes.size:
-            continue
+        x, y, w, h = (int(v) for v in stats[k, :4])
         pad = int(np.clip(0.25 * max(w, h), 8, 40))
         rows, columns = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
         inside = labels[rows, columns] == k
