@@ -19,7 +19,7 @@ PROBE_PIXELS = 8
 OBJECT_INDEX = "Object Index.X" if bpy.app.version >= (5, 0) else "IndexOB.X"
 """Channel of the object index pass."""
 HEADLESS = ("--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1")
-"""Arguments of every Blender that we start: no window, nobody's preferences, and no script of any file."""
+"""Arguments of every Blender that we start: no window, factory settings, and no scripts from files."""
 
 
 if TYPE_CHECKING:

@@ -46,8 +46,8 @@ _LAUNCHER = Path(__file__).with_name("launch.py")
 def child_environment() -> dict[str, str]:
     """Return this environment without variables that would make another interpreter load wrong libraries or wait.
 
-    Events are lines of UTF-8, also on Windows, where Python would use another encoding for pipes. Taichi asks nobody
-    for a newer version, even where it is started by itself.
+    Events are lines of UTF-8, also on Windows, where Python would use another encoding for pipes. Taichi's
+    check for updates is disabled, also where it is started by itself.
     """
     kept = {key: value for key, value in os.environ.items() if key in _KEPT or not key.upper().startswith(_STRIPPED)}
     return {**kept, "PYTHONUTF8": "1", "TI_SKIP_VERSION_CHECK": "ON"}

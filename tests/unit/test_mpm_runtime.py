@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What this project changes in Taichi is given up, never insisted on, where Taichi is another; it calls nobody."""
+"""Patches of Taichi are skipped where its version differs; its check for updates is disabled."""
 
 import os
 import subprocess
