@@ -24,6 +24,7 @@ from .kernels.kernel_arrays import (
 )
 from .kernels.lanes import Lanes
 from .kernels.layout import BLOCK_NODES, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, vec4
+from .kernels.runtime import new_array
 from .rigid.rigid_bodies import RigidBodies
 
 LEAST_BLOCKS = 64
@@ -43,7 +44,7 @@ class BlockLists:
         or the crowding of particles. lanes: threads that share a block."""
         self._field_count, self._rigid_bodies, self._lanes = field_count, rigid_bodies, lanes
         self._flowing, self._fluid = flowing, fluid
-        self._g_starts = ti.ndarray(ti.i32, field_count + 1)
+        self._g_starts = new_array(ti.i32, field_count + 1)
         self._p_count = self._g_count = 0
         self._near = (0, 0)
         self._overlap = (0, 0, 0)
@@ -54,35 +55,35 @@ class BlockLists:
         """Make room for ``p`` particle blocks and ``g`` grid blocks, where there is less; contents are lost."""
         if p > self._p_capacity:
             self._p_capacity = p
-            self._p_cells, self._p_field = ti.ndarray(ivec3, p), ti.ndarray(ti.i32, p)
-            self._starts, self._cursors = ti.ndarray(ti.i32, p + 1), ti.ndarray(ti.i32, p)
-            self._p_neighbours = ti.ndarray(ti.i32, p * 27)
-            self._near_of_p, self._near_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._meets_p, self._meet_p = ti.ndarray(ti.i32, p), ti.ndarray(ti.i32, p)
-            self._touched, self._slack = ti.ndarray(ti.i32, p), ti.ndarray(ti.f32, p)
-            self.pushes = ti.ndarray(ti.f32, max(1, p * self._rigid_bodies * PUSH))
-            self._window, self._scattered = ti.ndarray(vec4, p * WINDOW_NODES), ti.ndarray(vec4, p * WINDOW_NODES)
-            self._past_window = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
-            self._past_scattered = ti.ndarray(vec4, p * WINDOW_NODES if self._flowing else 1)
-            self._crowding_window = ti.ndarray(ti.f32, p * WINDOW_NODES if self._fluid else 1)
-            self._report = ti.ndarray(ti.f32, p * SCALARS_PER_BLOCK)
+            self._p_cells, self._p_field = new_array(ivec3, p), new_array(ti.i32, p)
+            self._starts, self._cursors = new_array(ti.i32, p + 1), new_array(ti.i32, p)
+            self._p_neighbours = new_array(ti.i32, p * 27)
+            self._near_of_p, self._near_p = new_array(ti.i32, p), new_array(ti.i32, p)
+            self._meets_p, self._meet_p = new_array(ti.i32, p), new_array(ti.i32, p)
+            self._touched, self._slack = new_array(ti.i32, p), new_array(ti.f32, p)
+            self.pushes = new_array(ti.f32, max(1, p * self._rigid_bodies * PUSH))
+            self._window, self._scattered = new_array(vec4, p * WINDOW_NODES), new_array(vec4, p * WINDOW_NODES)
+            self._past_window = new_array(vec4, p * WINDOW_NODES if self._flowing else 1)
+            self._past_scattered = new_array(vec4, p * WINDOW_NODES if self._flowing else 1)
+            self._crowding_window = new_array(ti.f32, p * WINDOW_NODES if self._fluid else 1)
+            self._report = new_array(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
-            self._p_keys, self._p_slots = ti.ndarray(ti.i64, self._p_mask + 1), ti.ndarray(ti.i32, self._p_mask + 1)
+            self._p_keys, self._p_slots = new_array(ti.i64, self._p_mask + 1), new_array(ti.i32, self._p_mask + 1)
         if g > self._g_capacity:
             self._g_capacity = g
-            self._g_cells, self._g_field = ti.ndarray(ivec3, g), ti.ndarray(ti.i32, g)
-            self._g_neighbours = ti.ndarray(ti.i32, g * 27)
-            self._near_g, self._mate, self._meet = (ti.ndarray(ti.i32, g) for _ in range(3))
-            self._meet_g, self._leads = ti.ndarray(ti.i32, g), ti.ndarray(ti.i32, g)
-            self._nodes, self._sums = ti.ndarray(vec4, g * BLOCK_NODES), ti.ndarray(vec4, g * BLOCK_NODES)
-            self._past_nodes = ti.ndarray(vec4, g * BLOCK_NODES if self._flowing else 1)
-            self._crowding = ti.ndarray(ti.f32, g * BLOCK_NODES if self._fluid else 1)
+            self._g_cells, self._g_field = new_array(ivec3, g), new_array(ti.i32, g)
+            self._g_neighbours = new_array(ti.i32, g * 27)
+            self._near_g, self._mate, self._meet = (new_array(ti.i32, g) for _ in range(3))
+            self._meet_g, self._leads = new_array(ti.i32, g), new_array(ti.i32, g)
+            self._nodes, self._sums = new_array(vec4, g * BLOCK_NODES), new_array(vec4, g * BLOCK_NODES)
+            self._past_nodes = new_array(vec4, g * BLOCK_NODES if self._flowing else 1)
+            self._crowding = new_array(ti.f32, g * BLOCK_NODES if self._fluid else 1)
             crowded = max(1, g * self._rigid_bodies * PUSH) if self._fluid else 1
-            self._crowd_pushes = ti.ndarray(ti.f32, crowded)
-            self._masses = ti.ndarray(ti.f32, g * BLOCK_NODES)
-            self._block_sums = ti.ndarray(ti.f32, g * SUMS)
+            self._crowd_pushes = new_array(ti.f32, crowded)
+            self._masses = new_array(ti.f32, g * BLOCK_NODES)
+            self._block_sums = new_array(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
-            self._g_keys, self._g_slots = ti.ndarray(ti.i64, self._g_mask + 1), ti.ndarray(ti.i32, self._g_mask + 1)
+            self._g_keys, self._g_slots = new_array(ti.i64, self._g_mask + 1), new_array(ti.i32, self._g_mask + 1)
 
     @property
     def device_bytes(self) -> int:

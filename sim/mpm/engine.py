@@ -26,6 +26,7 @@ from .kernels.kernel_arrays import (
 from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
 from .kernels.layout import FIXED_ONE, ivec3, mat3, vec3, vec4
+from .kernels.runtime import new_array
 from .kernels.substep import rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
@@ -88,11 +89,11 @@ class Engine:
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
         self.rigid_bodies = rigid_bodies
         self._most_rigid_bodies = int(numbers.world_integers[:, layout.RIGID_BODIES].max())
-        self._touching = ti.ndarray(ti.f32, max(1, rigid_bodies.count))
+        self._touching = new_array(ti.f32, max(1, rigid_bodies.count))
         self.laws = numbers.laws
         models = law_set(self.laws)
         self.world_count = len(numbers.worlds)
-        self._running = ti.ndarray(ti.i32, self.world_count if lanes.parallel else 1)
+        self._running = new_array(ti.i32, self.world_count if lanes.parallel else 1)
         self._launches = 1
         self.field_count = len(numbers.fields)
         self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
@@ -124,11 +125,11 @@ class Engine:
             pair_count=len(pairs),
             touches=upload_new(touches),
             pairs=upload_new(pairs),
-            touch_sums=ti.ndarray(ti.i64, max(1, len(touches))),
-            pair_sums=ti.ndarray(ti.i64, max(1, len(pairs))),
+            touch_sums=new_array(ti.i64, max(1, len(touches))),
+            pair_sums=new_array(ti.i64, max(1, len(pairs))),
         )
-        self._means = ti.ndarray(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
-        self._control = ti.ndarray(ti.f64, self.world_count * layout.CONTROL_ROW)
+        self._means = new_array(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
+        self._control = new_array(ti.f64, self.world_count * layout.CONTROL_ROW)
         control = np.zeros((self.world_count, layout.CONTROL_ROW))
         control[:, layout.CFL_SCALE] = 1.0
         control[:, layout.STATUS] = layout.DONE
@@ -136,8 +137,8 @@ class Engine:
         self._put_control(control)
         self._capacity = max(1, capacity)
         self._particles = [self._particle_arrays() for _ in range(2)]
-        self._keys = ti.ndarray(ti.i64, self._capacity)
-        self._targets = ti.ndarray(ti.i32, self._capacity)
+        self._keys = new_array(ti.i64, self._capacity)
+        self._targets = new_array(ti.i32, self._capacity)
         self._blocks = BlockLists(
             field_count=self.field_count,
             rigid_bodies=self._most_rigid_bodies,
@@ -164,7 +165,7 @@ class Engine:
             "slopes": vec3,
             "conformation": mat3,
         }
-        return {name: ti.ndarray(kinds[name], self._capacity) for name in self._names}
+        return {name: new_array(kinds[name], self._capacity) for name in self._names}
 
     @property
     def device_bytes(self) -> int:
@@ -504,7 +505,7 @@ def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArr
 def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
     """A new array on the device with the numbers of ``values``, flat; at least one long."""
     kind = ti.i32 if values.dtype == np.int32 else ti.f32
-    array = ti.ndarray(kind, max(1, values.size))
+    array = new_array(kind, max(1, values.size))
     if values.size:
         array.from_numpy(np.ascontiguousarray(values).ravel())
     return array

@@ -7,6 +7,7 @@ import contextlib
 import io
 import logging
 import os
+import weakref
 from typing import Any
 
 import taichi as ti
@@ -121,6 +122,25 @@ def _no_stack(stacklevel: int = 1) -> str:
 def generation() -> int:
     """Number of times that Taichi was started in this process."""
     return _GENERATION
+
+
+def new_array(kind: Any, length: int) -> ti.Ndarray:
+    """A new array of zeros on the device, whose memory is given back when nothing refers to it any more.
+
+    Taichi (1.7) does that for arrays of numbers alone: those of vectors and matrices, nearly all that a world has, stay
+    until it is restarted.
+    """
+    array = ti.ndarray(kind, length)
+    if not hasattr(type(array), "__del__"):
+        weakref.finalize(array, _give_back, _GENERATION, array.arr).atexit = False
+    return array
+
+
+def _give_back(made: int, memory: Any) -> None:
+    """Let Taichi free ``memory`` of an array that was ``made`` in this generation; a restart has freed all before."""
+    program = ti.lang.impl.get_runtime().prog
+    if made == _GENERATION and program is not None:
+        program.delete_ndarray(memory)
 
 
 def _available(arch: str) -> str:
