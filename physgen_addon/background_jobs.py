@@ -19,7 +19,7 @@ import bpy
 from ..sim.errors import Cancelled, PhysGenError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent
 from .compat import OperatorMixin
-from .context import redraw, scene_with
+from .context import TAB, redraw, scene_with
 from .interpreter import NoPython
 from .text import duration, popup
 
@@ -38,7 +38,8 @@ class Job:
     title: its name in the interface. stage, message, done and total (in the stage's units), fraction (0 to 1, None if
     unknown), eta_s: progress as of the last ``step``. notices: messages to the user. details: what the work reported by
     ``{"event": "detail", …}``. operator, scene: the operator that runs it, and the ``session_uid`` of its scene.
-    longest_tick_s: longest time it has blocked the main thread.
+    longest_tick_s: longest time it has blocked the main thread. undone: whether the user has undone anything since it
+    began.
     """
 
     def __init__(self, title: str, work: Work, *, operator: str = "", scene: int = 0) -> None:
@@ -48,6 +49,7 @@ class Job:
         self.total: int | None = None
         self.details: dict[str, Any] = {}
         self.longest_tick_s = 0.0
+        self.undone = False
         self.stage, self.message = "", "starting"
         self.fraction: float | None = None
         self.eta_s: float | None = None
@@ -150,6 +152,12 @@ def stopping() -> list[Job]:
     return list(_stopping)
 
 
+def note_undo() -> None:
+    """Note that the user has undone something while a job runs."""
+    for job in _running:
+        job.undone = True
+
+
 def wait_for(others: list[Job], on_event: OnEvent, cancelled: IsCancelled) -> None:
     """In a job's thread, wait until ``others`` have ended. Raises Cancelled when cancelled."""
     while any(not job.has_ended for job in others):
@@ -177,6 +185,11 @@ class JobOperator(OperatorMixin):
 
     bl_idname: str
     job_title: ClassVar[str] = "Job"
+    keeps_redo: ClassVar[bool] = False
+    """Whether its end is no step of undo if the user has undone something meanwhile: a step would end what can be
+    redone. Only for results that are found again without one."""
+    _drawn: tuple[Any, ...] = ()
+    """What of the job was drawn last."""
 
     def request(self, context: bpy.types.Context) -> Work:
         """Return the work. Raises InputError for missing input."""
@@ -232,10 +245,14 @@ class JobOperator(OperatorMixin):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         result = self.tick()
-        # Sidebars show the progress, some of them in image editors.
-        redraw("VIEW_3D", "UI")
-        redraw("IMAGE_EDITOR", "UI")
-        redraw("DOPESHEET_EDITOR", "WINDOW")
+        shown = (progress_text(self._job), self._job.message, self._job.done)
+        # Without a graphics card each drawing takes what the job could compute with.
+        if shown != self._drawn or result is not None:
+            self._drawn = shown
+            # Sidebars show the progress, some of them in image editors.
+            redraw("VIEW_3D", "UI")
+            redraw("IMAGE_EDITOR", "UI")
+            redraw("DOPESHEET_EDITOR", "WINDOW")
         if result is None:
             return {"PASS_THROUGH"}
         context.window_manager.event_timer_remove(self._timer)
@@ -297,7 +314,7 @@ class JobOperator(OperatorMixin):
         # A command is nothing for a popup: it is in the preferences, and buttons are in the panel.
         words = str(error)
         if isinstance(error, NoPython) and not bpy.app.background:
-            words = f"{error.reason}: install one (see the panel)"
+            words = f"{error.reason} (see Scene in the tab {TAB})"
         is_stop = isinstance(error, Cancelled)
         self.report({"WARNING" if is_stop else "ERROR"}, words if is_stop else popup(words))
         self.stopped(scene, error)
@@ -311,7 +328,7 @@ class JobOperator(OperatorMixin):
         for notice in self._job.notices[-3:]:
             self.report({"INFO"}, notice)
         self.report({"INFO"}, sentence)
-        return {"FINISHED"}
+        return {"CANCELLED"} if self._job.undone and self.keeps_redo else {"FINISHED"}
 
 
 class PHYSGEN_OT_cancel_job(bpy.types.Operator):
@@ -352,7 +369,9 @@ def start_chosen(
 
 def progress_text(job: Job) -> str:
     """Return progress as text, such as ``Diagnose: fits 40 %, 12 s left``; elapsed time if the fraction is unknown."""
-    text = job.title if job.stage in ("", job.title.lower()) else f"{job.title}: {job.stage}"
+    # "Reconstruction: reconstruct" says nothing that "Reconstruction" does not.
+    is_told = not job.stage or job.stage.lower()[:5] == job.title.lower()[:5]
+    text = job.title if is_told else f"{job.title}: {job.stage}"
     if job.fraction is None:
         return f"{text}, {time.monotonic() - job.started:.0f} s"
     text += f" {100 * job.fraction:.0f} %"

@@ -177,7 +177,7 @@ def caches_of(scene: bpy.types.Scene) -> list[Path]:
 
 def concerns(scene: bpy.types.Scene) -> bool:
     """Return whether ``scene`` has bodies or a bake, so that files that do not use PhysGen cost nothing."""
-    return bool(scene.physgen.simulation.bake) or bool(bodies(scene))
+    return bool(scene.physgen.simulation.bake) or bool(bodies(scene)) or bake_job(scene) is not None
 
 
 def refresh(scene: bpy.types.Scene) -> BakeState:
@@ -250,6 +250,11 @@ def _fingerprint(scene: bpy.types.Scene) -> tuple[str, str]:
             known = "", str(error)
         _fingerprints[scene.session_uid] = known
     return known
+
+
+def matches(scene: bpy.types.Scene, record: BakeRecord) -> bool:
+    """Return whether the bake of ``record`` is one of ``scene`` as it is now."""
+    return _fingerprint(scene)[0] in record.fingerprints
 
 
 def _show_matching(scene: bpy.types.Scene) -> None:

@@ -99,15 +99,16 @@ def show_whole(context: bpy.types.Context, scene: bpy.types.Scene, *, colours: s
 
 
 def _leave_sidebar_free(view: bpy.types.RegionView3D, region: bpy.types.Region, area: bpy.types.Area) -> None:
-    """Shrink and shift the camera's frame, which fills ``region``, to where no sidebar covers it."""
-    sidebar = next((other.width for other in area.regions if other.type == "UI" and other.width > 1), 0)
-    if not 0 < sidebar < region.width / 2:
+    """Shrink and shift the camera's frame, which fills ``region``, to where neither sidebar nor toolbar covers it."""
+    widths = {other.type: other.width for other in area.regions if other.width > 1}
+    sidebar, tools = widths.get("UI", 0), widths.get("TOOLS", 0)
+    if not 0 < sidebar + tools < region.width / 2:
         return
-    free = (region.width - sidebar) / region.width
+    free = (region.width - sidebar - tools) / region.width
     # As in Blender's BKE_screen_view3d_zoom_to_fac and BKE_camera_params_from_view3d.
     size = (math.sqrt(2) + view.view_camera_zoom / 50) ** 2 / 4 * free
     view.view_camera_zoom = (math.sqrt(4 * size) - math.sqrt(2)) * 50
-    view.view_camera_offset[0] += (1 - free) / (4 * size)
+    view.view_camera_offset[0] += (sidebar - tools) / region.width / (4 * size)
 
 
 def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
@@ -148,6 +149,7 @@ def show_result(context: bpy.types.Context, image: bpy.types.Image) -> None:
     for area in areas[:1]:
         area.type = "IMAGE_EDITOR"
         area.spaces.active.image = image
+    bpy.app.timers.register(functools.partial(_fit, image.name), first_interval=0.2)
 
 
 def replace_shown(old: bpy.types.Image, new: bpy.types.Image) -> bool:
@@ -158,11 +160,13 @@ def replace_shown(old: bpy.types.Image, new: bpy.types.Image) -> bool:
         area.spaces.active.image = new
         area.tag_redraw()
     bpy.data.images.remove(old)
+    if showing:
+        bpy.app.timers.register(functools.partial(_fit, new.name), first_interval=0.2)
     return bool(showing)
 
 
 def _settle(name: str, tab: str) -> None:
-    """Fit the image ``name`` in the image editors that show it, and switch open sidebars to ``tab``."""
+    """Switch open sidebars to ``tab``, and fit the image ``name`` in the image editors that show it."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions:
@@ -171,6 +175,13 @@ def _settle(name: str, tab: str) -> None:
                     with contextlib.suppress(TypeError, AttributeError):
                         region.active_panel_category = tab
                         area.tag_redraw()
+    _fit(name)
+
+
+def _fit(name: str) -> None:
+    """Fit the image ``name`` in the image editors that show it."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
             shown = area.spaces.active.image if area.type == "IMAGE_EDITOR" else None
             if shown is not None and shown.name == name:
                 region = next(region for region in area.regions if region.type == "WINDOW")

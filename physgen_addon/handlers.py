@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from . import bake_state, blend_trust, paths
+from . import background_jobs, bake_state, blend_trust, paths
 from . import bake_state as unsaved
 from .context import redraw
 from .playback import point_caches
@@ -135,6 +135,8 @@ def _look_at(scene: bpy.types.Scene) -> None:
     before, now = bake_state.last_seen(scene), bake_state.refresh(scene)
     if now != before:
         redraw("VIEW_3D", "UI")
+        # The bar of cached frames.
+        redraw("DOPESHEET_EDITOR", "WINDOW")
     if now.status == "baking" or bake_state.is_stopping(scene):
         bake_state.mark_progress(scene)
 
@@ -162,6 +164,12 @@ def _on_history(*_: Any) -> None:
     bake_state.mark_dirty()
     if bpy.app.background:
         _refresh_all()
+
+
+@persistent
+def _on_undo(*_: Any) -> None:
+    background_jobs.note_undo()
+    _on_history()
 
 
 @persistent
@@ -227,7 +235,7 @@ def _after_save(path: str = "", *_: Any) -> None:
 
 HANDLERS = {
     "depsgraph_update_post": _on_change,
-    "undo_post": _on_history,
+    "undo_post": _on_undo,
     "redo_post": _on_history,
     "load_post": _on_load,
     "blend_import_post": _on_import,

@@ -103,6 +103,12 @@ def named_python() -> Path | None:
     return _home_python() if _home_python().is_file() else None
 
 
+def is_set_up(preferred: str = "") -> bool:
+    """Return whether there is an interpreter for ``find_python`` to try, without starting any: for panels."""
+    named = preferred.strip() or os.environ.get(VARIABLE, "").strip()
+    return bool(named or wheel_folder()) or _home_python().is_file()
+
+
 def python_version(python: Path) -> str:
     """Return the version, such as ``3.13.1``, of an interpreter from ``find_python``."""
     return _checked(str(python), wheels_for(python)).version
@@ -225,12 +231,12 @@ def _home_python() -> Path:
 
 def why_not(version: tuple[int, int], wheels: str, trouble: str) -> str:
     """Return why Blender's own Python of that version, with those wheels, cannot simulate, and the remedy."""
-    which = f"name a Python {_dotted(OLDEST)} to {_dotted(NEWEST)} that has its packages"
-    remedy = f"{which} in PhysGen's preferences, or in {VARIABLE}"
+    remedy = "press Install, or choose another Python in PhysGen's preferences"
     if not OLDEST <= version <= NEWEST:
-        return f"Taichi, which simulates, has no build for Blender's Python {_dotted(version)}: {remedy}"
+        wanted, own = f"{_dotted(OLDEST)} to {_dotted(NEWEST)}", _dotted(version)
+        return f"simulations need Python {wanted}, and Blender's own is {own}: {remedy}"
     if not wheels:
-        return f"PhysGen was installed without its simulation packages: install the zip that has them, or {remedy}"
+        return f"this PhysGen came without its simulation packages: {remedy}"
     return f"Blender's own Python cannot simulate ({trouble}): {remedy}"
 
 

@@ -104,6 +104,7 @@ class Bake(JobOperator):
 
     bl_idname = bake_state.BAKE_OPERATOR
     job_title = "Bake"
+    keeps_redo = True
 
     def request(self, context: bpy.types.Context) -> Work:
         """Export the scene and return the bake job; later edits cannot affect it."""
@@ -169,6 +170,8 @@ class Bake(JobOperator):
             record = read_record(path)
             if record is None or not bake_record.playable(path):
                 return
+            if job.undone and not bake_state.matches(scene, record):
+                return
             show_bake.show(scene, record)
         self._refresh_held_frame(scene, done)
         self._shown = done
@@ -186,6 +189,9 @@ class Bake(JobOperator):
         record = read_record(folder)
         if record is None:
             raise InputError(f"{folder}: the record of the bake is gone; bake again")
+        if self._job.undone and not bake_state.matches(scene, record):
+            bake_state.observe(scene)
+            return "Baked. What was baked is undone: redo it, and the bake is shown"
         troubles = show_bake.show(scene, record)
         # Of the bake: settings may have been undone since it began.
         last = record.frame_start + load_manifest(folder).frames_done - 1

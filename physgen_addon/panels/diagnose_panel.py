@@ -111,9 +111,9 @@ class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
         sizes = {"ball": ("diameter",), "cylinder": ("diameter", "height"), "box": ("edges",), "mesh": ("mesh",)}
         for name in sizes[video.kind]:
             column.prop(video, name)
-        optional(column, video, "own_fps", "fps", "True Frame Rate")
+        optional(column, video, "own_fps", "fps", "True Frame Rate", otherwise="The file's")
         column.prop(video, "start")
-        optional(column, video, "own_end", "end", "Last Frame")
+        optional(column, video, "own_end", "end", "Last Frame", otherwise="The file's")
         if not draw_job(layout, context, "Explanation"):
             row = layout.row()
             row.scale_y = 1.4

@@ -248,7 +248,7 @@ class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
         column = settings(self.layout, context)
         column.prop(body, "fill")
         if not body.fill:
-            optional(column, body, "own_wall", "shell_thickness", "Wall")
+            optional(column, body, "own_wall", "shell_thickness", "Wall", otherwise="Automatic")
         law = body.material.law
         # Only deformable objects can turn to sand.
         if cohesion_of(law) in (SHAPED, COHERENT):

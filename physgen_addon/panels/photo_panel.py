@@ -13,7 +13,7 @@ from ...sim.reconstruct.models.known_models import ISNET
 from ...sim.reconstruct.models.model_folder import model_status
 from .. import text
 from ..context import TAB
-from ..interpreter import photo_check
+from ..interpreter import is_set_up, photo_check
 from ..operators.install_ops import PHYSGEN_OT_improve_cutouts, PHYSGEN_OT_remove_model
 from ..operators.mask_horizon_ops import PHYSGEN_OT_clear_mask, PHYSGEN_OT_paint_mask, PHYSGEN_OT_set_horizon
 from ..operators.photo_object_ops import (
@@ -31,6 +31,7 @@ from ..operators.photo_ops import (
 )
 from ..photo.photo_consent import OFFLINE, is_allowed
 from ..photo.photo_request import made_folder, scene_folder
+from ..props.preferences import python
 from .sidebar import draw_job, optional
 
 KEY_VARIABLE = "PHYSGEN_API_KEY"
@@ -61,7 +62,7 @@ def draw_details(layout: bpy.types.UILayout, context: bpy.types.Context, box: An
     inflated = shape.column()
     inflated.active = box.shape in ("auto", "inflated")
     inflated.prop(box, "back")
-    optional(inflated, box, "own_thickness", "thickness", "Thickness")
+    optional(inflated, box, "own_thickness", "thickness", "Thickness", otherwise="Automatic")
     column.prop(box, "mesh")
     if box.mesh.strip():
         column.prop(box, "mesh_up")
@@ -201,7 +202,8 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if state.image is None:
         text.sentences(layout, context, "A photo of objects on a table or floor. It can be dropped here.")
         return
-    if photo_check.trouble:
+    # The panel Scene of the viewport's sidebar says by itself that there is none.
+    if photo_check.trouble and (editor or is_set_up(python(context))):
         text.sentences(layout, context, f"{photo_check.trouble}.", icon="ERROR")
         layout.operator("physgen.install_python", text="Install…", icon="IMPORT")
     _draw_boxes(layout, context, state)
@@ -248,7 +250,7 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     box = state.boxes[state.box_index]
     column = layout.column(align=True)
     column.use_property_split, column.use_property_decorate = True, False
-    optional(column, box, "knows_size", "size_m", "Size")
+    optional(column, box, "knows_size", "size_m", "Size", otherwise="Estimated")
     if not any(other.size_m > 0 for other in state.boxes):
         text.sentences(layout, context, "Set the size of one object; otherwise the scale is estimated.")
 

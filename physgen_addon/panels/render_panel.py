@@ -53,7 +53,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     choices.prop(rendering, "engine")
     if rendering.engine == "cycles":
         choices.prop(rendering, "device")
-    optional(choices, rendering, "own_samples", "samples", "Samples")
+    optional(choices, rendering, "own_samples", "samples", "Samples", otherwise="Automatic")
     choices.prop(rendering, "size", slider=True)
     choices.prop(rendering, "format")
     choices.prop(rendering, "video")
@@ -133,7 +133,7 @@ class PHYSGEN_PT_look(_OfPhoto, bpy.types.Panel):
         column.column(heading="Floor").prop(rendering, "reflections")
         optional(column, rendering, "blurs_depth", "f_number", "F-Number")
         if rendering.blurs_depth:
-            optional(column, rendering, "own_focus", "focus_distance", "Focus")
+            optional(column, rendering, "own_focus", "focus_distance", "Focus", otherwise="On the objects")
         text.sentences(column, context, "Frame 1 always equals the photo.")
         if rendering.format == "exr_layers":
             column.operator(PHYSGEN_OT_look_nodes.bl_idname, icon="NODE_COMPOSITING")

@@ -18,7 +18,16 @@ from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, i
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
-from .sidebar import COMMAND, SCENE, Sidebar, draw_progress, draw_trouble, draw_trust
+from .sidebar import (
+    COMMAND,
+    SCENE,
+    Sidebar,
+    draw_bake_button,
+    draw_missing_python,
+    draw_progress,
+    draw_trouble,
+    draw_trust,
+)
 
 
 class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
@@ -43,20 +52,24 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
         if not found:
             _draw_beginning(layout, context)
             return
-        what = text.count(len(found), "object")
-        text.sentences(layout, context, f"{what}, without a photo.", icon="CHECKMARK")
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo", icon="IMAGE_DATA")
         row.operator(PHYSGEN_OT_import_scene.bl_idname, text="Import", icon="IMPORT")
 
 
 def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw what must be seen however long the panels below are: progress, or that no Python simulates."""
-    job = running()
+    """Draw what must be seen however long the panels below are: progress, that no Python simulates, or Bake."""
+    job, scene = running(), context.scene
     if job is None:
-        trouble = bake_state.state(context.scene).trouble
-        if COMMAND in trouble:
-            draw_trouble(layout.box(), context, trouble, icon="ERROR")
+        found = bake_state.state(scene)
+        if COMMAND in found.trouble:
+            draw_trouble(layout.box(), context, found.trouble, icon="ERROR")
+        elif draw_missing_python(layout, context) or found.status == "baking":
+            pass
+        elif found.status == "baked" and not found.trouble:
+            text.sentences(layout, context, f"Baked: {text.count(found.frames_done, 'frame')}", icon="CHECKMARK")
+        elif any(item.physgen.role == "dynamic" for item in bodies(scene)):
+            draw_bake_button(layout, found.status)
         return
     shows_photo = not context.scene.physgen.folder and context.scene.physgen_photo.image is not None
     if shows_photo and job.title in photo_panel.JOBS:
@@ -87,12 +100,12 @@ def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> N
         row.scale_y = 1.3
         row.operator(operator.bl_idname, text=label, icon=icon)
     box = layout.box()
-    text.sentences(box, context, "Nothing at hand: one of our own")
+    text.sentences(box, context, "No scene at hand? Try a sample")
     row = box.row(align=True)
     row.scale_y = 1.3
     row.operator(PHYSGEN_OT_open_sample.bl_idname, text="Sample Meshes", icon="SHADERFX").sample = "MESHES"
     row.operator(PHYSGEN_OT_open_sample.bl_idname, text="Sample Photo", icon="IMAGE_REFERENCE").sample = "PHOTO"
-    text.sentences(layout, context, "Then choose materials and velocities here, and press Bake (see Simulate).")
+    text.sentences(layout, context, "Then choose materials and velocities, and press Bake.")
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:

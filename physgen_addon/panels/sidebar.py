@@ -11,14 +11,18 @@ from .. import bake_state, blend_trust, text
 from ..background_jobs import Job, PHYSGEN_OT_cancel_job, progress_text, running
 from ..context import TAB
 from ..gizmos import SHOW_ARROWS
-from ..interpreter import TERMINAL
+from ..interpreter import TERMINAL, is_set_up
 from ..preview import live_preview
 from ..preview.live_preview import PHYSGEN_OT_toggle_preview
 from ..props.body_props import is_body
-from ..props.preferences import PHYSGEN_AP_preferences
+from ..props.preferences import PHYSGEN_AP_preferences, python
 
 SCENE, OBJECTS, MOTION, SIMULATE, RENDER, WORLD, COMPOSE, DIAGNOSE = range(8)
 """``bl_order``: the order of a first visit, so that Bake is in sight; what few need comes last."""
+
+BAKE_LABELS = {"paused": "Resume", "baked": "Bake Again", "stale": "Bake Again", "missing": "Bake Again"}
+BAKE_ICONS = {"paused": "PLAY", "none": "PHYSICS"}
+"""By the bake's state."""
 
 COMMAND = f" In {TERMINAL}:"
 """Prefix of the command that installs missing packages (``interpreter``)."""
@@ -49,13 +53,21 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
     return column
 
 
-def optional(layout: bpy.types.UILayout, data: Any, switched_by: str, value: str, heading: str) -> None:
-    """Draw the checkbox ``switched_by`` and, beside it, the number ``value``, which counts while that is on."""
+def optional(
+    layout: bpy.types.UILayout, data: Any, switched_by: str, value: str, heading: str, *, otherwise: str = ""
+) -> None:
+    """Draw the checkbox ``switched_by`` and, beside it, the number ``value``, which counts while that is on.
+
+    otherwise: what counts while it is off; empty for nothing.
+    """
     row = layout.row(heading=heading, align=True)
     row.prop(data, switched_by, text="")
     field = row.row(align=True)
     field.enabled = getattr(data, switched_by)
-    field.prop(data, value, text="")
+    if otherwise and not field.enabled:
+        field.label(text=otherwise)
+    else:
+        field.prop(data, value, text="")
 
 
 def draw_static_friction_note(layout: bpy.types.UILayout, context: bpy.types.Context, surface: Any) -> None:
@@ -70,10 +82,34 @@ def draw_trouble(layout: bpy.types.UILayout, context: bpy.types.Context, message
     words, command, _ = message.partition(COMMAND)
     text.sentences(layout, context, text.brief(words), icon=icon)
     if command:
-        row = layout.row(align=True)
-        row.operator("physgen.install_python", text="Install…", icon="IMPORT")
-        button = row.operator("preferences.addon_show", text="Choose…", icon="PREFERENCES")
-        button.module = PHYSGEN_AP_preferences.bl_idname
+        _draw_set_up(layout)
+
+
+def _draw_set_up(layout: bpy.types.UILayout) -> None:
+    row = layout.row(align=True)
+    row.operator("physgen.install_python", text="Install…", icon="IMPORT")
+    button = row.operator("preferences.addon_show", text="Choose…", icon="PREFERENCES")
+    button.module = PHYSGEN_AP_preferences.bl_idname
+
+
+def draw_missing_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
+    """Draw that the Python which simulates is still to be set up, before anything is tried; return whether it is."""
+    if is_set_up(python(context)):
+        return False
+    box = layout.box()
+    words = "Before the first bake: simulations run in a Python of their own, which is not set up yet."
+    text.sentences(box, context, words, icon="INFO")
+    _draw_set_up(box)
+    return True
+
+
+def draw_bake_button(layout: bpy.types.UILayout, status: str, *, ready: bool = True) -> None:
+    """Draw *Bake*, as it is called in that state of the bake; grey where nothing can be baked yet."""
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    row.enabled = ready
+    label, icon = BAKE_LABELS.get(status, "Bake"), BAKE_ICONS.get(status, "FILE_REFRESH")
+    row.operator(bake_state.BAKE_OPERATOR, text=label, icon=icon)
 
 
 def draw_trust(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -118,7 +154,7 @@ def draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, job: J
     row.scale_y = 1.4
     row.progress(factor=job.fraction or 0.0, text=progress_text(job))
     if job.message:
-        text.sentences(column, context, job.message)
+        text.sentences(column, context, job.message[0].upper() + job.message[1:])
     return row
 
 

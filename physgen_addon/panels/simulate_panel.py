@@ -26,6 +26,7 @@ from .sidebar import (
     COMMAND,
     SIMULATE,
     Sidebar,
+    draw_bake_button,
     draw_preview,
     draw_progress,
     draw_trouble,
@@ -71,7 +72,7 @@ def _draw_length(layout: bpy.types.UILayout, context: bpy.types.Context, simulat
         return
     shown = f"{frames} frames: {frames / rate:.2g} s at {rate:.4g} fps"
     if simulation.slow != 1.0:
-        shown += f", of {frames / rate / simulation.slow:.2g} s in the scene"
+        shown += f", {frames / rate / simulation.slow:.2g} s of motion"
     text.sentences(layout, context, shown)
 
 
@@ -81,7 +82,8 @@ def _lacking(scene: bpy.types.Scene) -> str:
     if found and all(item.physgen.role == "collider" for item in found):
         return "Nothing moves yet: give an object the role Moves (see Objects)."
     if not found and scene.physgen_photo.image is not None:
-        return "Nothing moves yet: draw boxes and reconstruct the photo (see Scene)."
+        first = "reconstruct the photo" if scene.physgen_photo.boxes else "draw boxes and reconstruct the photo"
+        return f"Nothing moves yet: {first} (see Scene)."
     if not found:
         return "Nothing moves yet: select a mesh, then Simulate Selected (see Scene)."
     return ""
@@ -101,14 +103,9 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
         return
     other = running()
     if other is not None:
-        text.sentences(layout, context, f"{other.title} is running; bake when it is done.", icon="INFO")
-    labels = {"paused": "Resume", "baked": "Bake Again", "stale": "Bake Again", "missing": "Bake Again"}
-    icons = {"paused": "PLAY", "none": "PHYSICS"}
-    row = layout.row(align=True)
-    row.scale_y = 1.4
-    row.enabled = ready
-    label, icon = labels.get(found.status, "Bake"), icons.get(found.status, "FILE_REFRESH")
-    row.operator(PHYSGEN_OT_bake.bl_idname, text=label, icon=icon)
+        what = "Another bake" if other.title == PHYSGEN_OT_bake.job_title else other.title
+        text.sentences(layout, context, f"{what} is running; bake when it is done.", icon="INFO")
+    draw_bake_button(layout, found.status, ready=ready)
     if not ready and found.status == "none":
         return
     _draw_status(layout, context, found)

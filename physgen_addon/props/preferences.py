@@ -5,7 +5,7 @@ import bpy
 
 from .. import text
 from ..context import redraw
-from ..interpreter import TERMINAL, home_folder
+from ..interpreter import TERMINAL, home_folder, is_set_up
 from ..paths import ADDON
 
 
@@ -37,10 +37,12 @@ class PHYSGEN_AP_preferences(bpy.types.AddonPreferences):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the preferences."""
         layout = self.layout
-        layout.label(text="Simulations run in a separate Python process.")
+        layout.label(text="Simulations run in a Python of their own, outside Blender.")
         split = layout.split(factor=0.85, align=True)
-        split.prop(self, "python", placeholder="PHYSGEN_PYTHON, else Blender's own")
+        split.prop(self, "python", placeholder="Automatic")
         split.operator("physgen.check_python")
+        if not self.progress_text and (self.check == "NO" or not is_set_up(self.python)):
+            layout.operator("physgen.install_python", text="Install…", icon="IMPORT")
         if self.progress_text:
             row = layout.row(align=True)
             row.progress(factor=self.progress, text=self.progress_text)
@@ -58,8 +60,7 @@ def _draw_check(self: PHYSGEN_AP_preferences, context: bpy.types.Context) -> Non
         text.sentences(box, context, self.check_text, icon="CHECKMARK" if self.check == "YES" else "ERROR")
         if self.check_command:
             emptied = "empty the field above and " if self.python and str(home_folder()) in self.check_command else ""
-            box.operator("physgen.install_python", text="Install Here…", icon="IMPORT")
-            box.label(text=f"Or type this into {TERMINAL}; when it has ended, {emptied}press Check again:")
+            box.label(text=f"Or run this in {TERMINAL}; when it has ended, {emptied}press Check again:")
             row = box.row(align=True)
             row.prop(self, "check_command", text="")
             row.operator("physgen.copy_command", text="", icon="COPYDOWN").command = self.check_command

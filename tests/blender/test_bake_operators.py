@@ -169,6 +169,25 @@ def test_undoing_a_bake_keeps_it(baked, tmp_path):
     assert status() == "baked"
 
 
+def test_what_was_undone_during_a_bake_can_be_redone_and_is_baked_then(file):
+    show_bake.hide(scene())
+    bpy.data.objects["Cube"].physgen.enabled = False
+    bpy.ops.ed.undo_push(message="before")
+    bpy.data.objects["Cube"].physgen.enabled = True
+    bpy.ops.ed.undo_push(message="added")
+    live = Live()
+    live.begin(bpy.context)
+    bpy.ops.ed.undo()
+    assert bake_state.state(scene()).status == "baking"
+    while (result := live.tick()) is None:
+        time.sleep(0.05)
+    # A step of undo would end what can be redone.
+    assert result == {"CANCELLED"} and "redo it" in live.said[-1][1]
+    assert not scene().physgen.simulation.bake and status() == "none"
+    bpy.ops.ed.redo()
+    assert status() == "baked" and point_caches.MODIFIER in bpy.data.objects["Cube"].modifiers
+
+
 def test_a_file_that_moves_with_its_caches_plays_and_one_without_says_so(file, tmp_path):
     other = tmp_path / "alone"
     other.mkdir()

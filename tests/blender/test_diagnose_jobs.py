@@ -205,6 +205,10 @@ def test_a_job_reports_progress_and_is_cancelled():
         assert not job.step()
         time.sleep(0.02)
     assert background_jobs.progress_text(job) == "Test: fits 25 %, 9 s left"
+    job.title = "Fitting"
+    assert background_jobs.progress_text(job) == "Fitting: fits 25 %, 9 s left"
+    job.title, job.stage = "Reconstruction", "reconstruct"
+    assert background_jobs.progress_text(job) == "Reconstruction 25 %, 9 s left"
     job.cancel()
     with pytest.raises(Cancelled):
         job.wait()

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Which Python simulates: the one that somebody named or none, and what is said where it cannot."""
 
+import importlib
 import shlex
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,6 +14,8 @@ bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import interpreter
 from physgen.physgen_addon.props import preferences
+
+from . import checked_layout
 
 
 @pytest.fixture(autouse=True)
@@ -64,10 +69,36 @@ def test_output_of_other_programs_is_quoted():
 
 def test_why_blenders_own_will_not_do():
     reason = interpreter.why_not((3, 14), "", "it lacks numpy")
-    assert "no build for Blender's Python 3.14: name a Python 3.11 to 3.13" in reason
+    assert "need Python 3.11 to 3.13, and Blender's own is 3.14: press Install" in reason
     lacking = interpreter.why_not((3, 13), "", "it lacks taichi")
-    assert "without its simulation packages: install the zip that has them" in lacking
+    assert "without its simulation packages: press Install" in lacking
     assert "(Taichi does not load)" in interpreter.why_not((3, 11), "/wheels", "Taichi does not load")
+
+
+@pytest.fixture
+def nothing_set_up(tmp_path, monkeypatch):
+    """Blender's own Python without wheels, and nothing in the home folder."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if not (Path(path) / "taichi").is_dir()])
+    importlib.invalidate_caches()
+
+
+@pytest.mark.usefixtures("addon")
+def test_what_is_to_be_set_up_is_said_before_anything_is_tried(nothing_set_up, tmp_path, monkeypatch):
+    scene_panel, own_page = bpy.types.PHYSGEN_PT_scene, preferences.PHYSGEN_AP_preferences
+    install = "physgen.install_python"
+    assert not interpreter.is_set_up()
+    shown = checked_layout.draw(scene_panel)
+    assert install in shown.names and "not set up yet" in " ".join(shown.words)
+    page = SimpleNamespace(python="", progress_text="", check="", bl_rna=own_page.bl_rna)
+    page.layout = checked_layout.CheckedLayout()
+    own_page.draw(page, checked_layout.Context())
+    assert install in page.layout.names
+    monkeypatch.setenv(interpreter.VARIABLE, sys.executable)
+    assert interpreter.is_set_up() and install not in checked_layout.draw(scene_panel).names
+    monkeypatch.delenv(interpreter.VARIABLE)
+    (tmp_path / "physgen-python").symlink_to(sys.prefix)
+    assert interpreter.is_set_up() and install not in checked_layout.draw(scene_panel).names
 
 
 def test_the_environment_that_the_command_makes_is_found_unnamed(tmp_path, monkeypatch):

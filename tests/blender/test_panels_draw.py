@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from physgen import physgen_addon
 from physgen.physgen_addon import background_jobs, bake_state
-from physgen.physgen_addon.panels import simulate_panel
+from physgen.physgen_addon.panels import sidebar, simulate_panel
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS
 
 from . import checked_layout
@@ -139,11 +139,32 @@ def test_a_job_that_runs_locks_what_it_reads_and_can_be_cancelled():
         shown = draw_all()
         assert any("Bake is running" in " ".join(layout.words) for layout in shown.values())
         words = shown["PHYSGEN_PT_scene"].words
-        assert job.message not in words and job.message in " ".join(words)
+        assert job.message not in words and f"F{job.message[1:]}" in " ".join(words)
     finally:
         go_on.set()
         job.wait()
         background_jobs._running.clear()
+
+
+def test_bake_is_in_the_first_panel_until_it_is_done():
+    """In Blender's own layout the panel Simulate begins below a laptop's window."""
+    assert "physgen.bake" not in draw_all("PT_scene")["PHYSGEN_PT_scene"].names
+    item = a_body()
+    assert "physgen.bake" in draw_all("PT_scene")["PHYSGEN_PT_scene"].names
+    item.physgen.role = "collider"
+    assert "physgen.bake" not in draw_all("PT_scene")["PHYSGEN_PT_scene"].names
+    layout = checked_layout.CheckedLayout()
+    sidebar.draw_bake_button(layout, "stale")
+    assert layout.words == ["Bake Again"]
+
+
+def test_what_counts_instead_of_a_number_that_is_off_is_said():
+    rendering = bpy.context.scene.physgen.rendering
+    for own, words in ((False, ["Automatic"]), (True, [])):
+        rendering.own_samples = own
+        layout = checked_layout.CheckedLayout()
+        sidebar.optional(layout, rendering, "own_samples", "samples", "Samples", otherwise="Automatic")
+        assert layout.words == words and ("samples" in layout.names) == own
 
 
 NUMBERS = st.floats(-1, 1e6, width=32) | st.sampled_from([-1.0, 0.0, math.nan, math.inf])

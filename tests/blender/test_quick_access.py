@@ -9,7 +9,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 import physgen
-from physgen.physgen_addon import paths
+from physgen.physgen_addon import context, paths
 from physgen.physgen_addon.operators import asset_ops, photo_ops, quick_ops
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
@@ -159,3 +159,18 @@ def test_opening_a_photo_in_the_background_leaves_the_areas_alone():
     before = [area.type for area in screen.areas]
     assert bpy.ops.physgen.open_sample(sample="PHOTO") == {"FINISHED"}
     assert [area.type for area in screen.areas] == before and "IMAGE_EDITOR" not in before
+
+
+def test_the_cameras_frame_leaves_sidebar_and_toolbar_free():
+    def framed(**widths):
+        view = SimpleNamespace(view_camera_zoom=0.0, view_camera_offset=[0.0, 0.0])
+        regions = [SimpleNamespace(type=kind, width=width) for kind, width in widths.items()]
+        context._leave_sidebar_free(view, SimpleNamespace(width=1000), SimpleNamespace(regions=regions))
+        return view.view_camera_zoom, view.view_camera_offset[0]
+
+    zoom, offset = framed(UI=250)
+    assert zoom < 0 < offset
+    smaller, less = framed(UI=250, TOOLS=50)
+    assert smaller < zoom and 0 < less < offset
+    # Between two of the same width it stays in the middle; closed ones have a width of 1.
+    assert framed(UI=200, TOOLS=200)[1] == 0.0 and framed(UI=1, TOOLS=1) == (0.0, 0.0)
