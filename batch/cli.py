@@ -7,6 +7,7 @@ Its parser has commands in groups, one short usage line, and errors without the 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import os
 import re
@@ -27,7 +28,7 @@ from ..sim.cache.folder_lock import LOCK_FILE, release_all, remove_dead_lock
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import ANYWAY, OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
-from ..sim.files import shown
+from ..sim.files import NOT_UTF8, shown, utf8
 from ..sim.memory import ran_out
 from ..sim.processes import kill_children
 from ..sim.trust import LIST_FILE, config_folder
@@ -271,6 +272,17 @@ def _named_paths(options: argparse.Namespace) -> Iterator[Path]:
                 yield item
 
 
+def _require_utf8(options: argparse.Namespace) -> None:
+    """Raise InputError for a path whose bytes are no UTF-8: libraries below would end in the middle of the work."""
+    here = []
+    # A working folder that is gone is none.
+    with contextlib.suppress(OSError):
+        here.append(Path.cwd())
+    for path in (*_named_paths(options), *here):
+        if not utf8(str(path)):
+            raise InputError(f"{shown(path)}: {NOT_UTF8}")
+
+
 def force_exit(terminal: Terminal) -> NoReturn:
     """End a command that does not stop by itself, and leave nothing of it but what was complete."""
     kill_children()
@@ -310,6 +322,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     with stop_signals(lambda: force_exit(terminal)) as stopped:
         try:
             # Before this command has a temporary folder of its own: the others' are beside it.
+            _require_utf8(options)
             recover(options, terminal)
             with atomic.own_scratch():
                 return run(options, terminal, lambda: stopped() or terminal.reader_gone)

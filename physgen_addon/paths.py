@@ -14,6 +14,7 @@ import bpy
 
 from ..sim.cache.bake_folder import load_manifest
 from ..sim.errors import InputError
+from ..sim.files import shown
 from ..sim.validation import DEVICES
 from . import blend_trust
 
@@ -37,6 +38,20 @@ def user_folder(name: str, *, create: bool = False) -> Path:
     if not folder:
         raise InputError("Blender has no folder for the user's files; set BLENDER_USER_RESOURCES to one")
     return Path(folder)
+
+
+LONGEST_FOR_BLENDER = 1023
+"""Bytes of the longest path that Blender opens (FILE_MAX)."""
+
+
+def for_blender(path: Path) -> str:
+    """Return ``path`` for Blender's own readers. Raises InputError for one in which they see another: Blender takes
+    backslashes for slashes, also where they are not, and cuts what is long."""
+    text = str(path)
+    if (os.sep != "\\" and "\\" in text) or len(os.fsencode(text)) > LONGEST_FOR_BLENDER:
+        limit = f"backslashes or more than {LONGEST_FOR_BLENDER} bytes"
+        raise InputError(f"{shown(text)}: Blender opens no path with {limit}; rename or move its folder")
+    return text
 
 
 def require_folder(path: str, what: str) -> Path:

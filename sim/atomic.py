@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
-from .files import to_disk
+from .files import shown, to_disk
 from .processes import MARK, Mark, own_mark, parse_mark
 
 WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
@@ -35,6 +35,8 @@ _PATIENT = os.name == "nt"
 _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK})(?P<suffix>(?:\.[^/]*)?)", re.DOTALL)
 _SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
 
+LONGEST_NAME = 255
+"""Bytes of the longest name on usual file systems."""
 MOST_DEPTH, MOST_ENTRIES = 3, 100_000
 """Depth, and number of names, to which ``recover`` looks in a folder: ours are not deeper."""
 
@@ -50,6 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
     folder cannot be written.
     """
     partial = path.with_name(f".{path.stem}.partial-{own_mark()}{path.suffix}")
+    _require_short(path, partial)
     _unfinished.add(partial)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,6 +67,16 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         _remove(partial)
         _unfinished.discard(partial)
+
+
+def _require_short(path: Path, *temporary: Path) -> None:
+    """Raise InputError if a ``temporary`` name of ``path`` is longer than file systems allow."""
+    longest = max(len(os.fsencode(name.name)) for name in temporary)
+    if longest > LONGEST_NAME:
+        most = LONGEST_NAME - longest + len(os.fsencode(path.name))
+        raise InputError(
+            f"{shown(final_path(path))}: the name is too long to be written; choose one of at most {most} bytes"
+        )
 
 
 @contextmanager
@@ -92,9 +105,10 @@ def replacing_tree(out: Path) -> Iterator[Path]:
     ``out`` is at every moment the whole earlier folder or the whole new one, whatever kills the process: the two are
     exchanged in one call, where the system has one. Elsewhere the earlier one is moved aside first, and a process that
     dies between the two calls leaves it as ``.NAME.old-MARK``, from where ``recover`` puts it back. The caller holds a
-    lock of ``out``. Raises OSError.
+    lock of ``out``. Raises OSError, and InputError for a name that is too long.
     """
     partial, old = (out.with_name(f".{out.name}.{role}-{own_mark()}") for role in ("partial", "old"))
+    _require_short(out, partial)
     _unfinished.add(partial)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -114,6 +114,9 @@ def name_for_ffmpeg(path: Path) -> str:
 
     The name is absolute, as a relative one such as ``data:x/video`` would be taken for a protocol.
     """
+    if not utf8(str(path)):
+        # OpenCV 5.0 ends the whole process instead.
+        raise InputError(f"{shown(path)}: {NOT_UTF8}")
     given = os.environ.get(VIDEO_VARIABLE, "")
     if not given.endswith(_VIDEO_BOUNDS):
         os.environ[VIDEO_VARIABLE] = f"{given}|{_VIDEO_BOUNDS}" if given else _VIDEO_BOUNDS
@@ -142,6 +145,18 @@ def to_disk(path: Path) -> None:
             raise
     finally:
         os.close(number)
+
+
+NOT_UTF8 = "the name is no UTF-8, which the libraries that write pictures and videos need; rename it"
+
+
+def utf8(name: str) -> bool:
+    """Return whether ``name``, of a file as Python gives it, is UTF-8 and not other bytes."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def is_file(path: Path) -> bool:

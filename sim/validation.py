@@ -283,9 +283,15 @@ def valid_names(wanted: Sequence[str]) -> list[str]:
     return found
 
 
+def may_be_named(name: str) -> bool:
+    """Return whether all of ``name`` may be in the name of an object or preset: letters of any script with the marks
+    that belong to them (vowels of Hindi, accents that are not composed), digits, spaces, ``_`` and ``-``."""
+    return all(c.isalnum() or c in "_- " or unicodedata.category(c).startswith("M") for c in name)
+
+
 def _cleaned(name: str) -> str:
     composed = unicodedata.normalize("NFC", name)
-    allowed = "".join(c if c.isalnum() or c in "_- " else "_" for c in composed).strip()
+    allowed = "".join(c if may_be_named(c) else "_" for c in composed).strip()
     cut = _cut(allowed, 0) or "object"
     return f"{cut}_" if cut.casefold() in DEVICES | {GROUND} else cut
 

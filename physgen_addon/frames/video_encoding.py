@@ -48,12 +48,23 @@ def encode_video(
     with tempfile.TemporaryDirectory(prefix=scratch_prefix("video")) as folder:
         staged = _staged(frames, Path(folder), cancelled)
         with replacing(video) as partial:
-            _encode(staged, partial.resolve(), fps, progress)
+            _encode(staged, _plainly_named(partial.resolve(), Path(folder)), fps, progress)
             # Blender does not report a full disk.
             found = _count(partial)
             if found != len(frames):
                 message = f"only {found} of {len(frames)} frames are in the file; free space, then encode again"
                 raise RenderError(f"{video}: {message}")
+
+
+def _plainly_named(video: Path, folder: Path) -> Path:
+    """Return a link to ``video`` in ``folder``: Blender puts frame numbers in place of ``#`` in the name that it
+    writes to, and values in place of ``{…}``. Where there are no links, ``video`` itself."""
+    link = folder / f"video{video.suffix}"
+    try:
+        link.symlink_to(video)
+    except OSError:
+        return video
+    return link
 
 
 def _count(video: Path) -> int:

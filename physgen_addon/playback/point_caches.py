@@ -13,6 +13,7 @@ from ...sim.cache.folder_lock import is_locked
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
 from ...sim.scene.folder import Scene
+from ..paths import for_blender
 
 MODIFIER = "PhysGen cache"
 
@@ -149,7 +150,7 @@ def attach(item: bpy.types.Object, cache: Pc2Reader, first_frame: int) -> bpy.ty
     require_fit(cache, len(item.data.vertices), item.name)
     modifier = item.modifiers.get(MODIFIER) or item.modifiers.new(MODIFIER, "MESH_CACHE")
     modifier.cache_format = "PC2"
-    modifier.filepath = str(cache.path.resolve())
+    modifier.filepath = for_blender(cache.path.resolve())
     modifier.interpolation = "LINEAR"
     modifier.frame_start = first_frame
     return modifier
@@ -162,6 +163,7 @@ def attach_as_first(item: bpy.types.Object, cache: Pc2Reader, path: str, first_f
     nothing is evaluated again.
     """
     require_fit(cache, len(item.data.vertices), item.name)
+    for_blender(cache.path.resolve())
     modifier = item.modifiers.get(MODIFIER)
     if modifier is None:
         modifier = item.modifiers.new(MODIFIER, "MESH_CACHE")

@@ -25,6 +25,7 @@ from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
 from ...sim.scene.model import Camera, Ground, SceneObject
 from .. import compat
 from ..frames.frame_files import read_layers
+from ..paths import for_blender
 from ..playback import point_caches
 from ..scene_io.photo_view import add_camera, aim_camera, new_sun, photo_uv, render_size
 from . import render_engines
@@ -225,7 +226,7 @@ def add_environment(scenes: list[bpy.types.Scene], folder: Scene) -> float:
         shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     else:
         texture = tree.nodes.new("ShaderNodeTexEnvironment")
-        texture.image = bpy.data.images.load(str(sky.path))
+        texture.image = bpy.data.images.load(for_blender(sky.path))
         texture.image.colorspace_settings.name = "Linear Rec.709"
         tree.links.new(texture.outputs["Color"], shader.inputs["Color"])
         # Sampled at the map's own resolution; the automatic choice is larger and costs time in every frame.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
 from ..cache.pc2 import Pc2Reader
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
-from ..files import is_file
+from ..files import is_file, shown
 from ..memory import ran_out
 from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
@@ -83,6 +84,8 @@ def export_usd(
     file = Path(file)
     if file.suffix.lower() not in ENDINGS:
         raise InputError(f"{file}: give a name that ends in {' or '.join(ENDINGS)}")
+    if any(unicodedata.category(c) == "Cc" for c in file.stem):
+        raise InputError(f"{shown(file)}: USD names no textures by control characters; choose another name")
     if file.exists():
         raise InputError(f"{file}: is there already; choose another name")
     try:

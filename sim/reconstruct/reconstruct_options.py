@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from ..errors import InputError
 from ..scene.equirectangular import FRAMES
 from ..scene.model import SceneObject, Vector
 from ..trust import UntrustedSpec
-from ..validation import quantity, require, require_quantities
+from ..validation import DEVICES, GROUND, quantity, require, require_quantities
 
 SHAPES = ("auto", "inflated", "box", "cylinder", "sphere")
 BACKS = ("auto", "symmetric", "flat")
@@ -179,12 +180,17 @@ class ReconstructOptions:
 
 
 def object_names(objects: Sequence[ObjectRequest]) -> list[str]:
-    """Return the names of ``objects``. Raises InputError for a name that is invalid or occurs twice."""
+    """Return the names of ``objects``. Raises InputError for a name that is invalid, reserved or occurs twice.
+
+    The objects' files are called by it, also on Windows and macOS.
+    """
     names = [item.name or f"object_{number}" for number, item in enumerate(objects, start=1)]
     for name in names:
         # The scene model validates names; do it before any work is done.
         SceneObject(name=name, mesh="-", size_m=1.0)
-    folded = [name.casefold() for name in names]
+        taken = "the ground is called that" if name == GROUND else "Windows has no file of that name"
+        require(name.casefold() not in DEVICES | {GROUND}, "object.name", name, f"{taken}; choose another")
+    folded = [unicodedata.normalize("NFC", name).casefold() for name in names]
     if len(set(folded)) < len(folded):
         raise InputError(f"objects are named {names!r}: give every object a name of its own")
     return names

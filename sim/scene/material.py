@@ -15,7 +15,7 @@ from ..atomic import replacing
 from ..constitutive import RIGID, models
 from ..errors import InputError
 from ..files import read_toml
-from ..validation import DEVICES, finite, parse, quantity, require, require_quantities
+from ..validation import DEVICES, finite, may_be_named, parse, quantity, require, require_quantities
 
 LAWS = (*(model.law for model in models()), RIGID)
 """Constitutive models by name, and RIGID."""
@@ -151,7 +151,7 @@ def read_presets(folder: Path) -> PresetFolder:
 
 def check_preset_name(name: str) -> None:
     """Raise InputError unless ``name`` is a valid file name on every system."""
-    good = 0 < len(name) <= 48 and name == name.strip() and all(c.isalnum() or c in "_- " for c in name)
+    good = 0 < len(name) <= 48 and name == name.strip() and may_be_named(name)
     if not good:
         raise InputError(f"preset name {name!r}: use up to 48 letters, digits, spaces, '_' and '-'")
     if name.casefold() in _RESERVED:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..constitutive import RIGID, model_of
-from ..validation import finite, quantity, range_of, require, require_quantities, require_range
+from ..validation import finite, may_be_named, quantity, range_of, require, require_quantities, require_range
 from .material import Material
 
 Vector = tuple[float, float, float]
@@ -282,10 +282,7 @@ class SceneObject:
 
     def __post_init__(self) -> None:
         allowed = (
-            bool(self.name)
-            and len(self.name) <= 64
-            and all(c.isalnum() or c in "_- " for c in self.name)
-            and self.name == self.name.strip()
+            bool(self.name) and len(self.name) <= 64 and may_be_named(self.name) and self.name == self.name.strip()
         )
         require(allowed, "object.name", self.name, "use up to 64 letters, digits, spaces, '_' and '-'")
         require(self.role in ROLES, f"object {self.name}: role", self.role, f"choose one of {', '.join(ROLES)}")

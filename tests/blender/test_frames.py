@@ -2,6 +2,7 @@
 """The loop over frames: what is skipped, what is resumed, what is refused; the script; the video."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +89,13 @@ def test_unusable_input_is_named(world, bake, tmp_path):
     write_png(foreign / "0001.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match="choose an empty or new folder"):
         render_frames(world.folder, load_bake(bake(SHIFTS, "again")), out=foreign, options=QUICK)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="backslashes separate folders there")
+def test_a_cache_that_blender_would_not_find_is_refused(world, bake, tmp_path):
+    """It takes the backslash for a slash, and a missing cache for one that does not move."""
+    with pytest.raises(InputError, match=r"backslashes .* rename or move its folder"):
+        render_frames(world.folder, load_bake(bake(SHIFTS, "a\\b")), out=tmp_path / "frames", options=QUICK)
 
 
 @pytest.mark.parametrize(

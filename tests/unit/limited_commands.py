@@ -104,19 +104,20 @@ def run(words: str, name: str, folder: Path) -> tuple[int, str]:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), said
 
 
-def draw(folder: Path) -> None:
-    """Write the inputs of all commands into ``folder``."""
+def draw(folder: Path, *, frames: int = 2) -> None:
+    """Write the inputs of all commands, of ``frames`` baked frames, into ``folder``."""
     folder.mkdir()
     draw_inputs(folder)
     (folder / "whole").mkdir()
-    points = np.random.default_rng(0).random((2, 162, 3))
+    points = np.random.default_rng(0).random((frames, 162, 3))
     items = []
     for name in "ab":
         with Pc2Writer(folder / "whole" / f"{name}.pc2", vertex_count=162, start_frame=1) as cache:
             for sample in points:
                 cache.append(sample)
         items.append(BakedObject(name=name, file=f"{name}.pc2", vertices=162))
-    numbers = {"inputs_hash": "0" * 64, "fps": 24.0, "frame_start": 1, "frames": 2, "frames_done": 2, "particles": 324}
+    numbers = {"inputs_hash": "0" * 64, "fps": 24.0, "frame_start": 1, "particles": 324}
+    numbers |= {"frames": frames, "frames_done": frames}
     manifest = BakeManifest(**numbers, state="complete", engine="mpm", version=VERSION, objects=tuple(items))
     save_manifest(folder / "whole", manifest)
 
