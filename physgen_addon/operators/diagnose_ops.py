@@ -93,7 +93,7 @@ def _fill_trials(state: bpy.types.PropertyGroup, capture: Capture) -> None:
         line.name = trial.name
         rate = (len(trial.times) - 1) / (trial.times[-1] - trial.times[0])
         what = "" if trial.role == "fit" else "; its end is withheld"
-        line.label = f"{len(trial.times)} frames at {rate:.4g} Hz, {trial.observed.shape[1]} points{what}"
+        line.label = f"{len(trial.times)} frames at {rate:.4g} Hz, {count(trial.observed.shape[1], 'point')}{what}"
     state.capture_warnings.clear()
     for text in capture.warnings:
         state.capture_warnings.add().text = text
@@ -132,7 +132,7 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
             folder = None
         is_first = state.root is None
         capture = show_capture(scene, folder)
-        hidden = _hide_around(scene) if is_first else ""
+        hidden = _show_first(scene) if is_first else ""
         if folder is not None:
             state.report = str(folder)
         turn_to(context, *capture_view.capture_bounds(state.root, state.trial))
@@ -141,6 +141,14 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
         trials = f"{count(len(capture.trials), 'trial')} of {capture_folder(state.capture).name}"
         self.report({"INFO"}, f"{trials} loaded{hidden}")
         return {"FINISHED"}
+
+
+def _show_first(scene: bpy.types.Scene) -> str:
+    """Go to the middle of the recording, where trails show its motion, and hide what it lies inside; return the end of
+    a report.
+    """
+    scene.frame_set((scene.frame_start + scene.frame_end) // 2)
+    return _hide_around(scene)
 
 
 def _hide_around(scene: bpy.types.Scene) -> str:
@@ -314,7 +322,7 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
         is_first = state.root is None
         show_capture(scene, Path(state.report))
         if is_first:
-            _hide_around(scene)
+            _show_first(scene)
         turn_to(bpy.context, *capture_view.capture_bounds(state.root, state.trial))
         return str(state.summary)
 

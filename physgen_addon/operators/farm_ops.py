@@ -17,6 +17,7 @@ from ...sim.atomic import write_bytes
 from ...sim.errors import InputError, RenderError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
+from .. import blend_trust
 from ..background_jobs import JobOperator, Work
 from ..interpreter import cli_command, find_python, require_renderer
 from ..paths import require_folder, require_writable
@@ -31,10 +32,10 @@ JOB_FILE, SCENE = "job.toml", "scene"
 NAME, CLIP = "results", "clip"
 """Names of the job, which is that of the folder of its results, and of its only scene there."""
 START = {
-    "flamenco": "submit job.json there to Flamenco (docs/farm.md)",
-    "slurm": "run submit.sh there on the cluster",
+    "flamenco": ("job.json", "Submit job.json to Flamenco (see docs/farm.md)."),
+    "slurm": ("submit.sh", "Run submit.sh on the cluster."),
 }
-"""Next step with a job that was written for another machine."""
+"""Of a job that was written for another machine: the file that starts it, and the next step."""
 VARIANT = "base"
 """Of the only variant, as the job file calls it."""
 
@@ -49,6 +50,19 @@ def command(scene: bpy.types.Scene) -> str:
     """Return the same as a command to be typed where PhysGen is installed."""
     rendering = scene.physgen.rendering
     return shlex.join(["physgen", *arguments(Path(bpy.path.abspath(rendering.farm_folder)), rendering.farm)])
+
+
+def written(scene: bpy.types.Scene) -> tuple[Path, str] | None:
+    """Return where the job is that was written for the chosen farm, and the next step; None if there is none.
+
+    Nothing is looked for where somebody else's file points and the user has not agreed to it.
+    """
+    rendering = scene.physgen.rendering
+    if rendering.farm not in START or blend_trust.is_pending(rendering.farm_folder):
+        return None
+    folder = Path(bpy.path.abspath(rendering.farm_folder)) / rendering.farm
+    name, step = START[rendering.farm]
+    return (folder, step) if (folder / name).is_file() else None
 
 
 def job_text(bake: BakeOptions, render: RenderOptions, *, video: str, chunk: int) -> str:
@@ -109,7 +123,13 @@ class PHYSGEN_OT_farm(JobOperator, bpy.types.Operator):
                 # Each task is a process of that interpreter; Blender itself cannot be one.
                 require_renderer(interpreter)
             line = cli_command(interpreter, *arguments(folder, target))
-            return {**run_stage(line, on_event, cancelled, failure=RenderError), "folder": str(folder)}
+
+            def relay(event: Event) -> None:
+                # Of "clip/base/render-0001-0024" the task alone: there is one scene, and one variant of it.
+                task = str(event.get("message") or "").removeprefix(f"{CLIP}/{VARIANT}/")
+                on_event({**event, "stage": "", "message": task} if event.get("event") == "progress" else event)
+
+            return {**run_stage(line, relay, cancelled, failure=RenderError), "folder": str(folder)}
 
         return work
 
@@ -117,12 +137,12 @@ class PHYSGEN_OT_farm(JobOperator, bpy.types.Operator):
         """Report what was made."""
         rendering, folder = scene.physgen.rendering, Path(str(final["folder"]))
         if rendering.farm != "local":
-            return f"the job is written to {folder / rendering.farm}: {START[rendering.farm]}"
+            return f"The job is written to {folder / rendering.farm}. {START[rendering.farm][1]}"
         video = folder / NAME / CLIP / VARIANT / f"video.{rendering.video}"
         if not video.is_file():
             raise InputError(f"{video}: is not there, although the job has ended; see {folder / NAME}")
         rendering.result = str(video)
-        return f"rendered {video}"
+        return f"Rendered {video}"
 
 
 class PHYSGEN_OT_copy_farm_command(bpy.types.Operator):

@@ -69,7 +69,7 @@ class PHYSGEN_PT_diagnose(Sidebar, bpy.types.Panel):
         if state.root is not None:
             row.operator(PHYSGEN_OT_clear_capture.bl_idname, text="", icon="TRASH")
         if state.root is None:
-            text.sentences(layout, context, "Choose a capture folder: capture.json, meshes and tracked trials.")
+            text.sentences(layout, context, "Choose a capture, a folder with capture.json, or open From a Video below.")
             return
         row = layout.row(align=True)
         row.prop(state, "trial")
@@ -113,7 +113,7 @@ class PHYSGEN_PT_diagnose_video(_Part, bpy.types.Panel):
             column.prop(video, name)
         optional(column, video, "own_fps", "fps", "True Frame Rate", otherwise="The file's")
         column.prop(video, "start")
-        optional(column, video, "own_end", "end", "Last Frame", otherwise="The file's")
+        optional(column, video, "own_end", "end", "Last Frame", otherwise="The last one")
         if not draw_job(layout, context, "Explanation"):
             row = layout.row()
             row.scale_y = 1.4

@@ -9,8 +9,7 @@ import bpy
 
 from .. import blend_trust, text
 from ..background_jobs import running
-from ..interpreter import missing_modules
-from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command
+from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command, written
 from ..operators.render_ops import (
     PHYSGEN_OT_export_alembic,
     PHYSGEN_OT_export_usd,
@@ -61,8 +60,6 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     if rendering.output.startswith("//") and not bpy.data.filepath:
         words = "Until this file is saved, frames go to a temporary folder."
         text.sentences(layout, context, words, icon="INFO")
-    if missing_modules():
-        text.sentences(layout, context, "Rendered by the Python that simulates (see Preferences).", icon="INFO")
     if not draw_job(layout, context, "Render") and not state.simulation.bake:
         text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
     row = layout.row(align=True)
@@ -163,9 +160,16 @@ class PHYSGEN_PT_farm(_OfPhoto, bpy.types.Panel):
             text="Bake and Render Here" if here else "Write the Job",
             icon="RENDER_ANIMATION" if here else "EXPORT",
         )
+        found = written(context.scene)
+        if found is not None:
+            folder, step = found
+            row = layout.row(align=True)
+            text.sentences(row, context, f"Written to {folder.name}. {step}", icon="CHECKMARK")
+            if blend_trust.may_open(folder):
+                row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(folder)
         box = layout.box()
         row = box.row(align=True)
-        row.label(text="The same in a terminal:", icon="CONSOLE")
+        row.label(text="In a terminal, once it is written:", icon="CONSOLE")
         row.operator(PHYSGEN_OT_copy_farm_command.bl_idname, text="", icon="COPYDOWN")
         text.sentences(box, context, command(context.scene))
 

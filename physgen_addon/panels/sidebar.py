@@ -154,7 +154,7 @@ def draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, job: J
     row.scale_y = 1.4
     row.progress(factor=job.fraction or 0.0, text=progress_text(job))
     if job.message:
-        text.sentences(column, context, job.message[0].upper() + job.message[1:])
+        text.sentences(column, context, job.message)
     return row
 
 

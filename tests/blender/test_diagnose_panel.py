@@ -60,6 +60,8 @@ def test_points_are_where_they_were_seen(throw):
     state = load(folder)
     scene = bpy.context.scene
     assert (scene.frame_start, scene.frame_end) == (1, FRAMES)
+    # In the middle of the motion, where its trails are seen; the first frame shows none.
+    assert scene.frame_current == (1 + FRAMES) // 2 and "8 points" in state.trials[0].label
     assert scene.render.fps / scene.render.fps_base == pytest.approx(RATE)
     assert state.trial == "take é"
     for index in (0, 4, FRAMES - 1):

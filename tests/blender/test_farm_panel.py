@@ -23,6 +23,8 @@ from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.model import Ground
 
+from . import checked_layout
+
 NAMES = {"ball": "ball"}
 
 
@@ -92,8 +94,13 @@ def test_the_job_file_says_everything(photo, tmp_path, capfd):
     assert planned.options == dataclasses.replace(render_options(rendering), f_number=planned.options.f_number)
     assert (tmp_path / "physgen_farm" / "flamenco" / "job.json").is_file()
     # What there is to do, not a list of a dozen files in one line of the status bar.
-    (said,) = [line for line in capfd.readouterr().out.splitlines() if "the job is written" in line]
-    assert said.endswith("flamenco: submit job.json there to Flamenco (docs/farm.md)")
+    (said,) = [line for line in capfd.readouterr().out.splitlines() if "The job is written" in line]
+    assert said.endswith("flamenco. Submit job.json to Flamenco (see docs/farm.md).")
+    # It stays in the panel, for that farm alone.
+    panel = bpy.types.PHYSGEN_PT_farm
+    assert "Submit job.json" in " ".join(checked_layout.draw(panel).words)
+    rendering.farm = "slurm"
+    assert farm_ops.written(bpy.context.scene) is None and "Submit" not in " ".join(checked_layout.draw(panel).words)
 
 
 def test_what_a_photos_scene_cannot_say_is_refused_before_anything_is_written(photo, tmp_path):
