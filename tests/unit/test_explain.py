@@ -283,18 +283,13 @@ def test_a_slope_is_found_from_the_path_alone(angle, friction, scale, left):
     assert view.kind == "slope"
     assert np.degrees(np.arctan2(abs(view.normal[0]), view.normal[2])) == pytest.approx(angle, abs=1.0)
     assert view.normal[0] * way[0] > 0
-    # Nothing gains speed on a level surface: a disc on its rim looks like one from above.
-    with pytest.raises(InputError, match="rolls on its rim"):
-        understand_motion(
-            t,
-            places,
-            diameter_px=0.05 * scale,
-            diameter=0.05,
-            clearance=0.02,
-            elevation=1.2,
-            where="v",
-            from_above=True,
-        )
+    # Nothing gains speed on a level surface; but a disc on its rim looks like one from above.
+    known = {"diameter_px": 0.05 * scale, "diameter": 0.05, "clearance": 0.02, "elevation": 1.2, "from_above": True}
+    with pytest.raises(InputError, match="film a slope from its side"):
+        understood(t, places, **known)
+    rolls = understood(t, places, **known, rim=0.025)
+    assert rolls.on_rim and rolls.kind == "slope"
+    assert np.linalg.norm(rolls.point) == pytest.approx(0.025)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from .multiple_shooting import Fit, solve
 from .observed_poses import ObservedBody, frame_pose, observe_body, turns_on_a_face
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, tether_numbers
 from .rigid_misfit import misfit
-from .rigid_simulator import RigidWorlds, rigid_body
+from .rigid_simulator import RigidWorlds, on_its_rim, rigid_body
 from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem
 from .start_numbers import missing_forces, tether_start
 from .state_tracking import initial_camera, track_states, weight_contacts
@@ -86,9 +86,13 @@ class BodyFits:
 def body_problem(capture: Capture, index: int, work: Work) -> Problem:
     """Return the trials of object ``index`` of ``capture``, with nodes and initial states."""
     body = rigid_body(capture.objects[index])
-    simulator = RigidWorlds(body=body, work=work)
     seen = [observe_body(capture, t, index, body.center) for t in capture.trials if (t.object_index == index).any()]
     seen = [s for s in seen if np.isfinite(s.seen).all(axis=2).any()]
+    unscaled, normal = all(s.hides_spin for s in seen), np.asarray(capture.ground.unit_normal)
+    if unscaled:
+        # Its turn is not seen: it is that of its mesh, until it rolls.
+        body = on_its_rim(capture.objects[index], normal) or body
+    simulator = RigidWorlds(body=body, work=work)
     places = []
     for observations in seen:
         for frame in range(0, len(observations.times), max(1, len(observations.times) // 8)):
@@ -100,9 +104,8 @@ def body_problem(capture: Capture, index: int, work: Work) -> Problem:
         capture=capture,
         body=body,
         middle=middle,
-        unscaled=all(s.hides_spin for s in seen),
-        turns_on_a_face=len(body.corners) > 1
-        and turns_on_a_face(seen, np.asarray(capture.ground.unit_normal), body.bound),
+        unscaled=unscaled,
+        turns_on_a_face=len(body.corners) > 1 and turns_on_a_face(seen, normal, body.bound),
     )
     return Problem(scene=scene, simulator=simulator, trials=track_states(scene, simulator, seen))
 

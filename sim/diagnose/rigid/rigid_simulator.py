@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -108,6 +108,37 @@ def rigid_body(item: CaptureObject) -> RigidBody:
         density=item.belief.density_kg_m3,
         volume=float(mesh.volume),
     )
+
+
+ALONG_GROUND = float(np.sin(np.radians(10)))
+"""Sine of a cylinder's axis to the ground up to which it lies on its rim."""
+ON_RIM = 24
+"""Corners of a mesh, on both rims, from which a prism counts as a cylinder."""
+
+
+def on_its_rim(item: CaptureObject, normal: Array) -> RigidBody | None:
+    """Return the body of a cylinder that lies on its rim on a ground of unit ``normal`` (3,), None for other bodies.
+
+    As long as its axis keeps its direction, it touches the ground like a ball of its radius, with its own moments of
+    inertia: a rim of corners would fall from one to the next.
+    """
+    vertices = np.unique(item.vertices[np.unique(item.faces)], axis=0) if len(item.faces) else item.vertices
+    try:
+        hull = ConvexHull(vertices)
+    except (QhullError, ValueError):
+        return None
+    corners = vertices[hull.vertices] - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    if len(corners) < ON_RIM:
+        return None
+    for axis in np.linalg.eigh(corners.T @ corners)[1].T:
+        along = corners @ axis
+        radii = np.linalg.norm(corners - along[:, None] * axis, axis=1)
+        ends = np.abs(np.abs(along) - np.abs(along).max())
+        if np.ptp(radii) < 0.01 * radii.max() and ends.max() < 0.01 * np.abs(along).max():
+            body = rigid_body(item)
+            lies = abs(float(axis @ normal)) < ALONG_GROUND
+            return replace(body, corners=np.zeros((1, 3)), radius=float(radii.max())) if lies else None
+    return None
 
 
 def _spherical(hull: ConvexHull, middle: Array, reach: float) -> bool:

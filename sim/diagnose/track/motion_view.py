@@ -61,7 +61,7 @@ class MotionView:
     origin: (2,) px. matrix: (2, 3) px per m, from world axes (z up). points: (N, 3) m, the centre at those samples.
     normal: (3,) of the ground, point: (3,) m on it. notes: what was decided, in words. camera: where it is known, with
     ``start``, (3,) m, the origin of ``points`` in the camera's world; ``origin`` and ``matrix`` are then those of a
-    picture from straight above.
+    picture from straight above. on_rim: a disc that rolls down the slope.
     """
 
     kind: str
@@ -76,6 +76,7 @@ class MotionView:
     notes: tuple[str, ...]
     camera: GroundCamera | None = None
     start: Array | None = None
+    on_rim: bool = False
 
     def pixels(self, points: Array) -> Array:
         """Return px (..., 2) of world points (..., 3)."""
@@ -94,12 +95,13 @@ def understand_motion(
     elevation: float,
     where: str,
     from_above: bool = False,
+    rim: float | None = None,
 ) -> MotionView:
     """Return the view of the free motion in ``places`` (N, 2) px at ``times`` (N,) s.
 
     diameter_px, diameter: a length of the body in px and m. clearance: m, of its centre above what it stands on.
     elevation: rad, of the camera above a level surface; half a turn's quarter looks straight down. from_above: the
-    body's outline shows its upper side, so that no slope is seen from its side.
+    body's outline shows its upper side, so that no slope is seen from its side, unless it rolls on its rim: radius, m.
     Raises InputError where nothing moves freely for long enough, and for what gains speed on a level surface.
     """
     scale = diameter_px / diameter
@@ -110,7 +112,7 @@ def understand_motion(
             f"{where}: what moves goes around one point: a pivot, an axle or a string holds it, which is not "
             "simulated; film a body that is free"
         )
-    view = _setting(times, places, scale, diameter_px, clearance, elevation, where, from_above)
+    view = _setting(times, places, scale, diameter_px, clearance, elevation, where, from_above, rim)
     return replace(view, first=view.first + begin, last=view.last + begin)
 
 
@@ -148,6 +150,7 @@ def _setting(
     elevation: float,
     where: str,
     from_above: bool,
+    rim: float | None,
 ) -> MotionView:
     """Return the view as ``understand_motion`` does, of a path that is mostly motion. scale: px/m by the size."""
     impacts = jumps(times, places)
@@ -168,14 +171,16 @@ def _setting(
         known = pieces if any(p is best for p in pieces) else finer
         return _flight(times, places, known, [best], impacts, scale, diameter_px, clearance, where)
     if _runs_down(best, scale, places):
-        if from_above:
+        if from_above and rim is None:
             raise InputError(
-                f"{where}: the body gains speed, and its outline is one from above: film a slope from its side; "
-                "a disc that rolls on its rim cannot be simulated"
+                f"{where}: the body gains speed, and its outline is one from above: film a slope from its side"
             )
         way = places[best.last] - places[best.first]
         if np.degrees(np.arctan2(way[1], abs(way[0]))) > STEEPEST:
             raise _strange_fall(best, times, scale, where)
+        if from_above and rim is not None:
+            rolls = _slope(times, places, best, scale, rim)
+            return replace(rolls, on_rim=True, notes=(*rolls.notes, "a disc that rolls on its rim"))
         return _slope(times, places, best, scale, clearance)
     if _curves_down(best, times, places):
         raise _strange_fall(best, times, scale, where)

@@ -35,6 +35,9 @@ SHADOW = (0.45, 0.97, 0.09)
 """A shadow: least and largest brightness over the background's, and largest difference between the channels."""
 STRONG = 0.55
 """Share of a frame's largest difference from which even what looks like a shadow counts as a body."""
+LEAST_FULL, ONE_COLOUR = 0.3, 0.6
+"""Contrast of a pixel that is all body, over the body's usual one, at least: where its colour is nearly that of the
+background, how far it covers a pixel is noise. Contrast of its mean colour, over the same, from which that tells."""
 LEAST_AREA = 7
 """Pixels of the smallest region."""
 MOST_REGIONS = 12
@@ -171,17 +174,22 @@ def _regions(picture: Picture, background: Picture, limit: Array, index: int) ->
         mask &= ~weak
     square = np.ones((3, 3), np.uint8)
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square), np.uint8)
-    clear = list(_outlined(mask, picture, away, shade, index))
+    clear = list(_outlined(mask, picture, background, away, shade, index))
     if not faint.any():
         return clear, []
     # A shadow beside its body is no thing of its own.
     _, labels = cv2.connectedComponents(cv2.dilate(faint, square))
     faint[np.isin(labels, np.unique(labels[mask > 0]))] = 0
-    return clear, list(_outlined(faint, picture, away, shade, index))
+    return clear, list(_outlined(faint, picture, background, away, shade, index))
 
 
 def _outlined(
-    mask: NDArray[np.uint8], picture: Picture, away: NDArray[np.float32], shade: NDArray[np.uint8], index: int
+    mask: NDArray[np.uint8],
+    picture: Picture,
+    background: Picture,
+    away: NDArray[np.float32],
+    shade: NDArray[np.uint8],
+    index: int,
 ) -> Iterator[Region]:
     """Yield the largest regions of ``mask`` (H, W), largest first. away: (H, W) difference from the background. shade:
     (H, W) what looks like a shadow."""
@@ -195,12 +203,14 @@ def _outlined(
             continue
         part = away[y : y + h, x : x + w]
         strength = max(float(np.percentile(part[inside > 0], 70)), 1.0)
+        box = slice(y, y + h), slice(x, x + w)
+        cover = part / _full_contrast(picture[box], background[box], part, inside, strength)
         # Coverage: pixels of the rim count by how far they have left the background, about half of the way, so that
         # blur and the coarse colours of compressed video do not widen the body.
-        firm = (part > 0.5 * strength).astype(np.uint8) & inside
+        firm = (cover > 0.5).astype(np.uint8) & inside
         rims, _ = cv2.findContours(firm, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(firm, rims, -1, 1, cv2.FILLED)
-        soft = np.clip((part / strength - 0.2) / 0.6, 0, 1) * inside
+        soft = np.clip((cover - 0.2) / 0.6, 0, 1) * inside
         soft = np.maximum(soft, cv2.erode(firm, np.ones((3, 3), np.uint8)))
         if soft.sum() <= 0:
             continue
@@ -225,6 +235,24 @@ def _outlined(
             shade=float(shade[y : y + h, x : x + w][inside > 0].mean()),
             contrast=strength,
         )
+
+
+def _full_contrast(
+    picture: Picture, background: Picture, away: NDArray[np.float32], inside: NDArray[np.uint8], strength: float
+) -> NDArray[np.float32]:
+    """Return (H, W) how far a pixel would be from the background if the body of ``inside`` covered all of it. strength:
+    the body's usual difference, grey levels.
+
+    It is that, but for what the background's own colours make of it: a body may pass from a light wall to a dark one.
+    """
+    even = np.full(inside.shape, strength, np.float32)
+    weight = inside * np.clip(away / strength, 0, 1) ** 2
+    colour = (picture * weight[..., None]).sum(axis=(0, 1)) / max(float(weight.sum()), 1e-6)
+    apart = largest_channel(np.abs(colour.astype(np.float32) - background.astype(np.float32)))
+    usual = float(np.percentile(apart[inside > 0], 70))
+    if usual < ONE_COLOUR * strength:
+        return even
+    return np.maximum(apart / usual, LEAST_FULL) * even
 
 
 def _shadows(picture: Picture, background: Picture) -> NDArray[np.uint8]:

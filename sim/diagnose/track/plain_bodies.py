@@ -136,7 +136,10 @@ def follow_plain_body(
         elevation=elevation,
         where=str(path),
         from_above=body.kind != "ball" and misfit < CLEAR and elevation >= FROM_ABOVE,
+        rim=0.5 * body.diameter if body.kind == "cylinder" and body.diameter is not None else None,
     )
+    if view.on_rim:
+        item = body.capture_object(on_rim=True)
     path_px, box = places, None
     if view.kind == "surface" and body.kind == "box":
         seen_so = _seen_as_box(regions, item, found.scale, (info.width, info.height), seen_at, standing, str(path))
@@ -255,12 +258,12 @@ def _trial(
     noise: float,
     turns: Array | None,
 ) -> tuple[Trial, float]:
-    """Return the trial, and its noise in m. A ball is its centre; other bodies keep their side to the ground, and turn
-    about its normal by ``turns`` (T,) rad where that is known."""
+    """Return the trial, and its noise in m. A ball or a disc on its rim is its centre; other bodies keep their side to
+    the ground, and turn about its normal by ``turns`` (T,) rad where that is known."""
     clean = "".join(c if c.isalnum() or c in "_-" else "_" for c in name).strip("_") or "take"
     vertices = item.vertices
     rest, turn = np.zeros((1, 3)), np.eye(3)
-    if not _is_round(item):
+    if not _is_round(item) and not view.on_rim:
         half = vertices.max(axis=0)
         rest = np.array([[0, 0, 0], [half[0], 0, 0], [0, half[1], 0], [0, 0, half[2]], [-half[0], 0, 0]], dtype=float)
         across = np.array([0.0, 1.0, 0.0])

@@ -72,8 +72,11 @@ class BodyRequest:
         if not 0 <= self.restitution <= 1:
             raise InputError(f"object {self.kind}: restitution is {self.restitution!r}: give 0 to 1")
 
-    def capture_object(self) -> CaptureObject:
-        """Return the body with its mesh, centred on its middle. Raises InputError for an unreadable mesh."""
+    def capture_object(self, on_rim: bool = False) -> CaptureObject:
+        """Return the body with its mesh, centred on its middle. Raises InputError for an unreadable mesh.
+
+        on_rim: a cylinder lies, with its axis along y.
+        """
         import trimesh
 
         if self.kind == "ball":
@@ -83,6 +86,9 @@ class BodyRequest:
         elif self.kind == "cylinder":
             assert self.diameter is not None and self.height is not None
             mesh = trimesh.creation.cylinder(radius=self.diameter / 2, height=self.height, sections=16)
+            if on_rim:
+                mesh = trimesh.creation.cylinder(radius=self.diameter / 2, height=self.height, sections=48)
+                mesh.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2, (1, 0, 0)))
             volume = math.pi * self.diameter**2 / 4 * self.height
         elif self.kind == "box":
             mesh = trimesh.creation.box(extents=[float(v or 0.0) for v in (self.x, self.y, self.z)])
