@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,12 @@ from .rigid.rigid_motion import advance_bodies
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
 
-ALWAYS = ParticleState._fields
+ALWAYS = (*ParticleState._fields, "constants", "ids")
 """Arrays that every particle needs."""
+
+HELD = ("constants", "ids", "material", "volumes", "anchors")
+"""Arrays that no substep changes. There is one of each; of the others two, between which a sort moves them, because
+the state from before it must be there for another try."""
 
 MATTER = ("memory", "material")
 """Arrays that only models other than plain fixed-corotated elasticity need."""
@@ -136,7 +140,9 @@ class Engine:
         control[:, layout.LONGEST_STEP] = math.inf
         self._put_control(control)
         self._capacity = max(1, capacity)
-        self._particles = [self._particle_arrays() for _ in range(2)]
+        held = self._particle_arrays(name for name in self._names if name in HELD)
+        moving = [name for name in self._names if name not in HELD]
+        self._particles = [{**self._particle_arrays(moving), **held} for _ in range(2)]
         self._keys = new_array(ti.i64, self._capacity)
         self._targets = new_array(ti.i32, self._capacity)
         self._blocks = BlockLists(
@@ -149,7 +155,7 @@ class Engine:
 
     # ---- arrays -------------------------------------------------------------------------------------------------
 
-    def _particle_arrays(self) -> dict[str, ti.Ndarray]:
+    def _particle_arrays(self, names: Iterable[str]) -> dict[str, ti.Ndarray]:
         kinds = {
             "x": ivec3,
             "v": vec3,
@@ -165,12 +171,12 @@ class Engine:
             "slopes": vec3,
             "conformation": mat3,
         }
-        return {name: new_array(kinds[name], self._capacity) for name in self._names}
+        return {name: new_array(kinds[name], self._capacity) for name in names}
 
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
-        arrays = [a for group in self._particles for a in group.values()]
+        arrays = [*self._particles[0].values(), *(a for n, a in self._particles[1].items() if n not in HELD)]
         arrays += [a for a in (*vars(self).values(), *self._adhesion) if isinstance(a, ti.Ndarray)]
         return self._blocks.device_bytes + sum(bytes_of(a) for a in arrays)
 
@@ -308,16 +314,24 @@ class Engine:
         rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks.particle_blocks)
         self._group()
 
-    def _group(self) -> None:
-        """Lists, neighbours and permutation for the blocks named in ``_keys``."""
+    def _group(self, *, again: bool = False) -> None:
+        """Lists, neighbours and permutation for the blocks named in ``_keys``; ``again``: as the last time."""
         self._blocks.build(self.count, self._keys, self._targets)
         old, new = self._particles
+        if not again:
+            movers = {
+                "constants": sorting.permute_held_vectors,
+                "ids": sorting.permute_held_integers,
+                "material": sorting.permute_held_integers,
+                "volumes": sorting.permute_held_numbers,
+                "anchors": sorting.permute_held_vectors,
+            }
+            for name in HELD:
+                if name in self._names:
+                    movers[name](self.count, self._targets, old[name], new["reaction"])
         sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
             "memory": sorting.permute_numbers,
-            "material": sorting.permute_integers,
-            "volumes": sorting.permute_numbers,
-            "anchors": sorting.permute_vectors,
             "slopes": sorting.permute_triples,
             "conformation": sorting.permute_matrices,
         }
@@ -375,7 +389,7 @@ class Engine:
                     self._means.from_numpy(means)
                 if before is not None:
                     self.rigid_bodies.put_back(before)
-                self._group()
+                self._group(again=True)
                 if attempts.max() > MOST_RETRIES:
                     self._put_control(control)
                     world = int(np.argmax(attempts))

@@ -163,7 +163,7 @@ class OverlapBlocks(NamedTuple):
 
 
 class ParticleState(NamedTuple):
-    """State that every particle has, sorted by block."""
+    """State of every particle that substeps change, sorted by block."""
 
     x: Cells
     """(N,) position in the block's window, fixed point, 2**-28 cells."""
@@ -177,14 +177,8 @@ class ParticleState(NamedTuple):
     F: Matrices
     """(N,) elastic deformation gradient."""
 
-    constants: Vectors4
-    """(N,) mass (kg), 2 mu V0 and lambda V0 (kg cells²/s²; of fluids 2 eta V0 and K V0), contact radius (cells)."""
-
     reaction: Vectors4
     """(N,) contact acceleration of the last substep (cells/s²) and the share of contacting mass at the particle."""
-
-    ids: Integers
-    """(N,) number of the particle as the caller counts."""
 
 
 class ParticleArrays(NamedTuple):
@@ -195,7 +189,10 @@ class ParticleArrays(NamedTuple):
     v: Vectors3
     C: Matrices
     F: Matrices
+
     constants: Vectors4
+    """(N,) mass (kg), 2 mu V0 and lambda V0 (kg cells²/s²; of fluids 2 eta V0 and K V0), contact radius (cells)."""
+
     reaction: Vectors4
 
     memory: Scalars

@@ -268,17 +268,30 @@ def permute_numbers(count: ti.i32, targets: Integers, old: Scalars, new: Scalars
 
 
 @kernel
-def permute_integers(count: ti.i32, targets: Integers, old: Integers, new: Integers):
-    """Move one whole number a particle to its new index."""
+def permute_held_vectors(count: ti.i32, targets: Integers, held: Vectors4, spare: Vectors4):
+    """Move one vector a particle to its new index within ``held``, by way of ``spare``."""
     for p in range(count):
-        new[targets[p]] = old[p]
+        spare[targets[p]] = held[p]
+    for p in range(count):
+        held[p] = spare[p]
 
 
 @kernel
-def permute_vectors(count: ti.i32, targets: Integers, old: Vectors4, new: Vectors4):
-    """Move one vector a particle to its new index."""
+def permute_held_numbers(count: ti.i32, targets: Integers, held: Scalars, spare: Vectors4):
+    """Move one number a particle to its new index within ``held``, by way of ``spare``."""
     for p in range(count):
-        new[targets[p]] = old[p]
+        spare[targets[p]][0] = held[p]
+    for p in range(count):
+        held[p] = spare[p][0]
+
+
+@kernel
+def permute_held_integers(count: ti.i32, targets: Integers, held: Integers, spare: Vectors4):
+    """Move one whole number a particle to its new index within ``held``, by way of ``spare``."""
+    for p in range(count):
+        spare[targets[p]][0] = ti.bit_cast(held[p], ti.f32)
+    for p in range(count):
+        held[p] = ti.bit_cast(spare[p][0], ti.i32)
 
 
 @kernel
