@@ -39,11 +39,14 @@ class BlockLists:
     within reach of rigid bodies and colliders, overlap blocks those in which several fields have nodes.
     """
 
-    def __init__(self, *, field_count: int, rigid_bodies: int, flowing: bool, fluid: bool, lanes: Lanes) -> None:
+    def __init__(
+        self, *, field_count: int, rigid_bodies: int, flowing: bool, fluid: bool, lanes: Lanes, windows: int
+    ) -> None:
         """rigid_bodies: the most that one world has. flowing, fluid: whether any law needs past values of the nodes,
-        or the crowding of particles. lanes: threads that share a block."""
+        or the crowding of particles. lanes: threads that share a block. windows: at most, to read nodes from, where
+        those do not lie in shared memory."""
         self._field_count, self._rigid_bodies, self._lanes = field_count, rigid_bodies, lanes
-        self._flowing, self._fluid = flowing, fluid
+        self._flowing, self._fluid, self._windows = flowing, fluid, windows
         self._g_starts = new_array(ti.i32, field_count + 1)
         self._p_count = self._g_count = 0
         self._near = (0, 0)
@@ -62,10 +65,12 @@ class BlockLists:
             self._meets_p, self._meet_p = new_array(ti.i32, p), new_array(ti.i32, p)
             self._touched, self._slack = new_array(ti.i32, p), new_array(ti.f32, p)
             self.pushes = new_array(ti.f32, max(1, p * self._rigid_bodies * PUSH))
-            self._window, self._scattered = new_array(vec4, p * WINDOW_NODES), new_array(vec4, p * WINDOW_NODES)
-            self._past_window = new_array(vec4, p * WINDOW_NODES if self._flowing else 1)
+            read = 1 if self._lanes.shared else min(p, self._windows) * WINDOW_NODES
+            self._window, self._scattered = new_array(vec4, read), new_array(vec4, p * WINDOW_NODES)
+            self._past_window = new_array(vec4, read if self._flowing else 1)
             self._past_scattered = new_array(vec4, p * WINDOW_NODES if self._flowing else 1)
-            self._crowding_window = new_array(ti.f32, p * WINDOW_NODES if self._fluid else 1)
+            crowded = p * WINDOW_NODES if self._lanes.shared else read
+            self._crowding_window = new_array(ti.f32, crowded if self._fluid else 1)
             self._report = new_array(ti.f32, p * SCALARS_PER_BLOCK)
             self._p_mask = (1 << math.ceil(math.log2(4 * p))) - 1
             self._p_keys, self._p_slots = new_array(ti.i64, self._p_mask + 1), new_array(ti.i32, self._p_mask + 1)

@@ -87,8 +87,9 @@ class Engine:
         numbers: PackedWorlds,
         rigid_bodies: RigidBodies,
         lanes: Lanes,
+        windows: int,
     ) -> None:
-        """lanes: threads that share a block, ``lanes_of`` the architecture in use."""
+        """lanes: threads that share a block, ``lanes_of`` the architecture in use; windows: ``windows_of`` it."""
         self._lanes = lanes
         self.cfl_elastic, self.cfl_velocity = cfl_elastic, cfl_velocity
         self.rigid_bodies = rigid_bodies
@@ -151,6 +152,7 @@ class Engine:
             flowing=models.flowing,
             fluid=bool(models.volumetric),
             lanes=lanes,
+            windows=windows,
         )
 
     # ---- arrays -------------------------------------------------------------------------------------------------

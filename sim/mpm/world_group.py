@@ -20,7 +20,7 @@ from .colliders import SAME_TIME, Track
 from .diagnostics import FittedGradients
 from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, upload_new
 from .kernels import layout, runtime
-from .kernels.lanes import lanes_of
+from .kernels.lanes import lanes_of, windows_of
 from .kernels.time_stepping import RIGID_LOST
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
@@ -113,6 +113,7 @@ class WorldGroup:
             numbers=packing.pack(self._places),
             rigid_bodies=self._rigid_bodies,
             lanes=lanes_of(self.arch),
+            windows=windows_of(self.arch, self.options.threads),
         )
 
     def __len__(self) -> int:

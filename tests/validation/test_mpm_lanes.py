@@ -66,6 +66,18 @@ def test_only_cuda_shares_a_block_among_threads():
 
 
 @pytest.mark.long
+def test_blocks_that_take_turns_at_windows_have_the_bytes_of_blocks_with_their_own(monkeypatch):
+    """Jelly, sand, water and a rigid block: three windows for all their blocks, and one for each."""
+    states = []
+    for windows in (3, 10_000):
+        monkeypatch.setattr(world_group, "windows_of", lambda arch, threads, windows=windows: windows)
+        world = mixed_world("cpu")
+        world.advance(2e-3)
+        states.append(world.checkpoint())
+    assert all(np.array_equal(states[0][name], states[1][name]) for name in states[0])
+
+
+@pytest.mark.long
 def test_the_cards_algorithms_move_all_matter_as_the_cpus_do(monkeypatch):
     """Jelly, sand, water and a rigid block, with contact between them, sorts and a pile on the ground. Sums are in
     another order: 1e-5 cells after 0.05 s."""

@@ -7,6 +7,7 @@ import io
 
 import numpy as np
 import pytest
+from physgen.benchmarks.mpm import world_of
 from physgen.sim.errors import InputError, SimulationError
 from physgen.sim.mpm.solver_options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
@@ -95,6 +96,12 @@ def test_body_waits_for_its_start(box, options, similarity):
     world.advance(0.13)
     fall = float((body.positions - world.positions(0)).mean(axis=0)[2])
     assert fall == pytest.approx(0.5 * 9.81 * 0.01, rel=0.02)
+
+
+def test_a_particle_takes_400_bytes():
+    """With the caller's own 40: its place, volume and contact radius. Eight particles a cell, contact with a ground."""
+    world = world_of(100_000, arch="cpu", threads=2, cache_folder=None)
+    assert world.device_bytes / sum(body.count for body in world.bodies) < 360
 
 
 def test_body_that_leaves_the_box_flies_on_and_is_reported(box, options, similarity):

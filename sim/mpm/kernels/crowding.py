@@ -53,14 +53,18 @@ from .layout import (
     SOUND_SPEED_SQUARED,
     SPREAD,
     STEP,
+    WINDOW_NODES,
     WORLD,
     WORLD_INTEGERS,
     WORLD_ROW,
+    Integers,
+    Scalars,
     ivec3,
     triple,
     vec3,
     vec4,
 )
+from .windows import add_to, grid_node, weights
 
 STIFFNESS = 0.02
 """k: stiffness against crowding over the bulk modulus. In two dimensions a pond holds its volume from 0.02 on and is
@@ -310,3 +314,40 @@ def push_fields(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, n
                                     nodes.velocity[m] = nodes.velocity[m] - push / nodes.mass[m]
                         b = overlap.mate[b]
                     a = overlap.mate[a]
+
+
+@ti.func
+def load_crowding(
+    lanes: ti.template(), lane: ti.i32, k: ti.i32, spot: ti.i32, neighbours: Integers, window: Scalars, nodes: Scalars
+):
+    """Copy the crowding of the nodes around particle block ``k`` to ``window`` from ``spot`` on, as ``fetch_window``
+    does."""
+    n = lane
+    while n < WINDOW_NODES:
+        window[spot + n] = nodes[grid_node(k, n, neighbours)]
+        n += ti.static(lanes.threads)
+
+
+@ti.func
+def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window: Scalars, scattered: ti.template()):
+    """Mean crowding at ``fx`` from the window's node ``known``, and the impulse on the particle there; the nodes take
+    the opposite, along the line to the particle, so both momenta stay. Nodes that are no measure count as the mean of
+    the others. strength: impulse at a slope of 1 per cell."""
+    w = weights(fx)
+    total, part = 0.0, 0.0
+    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+        crowding = window[known + (i * 64 + j * 8 + m)]
+        if crowding < NOTHING:
+            weight = w[i][0] * w[j][1] * w[m][2]
+            part += weight
+            total += weight * crowding
+    mean = total / ti.max(part, 0.1)
+    given = vec3(0.0)
+    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+        crowding = window[known + (i * 64 + j * 8 + m)]
+        if crowding >= NOTHING:
+            crowding = mean
+        push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * crowding) * (vec3(i, j, m) - fx)
+        given -= push
+        add_to(scattered, first + (i * 64 + j * 8 + m), vec4(push[0], push[1], push[2], 0.0))
+    return mean, given

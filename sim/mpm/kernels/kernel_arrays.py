@@ -237,7 +237,8 @@ class NodeArrays(NamedTuple):
     """Grid nodes, and the private windows between particles and nodes."""
 
     window: Vectors4
-    """(P, WINDOW_NODES) copy of the nodes around a particle block: velocity (cells/s), share of contacting mass."""
+    """(., WINDOW_NODES) copy of the nodes around the particle block at hand: velocity (cells/s), share of contacting
+    mass. Blocks take turns at a window, see ``windows.turns``."""
 
     scattered: Vectors4
     """(P, WINDOW_NODES) momentum (kg cells/s) and mass (kg) that a block's particles scatter."""
@@ -267,7 +268,7 @@ class FlowArrays(NamedTuple):
     """(G, BLOCK_NODES) ln of what fluids fill over what their ln J says, see ``crowding``; length 1 without fluids."""
 
     crowding_window: Scalars
-    """(P, WINDOW_NODES) copy of the crowding around a particle block."""
+    """(., WINDOW_NODES) copy of the crowding around the particle block at hand; on a card (P, WINDOW_NODES)."""
 
     pushes: Scalars
     """(G, most_bodies, PUSH) what crowding in a block does to a body, as in ``CouplingArrays``; last but one: whether

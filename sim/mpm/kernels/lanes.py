@@ -13,6 +13,7 @@ is known when they are compiled, so the CPU's code stays what it would be withou
 A ``Lanes`` of one lane without shared memory (``ALONE``) runs the card's algorithms on the CPU, for tests.
 """
 
+import os
 from typing import Any, NamedTuple
 
 import taichi as ti
@@ -51,6 +52,16 @@ CUDA = Lanes(threads=512, shared=True, parallel=True)
 def lanes_of(arch: str) -> Lanes:
     """The lanes of an architecture in use, as ``runtime.ensure_started`` names it; Vulkan lacks 64-bit atomics."""
     return CUDA if arch == "cuda" else SERIAL
+
+
+WINDOWS_A_THREAD = 32
+"""Windows to read nodes from, of each thread of a CPU: pieces of work to share out evenly, four at a time."""
+
+
+def windows_of(arch: str, threads: int) -> int:
+    """How many windows to read from there are at most: a CPU's threads, 0 for all that it has, take blocks in turn;
+    elsewhere every block has its own."""
+    return WINDOWS_A_THREAD * (threads or os.cpu_count() or 1) if arch == "cpu" else 2**31
 
 
 class Pads(NamedTuple):

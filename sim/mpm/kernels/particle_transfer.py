@@ -17,7 +17,7 @@ import taichi as ti
 
 from .constitutive_response import deform, is_fluid, law_of, respond
 from .constitutive_response import flows as material_flows
-from .crowding import NOTHING, RELAXED, STIFFNESS
+from .crowding import RELAXED, STIFFNESS, load_crowding, part_crowd
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
 from .lanes import lane_maxima, lane_sum, meet, pads_of
@@ -55,8 +55,6 @@ from .layout import (
     WINDOW_NODES,
     WORLD,
     WORLD_ROW,
-    Integers,
-    Scalars,
     ivec3,
     mat3,
     triple,
@@ -64,17 +62,15 @@ from .layout import (
     vec4,
 )
 from .windows import (
-    add_to,
     clear_window,
     fetch_window,
-    grid_node,
     interpolate,
     interpolate_curved,
     load_window,
     spread,
     spread_kept,
     store_window,
-    weights,
+    turns,
 )
 
 PIN, GOAL = 1.0, 2.0
@@ -128,40 +124,6 @@ def goal_step(
 
 
 @ti.func
-def load_crowding(lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, window: Scalars, nodes: Scalars):
-    """Copy the crowding of the nodes around particle block ``k`` into its window, as ``fetch_window`` does."""
-    n = lane
-    while n < WINDOW_NODES:
-        window[k * WINDOW_NODES + n] = nodes[grid_node(k, n, neighbours)]
-        n += ti.static(lanes.threads)
-
-
-@ti.func
-def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window: Scalars, scattered: ti.template()):
-    """Mean crowding at ``fx`` from the window's node ``known``, and the impulse on the particle there; the nodes take
-    the opposite, along the line to the particle, so both momenta stay. Nodes that are no measure count as the mean of
-    the others. strength: impulse at a slope of 1 per cell."""
-    w = weights(fx)
-    total, part = 0.0, 0.0
-    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-        crowding = window[known + (i * 64 + j * 8 + m)]
-        if crowding < NOTHING:
-            weight = w[i][0] * w[j][1] * w[m][2]
-            part += weight
-            total += weight * crowding
-    mean = total / ti.max(part, 0.1)
-    given = vec3(0.0)
-    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-        crowding = window[known + (i * 64 + j * 8 + m)]
-        if crowding >= NOTHING:
-            crowding = mean
-        push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * crowding) * (vec3(i, j, m) - fx)
-        given -= push
-        add_to(scattered, first + (i * 64 + j * 8 + m), vec4(push[0], push[1], push[2], 0.0))
-    return mean, given
-
-
-@ti.func
 def scatter_past(
     first: ti.i32,
     fx: vec3,
@@ -179,6 +141,243 @@ def scatter_past(
     c1 = mass * vec4(C[0, 1], C[1, 1], C[2, 1], slope[1])
     c2 = mass * vec4(C[0, 2], C[1, 2], C[2, 2], slope[2])
     spread(first, fx, b4, c0, c1, c2, past_scattered)
+
+
+@func
+def advance_block(
+    laws: ti.template(),
+    lanes: ti.template(),
+    pads: ti.template(),
+    lane: ti.i32,
+    k: ti.i32,
+    spot: ti.i32,
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    near: NearBlocks,
+    particles: ParticleArrays,
+    flow: FlowArrays,
+    nodes: NodeArrays,
+):
+    """``advance_particles`` of block ``k``, whose windows to read begin at ``spot`` of their arrays."""
+    offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
+    crowd_spot = k * WINDOW_NODES if ti.static(lanes.shared) else spot
+    f = blocks.field[k]
+    world = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+    c = world * CONTROL_ROW
+    phase = worlds.control[c + PHASE]
+    gather = phase == FULL
+    scatter = phase != IDLE and worlds.control[c + SCATTER] == 1.0
+    store = worlds.control[c + STORE] == 1.0
+    dt_gather = ti.cast(worlds.control[c + STEP], ti.f32)
+    dt_scatter = ti.cast(worlds.control[c + NEXT_STEP], ti.f32)
+    flows = False
+    law = 0
+    if ti.static(laws.flowing):
+        law = law_of(blocks.starts[k], worlds, particles)
+        flows = material_flows(law)
+    crowds = worlds.field_numbers[f * FIELD_ROW + FULL_MASS] > 0.0
+    sound2 = worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
+    if gather:
+        if ti.static(lanes.parallel):
+            fetch_window(lanes, lane, k, spot, blocks.neighbours, nodes.velocity, pads.window)
+        else:
+            load_window(k, spot, blocks.neighbours, nodes.window, nodes.velocity)
+        if ti.static(laws.flowing):
+            if flows:
+                if ti.static(lanes.parallel):
+                    fetch_window(lanes, lane, k, spot, blocks.neighbours, flow.velocity, pads.past_window)
+                else:
+                    load_window(k, spot, blocks.neighbours, flow.window, flow.velocity)
+        if ti.static(len(laws.volumetric) > 0):
+            if crowds:
+                load_crowding(lanes, lane, k, crowd_spot, blocks.neighbours, flow.crowding_window, flow.crowding)
+    if scatter:
+        clear_window(lanes, lane, offset, pads.scattered)
+        if ti.static(laws.flowing):
+            if flows:
+                clear_window(lanes, lane, offset, pads.past_scattered)
+    meet(lanes)
+    touching = near.slot[k] >= 0
+    on_plane = touching and worlds.numbers[world * WORLD_ROW + HAS_PLANE] > 0.5
+    normal = triple(worlds.numbers, world * WORLD_ROW + PLANE_NORMAL)
+    first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
+    level = normal.dot(first_node) - worlds.numbers[world * WORLD_ROW + PLANE_OFFSET]
+    goal = 0.0
+    if worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1:
+        goal = worlds.field_numbers[f * FIELD_ROW + GOAL_STIFFNESS]
+    adheres = worlds.field_numbers[f * FIELD_ROW + PLANE_ADHESION] > 0.0
+    gap = FAR
+    speed2 = 0.0
+    stiffness = 0.0
+    sum2 = 0.0
+    lowest = FIXED_HIGH
+    highest = FIXED_LOW
+    first_p, last_p = blocks.starts[k], blocks.starts[k + 1]
+    if phase == IDLE:
+        last_p = first_p
+    p = first_p + lane
+    while p < last_p:
+        xi = particles.x[p]
+        fixed = particles.constants[p]
+        vp = vec3(0.0)
+        Cp = mat3(0.0)
+        Fp = particles.F[p]
+        slope = vec3(0.0)
+        packing = 0.0
+        E01, E02, E12 = vec4(0.0), vec4(0.0), vec4(0.0)
+        D0, D1, D2 = vec4(0.0), vec4(0.0), vec4(0.0)
+        if ti.static(len(laws.volumetric) > 0):
+            packing = particles.memory[p]
+        if gather:
+            gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            base = ti.cast(gp - 0.5, ti.i32)
+            fx = gp - ti.cast(base, ti.f32)
+            first = spot + base[0] * 64 + base[1] * 8 + base[2]
+            A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
+            if ti.static(not laws.flowing):
+                A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
+            elif ti.static(laws.only_flowing):
+                A, B0, B1, B2 = interpolate(first, fx, pads.window)
+            else:
+                if flows:
+                    A, B0, B1, B2 = interpolate(first, fx, pads.window)
+                else:
+                    A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
+            for r in ti.static(range(3)):
+                vp[r] = A[r]
+                Cp[r, 0] = 4.0 * B0[r]
+                Cp[r, 1] = 4.0 * B1[r]
+                Cp[r, 2] = 4.0 * B2[r]
+            if ti.static(laws.only_elastic):
+                Fp += dt_gather * Cp @ Fp
+            else:
+                Fp = deform(laws, p, dt_gather, Cp, worlds, particles)
+            particles.F[p] = Fp
+            step = vp * dt_gather
+            if ti.static(laws.flowing):
+                if flows:
+                    speed2 = ti.max(speed2, vp.dot(vp))
+                    # Part of the particle's velocity that the grid, before the forces, does not carry.
+                    past, past0, past1, past2 = interpolate(first, fx, pads.past_window)
+                    vp += KEPT * (particles.v[p] - vec3(past[0], past[1], past[2]))
+                    # Only the spin of C: angular momentum needs it, and no stress feels it.
+                    kept = particles.C[p]
+                    a01 = 0.5 * KEPT * ((kept[0, 1] - 4.0 * past1[0]) - (kept[1, 0] - 4.0 * past0[1]))
+                    a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
+                    a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
+                    Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
+                    if ti.static(len(laws.volumetric) > 0):
+                        if crowds and scatter:
+                            strength = dt_gather * STIFFNESS * sound2 * fixed[0]
+                            known = first - spot + crowd_spot
+                            crowding, given = part_crowd(
+                                known, first - spot + offset, fx, strength, flow.crowding_window, pads.scattered
+                            )
+                            vp += given / fixed[0]
+                            particles.memory[p] -= RELAXED * crowding
+                    particles.v[p] = vp
+                    particles.C[p] = Cp
+                    if ti.static(len(laws.volumetric) > 0):
+                        if is_fluid(law):
+                            particles.memory[p] -= LEVELLED * (packing - past[3])
+                            slope = 4.0 * vec3(past0[3], past1[3], past2[3])
+                            if store:
+                                particles.slopes[p] = slope
+            if touching:
+                if on_plane:
+                    phi = level + normal.dot(gp) - fixed[3]
+                    floor = ti.min(phi, -worlds.field_numbers[f * FIELD_ROW + SUNK_LIMIT])
+                    moved = phi + normal.dot(step)
+                    if moved < floor:
+                        step += (floor - moved) * normal
+                old = particles.reaction[p]
+                particles.reaction[p] = vec4(old[0], old[1], old[2], A[3])
+            # Never outside the window, whatever the velocity: this is what keeps memory safe.
+            xi = ti.min(ti.max(xi + ti.floor(step * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH)
+            particles.x[p] = xi
+            lowest = ti.min(lowest, xi.min())
+            highest = ti.max(highest, xi.max())
+            here2 = vp.dot(vp)
+            sum2 += here2
+            speed2 = ti.max(speed2, here2)
+            if store:
+                particles.v[p] = vp
+                particles.C[p] = Cp
+        else:
+            vp = particles.v[p]
+            Cp = particles.C[p]
+            if ti.static(len(laws.volumetric) > 0):
+                slope = particles.slopes[p]
+        if adheres:
+            here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            gap = ti.min(gap, level + normal.dot(here) - fixed[3])
+        if scatter:
+            own_v = vp  # before any force
+            if goal > 0.0:
+                vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, worlds, particles)
+            mass = fixed[0]
+            tau = mat3(0.0)
+            modulus = 0.0
+            if ti.static(laws.only_elastic):
+                tau, modulus, _ = laws.solid[0].stress(Fp, Cp, 0.0, fixed[1], fixed[2], fixed)
+            else:
+                tau, modulus = respond(laws, p, Fp, Cp, fixed, worlds, particles)
+            stiffness = ti.max(stiffness, modulus / mass)
+            Q = (-4.0 * dt_scatter) * tau + mass * Cp
+            gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            base = ti.cast(gp - 0.5, ti.i32)
+            fx = gp - ti.cast(base, ti.f32)
+            first = offset + base[0] * 64 + base[1] * 8 + base[2]
+            if touching:
+                # Start the contact solve from the forces of the last substep.
+                a = particles.reaction[p]
+                vp += dt_scatter * vec3(a[0], a[1], a[2])
+            q = mass * vp - Q @ fx
+            b4 = vec4(q[0], q[1], q[2], mass)
+            c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
+            c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
+            c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
+            if ti.static(not laws.flowing):
+                spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
+            elif ti.static(laws.only_flowing):
+                spread(first, fx, b4, c0, c1, c2, pads.scattered)
+            else:
+                if flows:
+                    spread(first, fx, b4, c0, c1, c2, pads.scattered)
+                else:
+                    spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
+            if ti.static(laws.flowing):
+                if flows:
+                    packing = 0.0
+                    if is_fluid(law):
+                        packing = particles.memory[p]
+                    scatter_past(first, fx, mass, own_v, Cp, packing, slope, pads.past_scattered)
+        p += ti.static(lanes.threads)
+    meet(lanes)
+    if scatter:
+        store_window(lanes, lane, k, pads.scattered, nodes.scattered)
+        if ti.static(laws.flowing):
+            if flows:
+                store_window(lanes, lane, k, pads.past_scattered, flow.scattered)
+    margin = ti.cast(ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest), ti.f32) * (1.0 / FIXED_ONE)
+    if ti.static(lanes.shared):
+        sum2 = lane_sum(lanes, lane, sum2, pads)
+        most = lane_maxima(lanes, lane, vec4(speed2, stiffness, -gap, -margin), pads)
+        speed2, stiffness, gap, margin = most[0], most[1], -most[2], -most[3]
+    if adheres and phase != IDLE and lane == 0:
+        # The next whole substep reads this; the number that the present one has read waits for the one after.
+        now = ti.cast(worlds.control[c + SUBSTEPS], ti.i32) & 1
+        following = ti.select(gather, 1 - now, now)
+        worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + 1 - following] = FAR
+        ti.atomic_min(worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + following], gap)
+    r = k * SCALARS_PER_BLOCK
+    if lane == 0:
+        if gather:
+            blocks.report[r] = speed2
+            blocks.report[r + 2] = margin
+            blocks.report[r + 4] = sum2
+        if scatter:
+            blocks.report[r + 1] = stiffness
 
 
 @func
@@ -205,226 +404,14 @@ def advance_particles(
     """
     if ti.static(lanes.shared):
         ti.loop_config(block_dim=ti.static(lanes.threads))
-    for kk in range(blocks.count * ti.static(lanes.span)):
+    for kk in range(turns(lanes, blocks.count, nodes.window) * ti.static(lanes.span)):
         lane = kk % ti.static(lanes.span)
         if lane < ti.static(lanes.threads):
-            k = kk // ti.static(lanes.span)
+            turn, all_turns = kk // ti.static(lanes.span), turns(lanes, blocks.count, nodes.window)
             pads = ti.static(pads_of(lanes, nodes, flow if laws.flowing else None))
-            offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
-            f = blocks.field[k]
-            world = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
-            c = world * CONTROL_ROW
-            phase = worlds.control[c + PHASE]
-            gather = phase == FULL
-            scatter = phase != IDLE and worlds.control[c + SCATTER] == 1.0
-            store = worlds.control[c + STORE] == 1.0
-            dt_gather = ti.cast(worlds.control[c + STEP], ti.f32)
-            dt_scatter = ti.cast(worlds.control[c + NEXT_STEP], ti.f32)
-            flows = False
-            law = 0
-            if ti.static(laws.flowing):
-                law = law_of(blocks.starts[k], worlds, particles)
-                flows = material_flows(law)
-            crowds = worlds.field_numbers[f * FIELD_ROW + FULL_MASS] > 0.0
-            sound2 = worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
-            if gather:
-                if ti.static(lanes.parallel):
-                    fetch_window(lanes, lane, k, blocks.neighbours, nodes.velocity, pads.window)
-                else:
-                    load_window(k, blocks.neighbours, nodes.window, nodes.velocity)
-                if ti.static(laws.flowing):
-                    if flows:
-                        if ti.static(lanes.parallel):
-                            fetch_window(lanes, lane, k, blocks.neighbours, flow.velocity, pads.past_window)
-                        else:
-                            load_window(k, blocks.neighbours, flow.window, flow.velocity)
-                if ti.static(len(laws.volumetric) > 0):
-                    if crowds:
-                        load_crowding(lanes, lane, k, blocks.neighbours, flow.crowding_window, flow.crowding)
-            if scatter:
-                clear_window(lanes, lane, offset, pads.scattered)
-                if ti.static(laws.flowing):
-                    if flows:
-                        clear_window(lanes, lane, offset, pads.past_scattered)
-            meet(lanes)
-            touching = near.slot[k] >= 0
-            on_plane = touching and worlds.numbers[world * WORLD_ROW + HAS_PLANE] > 0.5
-            normal = triple(worlds.numbers, world * WORLD_ROW + PLANE_NORMAL)
-            first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
-            level = normal.dot(first_node) - worlds.numbers[world * WORLD_ROW + PLANE_OFFSET]
-            goal = 0.0
-            if worlds.field_integers[f * FIELD_INTEGERS + HAS_ANCHORS] == 1:
-                goal = worlds.field_numbers[f * FIELD_ROW + GOAL_STIFFNESS]
-            adheres = worlds.field_numbers[f * FIELD_ROW + PLANE_ADHESION] > 0.0
-            gap = FAR
-            speed2 = 0.0
-            stiffness = 0.0
-            sum2 = 0.0
-            lowest = FIXED_HIGH
-            highest = FIXED_LOW
-            first_p, last_p = blocks.starts[k], blocks.starts[k + 1]
-            if phase == IDLE:
-                last_p = first_p
-            p = first_p + lane
-            while p < last_p:
-                xi = particles.x[p]
-                fixed = particles.constants[p]
-                vp = vec3(0.0)
-                Cp = mat3(0.0)
-                Fp = particles.F[p]
-                slope = vec3(0.0)
-                packing = 0.0
-                E01, E02, E12 = vec4(0.0), vec4(0.0), vec4(0.0)
-                D0, D1, D2 = vec4(0.0), vec4(0.0), vec4(0.0)
-                if ti.static(len(laws.volumetric) > 0):
-                    packing = particles.memory[p]
-                if gather:
-                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
-                    base = ti.cast(gp - 0.5, ti.i32)
-                    fx = gp - ti.cast(base, ti.f32)
-                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
-                    A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
-                    if ti.static(not laws.flowing):
-                        A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
-                    elif ti.static(laws.only_flowing):
-                        A, B0, B1, B2 = interpolate(first, fx, pads.window)
-                    else:
-                        if flows:
-                            A, B0, B1, B2 = interpolate(first, fx, pads.window)
-                        else:
-                            A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
-                    for r in ti.static(range(3)):
-                        vp[r] = A[r]
-                        Cp[r, 0] = 4.0 * B0[r]
-                        Cp[r, 1] = 4.0 * B1[r]
-                        Cp[r, 2] = 4.0 * B2[r]
-                    if ti.static(laws.only_elastic):
-                        Fp += dt_gather * Cp @ Fp
-                    else:
-                        Fp = deform(laws, p, dt_gather, Cp, worlds, particles)
-                    particles.F[p] = Fp
-                    step = vp * dt_gather
-                    if ti.static(laws.flowing):
-                        if flows:
-                            speed2 = ti.max(speed2, vp.dot(vp))
-                            # Part of the particle's velocity that the grid, before the forces, does not carry.
-                            past, past0, past1, past2 = interpolate(first, fx, pads.past_window)
-                            vp += KEPT * (particles.v[p] - vec3(past[0], past[1], past[2]))
-                            # Only the spin of C: angular momentum needs it, and no stress feels it.
-                            kept = particles.C[p]
-                            a01 = 0.5 * KEPT * ((kept[0, 1] - 4.0 * past1[0]) - (kept[1, 0] - 4.0 * past0[1]))
-                            a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
-                            a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
-                            Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
-                            if ti.static(len(laws.volumetric) > 0):
-                                if crowds and scatter:
-                                    strength = dt_gather * STIFFNESS * sound2 * fixed[0]
-                                    known = first - offset + k * WINDOW_NODES
-                                    crowding, given = part_crowd(
-                                        known, first, fx, strength, flow.crowding_window, pads.scattered
-                                    )
-                                    vp += given / fixed[0]
-                                    particles.memory[p] -= RELAXED * crowding
-                            particles.v[p] = vp
-                            particles.C[p] = Cp
-                            if ti.static(len(laws.volumetric) > 0):
-                                if is_fluid(law):
-                                    particles.memory[p] -= LEVELLED * (packing - past[3])
-                                    slope = 4.0 * vec3(past0[3], past1[3], past2[3])
-                                    if store:
-                                        particles.slopes[p] = slope
-                    if touching:
-                        if on_plane:
-                            phi = level + normal.dot(gp) - fixed[3]
-                            floor = ti.min(phi, -worlds.field_numbers[f * FIELD_ROW + SUNK_LIMIT])
-                            moved = phi + normal.dot(step)
-                            if moved < floor:
-                                step += (floor - moved) * normal
-                        old = particles.reaction[p]
-                        particles.reaction[p] = vec4(old[0], old[1], old[2], A[3])
-                    # Never outside the window, whatever the velocity: this is what keeps memory safe.
-                    xi = ti.min(ti.max(xi + ti.floor(step * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH)
-                    particles.x[p] = xi
-                    lowest = ti.min(lowest, xi.min())
-                    highest = ti.max(highest, xi.max())
-                    here2 = vp.dot(vp)
-                    sum2 += here2
-                    speed2 = ti.max(speed2, here2)
-                    if store:
-                        particles.v[p] = vp
-                        particles.C[p] = Cp
-                else:
-                    vp = particles.v[p]
-                    Cp = particles.C[p]
-                    if ti.static(len(laws.volumetric) > 0):
-                        slope = particles.slopes[p]
-                if adheres:
-                    here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
-                    gap = ti.min(gap, level + normal.dot(here) - fixed[3])
-                if scatter:
-                    own_v = vp  # before any force
-                    if goal > 0.0:
-                        vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, worlds, particles)
-                    mass = fixed[0]
-                    tau = mat3(0.0)
-                    modulus = 0.0
-                    if ti.static(laws.only_elastic):
-                        tau, modulus, _ = laws.solid[0].stress(Fp, Cp, 0.0, fixed[1], fixed[2], fixed)
-                    else:
-                        tau, modulus = respond(laws, p, Fp, Cp, fixed, worlds, particles)
-                    stiffness = ti.max(stiffness, modulus / mass)
-                    Q = (-4.0 * dt_scatter) * tau + mass * Cp
-                    gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
-                    base = ti.cast(gp - 0.5, ti.i32)
-                    fx = gp - ti.cast(base, ti.f32)
-                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
-                    if touching:
-                        # Start the contact solve from the forces of the last substep.
-                        a = particles.reaction[p]
-                        vp += dt_scatter * vec3(a[0], a[1], a[2])
-                    q = mass * vp - Q @ fx
-                    b4 = vec4(q[0], q[1], q[2], mass)
-                    c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
-                    c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
-                    c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
-                    if ti.static(not laws.flowing):
-                        spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
-                    elif ti.static(laws.only_flowing):
-                        spread(first, fx, b4, c0, c1, c2, pads.scattered)
-                    else:
-                        if flows:
-                            spread(first, fx, b4, c0, c1, c2, pads.scattered)
-                        else:
-                            spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
-                    if ti.static(laws.flowing):
-                        if flows:
-                            packing = 0.0
-                            if is_fluid(law):
-                                packing = particles.memory[p]
-                            scatter_past(first, fx, mass, own_v, Cp, packing, slope, pads.past_scattered)
-                p += ti.static(lanes.threads)
-            meet(lanes)
-            if scatter:
-                store_window(lanes, lane, k, pads.scattered, nodes.scattered)
-                if ti.static(laws.flowing):
-                    if flows:
-                        store_window(lanes, lane, k, pads.past_scattered, flow.scattered)
-            margin = ti.cast(ti.min(lowest - FIXED_LOW, FIXED_HIGH - highest), ti.f32) * (1.0 / FIXED_ONE)
             if ti.static(lanes.shared):
-                sum2 = lane_sum(lanes, lane, sum2, pads)
-                most = lane_maxima(lanes, lane, vec4(speed2, stiffness, -gap, -margin), pads)
-                speed2, stiffness, gap, margin = most[0], most[1], -most[2], -most[3]
-            if adheres and phase != IDLE and lane == 0:
-                # The next whole substep reads this; the number that the present one has read waits for the one after.
-                now = ti.cast(worlds.control[c + SUBSTEPS], ti.i32) & 1
-                following = ti.select(gather, 1 - now, now)
-                worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + 1 - following] = FAR
-                ti.atomic_min(worlds.field_numbers[f * FIELD_ROW + PLANE_GAP + following], gap)
-            r = k * SCALARS_PER_BLOCK
-            if lane == 0:
-                if gather:
-                    blocks.report[r] = speed2
-                    blocks.report[r + 2] = margin
-                    blocks.report[r + 4] = sum2
-                if scatter:
-                    blocks.report[r + 1] = stiffness
+                advance_block(laws, lanes, pads, lane, turn, 0, worlds, blocks, near, particles, flow, nodes)
+            else:
+                for k in range(turn * blocks.count // all_turns, (turn + 1) * blocks.count // all_turns):
+                    spot = turn * WINDOW_NODES
+                    advance_block(laws, lanes, pads, lane, k, spot, worlds, blocks, near, particles, flow, nodes)

@@ -5,8 +5,8 @@
 """Windows between particles and grid nodes: filling and summing them, interpolation at a particle, spreading from one.
 
 Quadratic B-splines; APIC (Jiang et al. 2015) with second derivatives for solids (PolyPIC, Fu et al. 2017). A block of
-particles owns a window of nodes (see ``layout``). Where many lanes share a block it lies in shared memory, component by
-component; ``node_of``, ``set_node`` and ``add_to`` hide that.
+particles owns a window of nodes to write (see ``layout``) and borrows one to read. Where many lanes share a block both
+lie in shared memory, component by component; ``node_of``, ``set_node`` and ``add_to`` hide that.
 """
 
 from typing import Any
@@ -82,6 +82,16 @@ def store_window(lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.templ
 
 
 @ti.func
+def turns(lanes: ti.template(), count: ti.i32, window: Vectors4):
+    """Threads, or groups of them, that take ``count`` blocks in turn: as many as have a window to read, if it lies in
+    an array; in shared memory each group has its own."""
+    number = count
+    if ti.static(not lanes.shared):
+        number = ti.min(count, window.shape[0] // WINDOW_NODES)
+    return number
+
+
+@ti.func
 def grid_node(k: ti.i32, n: ti.i32, neighbours: Integers):
     """Index of node ``n`` of particle block ``k``'s window among the nodes of the grid blocks."""
     # Nodes 0 of the window's eight lie in the block before, 1 to 4 in the block itself, 5 to 7 in the one after.
@@ -92,14 +102,19 @@ def grid_node(k: ti.i32, n: ti.i32, neighbours: Integers):
 
 @ti.func
 def fetch_window(
-    lanes: ti.template(), lane: ti.i32, k: ti.i32, neighbours: Integers, nodes: Vectors4, window: ti.template()
+    lanes: ti.template(),
+    lane: ti.i32,
+    k: ti.i32,
+    spot: ti.i32,
+    neighbours: Integers,
+    nodes: Vectors4,
+    window: ti.template(),
 ):
-    """Copy the nodes around particle block ``k`` into its window, node by node: ``load_window`` for
+    """Copy the nodes around particle block ``k`` to ``window`` from ``spot`` on, node by node: ``load_window`` for
     many lanes."""
-    offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
     n = lane
     while n < WINDOW_NODES:
-        set_node(window, offset + n, nodes[grid_node(k, n, neighbours)])
+        set_node(window, spot + n, nodes[grid_node(k, n, neighbours)])
         n += ti.static(lanes.threads)
 
 
@@ -143,8 +158,8 @@ def span(side: ti.i32):
 
 
 @ti.func
-def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
-    """Copy the nodes around particle block ``k`` into its private window."""
+def load_window(k: ti.i32, spot: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
+    """Copy the nodes around particle block ``k`` to ``window`` from ``spot`` on."""
     for d in range(27):
         g = neighbours[k * 27 + d]
         il, ih = span(d // 9)
@@ -154,7 +169,7 @@ def load_window(k: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vector
             for j in range(jl, jh):
                 for m in range(ml, mh):
                     node = ((i + 3) & 3) * 16 + ((j + 3) & 3) * 4 + ((m + 3) & 3)
-                    window[k * WINDOW_NODES + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
+                    window[spot + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
 
 
 @ti.func
