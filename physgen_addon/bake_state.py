@@ -166,9 +166,7 @@ def record_of(scene: bpy.types.Scene, folder: Path) -> BakeRecord:
 
 def caches_of(scene: bpy.types.Scene) -> list[Path]:
     """Return folders that may hold bakes of ``scene``: its cache folder, and the folder of the bake it shows."""
-    found = []
-    with contextlib.suppress(InputError):
-        found.append(paths.scene_cache(scene))
+    found = _own_cache(scene)
     folder = paths.shown_bake(scene)
     if folder is not None and folder.parent.name == bake_record.BAKES and folder.parent.parent not in found:
         found.append(folder.parent.parent)
@@ -292,14 +290,34 @@ def _look(scene: bpy.types.Scene) -> BakeState:
     troubles = show_bake.misfits(scene, shown)
     if damage:
         return BakeState("missing", 0, manifest.frames, trouble=damage, advice=MESSAGES["damaged"])
+    advice = ""
     if current not in shown.fingerprints:
-        status = "stale"
+        status, owner = "stale", _owner(scene, shown.path)
+        if owner is not None:
+            advice = f"This bake belongs to the scene {owner.name}. Bake again, and this scene has its own"
     elif is_locked(shown.path) and not is_stopping(scene):
         words = f"Another process is baking this scene. If none is, delete {shown.path / LOCK_FILE}"
         return BakeState("baking", done, manifest.frames, advice=words)
     else:
         status = "baked" if manifest.state == "complete" and done == manifest.frames else "paused"
-    return BakeState(status, done, manifest.frames, trouble=_sentences(*troubles, obstacle), advice=MESSAGES[status])
+    return BakeState(
+        status, done, manifest.frames, trouble=_sentences(*troubles, obstacle), advice=advice or MESSAGES[status]
+    )
+
+
+def _owner(scene: bpy.types.Scene, folder: Path) -> bpy.types.Scene | None:
+    """Return the other scene of which ``scene``, as a copy, shows the bake ``folder``; None if it is its own."""
+    if any(folder.is_relative_to(cache) for cache in _own_cache(scene)):
+        return None
+    others = [other for other in bpy.data.scenes if other != scene]
+    return next((o for o in others if shows(o, folder) or any(map(folder.is_relative_to, _own_cache(o)))), None)
+
+
+def _own_cache(scene: bpy.types.Scene) -> list[Path]:
+    """Return the folder of the scene's bakes; none where it has no usable one."""
+    with contextlib.suppress(InputError):
+        return [paths.scene_cache(scene)]
+    return []
 
 
 def _unreadable(scene: bpy.types.Scene) -> str:

@@ -343,7 +343,12 @@ def test_two_scenes_of_a_file_keep_to_themselves(file):
     bpy.ops.scene.new(type="FULL_COPY")
     second = scene()
     assert second != first and paths.scene_cache(first) != paths.scene_cache(second)
-    assert bake_state.state(second).status in ("baked", "stale")
+    # The copied object has another name, so the bake is not its own; nothing has "changed", though.
+    copied = bake_state.state(second)
+    assert copied.status == "stale" and copied.advice.startswith("This bake belongs to the scene Scene.")
+    second.name = "Zweite"
+    assert "belongs to the scene Scene" in bake_state.observe(second).advice
+    assert bake_state.state(first).status == "baked"
     with bpy.context.temp_override(scene=second):
         assert bpy.ops.physgen.free_bake() == {"FINISHED"}
     # The files are the first scene's.

@@ -335,17 +335,7 @@ def drop(browser, onto, number):
     high = screens.window().height
     x, y = listed.x + 60, high - (listed.y + listed.height - 30)
     goal = (onto.x + onto.width // 2, high - (onto.y + onto.height // 3))
-    yield from screens.point(x, y)
-    screens.xdotool("mousedown", 1)
-    yield 0.5
-    for share in (0.1, 0.4, 0.8, 1.0):
-        screens.xdotool("mousemove", round(x + share * (goal[0] - x)), round(y + share * (goal[1] - y)))
-        yield 0.4
-    yield from screens.drawn()
-    screens.picture(screens.window(), SCREENS / f"{number}_dragging.png")
-    screens.xdotool("mouseup", 1)
-    yield 1.0
-    yield from screens.drawn()
+    yield from screens.drag((x, y), goal, SCREENS / f"{number}_dragging.png")
     screens.picture(screens.window(), SCREENS / f"{number + 1}_dropped.png")
     # The letter that the menu underlines in Start from a Photo.
     yield from screens.press("s")
