@@ -7,12 +7,14 @@ import pytest
 from physgen.sim.composite.inpaint import FillOptions, inpaint
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.segmentation.box_segmentation import check_distinct, pixel_box, segment
+from physgen.sim.reconstruct.segmentation.ground_shade import without_ground
 from physgen.sim.reconstruct.segmentation.mask_cleanup import (
     drop_ground_shadow,
     fill_holes,
     largest_component,
     settle_outline,
 )
+from physgen.sim.reconstruct.segmentation.mask_proposals import crop_around_box
 from scipy import ndimage
 
 WIDTH, HEIGHT = 320, 240
@@ -337,6 +339,39 @@ def test_a_box_around_object_and_shadow_yields_the_object(box, seed):
     found = segment(pixels, box, "toy")
     assert (found & ball).sum() / (found | ball).sum() > 0.95
     assert (found & shadow).sum() < 0.02 * shadow.sum()
+
+
+def ball_on_polished_planks(seed, height=240, width=320):
+    """A white ball, its shadow, and its mirror image within that: light that the wood has not coloured. Linear."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    plank = rng.uniform(0.85, 1.15, 9)[(rows // 30).astype(int)] * (1.0 + 0.05 * np.sin(columns / 9.0 + rows / 3.0))
+    wood = np.array([0.62, 0.27, 0.04]) * plank[..., None]
+    dark = ((columns - 155) / 95.0) ** 2 + ((rows - 176) / 36.0) ** 2
+    shade = (1.0 - 0.6 / (1.0 + np.exp(np.clip((dark - 1.0) * 14.0, -50, 50))))[..., None]
+    middle = np.exp(np.log(wood).mean(axis=2, keepdims=True))
+    image = ((columns - 155) / 50.0) ** 2 + ((rows - 174) / 32.0) ** 2 < 1
+    mirrored = cv2.GaussianBlur(0.035 * image, (0, 0), 1.5)[..., None]
+    picture = middle * (wood / middle) ** (1.0 - 0.5 * np.log(shade)) * shade + mirrored
+    ball = (columns - 155) ** 2 + (rows - 108) ** 2 < 58**2
+    normal = np.clip(0.75 - (rows - 108) / 150.0 - (columns - 155) / 300.0, 0.2, 1.0)
+    picture[ball] = (np.array([0.9, 0.78, 0.62]) * normal[..., None])[ball]
+    noisy = np.clip(picture, 0.0, 1.0) ** (1.0 / 2.2) + rng.normal(0.0, 0.01, (height, width, 3))
+    soft = cv2.GaussianBlur(np.clip(noisy, 0.0, 1.0), (0, 0), 0.7)
+    return np.round(255.0 * soft).astype(np.uint8), ball, image & ~ball, (shade[..., 0] < 0.7) & ~ball
+
+
+@pytest.mark.parametrize(("seed", "end"), [(0, 165), (1, 185)])
+def test_a_mirror_image_in_the_shade_is_ground_where_more_of_it_shows_beside(seed, end):
+    pixels, ball, image, shadow = ball_on_polished_planks(seed)
+    view = crop_around_box(pixels, (60, 30, 250, 225), np.zeros_like(ball))
+    taken = (image | shadow) & (np.arange(320) < end)
+    found = without_ground(view, ball | taken, polished=True)
+    assert overlap(found, ball) > 0.98
+    # The whole image, and no polish beside it: what is no shade of the ground may be a white foot.
+    assert without_ground(view, ball | image | shadow, polished=True)[image].mean() > 0.95
+    # It is no ground in the shade alone.
+    assert without_ground(view, ball | taken)[image & taken].mean() > 0.95
 
 
 def test_black_wheels_with_pale_hubs_are_no_shadow_of_the_car():

@@ -293,7 +293,7 @@ def _coarse(
         near = cv2.dilate(rest.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         again = _kept_part(without_ground(told, again) & near, closed, view.keep)
         rest = again if again.sum() > 0.5 * rest.sum() else rest
-    chosen = rest
+    chosen = _without_images(view, chosen, rest)
     completed = completed_by_contours(view, chosen, shade=_shade(view, chosen))
     notices = mask_warnings(view, raw, chosen)
     if completed.doubtful.any():
@@ -312,6 +312,17 @@ def _coarse(
         )
     )
     return np.asarray(full), np.asarray(closed), notices, cut_sides(view, completed.mask)
+
+
+def _without_images(view: BoxCrop, whole: Mask, rest: Mask) -> Mask:
+    """``rest`` of the proposal ``whole``, both (h, w), without the object's mirror images in polished ground.
+
+    An underside that the ground lights has their colours as well: seams a few pixels wide stay.
+    """
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    images = (rest & ~without_ground(view, whole, polished=True)).astype(np.uint8)
+    wide = cv2.dilate(cv2.morphologyEx(images, cv2.MORPH_OPEN, disc), np.ones((3, 3), np.uint8)) > 0
+    return _kept_part(rest & ~(wide & (images > 0)), view.others, view.keep)
 
 
 def _best_proposal(view: BoxCrop, iterations: int) -> tuple[Mask, Mask]:

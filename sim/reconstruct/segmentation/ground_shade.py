@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Ground that a mask has taken with the object: cast shadows, and what is lit between them.
+"""Ground that a mask has taken with the object: cast shadows, mirror images, and what is lit between them.
 
 A box that reaches to the end of a hard shadow teaches its colours as the object's own. Ground is told from the object
 by how it darkens. In logarithms of linear light a shadow moves every ground colour along one line, and not
 only towards black: what light there is has been reflected by the ground before, so shaded wood is redder than lit wood.
-The line's slope is read off the photo. A cut between this class and the object's own colours follows the edges, and a
-part is only given back to the ground if it borders on it, and an edge parts it from the object.
+The line's slope is read off the photo. Polish adds light that the ground has not coloured: between the shadows of a
+white toy the floor is neither its own colour nor that in shade. A cut between this class and the object's own colours
+follows the edges, and a part is only given back to the ground if it borders on it, and an edge parts it from the
+object.
 """
 
 from __future__ import annotations
@@ -39,6 +41,11 @@ LOCAL = 0.25
 NOISE, DARK_NOISE, SLOPE_NOISE = 0.12, 0.006, 0.08
 """Standard deviation of ground colours from the line, in natural logarithms; of linear light; and per unit of
 darkening."""
+MIRRORED, MIRROR_STEPS = 0.18, (0.3, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
+"""Largest share of what is seen that is mirrored, over the mean of the channels: 0.12 to 0.25 part a white toy's image
+from the toy, whose underside shows the floor's colour as well. Shares of the darkest channel that are tried."""
+POLISHED = 0.01
+"""Share of the ground beside the object that nothing but its polish explains, from which there is any."""
 BRIGHTEST = 0.5
 """Natural logarithm of ground over the local mean above which it is none."""
 LEAST_OWN, MOST_GROUND = 0.3, 0.45
@@ -63,15 +70,16 @@ SHADED, DEEP = -0.15, -0.4
 part: fainter shadows do not deceive a cut, but a bear of the floor's brown does."""
 
 
-def without_ground(view: BoxCrop, mask: Mask) -> Mask:
+def without_ground(view: BoxCrop, mask: Mask, *, polished: bool = False) -> Mask:
     """Return ``mask`` (h, w) without parts that are ground beside the object, shaded or lit.
 
-    What the user keeps stays. Where most of the mask could be ground, as with grey things on grey, nothing is told from
-    it and ``mask`` is returned. Cost: a tenth of a second.
+    polished: also ground that mirrors, where there is some beside the object. What the user keeps stays. Where most of
+    the mask could be ground, as with grey things on grey, nothing is told from it and ``mask`` is returned. Cost: a
+    tenth of a second, twice that where there is polish.
     """
     if mask.sum() < 200:
         return mask
-    unlike, brighter = _unlike_ground(view, mask)
+    unlike, brighter = _unlike_ground(view, mask, polished=polished)
     cut = _cut(view, mask, unlike, brighter)
     if cut is None:
         return mask
@@ -81,8 +89,9 @@ def without_ground(view: BoxCrop, mask: Mask) -> Mask:
 
 
 def shaded_ground(view: BoxCrop, mask: Mask) -> Mask:
-    """Return the pixels (h, w) whose colour is that of the ground around ``mask`` (h, w), not empty, in shade."""
-    unlike, brighter = _unlike_ground(view, mask)
+    """Return the pixels (h, w) whose colour is that of the ground around ``mask`` (h, w), not empty, in shade, also
+    under a mirror image."""
+    unlike, brighter = _unlike_ground(view, mask, polished=True)
     return np.asarray((unlike < LIKE) & (brighter < SHADED))
 
 
@@ -93,9 +102,10 @@ def _log_light(pixels: NDArray[np.uint8]) -> Light:
     return np.asarray(np.log(linear + DARKEST), dtype=np.float32)
 
 
-def _unlike_ground(view: BoxCrop, mask: Mask) -> tuple[Light, Light]:
+def _unlike_ground(view: BoxCrop, mask: Mask, *, polished: bool = False) -> tuple[Light, Light]:
     """Return how unlike the ground each pixel (h, w) is, lit or shaded: squared distance from the line in standard
-    deviations; and how much brighter than the ground around it, as a natural logarithm."""
+    deviations; and how much brighter than the ground around it, as a natural logarithm. polished: also under mirror
+    images, where the ground beside ``mask`` shows some, too."""
     light = _log_light(view.pixels)
     size = float(np.sqrt(mask.sum()))
     free = ~(cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~view.others
@@ -104,6 +114,25 @@ def _unlike_ground(view: BoxCrop, mask: Mask) -> tuple[Light, Light]:
     near = (cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & free
     # Along the line all channels change at these rates, whose mean is 1.
     rates = 1.0 + _slope(light - ground, near, np.median((ground - ground.mean(axis=2, keepdims=True))[mask], axis=0))
+    apart, along = _from_line(light, ground, rates)
+    if not polished:
+        return apart, along
+    linear = np.exp(light) - np.float32(DARKEST)
+    darkest, most = np.maximum(linear.min(axis=2), 0.0), MIRRORED * linear.mean(axis=2)
+    best, best_along = apart, along
+    for step in MIRROR_STEPS:
+        mirrored = np.minimum(step * darkest, most)[..., None]
+        under, under_along = _from_line(np.log(linear - mirrored + np.float32(DARKEST)), ground, rates)
+        best, best_along = np.minimum(best, under), np.where(under < best, under_along, best_along)
+    mirroring = (apart > LIKE) & (best < LIKE)
+    if mirroring[near].sum() < POLISHED * near.sum():
+        return apart, along
+    return np.where(mirroring, best, apart), np.where(mirroring, best_along, along)
+
+
+def _from_line(light: Light, ground: Light, rates: NDArray[np.floating]) -> tuple[Light, Light]:
+    """Return the squared distance (h, w) of ``light`` from the line through ``ground``, both (h, w, 3), in standard
+    deviations, and the place along it. rates: (3,), the line's direction."""
     variance = NOISE**2 + np.square(DARK_NOISE / np.exp(light))
     away = light - ground
     along = (rates * away / variance).sum(axis=2) / (rates**2 / variance).sum(axis=2)
