@@ -8,7 +8,7 @@ surroundings, so that a slow body leaves no ghost. A camera that drifts is stabi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -35,6 +35,8 @@ SHADOW = (0.45, 0.97, 0.09)
 """A shadow: least and largest brightness over the background's, and largest difference between the channels."""
 STRONG = 0.55
 """Share of a frame's largest difference from which even what looks like a shadow counts as a body."""
+LEAST_RIM = 1.1
+"""Area of a region with what looks like its shadow, over its own, from which that may be a rim."""
 LEAST_FULL, ONE_COLOUR = 0.3, 0.6
 """Contrast of a pixel that is all body, over the body's usual one, at least: where its colour is nearly that of the
 background, how far it covers a pixel is noise. Contrast of its mean colour, over the same, from which that tells."""
@@ -54,6 +56,7 @@ class Region:
     angle: rad, of the larger axis, from x towards y. outline: (N, 2) its convex hull. colour: (3,) BGR.
     cut: whether it touches the picture's border. solid: its area over its hull's. shade: share of it that looks like a
     shadow, the background made darker in all colours alike. contrast: of its inner part to the background, grey levels.
+    whole: the same with what touches it and looks like a shadow, if that is much: the blurred rim of a fast body does.
     """
 
     frame: int
@@ -67,6 +70,7 @@ class Region:
     solid: float
     shade: float = 0.0
     contrast: float = 0.0
+    whole: Region | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,8 +183,26 @@ def _regions(picture: Picture, background: Picture, limit: Array, index: int) ->
         return clear, []
     # A shadow beside its body is no thing of its own.
     _, labels = cv2.connectedComponents(cv2.dilate(faint, square))
-    faint[np.isin(labels, np.unique(labels[mask > 0]))] = 0
-    return clear, list(_outlined(faint, picture, background, away, shade, index))
+    beside = faint & np.isin(labels, np.unique(labels[mask > 0]))
+    if beside.any():
+        full = mask | beside
+        wholes = list(_outlined(full, picture, background, away, shade, index))
+        _, parts = cv2.connectedComponents(full)
+        clear = [_with_rim(r, clear, wholes, np.asarray(parts, np.int32)) for r in clear]
+    return clear, list(_outlined(faint & ~beside, picture, background, away, shade, index))
+
+
+def _with_rim(region: Region, clear: list[Region], wholes: list[Region], parts: NDArray[np.int32]) -> Region:
+    """Return ``region`` with the one of ``wholes`` that it is the only clear one of. parts: (H, W) their labels."""
+    label = _at(parts, region)
+    own = [w for w in wholes if _at(parts, w) == label] if label else []
+    if len(own) != 1 or own[0].area < LEAST_RIM * region.area or sum(_at(parts, r) == label for r in clear) > 1:
+        return region
+    return replace(region, whole=own[0])
+
+
+def _at(parts: NDArray[np.int32], region: Region) -> int:
+    return int(parts[int(region.middle[1]), int(region.middle[0])])
 
 
 def _outlined(

@@ -24,6 +24,9 @@ PIECE_SIZE, PIECE_OFF, PIECE_NEAR = 0.5, 0.25, 0.6
 the body's size, at most."""
 MOVED = 0.5
 """Way that a body has to go while a piece is seen with it, in its own sizes."""
+FAST, FASTS, ROOMY, ALIGNED = 0.4, 3, 1.2, 0.9
+"""Way of a body in a frame, over its width, from which blur may take its rim; frames in which that has to be seen; and
+largest size of body and rim over its width, and along the motion its way in a frame; least cosine of both."""
 BLURRED, AREA_RATIO = 4, 2.5
 """Frames of a gap up to which a path is followed into faint regions, and their largest ratio of areas."""
 
@@ -34,6 +37,7 @@ def bodies(paths: list[RegionPath], faint: list[list[Region]]) -> list[RegionPat
     whole = _without_shadows(_without_pieces(paths))
     for path in whole:
         _continue_faintly(path, faint)
+        _take_blurred_rims(path)
     return sorted(whole, key=lambda p: -p.freedom())
 
 
@@ -139,3 +143,29 @@ def _continue_faintly(path: RegionPath, faint: list[list[Region]]) -> None:
             if found is None:
                 break
             path.regions.insert(len(path.regions) if forward else 0, found)
+
+
+def _take_blurred_rims(path: RegionPath) -> None:
+    """Replace the regions of a fast body by those with the rim that blur makes look like a shadow.
+
+    A rim is as wide as the body across its way, and longer along it by no more than its way in a frame. A shadow that
+    touches the body has no such size; a body that is never fast has no such rim.
+    """
+    if path.freedom() <= 0 or sum(r.whole is not None for r in path.regions) < FASTS:
+        return
+    frames = np.array([r.frame for r in path.regions], dtype=np.float64)
+    speeds = np.gradient(path.middles, frames, axis=0)
+    width = float(np.percentile([4 * r.axes[1] for r in path.regions], 75))
+    fits = np.zeros(len(frames), dtype=np.bool_)
+    for k, rim in enumerate(r.whole for r in path.regions):
+        if rim is not None:
+            pace = float(np.linalg.norm(speeds[k]))
+            long, wide = 4 * rim.axes
+            way = abs(float(speeds[k] @ (np.cos(rim.angle), np.sin(rim.angle)))) / max(pace, 1e-9)
+            fits[k] = wide <= ROOMY * width and (
+                long <= ROOMY * width or (way > ALIGNED and long <= ROOMY * (width + pace))
+            )
+    fast = np.linalg.norm(speeds, axis=1) > FAST * width
+    if (fits & fast).sum() < FASTS:
+        return
+    path.regions[:] = [r.whole or r if fit else r for r, fit in zip(path.regions, fits, strict=True)]
