@@ -30,7 +30,7 @@ MESSAGES = {
     "stale": "Out of date: something has changed since. Bake again, or undo the change",
     "missing": "The bake was moved. Find its folder, or bake again",
     "asks": "This file came with a bake outside its folder, which is left alone until you agree (see Scene)",
-    "damaged": "Files of the bake are gone or damaged. Bake again, which computes that part anew, or find a good copy",
+    "damaged": "Files of the bake are missing or damaged. Bake again to recompute them, or find a good copy",
 }
 
 

@@ -191,7 +191,7 @@ class Bake(JobOperator):
             raise InputError(f"{folder}: the record of the bake is gone; bake again")
         if self._job.undone and not bake_state.matches(scene, record):
             bake_state.observe(scene)
-            return "Baked. What was baked is undone: redo it, and the bake is shown"
+            return "Baked, but what was baked has been undone: redo it to see the bake"
         troubles = show_bake.show(scene, record)
         # Of the bake: settings may have been undone since it began.
         last = record.frame_start + load_manifest(folder).frames_done - 1
@@ -200,11 +200,11 @@ class Bake(JobOperator):
         waits = paths.is_unsaved_cache(scene)
         unsaved.settle(scene)
         bake_state.observe(scene)
-        sentence = f"frames {record.frame_start} to {last} are baked"
+        sentence = f"Baked frames {record.frame_start} to {last}"
         if ends:
-            sentence += f", and playback now ends at {last}"
+            sentence += f"; playback now ends at {last}"
         if waits:
-            sentence += "; they wait in a temporary folder until you save the file"
+            sentence += ". Save the file to keep them: they are in a temporary folder"
         return ". ".join([sentence, *troubles])
 
     def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
@@ -349,8 +349,8 @@ class PHYSGEN_OT_free_bake(_CacheOperator, bpy.types.Operator):
             return {"CANCELLED"}
         bake_state.set_trouble(scene, "")
         bake_state.observe(scene)
-        words = f"its files stay, because they are not this scene's alone: {folder}" if kept else storage(freed)
-        self.report({"INFO"}, f"The bake is out of the scene; {words}")
+        words = f"its files are kept for another scene or file: {folder}" if kept else f"{storage(freed)} freed"
+        self.report({"INFO"}, f"Bake removed; {words}")
         return {"FINISHED"}
 
 
@@ -375,7 +375,7 @@ class PHYSGEN_OT_free_old_bakes(_CacheOperator, bpy.types.Operator):
         bake_state.observe(scene)
         for trouble in troubles:
             self.report({"WARNING"}, trouble)
-        self.report({"INFO"}, f"{count(deleted, 'bake')} deleted; {storage(freed)}")
+        self.report({"INFO"}, f"{count(deleted, 'bake')} deleted; {storage(freed)} freed")
         return {"FINISHED"}
 
 
@@ -401,7 +401,7 @@ class PHYSGEN_OT_free_one_bake(_CacheOperator, bpy.types.Operator):
             raise InputError(f"{record.path}: another scene or file plays it; free it there")
         freed = delete(record.path)
         bake_state.observe(scene)
-        self.report({"INFO"}, f"The bake is deleted; {storage(freed)}")
+        self.report({"INFO"}, f"Bake deleted; {storage(freed)} freed")
         return {"FINISHED"}
 
 
@@ -427,7 +427,7 @@ class PHYSGEN_OT_relink_caches(_CacheOperator, bpy.types.Operator):
         relink(scene, paths.require_folder(self.directory, "Folder"))
         bake_state.set_trouble(scene, "")
         bake_state.observe(scene)
-        self.report({"INFO"}, f"The bake is {scene.physgen.simulation.bake}")
+        self.report({"INFO"}, f"Bake found: {scene.physgen.simulation.bake}")
         return {"FINISHED"}
 
 

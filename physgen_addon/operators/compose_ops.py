@@ -111,7 +111,7 @@ class Compose(JobOperator):
         for item, _ in changes:
             item.update_tag(refresh={"DATA"})
         if not moved:
-            return "nothing had to move"
+            return "Nothing had to move"
         before, after = (sum(float(pair[f"volume_{when}"]) for pair in pairs) for when in ("before", "after"))
         deepest = max(float(pair["deepest_after"]) for pair in pairs)
         return (

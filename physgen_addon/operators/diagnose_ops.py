@@ -244,7 +244,7 @@ class PHYSGEN_OT_follow(bpy.types.Operator):
             return {"FINISHED"}
         body = capture_view.shown_body(state.root, state.trial)
         if body is None:
-            self.report({"WARNING"}, "no object is in sight: show the mesh of a layer")
+            self.report({"WARNING"}, "no object is visible: show the mesh of a layer")
             return {"CANCELLED"}
         for space in spaces:
             space.lock_object = body
@@ -377,7 +377,7 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
         state.scene_folder = str(final["scene"])
         state.before, state.after = str(final["before"]), str(final["after"])
         show_overlay(scene)
-        return "the effect is in the scene; before and after lie over each other"
+        return "Effect added; the bakes before and after are overlaid"
 
 
 class PHYSGEN_OT_show_overlay(bpy.types.Operator):

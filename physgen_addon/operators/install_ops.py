@@ -25,7 +25,9 @@ from ..props import preferences
 from ..props.preferences import python
 from ..text import report_errors
 
-_OFFLINE = "Blender's preferences keep it offline (System > Network > Allow Online Access): allow it there, or choose "
+_OFFLINE = (
+    "Blender is set to stay offline (Preferences > System > Network > Allow Online Access): allow it there, or choose "
+)
 OFFLINE_WHEELS = f"{_OFFLINE}a folder of wheels that were downloaded elsewhere"
 OFFLINE_MODEL = f"{_OFFLINE}an archive that was fetched elsewhere"
 
@@ -131,7 +133,7 @@ class PHYSGEN_OT_install_python(_Consent, bpy.types.Operator):
 
     bl_idname = "physgen.install_python"
     bl_label = "Install"
-    heading, source, offline, job = "Install What Simulates", "wheels", OFFLINE_WHEELS, "install_packages"
+    heading, source, offline, job = "Set Up the Simulation", "wheels", OFFLINE_WHEELS, "install_packages"
 
     wheels: StringProperty(
         name="Folder of Wheels",
@@ -155,8 +157,8 @@ def install_description() -> list[str]:
     )
     return [
         f"{packages}: about {_size(download)} to download, {_size(disk)} on disk.",
-        f"Into {interpreter.home_folder()}, which is yours to delete. Nothing else is changed.",
-        "From the Python package index, or whichever index pip is set to; wheels only, checked by pip.",
+        f"Installed in {interpreter.home_folder()}, which you may delete at any time. Nothing else is changed.",
+        "From the Python package index, or the one that pip is configured for; wheels only, checked by pip.",
     ]
 
 
@@ -225,7 +227,7 @@ class PHYSGEN_OT_copy_command(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Copy to the clipboard."""
         context.window_manager.clipboard = self.command
-        self.report({"INFO"}, "copied")
+        self.report({"INFO"}, "Command copied")
         return {"FINISHED"}
 
 
@@ -278,7 +280,7 @@ class PHYSGEN_OT_install_model(JobOperator, bpy.types.Operator):
 
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Tell that it is there."""
-        return "installed; the next reconstruction cuts out with it"
+        return "Installed; the next reconstruction uses it"
 
 
 class PHYSGEN_OT_remove_model(bpy.types.Operator):
@@ -299,5 +301,5 @@ class PHYSGEN_OT_remove_model(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Delete it."""
         model_folder.remove(ISNET)
-        self.report({"INFO"}, "removed")
+        self.report({"INFO"}, "Model removed")
         return {"FINISHED"}

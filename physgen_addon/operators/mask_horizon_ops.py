@@ -131,7 +131,7 @@ class PHYSGEN_OT_paint_mask(PhotoTool, bpy.types.Operator):
         if not painting.changed:
             return self.end(context, "CANCELLED")
         if store_mask(box, painting.mask) is None:
-            self.report({"INFO"}, f"the mask of {box.name} is empty: the object is cut out of its box")
+            self.report({"INFO"}, f"the mask of {box.name} is empty: the object is segmented from its box")
         widen(state, box, painting.mask)
         return self.end(context, "FINISHED")
 

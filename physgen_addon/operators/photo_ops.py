@@ -317,14 +317,14 @@ class PHYSGEN_OT_trust_file(bpy.types.Operator):
     """Agree to the paths outside its folder that this file names; each is shown first"""
 
     bl_idname = "physgen.trust_file"
-    bl_label = "This File Asks for Others"
+    bl_label = "Paths in This File"
 
     go_on: BoolProperty(name="Reconstruct Then", default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show every line."""
         manager = context.window_manager
-        title = "Somebody set these paths. Use them?"
+        title = "This file names paths outside its folder. Use them?"
         return manager.invoke_props_dialog(self, width=560, title=title, confirm_text="Trust This File")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -416,7 +416,7 @@ class PHYSGEN_OT_open_photo_report(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Enabled if the last reconstruction wrote one."""
         if report_page(context.scene.physgen_photo) is None:
-            cls.poll_message_set("Switch Write Report on and reconstruct")
+            cls.poll_message_set("Enable Write Report and reconstruct")
             return False
         return True
 
@@ -425,7 +425,7 @@ class PHYSGEN_OT_open_photo_report(bpy.types.Operator):
         """Open report.html."""
         page = report_page(context.scene.physgen_photo)
         if page is None:
-            raise InputError("there is no report of this photo; switch Write Report on and reconstruct")
+            raise InputError("there is no report of this photo; enable Write Report and reconstruct")
         require_harmless(page)
         webbrowser.open(page.as_uri())
         return {"FINISHED"}

@@ -113,10 +113,10 @@ class _Render(JobOperator):
         """Enabled with a photo and a bake, and without a running job."""
         state = context.scene.physgen
         if not state.folder:
-            cls.poll_message_set("This scene has no photo: render it as any scene of Blender")
+            cls.poll_message_set("This scene has no photo: render it as any Blender scene")
             return False
         if not state.simulation.bake:
-            cls.poll_message_set("Bake first (see Simulate)")
+            cls.poll_message_set("Bake first (see Scene)")
             return False
         return super().poll(context)
 
@@ -214,7 +214,7 @@ class PHYSGEN_OT_render_still(_Render, bpy.types.Operator):
         draft = bpy.data.images.get(self._draft)
         if draft is None or not replace_shown(draft, image):
             show_result(bpy.context, image)
-        return f"rendered {path}"
+        return f"Rendered {path}"
 
 
 class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
@@ -234,7 +234,7 @@ class PHYSGEN_OT_render_video(_Render, bpy.types.Operator):
         """Report its path."""
         path = Path(str(final["out"])) / str(final["video"])
         scene.physgen.rendering.result = str(path)
-        return f"rendered {path}"
+        return f"Rendered {path}"
 
 
 class PHYSGEN_OT_look_nodes(bpy.types.Operator):
@@ -344,7 +344,7 @@ class _ExportOperator(OperatorMixin):
 
 
 class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
-    """Export the baked animation as Alembic: bodies, surfaces, and grains as vertices. Blocks Blender meanwhile"""
+    """Export the baked animation as Alembic: bodies, surfaces, and grains as vertices. Blender waits for it"""
 
     bl_idname = "physgen.export_alembic"
     bl_label = "Export Alembic"
@@ -360,7 +360,7 @@ class PHYSGEN_OT_export_alembic(_ExportOperator, bpy.types.Operator):
 
 
 class PHYSGEN_OT_export_usd(_ExportOperator, bpy.types.Operator):
-    """Export the baked animation as USD: bodies, surfaces, and grains as vertices. Blocks Blender meanwhile"""
+    """Export the baked animation as USD: bodies, surfaces, and grains as vertices. Blender waits for it"""
 
     bl_idname = "physgen.export_usd"
     bl_label = "Export USD"

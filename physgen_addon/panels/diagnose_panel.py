@@ -147,7 +147,7 @@ class PHYSGEN_PT_diagnose_show(_Part, bpy.types.Panel):
             for key in ("points", "trail", "body"):
                 row.prop(layer, key, toggle=True)
         if not state.has_motion:
-            text.sentences(layout, context, "Diagnose to see what the models do.")
+            text.sentences(layout, context, "Press Diagnose to see how the models move.")
         colours = layout.column()
         colours.active = state.has_scores
         colours.prop(state, "colours")

@@ -228,7 +228,7 @@ class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
         animated = [name for name in known if name in WITH_UNITS and name != "fibre_modulus"]
         if animated:
             # Keyframes and drivers are those of numbers, and words that show one have none.
-            text.sentences(column, context, "To be animated, in Pa and Pa s:")
+            text.sentences(column, context, "To animate, in Pa and Pa s:")
             numbers = column.column(align=True)
             numbers.use_property_decorate = True
             for name in animated:

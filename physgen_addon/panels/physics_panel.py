@@ -35,4 +35,4 @@ class PHYSGEN_PT_physics(bpy.types.Panel):
             column.prop(body, "spin")
         if not draw_job(self.layout, context, PHYSGEN_OT_bake.job_title):
             self.layout.operator(PHYSGEN_OT_bake.bl_idname, icon="PHYSICS")
-        text.sentences(self.layout, context, "Everything else: 3D viewport, N, tab PhysGen.")
+        text.sentences(self.layout, context, "More in the 3D viewport: press N, tab PhysGen.")

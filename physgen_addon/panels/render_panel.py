@@ -61,7 +61,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
         words = "Until this file is saved, frames go to a temporary folder."
         text.sentences(layout, context, words, icon="INFO")
     if not draw_job(layout, context, "Render") and not state.simulation.bake:
-        text.sentences(layout, context, "Bake first (see Simulate); then the frames can be rendered.", icon="INFO")
+        text.sentences(layout, context, "Bake first (see Scene).", icon="INFO")
     row = layout.row(align=True)
     row.scale_y = 1.4
     row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
@@ -185,7 +185,7 @@ class PHYSGEN_PT_out(Sidebar, bpy.types.Panel):
         """Draw one button each."""
         layout = self.layout
         if not context.scene.physgen.simulation.bake:
-            text.sentences(layout, context, "Bake first (see Simulate) to export the motion.", icon="INFO")
+            text.sentences(layout, context, "Bake first (see Scene) to export the motion.", icon="INFO")
         row = layout.row(align=True)
         row.operator(PHYSGEN_OT_export_alembic.bl_idname, text="Alembic", icon="EXPORT")
         row.operator(PHYSGEN_OT_export_usd.bl_idname, text="USD", icon="EXPORT")

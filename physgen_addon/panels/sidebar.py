@@ -143,7 +143,7 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, *titles: st
     if job.title in titles:
         draw_progress(layout, context, job).operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
     else:
-        text.sentences(layout, context, f"{job.title} is running; go on when it is done.", icon="INFO")
+        text.sentences(layout, context, f"{job.title} is running; continue when it is done.", icon="INFO")
     return True
 
 
@@ -194,7 +194,7 @@ def draw_preview(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     for notice in session.notices[:1]:
         text.sentences(column, context, text.brief(notice, NOTICE), icon="INFO")
     if len(session.notices) > 1:
-        column.label(text=f"and {len(session.notices) - 1} more; a bake says them all", icon="BLANK1")
+        column.label(text=f"and {len(session.notices) - 1} more; a bake lists them all", icon="BLANK1")
 
 
 def draw_arrows(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -147,7 +147,7 @@ def _draw_status(layout: bpy.types.UILayout, context: bpy.types.Context, found: 
     last = context.scene.physgen.simulation.frame_end
     if found.status == "baked" and context.scene.frame_end > last:
         column = box.column(align=True)
-        text.sentences(column, context, f"Playback goes on to frame {context.scene.frame_end}, at rest.")
+        text.sentences(column, context, f"Playback goes on to frame {context.scene.frame_end}, without motion.")
         column.operator(PHYSGEN_OT_play_bake_only.bl_idname, text=f"End Playback at {last}", icon="PREVIEW_RANGE")
     row = box.row(align=True)
     row.label(text=f"{text.storage(found.disk_bytes)} on disk")
@@ -172,7 +172,7 @@ def _draw_bakes(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row.operator(PHYSGEN_OT_free_one_bake.bl_idname, text="", icon="TRASH", emboss=False).folder = bake.folder
         others = [Path(name).name for name in bake.files if name != bpy.data.filepath]
         if others:
-            text.sentences(column, context, f"also of {', '.join(others[:3])}", icon="FILE_BLEND")
+            text.sentences(column, context, f"also used by {', '.join(others[:3])}", icon="FILE_BLEND")
     if len(found) > LISTED:
         column.label(text=f"and {len(found) - LISTED} more", icon="BLANK1")
 
@@ -190,7 +190,7 @@ class PHYSGEN_PT_cache(Sidebar, bpy.types.Panel):
         column = settings(layout, context)
         column.prop(simulation, "cache", text="Folder")
         if simulation.cache.startswith("//") and not bpy.data.filepath:
-            words = "Until this file is saved, bakes wait in a temporary folder."
+            words = "Until this file is saved, bakes are in a temporary folder."
             text.sentences(column, context, words, icon="INFO")
         column.prop(simulation, "device")
         column.prop(simulation, "seed")

@@ -73,7 +73,7 @@ class PHYSGEN_PT_ground(_Part, bpy.types.Panel):
             column.prop(world, "ground_normal")
             column.operator(PHYSGEN_OT_ground_below.bl_idname, icon="TRIA_DOWN_BAR")
         elif not is_in(world.ground_object, context.scene):
-            text.sentences(column, context, "The plane is deleted: choose another, or clear the field.", icon="ERROR")
+            text.sentences(column, context, "The plane was deleted: choose another, or clear the field.", icon="ERROR")
         column.prop(world, "friction")
         column.prop(world, "static_friction")
         draw_static_friction_note(column, context, world)
@@ -238,5 +238,7 @@ def _draw_targets(layout: bpy.types.UILayout, context: bpy.types.Context, entry:
         row.label(text=item.name if item is not None else "Deleted", icon="OBJECT_DATA" if good else "ERROR")
         row.operator(PHYSGEN_OT_remove_effect_target.bl_idname, text="", icon="X", emboss=False).index = index
         if not good:
-            text.sentences(names, context, "It is not dynamic in the simulation: remove it here, or add it there.")
+            text.sentences(
+                names, context, "It does not move in the simulation: remove it here, or give it the role Moves."
+            )
     layout.operator(PHYSGEN_OT_add_effect_targets.bl_idname, icon="RESTRICT_SELECT_OFF")

@@ -10,8 +10,8 @@ _agreed: set[tuple[int, str]] = set()
 """Scene ``session_uid`` and address; both change with the file, so consent never persists."""
 
 OFFLINE = (
-    "Blender's preferences keep it offline (System > Network > Allow Online Access), and the address is not on this "
-    "machine"
+    "Blender is set to stay offline (Preferences > System > Network > Allow Online Access), and the address is not on "
+    "this machine"
 )
 
 

@@ -114,7 +114,7 @@ def _obstacles(item: bpy.types.Object, file: Path, first_frame: int) -> list[str
     if not (modifier.show_viewport and modifier.show_render):
         return [f"{item.name}: its modifier {point_caches.MODIFIER!r} is switched off in the viewport or for renders"]
     if (paths.absolute(modifier.filepath), modifier.frame_start) != (file, first_frame):
-        return [f"{item.name} plays another bake, as objects do that scenes share; bake again to play this scene's"]
+        return [f"{item.name} plays the bake of another scene that shares it; bake again to play this scene's"]
     before = item.modifiers[: item.modifiers.find(point_caches.MODIFIER)]
     return [
         f"{item.name}: modifier {other.name!r} comes before the bake, which no longer fits then; "

@@ -172,7 +172,7 @@ def test_no_request_without_consent(photo, tmp_path):
     assert not photo.send_photo and "--ask=https://host/v1" not in arguments(photo, online=True)
     photo.send_photo = True
     assert arguments(photo, online=True)[-3:] == ["--ask=https://host/v1", "--model=seer", "--send-photo"]
-    with pytest.raises(InputError, match="keep it offline"):
+    with pytest.raises(InputError, match="set to stay offline"):
         arguments(photo, online=False)
     # Consent is about an address.
     photo.ask_url = "http://127.0.0.1:11434"
@@ -346,7 +346,7 @@ def shown(area="VIEW_3D"):
 
 def test_the_panel_shows_what_can_be_told(photo, world):
     words = shown("IMAGE_EDITOR")
-    assert {"kind", "shape", "back", "thickness", "mesh", "mask", "x0", "depth", "report", "ask_url"} <= set(words)
+    assert {"kind", "shape", "back", "own_thickness", "mesh", "mask", "x0", "depth", "report", "ask_url"} <= set(words)
     assert "Reconstruct" in words and not {"mesh_up", "pitch", "horizon"} & set(words)
     photo.boxes[0].mesh, photo.camera = "//toy.glb", "HORIZON"
     assert {"mesh_up", "horizon", "roll"} <= set(shown())
