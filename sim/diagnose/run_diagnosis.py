@@ -39,7 +39,7 @@ from .model_comparison import (
     nominal_or_refitted,
 )
 from .provenance import provenance
-from .report.wording import verdict_summary
+from .report.wording import effect_label, verdict_summary
 from .suggested_experiments import next_experiment, recorded_setting
 from .verification_run import VerificationRun, run_verification
 from .work import RIGID_RATE, SOFT_RATE, Work, WorkRecord
@@ -155,12 +155,18 @@ def _left_out(fits: Fits, options: DiagnoseOptions, work: Work) -> list[str]:
     absent = [n for n in options.effects or () if n not in tried and n not in work.skipped]
     if absent:
         said.append(f"{', '.join(absent)}: asked for and not tried, because it cannot act or show in this capture")
+    return said + cut_off(work)
+
+
+def cut_off(work: Work) -> list[str]:
+    """Return sentences on what was left out for lack of work."""
     by_kind: dict[str, list[str]] = {}
     for name, what in sorted(work.skipped.items()):
-        by_kind.setdefault(what, []).append(name)
-    for what, names in by_kind.items():
-        said.append(f"{', '.join(names)}: not {what}, because the budget was spent; give a larger --budget or --work")
-    return said
+        by_kind.setdefault(what, []).append(effect_label(name))
+    return [
+        f"{', '.join(names)}: not {what}, because the budget was spent; give a larger --budget or --work"
+        for what, names in by_kind.items()
+    ]
 
 
 def fit_candidates(

@@ -310,6 +310,8 @@ def test_the_verdict_in_words():
     verdict = Verdict(effect="time_scale", probability=0.6, alternatives=("buoyancy",), effects=("time_scale",))
     text = verdict_summary(verdict, GAP)
     assert "clock" in text and "buoyancy" in text and "60 %" in text and "89 %" in text
+    # One rounding on the whole page: the table shows 99.6 %.
+    assert "(99.6 % confidence)" in verdict_summary(dataclasses.replace(verdict, probability=0.9964), GAP)
     unsure = dataclasses.replace(GAP, resolvable=False)
     assert "too close to the noise" in verdict_summary(verdict, unsure)
     assert "explains" in verdict_summary(Verdict(effect=NONE, probability=0.9), GAP)

@@ -12,7 +12,7 @@ from physgen.benchmarks.diagnosis import quick_capture
 from physgen.sim.diagnose.capture import load_capture
 from physgen.sim.diagnose.diagnosis import report_json
 from physgen.sim.diagnose.rigid.rigid_simulator import RigidWorlds
-from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, diagnose
+from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, cut_off, diagnose
 from physgen.sim.diagnose.work import LAUNCH, RIGID_RATE, Work
 from physgen.sim.errors import InputError
 
@@ -54,10 +54,17 @@ def test_what_the_budget_cuts_off_is_named(folder, monkeypatch):
     few, data = told(folder, effects=("air_drag", "gravity_tilt", "magnus"), work=100_000)
     assert data["work"]["budget"] == 100_000 <= data["work"]["spent"]
     assert data["work"]["skipped"]["magnus"] == "tried" and "magnus" not in {e["name"] for e in data["effects"]}
-    assert any("magnus" in w and "not tried" in w and "--budget" in w for w in data["warnings"])
+    assert any("Magnus lift" in w and "not tried" in w and "--budget" in w for w in data["warnings"])
     hours = iter(range(0, 10**9, 3600))
     monkeypatch.setattr(time, "monotonic", lambda: float(next(hours)))
     assert told(folder, effects=("air_drag", "gravity_tilt", "magnus"), work=100_000)[0] == few
+
+
+def test_a_pair_that_the_budget_cuts_off_is_named_in_words():
+    work = Work(limit=10)
+    work.skip(("rolling_resistance", "air_drag"), "refined")
+    (said,) = cut_off(work)
+    assert said.startswith("rolling resistance and air drag: not refined, because the budget was spent")
 
 
 def test_an_effect_that_was_asked_for_and_cannot_act_is_named(folder):

@@ -401,15 +401,15 @@ def verdict_summary(verdict: Verdict, gap: Gap) -> str:
     if not gap.resolvable:
         return text + " The gap is too close to the noise floor to say how much of it this closes."
     if math.isfinite(gap.closed_fraction):
-        share = "nothing" if gap.closed_fraction <= 0.005 else _rounded_percent(min(gap.closed_fraction, 1.0))
+        share = "nothing" if gap.closed_fraction <= 0.005 else _share(min(gap.closed_fraction, 1.0))
         text += f" It closes {share} of the gap on held-out motion."
     return text
 
 
 def _confidence(verdict: Verdict) -> str:
-    return f"{_rounded_percent(verdict.probability)} confidence"
+    return f"{_share(verdict.probability)} confidence"
 
 
-def _rounded_percent(value: float) -> str:
-    shown = round(100 * value)
-    return "over 99 %" if shown >= 100 else "under 1 %" if shown < 1 else f"{shown} %"
+def _share(value: float) -> str:
+    """Return a share as the page shows it, for terminals too."""
+    return percent_text(value).replace("\u00a0", " ")
