@@ -160,3 +160,14 @@ def test_a_photo_without_background_is_refused():
         fill_background(photo, everything[:9], everything, camera(), FillOptions())
     nothing = np.zeros_like(everything)
     assert (fill_background(photo, nothing, nothing, camera()) == photo).all()
+
+
+@pytest.mark.parametrize("start", [0, 260])
+def test_an_edge_beside_a_small_thing_only_does_not_pass_behind_a_large_one(start):
+    """A mat that ends between both at column 260 is no far edge of the floor."""
+    logs = np.random.default_rng(0).normal(-1.0, 0.01, (360, 480, 3)).astype(np.float32)
+    logs[200:, start:] -= np.float32([0.15, 0.25, 0.5])
+    hidden = np.zeros((360, 480), bool)
+    hidden[80:260, 60:200] = hidden[160:240, 330:400] = True
+    found = edges_behind(logs, hidden, hidden)
+    assert [round(edge.c) for edge in found] == ([200] if start == 0 else [])

@@ -83,11 +83,19 @@ def edges_behind(logs: Picture, part: Mask, hidden: Mask, shaded: Mask | None = 
         side = 2 * max(1, round(PENUMBRA * max(part.shape) / 1024.0)) + 1
         deep = cv2.erode((dark | hidden).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         hidden, dark = hidden | (dark & ~deep), dark & deep
-    for thing in things:
+    for index, thing in enumerate(things):
         edges = _edges_near(logs, thing, hidden, dark)
+        # One that passes behind a larger thing as well would have been found around that.
+        edges = [edge for edge in edges if not any(_passes_behind(edge, larger) for larger in things[:index])]
         if edges:
             return edges
     return []
+
+
+def _passes_behind(edge: Edge, thing: Mask) -> bool:
+    """Whether ``thing`` (H, W) has pixels on both sides of ``edge``."""
+    below = edge.below(thing.shape)[thing]
+    return bool(below.any() and not below.all())
 
 
 def _things(part: Mask, hidden: Mask) -> list[Mask]:
