@@ -16,6 +16,7 @@ from ...sim.app.propose import PICTURE_FILE, choose, propose
 from ...sim.app.reconstruct import correct, reconstruct, require_physics
 from ...sim.app.reconstruct_record import require_request
 from ...sim.cache.bake_folder import load_bake
+from ...sim.cache.folder_lock import lock_beside
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, never
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
@@ -309,7 +310,10 @@ def run_light(options: argparse.Namespace, terminal: Terminal, cancelled: IsCanc
     """Run ``physgen light``; the exit code."""
     from ...sim.app.set_light import set_light
 
-    light = set_light(load_scene(options.scene), request=light_request(options), on_event=terminal).model.light
+    root = load_scene(options.scene).root
+    with lock_beside(root):
+        # As it is now: a correction may have ended since.
+        light = set_light(load_scene(root), request=light_request(options), on_event=terminal).model.light
     terminal({"event": "done", "scene": str(options.scene), "light": to_json(light)})
     terminal.line(f"scene: {options.scene}")
     return 0

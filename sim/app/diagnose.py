@@ -43,13 +43,15 @@ def diagnose(
         raise InputError(f"{out}: is the capture itself; choose another folder")
     for warning in capture.warnings:
         on_event({"event": "notice", "stage": "diagnose", "message": warning})
-    diagnosis = run_diagnosis.diagnose(capture, options, on_event, cancelled)
-    try:
-        with lock_beside(out), replacing_tree(out) as partial:
-            write_diagnosis(diagnosis, partial)
-            write_report(diagnosis, capture, partial)
-    except OSError as error:
-        raise InputError(
-            f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
-        ) from error
+    # From the start: two at once would each take minutes, and one be lost.
+    with lock_beside(out):
+        diagnosis = run_diagnosis.diagnose(capture, options, on_event, cancelled)
+        try:
+            with replacing_tree(out) as partial:
+                write_diagnosis(diagnosis, partial)
+                write_report(diagnosis, capture, partial)
+        except OSError as error:
+            raise InputError(
+                f"{out}: cannot be written ({error.strerror or error}); free space or choose another folder"
+            ) from error
     return diagnosis

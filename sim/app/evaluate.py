@@ -8,7 +8,8 @@ figures.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -183,50 +184,52 @@ def evaluate(
     Cancelled when cancelled, and nothing is written then.
     """
     options, out = options or EvaluateOptions(), Path(out)
-    require_evaluation_folder(out)
-    if video is None and bake is None:
-        raise InputError("nothing to evaluate: give a video or a bake")
-    if video is None and (against or photo is not None or judge is not None):
-        raise InputError("against, photo, judge: compare a video, and none is given; give one beside the bake")
-    progress = StageProgress(on_event, STAGE, 3)
-    sections: list[Section] = []
-    strip: list[Frame] = []
-    tables: dict[str, bytes] = {}
-    subject = ""
-    if video is not None:
-        footage = open_footage(Path(video), options.fps)
-        subject, most = footage.name, most_frames(footage, options)
-        if against:
-            recordings = [open_footage(Path(other)) for other in against]
-            sections.append(against_section(footage, recordings, most))
-        progress.report(1)
-        flow = dis_flow() if options.flow is None else network_flow(options.flow)
-        named = "DIS" if options.flow is None else options.flow.name
-        still = None if photo is None else Path(photo)
-        sections.append(without_reference(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled))
-        strip = strip_frames(footage, most)
-        if judge is not None:
-            section, judgement = judged(footage, most, judge, notice=progress.notice, cancelled=cancelled)
-            sections.append(section)
-            tables[JUDGE_FILE] = json.dumps(judgement.to_json(), indent=1, ensure_ascii=False).encode(
-                "utf-8", "replace"
+    with evaluation_folder(out):
+        if video is None and bake is None:
+            raise InputError("nothing to evaluate: give a video or a bake")
+        if video is None and (against or photo is not None or judge is not None):
+            raise InputError("against, photo, judge: compare a video, and none is given; give one beside the bake")
+        progress = StageProgress(on_event, STAGE, 3)
+        sections: list[Section] = []
+        strip: list[Frame] = []
+        tables: dict[str, bytes] = {}
+        subject = ""
+        if video is not None:
+            footage = open_footage(Path(video), options.fps)
+            subject, most = footage.name, most_frames(footage, options)
+            if against:
+                recordings = [open_footage(Path(other)) for other in against]
+                sections.append(against_section(footage, recordings, most))
+            progress.report(1)
+            flow = dis_flow() if options.flow is None else network_flow(options.flow)
+            named = "DIS" if options.flow is None else options.flow.name
+            still = None if photo is None else Path(photo)
+            sections.append(
+                without_reference(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled)
             )
-    if cancelled():
-        raise Cancelled("the evaluation was cancelled; nothing was written")
-    progress.report(2)
-    if bake is not None:
-        baked = bake if isinstance(bake, Bake) else load_bake(bake)
-        subject = subject or baked.root.resolve().name
-        sections.append(bake_physics(baked, _scene_of(baked, scene), cancelled=cancelled))
-    found = Evaluation(root=out, subject=subject, sections=tuple(sections))
-    # Those of a judge were said as they came.
-    said = {notice for section in sections if section.name == JUDGE for notice in section.notices}
-    for notice in found.notices:
-        if notice not in said:
-            progress.notice(notice)
-    save(found, out, strip, tables)
-    progress.report(3)
-    return found
+            strip = strip_frames(footage, most)
+            if judge is not None:
+                section, judgement = judged(footage, most, judge, notice=progress.notice, cancelled=cancelled)
+                sections.append(section)
+                tables[JUDGE_FILE] = json.dumps(judgement.to_json(), indent=1, ensure_ascii=False).encode(
+                    "utf-8", "replace"
+                )
+        if cancelled():
+            raise Cancelled("the evaluation was cancelled; nothing was written")
+        progress.report(2)
+        if bake is not None:
+            baked = bake if isinstance(bake, Bake) else load_bake(bake)
+            subject = subject or baked.root.resolve().name
+            sections.append(bake_physics(baked, _scene_of(baked, scene), cancelled=cancelled))
+        found = Evaluation(root=out, subject=subject, sections=tuple(sections))
+        # Those of a judge were said as they came.
+        said = {notice for section in sections if section.name == JUDGE for notice in section.notices}
+        for notice in found.notices:
+            if notice not in said:
+                progress.notice(notice)
+        save(found, out, strip, tables)
+        progress.report(3)
+        return found
 
 
 VIEWS_FILE = "physics_iq.csv"
@@ -250,23 +253,25 @@ def evaluate_physics_iq(
     Raises InputError where nothing can be compared; Cancelled on request.
     """
     folder, out = Path(folder), Path(out)
-    require_evaluation_folder(out)
-    submission = read_submission(folder)
-    rows: list[ViewRow] = []
-    failed: list[FailedView] = []
-    if benchmark is not None:
-        views = read_benchmark(Path(benchmark), submission.fps)
-        progress = StageProgress(on_event, STAGE, max(1, len(set(views) & set(submission.videos))))
-        rows, failed = score_views(submission, views, on_row=progress.report, cancelled=cancelled)
-        if failed and not rows:
-            raise InputError(f"{folder}: no view can be compared; the first is {failed[0].reason}")
-        if not rows:
-            raise InputError(f"{folder}: none of its numbers is one of {benchmark}; name the same benchmark")
-    found = Evaluation(root=out, subject=folder.name, sections=(physics_iq_section(submission, rows, folder, failed),))
-    for notice in found.notices:
-        on_event({"event": "notice", "stage": STAGE, "message": notice})
-    save(found, out, tables={VIEWS_FILE: table(view_table(rows, failed))} if rows else {})
-    return found
+    with evaluation_folder(out):
+        submission = read_submission(folder)
+        rows: list[ViewRow] = []
+        failed: list[FailedView] = []
+        if benchmark is not None:
+            views = read_benchmark(Path(benchmark), submission.fps)
+            progress = StageProgress(on_event, STAGE, max(1, len(set(views) & set(submission.videos))))
+            rows, failed = score_views(submission, views, on_row=progress.report, cancelled=cancelled)
+            if failed and not rows:
+                raise InputError(f"{folder}: no view can be compared; the first is {failed[0].reason}")
+            if not rows:
+                raise InputError(f"{folder}: none of its numbers is one of {benchmark}; name the same benchmark")
+        found = Evaluation(
+            root=out, subject=folder.name, sections=(physics_iq_section(submission, rows, folder, failed),)
+        )
+        for notice in found.notices:
+            on_event({"event": "notice", "stage": STAGE, "message": notice})
+        save(found, out, tables={VIEWS_FILE: table(view_table(rows, failed))} if rows else {})
+        return found
 
 
 def is_bake(path: Path) -> bool:
@@ -295,10 +300,16 @@ def most_frames(footage: Footage, options: EvaluateOptions) -> int:
     return min(MOST_FRAMES, max(1, round(options.seconds * footage.fps)))
 
 
-def require_evaluation_folder(out: Path) -> None:
-    """Raise InputError where ``out`` is there and holds no evaluation."""
+@contextmanager
+def evaluation_folder(out: Path) -> Iterator[None]:
+    """Hold the folder ``out`` during an evaluation: two at once would each take minutes, and one be lost.
+
+    Raises InputError where another process holds it, and where it is there and holds no evaluation.
+    """
     if out.exists() and not (out / JSON_FILE).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there and holds no evaluation; choose another folder")
+    with lock_beside(out):
+        yield
 
 
 def save(
@@ -309,7 +320,7 @@ def save(
     strip: frames for its page. tables: further files, by name. Raises InputError where it cannot be written.
     """
     try:
-        with lock_beside(out), replacing_tree(out) as partial:
+        with replacing_tree(out) as partial:
             write_evaluation(found, partial)
             write_page(found, strip, partial)
             for name, content in tables.items():

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
 from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
+from ..cache.folder_lock import lock_beside
 from ..cache.pc2 import Pc2Reader
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
@@ -108,7 +109,9 @@ def export_usd(
     writer = _Writer(stage, scene, bake, file, cancelled)
     writer.write()
     # Only now: a texture or a file is never left of an export that failed.
-    with replacing(file) as partial, _written(writer.pictures):
+    with lock_beside(file), replacing(file) as partial, _written(writer.pictures):
+        if file.exists():
+            raise InputError(f"{file}: is there already, written meanwhile; choose another name")
         try:
             good = stage.GetRootLayer().Export(str(partial))
         except Tf.ErrorException:

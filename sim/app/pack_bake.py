@@ -16,6 +16,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -197,9 +198,15 @@ PACKED_FILE = "packed.json"
 SUFFIX = ".packed"
 
 
-def _require_new(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is there already; name a new folder")
+@contextmanager
+def _new(out: Path) -> Iterator[Path]:
+    """Yield the folder that becomes ``out``, which is held meanwhile. Raises InputError where something is there."""
+    with lock_beside(out):
+        # Not before: another run may have written it meanwhile.
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out}: is there already; name a new folder")
+        with replacing_tree(out) as partial:
+            yield partial
 
 
 def pack_bake(bake: Bake, *, out: Path, cancelled: IsCancelled = never) -> int:
@@ -214,8 +221,7 @@ def pack_bake(bake: Bake, *, out: Path, cancelled: IsCancelled = never) -> int:
     if any(item.splats for item in manifest.objects):
         raise InputError(f"{bake.root}: has splats, which are not packed; copy the folder as it is")
     require_intact(bake)
-    _require_new(out)
-    with lock_beside(out), replacing_tree(out) as partial:
+    with _new(out) as partial:
         sums: dict[str, str] = {}
         for name in manifest.files:
             if cancelled():
@@ -253,8 +259,7 @@ def unpack_bake(folder: Path, *, out: Path, cancelled: IsCancelled = never) -> B
             good = False
         if not good:
             raise InputError(f"{folder / name}: is missing, or not what was packed; copy the folder again")
-    _require_new(out)
-    with lock_beside(out), replacing_tree(out) as partial:
+    with _new(out) as partial:
         checksums: list[Checksum] = []
         for name, count in manifest.files.items():
             packed = PackedCache(inside(folder, f"{name}{SUFFIX}"))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..atomic import write_bytes, write_json
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
 from ..reconstruct.reconstruct_options import WITHOUT, Proposal
@@ -101,7 +102,6 @@ def propose(
         shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
         file = io.BytesIO()
         Image.fromarray(shown).save(file, format="JPEG", quality=90)
-        write_bytes(Path(out) / PICTURE_FILE, file.getvalue())
         width, height = picture.original_size
         record = ProposalRecord(
             photo=str(photo.resolve()),
@@ -111,7 +111,10 @@ def propose(
             height=height,
             proposals=found,
         )
-        write_json(Path(out) / LIST_FILE, to_json(record))
+        # The picture and the list of one photo, not of two.
+        with lock_beside(Path(out)):
+            write_bytes(Path(out) / PICTURE_FILE, file.getvalue())
+            write_json(Path(out) / LIST_FILE, to_json(record))
     return found
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..atomic import replacing
-from ..cache.folder_lock import LOCK_FILE, folder_lock
+from ..cache.folder_lock import LOCK_FILE, folder_lock, lock_beside
 from ..effects.registry import effect
 from ..errors import InputError
 from ..scene.folder import (
@@ -71,7 +71,8 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
     if (kind := folder_kind(out, NEVER_REPLACED)) is not None:
         raise InputError(f"{out}: is {kind}, which the variant would replace; choose another folder")
     new = not out.exists()
-    with folder_lock(out):
+    # Held beside it, too, as by what replaces scenes: reconstruct, correct, light.
+    with lock_beside(out), folder_lock(out):
         try:
             for name in source.with_model(scene).files():
                 _link_or_copy(source.file(name), inside(out, name))

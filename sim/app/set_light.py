@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..atomic import replacing
+from ..cache.folder_lock import lock_beside
 from ..composite.srgb import read_mask, read_rgb
 from ..errors import InputError
 from ..events import OnEvent, ignore
@@ -70,8 +71,13 @@ class LightRequest:
 def set_light(scene: Scene, *, request: LightRequest, on_event: OnEvent = ignore) -> Scene:
     """Return ``scene`` relit as ``request`` says; its folder is changed completely or, on an error, not at all.
 
-    Raises InputError for a scene, file or sun that cannot be used.
+    Raises InputError for a scene, file or sun that cannot be used, and for a scene that another process is changing.
     """
+    with lock_beside(scene.root):
+        return _relit(scene, request, on_event)
+
+
+def _relit(scene: Scene, request: LightRequest, on_event: OnEvent) -> Scene:
     folder = scene
     ground = folder.model.ground or Ground()
 

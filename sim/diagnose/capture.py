@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing, write_json
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..npz import read_npz
 from ..scene.folder import inside
@@ -289,12 +290,12 @@ def load_capture(root: str | Path) -> Capture:
 
 
 def save_capture(capture: Capture, root: Path) -> None:
-    """Write ``capture`` to the new folder ``root``, atomically. Raises InputError when it exists."""
+    """Write ``capture`` to the new folder ``root``, atomically. Raises InputError when it exists or is in use."""
     import trimesh
 
-    if root.exists():
-        raise InputError(f"{root}: already exists; choose another folder")
-    with replacing(root) as partial:
+    with lock_beside(root), replacing(root) as partial:
+        if root.exists():
+            raise InputError(f"{root}: already exists; choose another folder")
         partial.mkdir(parents=True)
         entries = []
         for item in capture.objects:
