@@ -110,6 +110,7 @@ class Run:
             ("tour", TOUR_SIZE),
             ("library", TOUR_SIZE),
             ("odd", TOUR_SIZE),
+            ("pictures", TOUR_SIZE),
             ("work", self.options.size),
         ):
             if self.options.script not in ("", name):
@@ -153,7 +154,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="steps of the scripts, by commas; nothing is opened again then")
     parser.add_argument("--scene", type=Path, help="scene.json of a photo, for the steps farm and nodes alone")
     parser.add_argument("--wheels", type=Path, help="folder of wheels of all that simulates, to try Install with")
-    names = ["", "tour", "library", "odd", "work"]
+    names = ["", "tour", "library", "odd", "pictures", "work"]
     parser.add_argument("--script", default="", choices=names, help="only this one (default: all)")
     parser.add_argument("--out", type=Path, default=Path("build/blender_app"), help="folder of the results, emptied")
     parser.add_argument("--size", default="1000x3200", help="of Blender's window, tall enough for every panel")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,14 +163,20 @@ def click(x: int, y: int) -> Generator[float, None, None]:
     yield from drawn()
 
 
-def drag(start: tuple[int, int], goal: tuple[int, int], path: Path) -> Generator[float, None, None]:
-    """Drag what lies at ``start`` to ``goal`` and drop it there; ``path``: a picture just before it is let go."""
+def drag(
+    start: tuple[int, int], goal: tuple[int, int], path: Path, wait: Iterable[float] = ()
+) -> Generator[float, None, None]:
+    """Drag what lies at ``start`` to ``goal`` and drop it there; ``path``: a picture just before it is let go.
+
+    wait: what to wait for before the picture, such as ``session.until``.
+    """
     yield from point(*start)
     xdotool("mousedown", 1)
     yield 0.5
     for share in (0.05, 0.1, 0.4, 0.8, 1.0):
         xdotool("mousemove", *(round(a + share * (b - a)) for a, b in zip(start, goal, strict=True)))
         yield 0.4
+    yield from wait
     yield from drawn(3)
     picture(window(), path)
     xdotool("mouseup", 1)

@@ -343,46 +343,11 @@ def drop(browser, onto, number):
     yield from screens.drawn()
 
 
-def documented():
-    """The pictures of docs/images, in Blender's own layout: both samples, the one of meshes previewed, and baked."""
-    for sample in ("PHOTO", "MESHES"):
-        bpy.ops.wm.read_homefile(use_factory_startup=True)
-        yield 0.5
-        screens.viewport().spaces.active.show_region_ui = True
-        yield from screens.drawn()
-        screens.region(screens.viewport(), "UI").active_panel_category = screens.TAB
-        yield from screens.drawn()
-        with screens.focus():
-            bpy.ops.physgen.open_sample(sample=sample)
-        yield 1.0
-        yield from page({"PHOTO": "blender_photo", "MESHES": "blender_objects"}[sample])
-    preview = session.extension("physgen_addon.preview.live_preview")
-    with screens.focus():
-        bpy.ops.physgen.toggle_preview()
-    yield from session.until(lambda: preview.session().clip is not None, 900, "the preview")
-    yield from session.until(lambda: preview.session().frame >= 10, 300, "the preview in flight")
-    yield from page("blender_preview")
-    with screens.focus():
-        bpy.ops.physgen.toggle_preview()
-        bpy.ops.physgen.bake("INVOKE_DEFAULT")
-    yield from session.ended("the bake")
-    bpy.context.scene.frame_set(16)
-    yield from page("blender_baked")
-
-
-def page(name):
-    """Write ``docs/NAME.jpg`` below the results, a picture for docs/images; the mouse is out of the way."""
-    yield from screens.point(640, 990)
-    yield from screens.shoot(SCREENS, name)
-    (OUT / "docs").mkdir(exist_ok=True)
-    screens.document(SCREENS / f"{name}.png", OUT / "docs" / f"{name}.jpg")
-
-
 def wanted(step) -> bool:
     """Whether the task asks for it; the window is arranged in any case."""
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
 STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, farm, nodes]
-STEPS += [dropped, documented, material, strange]
+STEPS += [dropped, material, strange]
 session.run("tour", [step for step in STEPS if wanted(step)])
