@@ -24,7 +24,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "video_to_cause.py"
 FPS, SCALE = 120.0, 400.0
 
 
-def draw(path, places, radius, size=(320, 240), shift=None, twins=False, light=None):
+def draw(path, places, radius, size=(320, 240), shift=None, twins=False, light=None, colour=(30, 30, 210)):
     """Write a video of a red ball at ``places`` (T, 2) px before a still, textured wall."""
     rng = np.random.default_rng(3)
     wall = cv2.GaussianBlur(rng.integers(90, 200, (size[1] + 40, size[0] + 40, 3), dtype=np.uint8), (0, 0), 2)
@@ -34,7 +34,7 @@ def draw(path, places, radius, size=(320, 240), shift=None, twins=False, light=N
         view = cv2.warpAffine(wall, np.array([[1, 0, off[0] - 20], [0, 1, off[1] - 20]]), size)
         large = cv2.resize(view, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
         centre = tuple(int(v) for v in np.round((np.asarray(place) + off) * 4))
-        cv2.circle(large, centre, round(radius * 4), (30, 30, 210), -1)
+        cv2.circle(large, centre, round(radius * 4), colour, -1)
         frame = cv2.resize(large, size, interpolation=cv2.INTER_AREA)
         frame = np.clip(frame + rng.normal(0, 1.5, frame.shape), 0, 255).astype(np.uint8)
         if light is not None:
@@ -79,6 +79,16 @@ def test_lamps_that_flicker_make_no_frame_a_repetition(tmp_path):
     assert found.view.kind == "flight" and len(found.frames) > 54
     assert np.linalg.norm(found.places - places[found.frames], axis=1).max() < 1.0
     assert found.view.scale == pytest.approx(SCALE, rel=0.04)
+
+
+def test_exposure_that_changes_from_frame_to_frame_hides_no_dull_ball(tmp_path):
+    _, places = tossed()
+    light = np.where(np.random.default_rng(8).random(60) < 0.5, 0.9, 1.1)
+    video = draw(tmp_path / "toss.avi", places, radius=8, light=light, colour=(105, 105, 175))
+    body = parse_body(f"ball:diameter={16 / SCALE}")
+    found = follow_plain_body(physgen.VideoTrial(path=video, fps_override=FPS), body)
+    assert found.view.kind == "flight" and len(found.frames) > 54
+    assert np.linalg.norm(found.places - places[found.frames], axis=1).max() < 1.0
 
 
 def test_a_repeated_frame_is_left_out_and_the_rest_spread_evenly():

@@ -21,6 +21,7 @@ from .video_background import (
     Aligner,
     Picture,
     difference,
+    evenly_lit,
     largest_channel,
     least_channel,
     reduced,
@@ -116,7 +117,9 @@ def find_moving_regions(
     moving_camera = float(np.median(ways)) > DRIFT_PX
     if moving_camera:
         samples = [warped(s, m) for s, m in zip(samples, maps, strict=True)]
-    stack = np.stack(samples)
+    levels = [float(np.median(s[::4, ::4, 1])) for s in samples]
+    usual = samples[int(np.argsort(levels)[len(levels) // 2])]
+    stack = np.stack([evenly_lit(s, usual) for s in samples])
     del samples
     background, noise = still_background(stack)
     del stack
@@ -138,7 +141,7 @@ def find_moving_regions(
             change.append(0.0 if before is None else _change(picture, before))
             before = picture
             stamps.append(frame.time)
-            clear, dim = _regions(picture, background, limit, index)
+            clear, dim = _regions(evenly_lit(picture, background), background, limit, index)
             regions.append(clear)
             faint.append(dim)
     return MovingRegions(

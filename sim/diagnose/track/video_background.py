@@ -80,6 +80,23 @@ def reduced(frame: Frame, scale: float) -> Picture:
     return np.asarray(cv2.resize(frame.colour, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+STEADY, MOST_GAIN = 0.015, 1.3
+"""Relative change of brightness that counts as none, and the largest that is evened out."""
+
+
+def evenly_lit(picture: Picture, reference: Picture) -> Picture:
+    """Return ``picture`` as bright as ``reference``: lamps flicker, and cameras change their exposure.
+
+    The factor is the median over pixels, of which a body covers less than half.
+    """
+    few = (slice(None, None, 4), slice(None, None, 4), 1)
+    ratios = (reference[few].astype(np.float32) + 1) / (picture[few].astype(np.float32) + 1)
+    gain = float(np.median(ratios))
+    if abs(gain - 1) < STEADY or not 1 / MOST_GAIN < gain < MOST_GAIN:
+        return picture
+    return np.asarray(cv2.convertScaleAbs(picture, alpha=gain), np.uint8)
+
+
 def sampled_frames(
     path: Path, start: int, end: int | None, on_frame: Callable[[], None]
 ) -> tuple[list[Picture], float]:
