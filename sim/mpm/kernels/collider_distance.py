@@ -66,12 +66,9 @@ def outside_box(shape, point, shapes: ShapeArrays):
 
 
 @func
-def sample_distance(shape, point, shapes: ShapeArrays):
-    """(gradient xyz, distance) of ``shape`` at ``point``, trilinear; the distance is negative inside.
-
-    Outside the lattice: the distance at the nearest point of its box plus the way there, which is no less than the true
-    one, and the sum of both gradients, of length 1.
-    """
+def lattice_cell(shape, point, shapes: ShapeArrays):
+    """The way from the lattice of ``shape`` to ``point``, the lattice's points along each axis, the cell that holds the
+    point or is nearest to it, and the place in that cell, 0 to 1."""
     away = outside_box(shape, point, shapes)
     inverse = 1.0 / shapes.lattices[4 * shape + 3]
     low = point
@@ -80,7 +77,18 @@ def sample_distance(shape, point, shapes: ShapeArrays):
     g = (point - away - low) * inverse
     n = ivec3(shapes.dims[4 * shape], shapes.dims[4 * shape + 1], shapes.dims[4 * shape + 2])
     i = ti.max(ti.min(ti.cast(g, ti.i32), n - 2), 0)
-    f = g - i
+    return away, n, i, g - i
+
+
+@func
+def sample_distance(shape, point, shapes: ShapeArrays):
+    """(gradient xyz, distance) of ``shape`` at ``point``, trilinear; the distance is negative inside.
+
+    Outside the lattice: the distance at the nearest point of its box plus the way there, which is no less than the true
+    one, and the sum of both gradients, of length 1.
+    """
+    away, n, i, f = lattice_cell(shape, point, shapes)
+    inverse = 1.0 / shapes.lattices[4 * shape + 3]
     first = shapes.dims[4 * shape + 3] + (i[0] * n[1] + i[1]) * n[2] + i[2]
     row, plane = n[2], n[1] * n[2]
     d000, d001 = shapes.distances[first], shapes.distances[first + 1]
@@ -108,15 +116,7 @@ def sample_distance(shape, point, shapes: ShapeArrays):
 def sample_motion(first, shape, point, shapes: ShapeArrays):
     """Velocity of the surface of ``shape``, which deforms, at ``point``, trilinear; those of its lattice begin at
     ``first``."""
-    away = outside_box(shape, point, shapes)
-    inverse = 1.0 / shapes.lattices[4 * shape + 3]
-    low = point
-    for c in ti.static(range(3)):
-        low[c] = shapes.lattices[4 * shape + c]
-    g = (point - away - low) * inverse
-    n = ivec3(shapes.dims[4 * shape], shapes.dims[4 * shape + 1], shapes.dims[4 * shape + 2])
-    i = ti.max(ti.min(ti.cast(g, ti.i32), n - 2), 0)
-    f = g - i
+    _, n, i, f = lattice_cell(shape, point, shapes)
     velocity = point * 0
     for corner in range(8):
         at = ivec3(corner >> 2, corner >> 1 & 1, corner & 1)

@@ -227,14 +227,8 @@ def separate_node(
     adhesion: AdhesionArrays,
 ):
     """The same at node ``i`` of the fields' blocks in the place of the block ``lead``."""
-    f = grid.field[lead]
-    w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
-    c = w * CONTROL_ROW
-    if worlds.control[c + PHASE] == FULL:
-        dt = ti.cast(worlds.control[c + STEP], ti.f32)
-        recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
-        first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
-        count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
+    w = worlds.field_integers[grid.field[lead] * FIELD_INTEGERS + WORLD]
+    if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
         if ti.static(thin and not summing):
             # What is light between heavy bodies takes one push and the other in turn.
             sweeps = 1
@@ -244,43 +238,9 @@ def separate_node(
             if ti.static(adheres):
                 part /= sweeps
             for _ in range(sweeps):
-                separate_pairs(
-                    thin,
-                    adheres,
-                    summing,
-                    lead,
-                    i,
-                    w,
-                    first,
-                    count,
-                    dt,
-                    recovery,
-                    worlds,
-                    grid,
-                    overlap,
-                    nodes,
-                    part,
-                    adhesion,
-                )
+                separate_pairs(thin, adheres, summing, lead, i, w, part, worlds, grid, overlap, nodes, adhesion)
         else:
-            separate_pairs(
-                thin,
-                adheres,
-                summing,
-                lead,
-                i,
-                w,
-                first,
-                count,
-                dt,
-                recovery,
-                worlds,
-                grid,
-                overlap,
-                nodes,
-                1.0,
-                adhesion,
-            )
+            separate_pairs(thin, adheres, summing, lead, i, w, 1.0, worlds, grid, overlap, nodes, adhesion)
 
 
 @func
@@ -291,18 +251,19 @@ def separate_pairs(
     lead: ti.i32,
     i: ti.i32,
     w: ti.i32,
-    first: ti.i32,
-    count: ti.i32,
-    dt: ti.f32,
-    recovery: ti.f32,
+    part: ti.f32,
     worlds: WorldArrays,
     grid: GridBlocks,
     overlap: OverlapBlocks,
     nodes: NodeArrays,
-    part: ti.f32,
     adhesion: AdhesionArrays,
 ):
-    """Pass once over all pairs of fields at node ``i``; ``part``: of the largest pull, for one of several passes."""
+    """Pass once over all pairs of fields of world ``w`` at node ``i``; ``part``: of the largest pull, where there are
+    several passes."""
+    dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
+    recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
+    first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
+    count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
     a = lead
     while overlap.mate[a] >= 0:
         b = overlap.mate[a]
