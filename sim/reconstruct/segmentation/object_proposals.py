@@ -25,6 +25,7 @@ from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
 from .outline_sharpness import in_focus
 from .proposal_features import (
+    FEATURES,
     Mask,
     contrast_of,
     cut_share,
@@ -34,6 +35,7 @@ from .proposal_features import (
     share_on_edges,
     solidity_of,
 )
+from .whole_objects import Candidate, whole_objects
 
 Pixels = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
@@ -65,21 +67,23 @@ class Examined:
 def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
 
-    Of two that overlap the better one is returned, and none that is out of focus where another is sharp. The list is
-    empty where nothing stands out.
+    Objects that overlap in the photo are told from parts of one, and from what is only ground beside one
+    (``whole_objects``); none is out of focus where another is sharp. The list is empty where nothing stands out.
     """
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     found = [(item, score_of(item.features)) for item in examined_candidates(small)]
-    # A whole goes before its parts, which often have the clearer outline.
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
     sharp = in_focus([item.mask for item, _ in found], small)
     found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
-    found.sort(key=lambda pair: -(pair[1] + WHOLE * float(np.log(pair[0].mask.mean()))))
+    shade = FEATURES.index("shade")
+    whole = whole_objects(
+        [Candidate(item.mask, value, bool(item.features[shade])) for item, value in found], _lab_of(small)
+    )
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
-    for item, value in sorted(_distinct(found), key=lambda pair: -pair[1])[:most]:
+    for item, value in sorted((found[i] for i in whole), key=lambda pair: -pair[1])[:most]:
         x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
@@ -265,8 +269,7 @@ def _plausible(mask: Mask, height: int, width: int) -> bool:
 def examined_candidates(pixels: Pixels) -> list[Examined]:
     """Return the most promising candidates of the copy ``pixels`` (h, w, 3), segmented in their boxes."""
     height, width = pixels.shape[:2]
-    blurred = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.float32) / 255.0
-    lab = np.asarray(cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    lab = _lab_of(pixels)
     edges = edge_strength(lab)
     rough = [(mask, _promise(mask, lab, edges)) for mask in candidates(pixels)]
     rough.sort(key=lambda pair: -pair[1])
@@ -283,6 +286,12 @@ def examined_candidates(pixels: Pixels) -> list[Examined]:
         if found is not None and _plausible(found, height, width):
             result.append(Examined(found, features_of(found, mask, (value, ground), lab, edges)))
     return result
+
+
+def _lab_of(pixels: Pixels) -> NDArray[np.float32]:
+    """CIELAB (h, w, 3) of the copy, a little smoothed."""
+    blurred = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.float32) / 255.0
+    return np.asarray(cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB), dtype=np.float32)
 
 
 def _promise(mask: Mask, lab: NDArray[np.float32], edges: NDArray[np.float32]) -> float:
@@ -320,8 +329,6 @@ def _segmented(pixels: Pixels, box: Box, start: Mask) -> tuple[Mask | None, floa
     return result, float(values[best]), float(ground[guesses[best]].mean())
 
 
-WHOLE = 0.12
-"""Score that e times the area is worth when two candidates overlap."""
 LEAST_SCORE = 0.5
 """Score below which a candidate is not proposed."""
 
@@ -332,23 +339,3 @@ def _box_iou(first: Sequence[float], second: Sequence[float]) -> float:
     common = max(0.0, width) * max(0.0, height)
     areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)]
     return float(common / max(1e-9, sum(areas) - common))
-
-
-def _distinct(found: Sequence[tuple[Examined, float]]) -> list[tuple[Examined, float]]:
-    """``found``, best first, without what is mostly one of its betters, or a part of it."""
-    result: list[tuple[Examined, float]] = []
-    for item, value in found:
-        if all(not _same_or_part(item.mask, other.mask) for other, _ in result):
-            result.append((item, value))
-    return result
-
-
-def _same_or_part(mask: Mask, better: Mask) -> bool:
-    """Whether ``mask`` is mostly ``better`` itself, a part of it, or a shadow or strap that touches it in its box."""
-    common = float((mask & better).sum())
-    if common > 0.5 * float(min(mask.sum(), better.sum())):
-        return True
-    x0, y0, x1, y1 = extent_of(better)
-    inside = float(mask[y0:y1, x0:x1].sum()) / float(mask.sum())
-    kernel = np.ones((7, 7), np.uint8)
-    return inside > 0.7 and bool(((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & better).any())
