@@ -88,6 +88,16 @@ def test_specks_are_left_out_and_faces_turned_outward():
     assert len(said) == 2 and "removed" in said[0] and "inward" in said[1]
 
 
+@pytest.mark.parametrize(("whole", "corners"), [(trimesh.creation.icosphere(2), 162), (trimesh.creation.box(), 24)])
+def test_faces_of_their_own_corners_join_but_at_sharp_edges(whole, corners):
+    """As STL has them: a ball is one smooth surface again, a box keeps its six sides apart."""
+    faces = np.arange(3 * len(whole.faces)).reshape(-1, 3)
+    split = trimesh.Trimesh(whole.vertices[whole.faces].reshape(-1, 3), faces, process=False)
+    repaired = repair_mesh(split, "ball", quiet)
+    assert len(repaired.vertices) == corners
+    assert np.allclose(repaired.vertices[repaired.faces], whole.vertices[whole.faces])
+
+
 def test_an_open_mesh_becomes_a_closed_volume_and_this_is_said():
     mesh = trimesh.creation.icosphere(3, 15.0)
     low = np.asarray(mesh.vertices)[np.asarray(mesh.faces)].mean(axis=1)[:, 2] < 12.0

@@ -5,7 +5,8 @@ object_bodies.py       a body for each object, in order
 primitives.py          boxes, spheres, surfaces of revolution; primitive_fit.py fits one to an outline,
                        primitive_choice.py decides which, primitive_mesh.py makes its mesh
 inflate.py             thickness of a silhouette; inflated_mesh.py its mesh
-reference_surfaces.py  middle surfaces of inflated bodies, from a wall, legs or a depth map; legs.py finds legs
+reference_surfaces.py  middle surfaces of inflated bodies, from a wall, legs or a depth map; legs.py finds legs,
+                       lying.py lays rings and sticks on the ground
 furniture.py           chairs, tables and shelves as boards
 surface_mesh.py        marching cubes at a wanted number of vertices
 stability.py           how safely a body stands, and a broader base

@@ -6,7 +6,7 @@ is that of a wall facing the camera, or of the ground in front of the wall, whic
 exactly, the base is flat, and the body reaches from its visible line of contact to behind the wall. The wall of a box
 is upright; that of a sphere leans back until it is perpendicular to the view; other things lie between. A leaning body
 is thicker behind (b > 1) so that it does not overhang. Moving the wall back enlarges the base, until the centre of
-mass lies well above it.
+mass lies well above it. What is thin and would topple, or is a ring on its side, lies on the ground (`lying.py`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from ...scene.model import Camera
 from .inflate import Silhouette
+from .lying import lying_surface, ring_lies
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
 from .stability import footed, settled, support_of
 from .surface_mesh import RELAXATION_ROUNDS, Faces, Points, relax, surface_of_size
@@ -31,6 +32,8 @@ BARE_THICKNESS = 0.8
 wide."""
 FLAT = 0.0
 """``ReferenceSurface.back`` of a body entirely in front of its reference surface."""
+TOPPLES = 0.05
+"""Steadiness below which a body may topple."""
 GROUND_TOLERANCE_PX = 0.75
 """Vertices nearer to the ground than this are put onto it; marching cubes leaves them slightly off."""
 
@@ -41,7 +44,8 @@ class BodyMesh:
 
     pixels: (V, 2) photo pixels at which the camera sees each vertex. colours: (V, 2) photo pixels whose colours the
     vertices have; None for ``pixels``. corner_colours: (T, 3, 2) those of the corners of each face, which differ from
-    the vertices' along the edges of a box; None for the vertices'.
+    the vertices' along the edges of a box; None for the vertices'. lies: whether it lies on the ground, where a wall
+    would stand on an edge.
     """
 
     vertices: Points
@@ -49,6 +53,7 @@ class BodyMesh:
     pixels: Points
     colours: Points | None = None
     corner_colours: Points | None = None
+    lies: bool = False
 
 
 class _DepthField:
@@ -146,18 +151,49 @@ class _DepthField:
 
 
 def inflated_mesh(
-    camera: Camera, silhouette: Silhouette, target: int = 12_000, *, flat: bool = False, front: Points | None = None
+    camera: Camera,
+    silhouette: Silhouette,
+    target: int = 12_000,
+    *,
+    flat: bool = False,
+    front: Points | None = None,
+    leans: bool = False,
 ) -> tuple[BodyMesh, float, float]:
-    """Return the closed surface of the body with about ``target`` vertices, standing on the ground.
+    """Return the closed surface of the body with about ``target`` vertices, standing or lying on the ground.
 
     Also its steadiness (``SupportMargin``) and the share of its surface that was disconnected and removed. The first
     reference surface with which it stands safely is used, or the best. That is judged on the mesh itself: the contact
     is often a narrow strip, which anything coarser would miss.
 
     flat: nothing behind the reference surface. front: (h, w) depth along the optical axis of the visible front on the
-    silhouette's crop, units, NaN where unknown; None inflates about a wall, or about legs where they stand. Raises
-    InputError when the silhouette is too thin for a closed surface.
+    silhouette's crop, units, NaN where unknown; None inflates about a wall, or about legs where they stand. leans:
+    whether something is there that it may lean on; then it does not lie. Raises InputError when the silhouette is too
+    thin for a closed surface.
     """
+    lying = None if flat or front is not None or leans else lying_surface(camera, silhouette)
+    if lying is not None and ring_lies(camera, silhouette):
+        return _lying_mesh(camera, silhouette, lying, target)
+    body, steadiness, lost = _standing_mesh(camera, silhouette, target, flat=flat, front=front)
+    if lying is not None and steadiness < TOPPLES:
+        laid = _lying_mesh(camera, silhouette, lying, target)
+        if laid[1] > steadiness:
+            return laid
+    return body, steadiness, lost
+
+
+def _lying_mesh(
+    camera: Camera, silhouette: Silhouette, lying: ReferenceSurface, target: int
+) -> tuple[BodyMesh, float, float]:
+    field = _DepthField(silhouette, lying)
+    points, faces, lost = surface_of_size(field, float(silhouette.mask.sum()), target)
+    points = relax(field, points, faces)
+    body = replace(_to_world(silhouette, lying, points, faces), lies=True)
+    return body, support_of(body.vertices, body.faces).steadiness, lost
+
+
+def _standing_mesh(
+    camera: Camera, silhouette: Silhouette, target: int, *, flat: bool, front: Points | None
+) -> tuple[BodyMesh, float, float]:
     best: tuple[ReferenceSurface, Points, Faces, float, float] | None = None
     if front is not None:
         choices = measured_surfaces(camera, silhouette, front)

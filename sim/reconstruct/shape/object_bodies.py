@@ -31,7 +31,7 @@ from ..user_mesh.fit_user_mesh import fit_mesh
 from .body_texture import TexturedSurface, colour_pixels, corner_pixels, crop_texture
 from .furniture import furniture_boards, furniture_mesh
 from .inflate import Crop, crop_mask, inflate
-from .inflated_mesh import BodyMesh, inflated_mesh, shadow_mesh
+from .inflated_mesh import TOPPLES, BodyMesh, inflated_mesh, shadow_mesh
 from .object_placement import PlacedBody, TriangleMesh, hung, place_on_supports, separate, turned_view
 from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
@@ -44,14 +44,14 @@ from .texture_atlas import textured_body
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
 
-TOPPLES = 0.05
-"""Steadiness below which a notice says that the body may topple."""
 BENT = 0.98
 """Silhouette overlap above which the warped primitive is the body; below, the outline is cut out of it."""
 KEPT = 0.96
 """Overlap of the finished silhouette with the mask that a primitive has to reach."""
 SAME_FIT = 0.001
 """Overlap that a box may lose when its unseen side is moved."""
+TOUCH = np.ones((7, 7), np.uint8)
+"""Window in pixels within which two objects touch in the photo."""
 UNLIKELY = 0.8
 """Overlap of a requested shape below which a notice reports the mismatch."""
 
@@ -60,8 +60,8 @@ UNLIKELY = 0.8
 class BuiltBody:
     """The body of one object. The camera is 1 unit above the ground z = 0.
 
-    mesh: closed surface, world units. shape: ``box``, ``cylinder``, ``sphere`` or ``inflated``. stability: the
-    steadiness of its ``SupportMargin``; a sphere counts as standing. fit: overlap (IoU) of its silhouette in the
+    mesh: closed surface, world units. shape: ``box``, ``cylinder``, ``sphere``, ``inflated`` or ``LYING``. stability:
+    the steadiness of its ``SupportMargin``; a sphere counts as standing. fit: overlap (IoU) of its silhouette in the
     photo's view with its mask.
     """
 
@@ -113,7 +113,7 @@ def build_body(
         )
     if choice is None:
         mesh, margin, lost = inflated.mesh()
-        shape = "inflated"
+        shape = LYING if mesh.lies else "inflated"
     else:
         part = 1.0 if request.thickness is None or choice.primitive.name == "box" else request.thickness
         mesh, lost = _solid(camera, crop, choice, full, part, options.mesh_vertices)
@@ -122,8 +122,9 @@ def build_body(
     fit = silhouette_overlap(camera, mesh, full)
     if choice is not None and fit < KEPT and request.shape == "auto":
         # Reject an automatic primitive that does not keep the outline.
-        choice, shape = None, "inflated"
+        choice = None
         mesh, margin, lost = inflated.mesh()
+        shape = LYING if mesh.lies else "inflated"
         fit = silhouette_overlap(camera, mesh, full)
     elif fit < KEPT:
         notice(f"{name}: the body's silhouette overlaps its mask by {fit:.2f} only; give another shape or mask")
@@ -193,7 +194,8 @@ class _Inflation:
             others = np.zeros_like(self.full) if self.others is None else self.others
             name = request.name or "object"
             front = front_of(self.depth, self.camera, silhouette, self.full, others, name, self.notice)
-        return inflated_mesh(self.camera, silhouette, self.target, flat=back == "flat", front=front)
+        leans = self.others is not None and bool((cv2.dilate(self.full.astype(np.uint8), TOUCH)[self.others] > 0).any())
+        return inflated_mesh(self.camera, silhouette, self.target, flat=back == "flat", front=front, leans=leans)
 
 
 def _furniture(
@@ -240,12 +242,14 @@ Pixels = NDArray[np.uint8]
 
 USER_MESH = "mesh"
 """Shape name of a body that comes from a user's mesh or a mesher."""
+LYING = "lying"
+"""Shape name of an inflated body that lies where a wall would stand on an edge."""
 
 
 @dataclass(frozen=True)
 class Body:
     """surface: closed, in the camera's unit, standing on z = 0 or a support, or hanging. shape: a primitive's name,
-    ``inflated`` or ``USER_MESH``. turned: the view in which it was made if it hangs."""
+    ``inflated``, ``LYING`` or ``USER_MESH``. turned: the view in which it was made if it hangs."""
 
     surface: TexturedSurface
     shape: str

@@ -30,6 +30,8 @@ GAP = 0.03
 """Distance over the largest extent beyond which a part floats."""
 VOXELS = 110
 """Voxels along the largest extent of a mesh that is closed as a volume."""
+SHARP = np.radians(40.0)
+"""Angle between the normals of two faces from which the edge between them is sharp."""
 MOST_FACES = 2_000_000
 MOST_TILES = 16
 """Repetitions of a mesh's own picture across a single face above which vertex colours are used instead."""
@@ -83,6 +85,9 @@ def repair_mesh(mesh: trimesh.Trimesh, name: str, notice: Callable[[str], None])
     colours = None if colours is None else colours[used]
     if _is_closed(welded[faces]):
         faces = _outward(vertices, faces, welded, name, notice)
+        if uv is None:
+            vertices, faces, source = _joined(vertices, faces, welded)
+            colours = None if colours is None else colours[source]
         return RepairedMesh(vertices, faces, uv, picture, colours)
     return _closed_volume(vertices, faces, colours, size, name, notice)
 
@@ -198,6 +203,24 @@ def _outward(
         faces = faces.copy()
         faces[turned] = faces[turned][:, ::-1]
     return faces
+
+
+def _joined(vertices: Points, faces: Faces, welded: NDArray[np.int64]) -> tuple[Points, Faces, NDArray[np.int64]]:
+    """Vertices (W, 3), faces (T, 3) and the vertex that each of the W was: split at sharp edges alone.
+
+    STL gives each face corners of its own; light and texture would begin and end with single faces.
+    """
+    places = np.zeros((int(welded.max()) + 1, 3))
+    places[welded] = vertices
+    body = trimesh.Trimesh(places, welded[faces], process=False)
+    pairs = np.asarray(body.face_adjacency)[np.asarray(body.face_adjacency_angles) < SHARP]
+    count = len(faces)
+    links = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count))
+    side = sparse.csgraph.connected_components(links, directed=False)[1].astype(np.int64)
+    keys = (welded[faces] * count + side[:, None]).reshape(-1)
+    _, first, renumbered = np.unique(keys, return_index=True, return_inverse=True)
+    source = faces.reshape(-1)[first]
+    return vertices[source], renumbered.reshape(-1, 3).astype(np.int64), source
 
 
 def _enclosed(surface: NDArray[np.bool_]) -> NDArray[np.bool_]:
