@@ -326,6 +326,7 @@ def test_an_error_far_above_noise_is_never_called_nothing(tmp_path):
     diagnosis, capture = case(verdict=Verdict(effect="none", probability=0.9), gap=_gap(0.028, 0.028, 0.009))
     text = said(written(diagnosis, capture, tmp_path)[0])
     assert "No known effect stands out, and an error of 28\u00a0mm is left" in text
+    assert "What is left is above the noise" in text and "mostly noise" not in text
     assert title_of_cause(diagnosis) == "no effect stands out"
     for words in ("Nothing is missing", "that nothing is missing", "No effect needs", "keep the scene as it is"):
         assert words not in text

@@ -187,13 +187,14 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 
 NO_DISCREPANCY = "No discrepancy above the noise was found"
+LEFT = "What is left is above the noise, and no candidate accounts for it."
 
 
 def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
     """Return the localisation of the discrepancy in sentences."""
-    if diagnosis.verdict.effect == NONE:
-        found = "No discrepancy is large enough to name a cause" if remains(diagnosis.gap) else NO_DISCREPANCY
-        return [f"{found}: the figures below show mostly noise."]
+    left = remains(diagnosis.gap)
+    if diagnosis.verdict.effect == NONE and not left:
+        return [f"{NO_DISCREPANCY}: the figures below show mostly noise."]
     where = diagnosis.where
     phases: dict[str, float] = {}
     for interval in where.intervals:
@@ -204,7 +205,8 @@ def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
         ("Discrepancy by object", ((shortened(o.name, 40), o.share) for o in where.objects if several)),
     )
     sentences = ((title, shares_sentence(shares)) for title, shares in groups)
-    return [f"{title}: {shares}." for title, shares in sentences if shares]
+    found = [f"{title}: {shares}." for title, shares in sentences if shares]
+    return [LEFT, *found] if diagnosis.verdict.effect == NONE else found
 
 
 def _object_rows(pictures: Pictures) -> list[list[Any]]:

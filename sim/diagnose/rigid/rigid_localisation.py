@@ -21,6 +21,11 @@ Array = NDArray[np.float64]
 PARTS = 8
 """Samples of a run per frame."""
 
+SHORTEST = 0.03
+"""Half of the shortest time in s over which a force in flight is measured."""
+STANDS_OUT = 4.0
+"""Standard deviations from which a force counts as seen; 1 in 900 of three components by chance."""
+
 REST_SPEED = 0.02
 """Speed in m/s of the fastest point below which a body is at rest."""
 
@@ -204,28 +209,39 @@ def measured_force(fit: Fit, index: int) -> Array:
 def _curvature(
     problem: Problem, trial: SegmentedTrial, segment: Segment, free: NDArray[np.int64], setting: WorldSettings
 ) -> Array:
+    """Return the missing force per mass (F, 3) at the frames ``free`` of flight.
+
+    Each is measured over the shortest time around its frame in which it stands out from the noise, the whole flight if
+    it never does: a gust is placed to a few frames, and a small steady force, which no few frames show, is not lost.
+    """
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
     _, slope, info = trial.observations.information(pose[:, :3], pose[:, 3:7], frames)
     t = trial.observations.times[frames]
     found = np.zeros((len(frames), 3))
     for k in range(len(frames)):
-        half = 0.03
+        half = SHORTEST
         while True:
             near = np.flatnonzero(np.abs(t - t[k]) <= half)
-            if len(near) >= 5 or len(near) == len(frames):
-                break
             half *= 1.5
-        s = t[near] - t[k]
-        basis = np.stack([np.ones_like(s), s, 0.5 * s**2], axis=1)
-        matrix = np.einsum("fa,fij,fb->aibj", basis, info[near], basis).reshape(18, 18)
-        pull = np.einsum("fa,fi->ai", basis, slope[near]).ravel()
-        cover = np.linalg.pinv(matrix + 1e-9 * np.trace(matrix) / 18 * np.eye(18))
-        a = (cover @ pull)[12:15]
-        noise = cover[12:15, 12:15]
-        size = float(np.sqrt(max(a @ np.linalg.pinv(noise) @ a, 0.0)))
-        found[k] = a * max(0.0, 1 - 2.0 / max(size, 1e-9))
+            if len(near) < min(5, len(frames)):
+                continue
+            force, size = _force_over(t[near] - t[k], slope[near], info[near])
+            if size > STANDS_OUT or len(near) == len(frames):
+                break
+        found[k] = force * max(0.0, 1 - 2.0 / max(size, 1e-9))
     return found
+
+
+def _force_over(since: Array, slope: Array, info: Array) -> tuple[Array, float]:
+    """Return the force per mass (3,) that bends the path of a body over the times ``since`` (F,) s from where it is
+    wanted, and its size in standard deviations. slope: (F, 6), info: (F, 6, 6) of the frames' likelihood."""
+    basis = np.stack([np.ones_like(since), since, 0.5 * since**2], axis=1)
+    matrix = np.einsum("fa,fij,fb->aibj", basis, info, basis).reshape(18, 18)
+    pull = np.einsum("fa,fi->ai", basis, slope).ravel()
+    cover = np.linalg.pinv(matrix + 1e-9 * np.trace(matrix) / 18 * np.eye(18))
+    force = (cover @ pull)[12:15]
+    return force, float(np.sqrt(max(force @ np.linalg.pinv(cover[12:15, 12:15]) @ force, 0.0)))
 
 
 def _summed(values: Array, nearest: NDArray[np.int64], frames: int) -> Array:
