@@ -321,8 +321,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.environ[ANYWAY] = "1"
     with stop_signals(lambda: force_exit(terminal)) as stopped:
         try:
-            # Before this command has a temporary folder of its own: the others' are beside it.
             _require_utf8(options)
+            # Before this command has a temporary folder of its own: the others' are beside it.
             recover(options, terminal)
             with atomic.own_scratch():
                 return run(options, terminal, lambda: stopped() or terminal.reader_gone)
