@@ -80,6 +80,8 @@ def nothing_set_up(tmp_path, monkeypatch):
     """Blender's own Python without wheels, and nothing in the home folder."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "path", [path for path in sys.path if not (Path(path) / "taichi").is_dir()])
+    # Other tests of this process have imported it.
+    monkeypatch.delitem(sys.modules, "taichi", raising=False)
     importlib.invalidate_caches()
 
 

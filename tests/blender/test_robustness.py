@@ -198,7 +198,7 @@ def test_scenes_that_share_objects_say_whose_bake_plays(folder):
     first = scene()
     bpy.ops.scene.new(type="LINK_COPY")
     cube().modifiers[point_caches.MODIFIER].frame_start = 99
-    assert "Cube plays another bake" in bake_state.refresh(first).trouble
+    assert "Cube plays the bake of another scene" in bake_state.refresh(first).trouble
 
 
 def test_changes_that_do_not_affect_motion_keep_the_bake_current(folder):

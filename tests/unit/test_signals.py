@@ -23,6 +23,15 @@ from ..conftest import complete_manifest
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 
+
+@pytest.fixture(autouse=True)
+def the_end_of_a_terminal_is_heard():
+    """Under nohup, tests and all that they start would ignore it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 DEAF = """
 import time
 from pathlib import Path
