@@ -39,9 +39,15 @@ State = dict[str, NDArray[np.generic]]
 ALWAYS = (*ParticleState._fields, "constants", "ids")
 """Arrays that every particle needs."""
 
-HELD = ("constants", "ids", "material", "volumes", "anchors")
-"""Arrays that no substep changes. There is one of each; of the others two, between which a sort moves them, because
-the state from before it must be there for another try."""
+HELD = {
+    "constants": sorting.permute_held_vectors,
+    "ids": sorting.permute_held_integers,
+    "material": sorting.permute_held_integers,
+    "volumes": sorting.permute_held_numbers,
+    "anchors": sorting.permute_held_vectors,
+}
+"""Arrays that no substep changes, and what sorts each. There is one of each; of the others two, between which a sort
+moves them, because the state from before it must be there for another try."""
 
 MATTER = ("memory", "material")
 """Arrays that only models other than plain fixed-corotated elasticity need."""
@@ -321,16 +327,9 @@ class Engine:
         self._blocks.build(self.count, self._keys, self._targets)
         old, new = self._particles
         if not again:
-            movers = {
-                "constants": sorting.permute_held_vectors,
-                "ids": sorting.permute_held_integers,
-                "material": sorting.permute_held_integers,
-                "volumes": sorting.permute_held_numbers,
-                "anchors": sorting.permute_held_vectors,
-            }
-            for name in HELD:
+            for name, move in HELD.items():
                 if name in self._names:
-                    movers[name](self.count, self._targets, old[name], new["reaction"])
+                    move(self.count, self._targets, old[name], new["reaction"])
         sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
             "memory": sorting.permute_numbers,

@@ -192,8 +192,7 @@ LEFT = "What is left is above the noise, and no candidate accounts for it."
 
 def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
     """Return the localisation of the discrepancy in sentences."""
-    left = remains(diagnosis.gap)
-    if diagnosis.verdict.effect == NONE and not left:
+    if diagnosis.verdict.effect == NONE and not remains(diagnosis.gap):
         return [f"{NO_DISCREPANCY}: the figures below show mostly noise."]
     where = diagnosis.where
     phases: dict[str, float] = {}

@@ -74,8 +74,8 @@ def without_ground(view: BoxCrop, mask: Mask, *, polished: bool = False) -> Mask
     """Return ``mask`` (h, w) without parts that are ground beside the object, shaded or lit.
 
     polished: also ground that mirrors, where there is some beside the object. What the user keeps stays. Where most of
-    the mask could be ground, as with grey things on grey, nothing is told from it and ``mask`` is returned. Cost: a
-    tenth of a second, twice that where there is polish.
+    the mask could be ground, as with grey objects on grey, colour does not separate them, and ``mask`` is returned
+    unchanged. Cost: a tenth of a second, twice that where there is polish.
     """
     if mask.sum() < 200:
         return mask

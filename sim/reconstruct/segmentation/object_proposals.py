@@ -67,8 +67,8 @@ class Examined:
 def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
 
-    Objects that overlap in the photo are told from parts of one, and from what is only ground beside one
-    (``whole_objects``); none is out of focus where another is sharp. The list is empty where nothing stands out.
+    Each box holds one whole object, not a group, a part, or an object with ground (``whole_objects``). Where one is
+    sharp, those out of focus are left out. The list is empty where nothing stands out.
     """
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))

@@ -88,10 +88,14 @@ def cut_share(mask: Mask) -> float:
 
 def solidity_of(mask: Mask) -> float:
     """Return the share of its convex hull that ``mask`` fills."""
-    points = np.argwhere(mask)[:, ::-1].astype(np.int32)
+    return float(mask.sum()) / max(1.0, float(hull_of(mask).sum()))
+
+
+def hull_of(mask: Mask) -> Mask:
+    """Return the convex hull (H, W) of ``mask``."""
     hull = np.zeros(mask.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
-    return float(mask.sum()) / max(1.0, float(hull.sum()))
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32)), 1)
+    return hull > 0
 
 
 def _is_like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .proposal_features import Mask, extent_of, solidity_of
+from .proposal_features import Mask, extent_of, hull_of, solidity_of
 
 GOOD = 0.8
 """Score of a candidate that may be an object of a group."""
@@ -70,8 +70,8 @@ def _within(mask: Mask, other: Mask) -> float:
 
 
 def _is_group(whole: Candidate, inner: Sequence[Candidate], lab: NDArray[np.float32]) -> bool:
-    """Whether ``whole`` is several objects: two or more of ``inner`` make it up, and each of
-    them stands by itself or is hidden in part by one that does."""
+    """Whether ``whole`` is several objects: two or more of ``inner`` make it up, and each of them stands by itself or
+    is hidden in part by one that does."""
     area = float(whole.mask.sum())
     _, top, _, bottom = extent_of(whole.mask)
     covered = np.zeros_like(whole.mask)
@@ -107,9 +107,7 @@ def _hides(front: Mask, behind: Mask) -> bool:
     """Whether ``front`` stands before ``behind``: it reaches lower, and into a dent of its outline."""
     if extent_of(front)[3] <= extent_of(behind)[3] or float((front & behind).sum()) > 0.15 * float(front.sum()):
         return False
-    hull = np.zeros(behind.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(behind)[:, ::-1].astype(np.int32)), 1)
-    return float((front & (hull > 0)).sum()) > 0.08 * float(behind.sum())
+    return float((front & hull_of(behind)).sum()) > 0.08 * float(behind.sum())
 
 
 def _has_ground(whole: Candidate, item: Candidate, inner: Sequence[Candidate], lab: NDArray[np.float32]) -> bool:
