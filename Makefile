@@ -16,8 +16,9 @@ NAMES ?= mpm worlds demo
 BLENDER ?= blender
 N ?= 100000
 SEED ?= 0
-# Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order.
-SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Tests of one file share scenes and bakes, so a file stays with one worker; tests/conftest.py has the order. A worker
+# that crashes is not replaced: xdist 3.8 would wait for ever with the replacement, instead of naming the test.
+SPREAD := -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 PYTEST := $(BIN)/python -m pytest $(SPREAD)
 # Where PYTHONDONTWRITEBYTECODE is set, every process that tests start would compile all that it imports. A tree that
 # may not be written works without.

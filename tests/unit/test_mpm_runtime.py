@@ -79,3 +79,41 @@ def test_the_memory_of_arrays_that_nothing_refers_to_is_given_back(kind):
         array = runtime.new_array(kind, length)
     assert array.shape == (length,)
     assert resident_memory() - before < 3 * 16_000_000
+
+
+RESTARTED = """
+import gc
+import numpy as np
+import taichi as ti
+from physgen.sim.mpm.kernels.layout import vec4
+from physgen.sim.mpm.kernels.runtime import ensure_started, generation, new_array
+from physgen.sim.mpm.solver_options import SolverOptions
+
+def arrays(count, value):
+    made = [new_array(kind, 1000) for kind in (ti.f32, vec4) for _ in range(count)]
+    for array in made:
+        array.fill(value)
+    return made
+
+ensure_started(SolverOptions())
+first = generation()
+old = arrays(300, 1.0)
+ensure_started(SolverOptions(threads=1))
+assert generation() == first + 1
+new = arrays(300, 2.0)
+try:
+    old[0].fill(3.0)
+except RuntimeError as error:
+    print(error)
+del old
+gc.collect()
+others = arrays(300, 4.0)
+print(sum(bool((array.to_numpy() != 2.0).any()) for array in new), "overwritten")
+"""
+
+
+def test_arrays_from_before_a_restart_free_none_from_after_it():
+    """Taichi frees the array at an old one's address: several of 600, which others then overwrite."""
+    result = subprocess.run([sys.executable, "-c", RESTARTED], capture_output=True, text=True, check=True)
+    said = ["this array was freed when Taichi restarted: make a new one", "0 overwritten"]
+    assert result.stdout.splitlines() == said and not result.stderr

@@ -21,6 +21,7 @@ logger = logging.getLogger(__name__)
 _GENERATION = 0
 _ASKED: tuple[str, int, str] | None = None
 _ARCH = "cpu"
+_ARRAYS: dict[int, weakref.ref[ti.Ndarray]] = {}
 
 
 def ensure_started(options: SolverOptions) -> tuple[str, int]:
@@ -30,7 +31,7 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
     change of architecture, thread count or cache folder restarts Taichi, which loses the arrays of earlier worlds; a
     world compares its generation before each use.
     """
-    global _ASKED, _ARCH, _GENERATION
+    global _ASKED, _ARCH
     folder = "" if options.cache_folder is None else str(options.cache_folder)
     wanted = (_available(options.arch), options.threads, folder)
     asked = wanted
@@ -61,7 +62,6 @@ def ensure_started(options: SolverOptions) -> tuple[str, int]:
         _start({**arguments, "arch": ti.cpu})
         wanted = ("cpu", options.threads, folder)
     _ASKED, _ARCH = asked, wanted[0]
-    _GENERATION += 1
     return wanted[0], _GENERATION
 
 
@@ -71,6 +71,7 @@ def _start(arguments: dict[str, object]) -> None:
     os.environ["TI_SKIP_VERSION_CHECK"] = "ON"
     _leave_source_lines_out()
     _leave_call_stacks_out()
+    _let_go_of_arrays()
     with contextlib.redirect_stdout(io.StringIO()) as output:
         ti.init(**arguments)
     logger.debug("%s", output.getvalue().strip())
@@ -124,23 +125,54 @@ def generation() -> int:
     return _GENERATION
 
 
+class FreedArray(ti.Ndarray):  # type: ignore[misc]  # Taichi has no types
+    """What an array becomes when Taichi restarts."""
+
+    @property
+    def arr(self) -> Any:
+        """The memory that it had; raises RuntimeError."""
+        raise RuntimeError("this array was freed when Taichi restarted: make a new one")
+
+
 def new_array(kind: Any, length: int) -> ti.Ndarray:
     """A new array of zeros on the device, whose memory is given back when nothing refers to it any more.
 
     Taichi (1.7) does that for arrays of numbers alone: those of vectors and matrices, nearly all that a world has, stay
-    until it is restarted.
+    until it is restarted. Whoever uses an array from before a restart gets RuntimeError.
     """
     array = ti.ndarray(kind, length)
-    if not hasattr(type(array), "__del__"):
-        weakref.finalize(array, _give_back, _GENERATION, array.arr).atexit = False
+    _ARRAYS[id(array)] = weakref.ref(array)
+    weakref.finalize(
+        array, _forget, id(array), _GENERATION, array.arr, not hasattr(type(array), "__del__")
+    ).atexit = False
     return array
 
 
-def _give_back(made: int, memory: Any) -> None:
-    """Let Taichi free ``memory`` of an array that was ``made`` in this generation; a restart has freed all before."""
+def _forget(number: int, made: int, memory: Any, free: bool) -> None:
+    """Drop array ``number``, and let Taichi ``free`` its memory if it was ``made`` in this generation: a restart has
+    freed all before."""
     program = ti.lang.impl.get_runtime().prog
-    if made == _GENERATION and program is not None:
-        program.delete_ndarray(memory)
+    if made == _GENERATION:
+        _ARRAYS.pop(number, None)
+        if free and program is not None:
+            program.delete_ndarray(memory)
+
+
+def _let_go_of_arrays() -> None:
+    """Turn all arrays into FreedArray before Taichi restarts, which frees their memory.
+
+    Taichi frees an array of numbers when nothing refers to it, also one from before a restart: by an address, at which
+    a new array may lie by then. That one was freed in its stead, and the next substep wrote to memory of others.
+    """
+    global _ASKED, _GENERATION
+    for reference in list(_ARRAYS.values()):
+        array = reference()
+        if array is not None:
+            del array.arr
+            array.__class__ = FreedArray
+    _ARRAYS.clear()
+    _ASKED = None
+    _GENERATION += 1
 
 
 def _available(arch: str) -> str:

@@ -18,6 +18,7 @@ from ..colliders import SAME_TIME, Collider, Surface
 from ..geometry.mass_properties import mass_properties
 from ..geometry.signed_distance import DistanceLattice
 from ..kernels.kernel_arrays import RigidArrays, RigidContacts, ShapeArrays
+from ..kernels.runtime import new_array
 from ..surface_contact import GROUND_NAME, MODES
 from ..world_setup import WorldSetup
 from . import rigid_layout as at
@@ -277,7 +278,7 @@ class RigidBodies:
     def _put(self, name: str, values: NDArray[np.generic], kind: object) -> None:
         flat = np.ascontiguousarray(values).ravel().astype(ti.lang.util.to_numpy_type(kind))
         if name not in self.arrays or self.arrays[name].shape != flat.shape:
-            self.arrays[name] = ti.ndarray(kind, flat.shape)
+            self.arrays[name] = new_array(kind, flat.size)
         self.arrays[name].from_numpy(flat)
 
     def _put_shapes(self, changed: Mapping[int, list[DistanceLattice]]) -> None:
