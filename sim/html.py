@@ -417,6 +417,9 @@ section{margin-top:40px}
 .ranking th,.ranking td{border:0;padding:2px 0}
 .ranking td:not(.probability)::before{content:attr(data-label) ': ';color:var(--quiet)}
 .ranking td.numbers{padding-left:0;min-width:0}
+.cards tr{display:grid;grid-template-columns:repeat(auto-fit,minmax(100px,1fr));gap:4px 14px}
+.cards th{grid-column:1/-1}
+.ranking.cards td:not(.probability)::before{content:attr(data-label);display:block;font-size:13px}
 }
 @media print{
 body{font-size:10pt;line-height:1.4}

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..composite.srgb import read_rgb
-from ..diagnose.track.track_videos import MAX_SIDE, Video
+from ..diagnose.track.track_videos import MAX_SIDE, Video, VideoInfo
 from ..errors import InputError
 from ..files import shown
 from ..validation import require_range
@@ -26,6 +26,10 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 USUAL_FPS = 24.0
 """Assumed frame rate of a folder of pictures."""
 MOST_FRAMES = 20_000
+STAMPED = 600
+"""Frames whose times are looked at first; of a video that is even so far, the rest is not."""
+UNEVEN = 1.0
+"""Frames by which a time may be off an even rate: times are rounded, and cameras jitter."""
 SAME_RATE = 0.002
 """Rates that differ by less than this share are taken for the same: 29.97 and 30."""
 
@@ -37,7 +41,8 @@ class Footage:
     """A video file or a folder of pictures in the order of their numbers.
 
     path: where it is. width, height: of a frame in pixels. fps: frames per second. pictures: of a folder, else empty.
-    notices: what was assumed.
+    shown: of a file of uneven frame rate, the number of the file's frame that a player shows at each time, rising;
+    else empty. notices: what was assumed.
     """
 
     path: Path
@@ -45,6 +50,7 @@ class Footage:
     height: int
     fps: float
     pictures: tuple[Path, ...] = ()
+    shown: tuple[int, ...] = ()
     notices: tuple[str, ...] = ()
 
     @property
@@ -57,10 +63,11 @@ class Footage:
 
         Raises InputError for a frame of another size, or one that cannot be read.
         """
-        for frame in self._pictures(most) if self.pictures else self._file(most):
+        for index, frame in enumerate(self._pictures(most) if self.pictures else self._file(most)):
             if frame.shape[:2] != (self.height, self.width):
+                which = self.pictures[index].name if self.pictures else f"frame {index + 1}"
                 raise InputError(
-                    f"{shown(self.path)}: has a frame of {frame.shape[1]}x{frame.shape[0]} pixels and earlier ones of "
+                    f"{shown(self.path)}: {which} has {frame.shape[1]}x{frame.shape[0]} pixels and earlier frames "
                     f"{self.width}x{self.height}; give a video of one size"
                 )
             yield frame
@@ -69,12 +76,21 @@ class Footage:
         """Return how many frames can be read, ``most`` at most: containers are not to be believed."""
         if self.pictures:
             return min(len(self.pictures), most)
+        if self.shown:
+            return min(len(self.shown), most)
         return sum(1 for _ in self._file(most))
 
     def _file(self, most: int) -> Iterator[Frame]:
         with Video(self.path) as video:
-            for frame in video.frames(0, most - 1):
-                yield frame.colour
+            if not self.shown:
+                for frame in video.frames(0, most - 1):
+                    yield frame.colour
+                return
+            wanted = self.shown[:most]
+            times = np.bincount(wanted)
+            for frame in video.frames(0, wanted[-1]):
+                for _ in range(times[frame.index]):
+                    yield frame.colour
 
     def _pictures(self, most: int) -> Iterator[Frame]:
         for path in self.pictures[:most]:
@@ -93,11 +109,47 @@ def open_footage(path: Path, fps: float | None = None) -> Footage:
     with Video(path) as video:
         info = video.info
         # What opens need not decode.
-        if next(video.frames(0, 0), None) is None:
+        first = next(video.frames(0, 0), None)
+        if first is None:
             raise InputError(f"{shown(path)}: no frame of it can be read; convert it to MP4 (H.264)")
+        times = [first.time, *video.times(STAMPED)] if fps is None else []
+        if _uneven(times) and len(times) > STAMPED:
+            times += video.times(MOST_FRAMES - len(times))
+    if fps is None and _uneven(times):
+        return _at_even_times(path, info, np.array(times))
     if fps is None and info.fps <= 0:
         raise InputError(f"{shown(path)}: does not say its frame rate; give --fps")
     return Footage(path=path, width=info.width, height=info.height, fps=fps or info.fps)
+
+
+def _uneven(times: list[float]) -> bool:
+    """Return whether ``times`` (N,) in seconds rise and are off even ones by more than ``UNEVEN`` frames."""
+    steps = np.diff(times)
+    if len(steps) < 2 or not np.isfinite(steps).all() or (steps <= 1e-6).any():
+        return False
+    even = np.linspace(times[0], times[-1], len(times))
+    return bool(np.abs(np.array(times) - even).max() > UNEVEN * steps.mean())
+
+
+def _at_even_times(path: Path, info: VideoInfo, times: NDArray[np.float64]) -> Footage:
+    """Return the video of uneven frame rate at its usual one: at each even time the frame that a player shows."""
+    step = float(np.median(np.diff(times)))
+    count = min(MOST_FRAMES, 1 + int((times[-1] - times[0]) / step + 0.5))
+    # A quarter of a step: stamps are rounded.
+    shown_then = np.searchsorted(times - times[0], np.arange(count) * step + step / 4, side="right") - 1
+    left_out = len(times) - len(np.unique(shown_then))
+    notice = (
+        f"{path.name}: its frame rate is uneven; it is taken at {1 / step:.4g} frames per second as a player shows it, "
+        f"{count - len(np.unique(shown_then))} frames repeated and {left_out} left out"
+    )
+    return Footage(
+        path=path,
+        width=info.width,
+        height=info.height,
+        fps=1 / step,
+        shown=tuple(shown_then.tolist()),
+        notices=(notice,),
+    )
 
 
 def _folder(path: Path, fps: float | None) -> Footage:

@@ -21,7 +21,7 @@ from ..events import IsCancelled
 from .evaluation import HIGHER, LOWER, NEITHER, Curve, Measure, Section
 from .flow import FlowEstimator, between
 from .footage import Footage, Frame, reduced
-from .physics_iq import motion_masks
+from .physics_iq import ASPECT, motion_masks
 
 SIDE = 960
 """Longest side in pixels at which a video is looked at by itself; longer ones are reduced."""
@@ -198,6 +198,9 @@ def _first_frame(first: Frame, photo: Path | None) -> list[Measure]:
         same = np.asarray(cv2.resize(picture, first.shape[1::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
         values = psnr(first, same), float(ssim_map(first / 255.0, same / 255.0).mean())
         note = "equal" if np.isinf(values[0] or 0.0) else ""
+        high, wide = picture.shape[:2]
+        if abs(wide * first.shape[0] / (high * first.shape[1]) - 1) > ASPECT:
+            note = f"the photo has another shape, {wide}x{high} pixels, and is stretched to the frame's"
     return [
         Measure(
             name="first_frame_psnr",

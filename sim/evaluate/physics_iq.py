@@ -218,6 +218,11 @@ def against(video: Footage, recordings: Sequence[Footage], most: int) -> Section
         raise InputError(f"against: {len(recordings)} recordings are given; give one, or two takes of the same event")
     size = quarter(recordings[0].width, recordings[0].height)
     notices = [*video.notices, *(text for other in recordings for text in _differences(video, other))]
+    if len(recordings) == 2 and recordings[0].path.resolve() == recordings[1].path.resolve():
+        notices.append(
+            f"{recordings[0].name}: is given twice: the two takes are equal, and the scores have no meaning; give "
+            "another take of the event"
+        )
     ours = take(video.frames(most), size, name=video.name)
     takes = [take(at_rate(other, video.fps, most), size, name=other.name) for other in recordings]
     count = min(map(len, (ours, *takes)))
@@ -256,6 +261,11 @@ def _differences(video: Footage, other: Footage) -> list[str]:
             f"{video.name}: has {video.width}x{video.height} pixels and {other.name} {other.width}x{other.height}; it "
             "is stretched to the recording's shape, so that places do not correspond"
         )
+    elif (video.width, video.height) != (other.width, other.height):
+        found.append(
+            f"{video.name}: has {video.width}x{video.height} pixels and {other.name} {other.width}x{other.height}; "
+            "both are compared at a quarter of the first recording's size"
+        )
     return found
 
 
@@ -267,7 +277,7 @@ def _section(
     between = compare(real, takes[1]) if len(takes) == 2 else None
     seconds = len(ours) / video.fps
     names = " and ".join(other.name for other in recordings)
-    limits = f"; the two takes: {_values_text(between)}" if between else ""
+    limits = f"; the two takes of each other: {_values_text(between)}" if between else ""
     return Section(
         name="against",
         title="Against a real video",
@@ -279,7 +289,9 @@ def _section(
 
 
 def _values_text(found: Comparison) -> str:
-    return ", ".join(f"{name} {value:.3g}" for name, value in found.values().items())
+    values = found.values()
+    words = zip(("spatial IoU", "spatiotemporal IoU", "weighted IoU", "MSE"), values.values(), strict=True)
+    return ", ".join(f"{name} {value:.3g}" for name, value in words)
 
 
 def _measures(found: Comparison, still: Comparison) -> list[Measure]:

@@ -20,15 +20,15 @@ from ..atomic import replacing_tree, write_bytes, write_json
 from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..files import shown
-from ..html import element, join, page_head, page_style
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .model_judge import CRITERIA, TITLES
 from .questionnaire import ANSWERS_FORMAT, load_key
+from .questionnaire_report import PAGE_FILE, result_page
 
 Array = NDArray[np.float64]
 
-RESULT_FILE, PAGE_FILE, TABLE_FILE = "questionnaire.json", "report.html", "scores.csv"
+RESULT_FILE, TABLE_FILE = "questionnaire.json", "scores.csv"
 MOST_PEOPLE = 2000
 _PERSON = re.compile(r"[A-Za-z0-9_-]{1,40}\Z")
 
@@ -173,7 +173,13 @@ def _sheets(paths: Sequence[Path], key: dict[str, Any]) -> tuple[list[Sheet], li
         try:
             sheet = read_answers(path, key)
         except InputError as error:
-            notes.append(f"left out: {error}")
+            # The page is passed on, so it names the file and not where it lies.
+            notes.append(f"left out: {str(error).replace(f'{shown(path.parent)}/', '')}")
+            continue
+        if not any(values for of in sheet.scores.values() for values in of.values()):
+            notes.append(
+                f"left out: {_problems_text(path, sheet)}; nothing is left of {sheet.person}, who is not counted"
+            )
             continue
         before = kept.get(sheet.person)
         if before is not None and before[1].scores == sheet.scores:
@@ -195,9 +201,14 @@ def _sheets(paths: Sequence[Path], key: dict[str, Any]) -> tuple[list[Sheet], li
             notes.append(f"{a.person} and {b.person} gave the same answers throughout; both are counted")
     for path, sheet in kept.values():
         if sheet.problems:
-            shown_first = "; ".join(sheet.problems[:5]) + ("; …" if len(sheet.problems) > 5 else "")
-            notes.append(f"{path.name}: {len(sheet.problems)} answers missing or unusable: {shown_first}")
+            notes.append(_problems_text(path, sheet))
     return [sheet for _, sheet in kept.values()], notes
+
+
+def _problems_text(path: Path, sheet: Sheet) -> str:
+    count = len(sheet.problems)
+    first = "; ".join(sheet.problems[:5]) + ("; …" if count > 5 else "")
+    return f"{path.name}: {count} answer{'s' * (count != 1)} missing or unusable: {first}"
 
 
 def collect_questionnaire(
@@ -324,98 +335,3 @@ def _csv(sheets: list[Sheet], cases: list[dict[str, Any]]) -> bytes:
                     score = sheet.scores[case["id"]][token].get(criterion, "")
                     writer.writerow([person, case["name"], video, criterion, score])
     return text.getvalue().encode()
-
-
-def _two(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
-
-
-def _p(value: float) -> str:
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def result_page(found: dict[str, Any]) -> str:
-    """Return the page of a result of ``collect_questionnaire``."""
-
-    def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Any:
-        cells = [
-            element("tr", element("th", row[0], scope="row"), *(element("td", c) for c in row[1:])) for row in rows
-        ]
-        top = element("tr", *(element("th", name, scope="col") for name in head))
-        return element("table", element("caption", caption), element("thead", top), element("tbody", *cells))
-
-    videos = list(dict.fromkeys(row["video"] for row in found["means"]))
-    of = {(row["video"], row["criterion"]): row for row in found["means"]}
-    percent = f"{100 * found['confidence']:g} %"
-    means = [
-        [
-            video,
-            *(
-                f"{_two(r['mean'])} ({_two(r['low'])} to {_two(r['high'])}), n = {r['count']}"
-                for r in (of[video, c] for c in CRITERIA)
-            ),
-        ]
-        for video in videos
-    ]
-    pairs = [
-        [
-            f"{r['first']} against {r['second']}",
-            TITLES[r["criterion"]],
-            f"{r['wins']} : {r['losses']}, {r['ties']} ties",
-            _p(r["p"]),
-            f"{r['people_for_first']} : {r['people_for_second']}",
-            _p(r["p_people"]),
-        ]
-        for r in found["preferences"]
-    ]
-    agreement = [[TITLES[r["criterion"]], _two(r["ordinal"]), _two(r["interval"])] for r in found["agreement"]]
-    notes = element(
-        "div", element("h2", "Notices"), element("ul", *(element("li", n) for n in found["notes"])), class_="notes"
-    )
-    body = element(
-        "body",
-        element(
-            "header",
-            element("p", "What people answered", class_="eyebrow"),
-            element("h1", f"{found['people']} people, {found['cases']} cases"),
-            notes if found["notes"] else None,
-        ),
-        element(
-            "main",
-            element(
-                "section",
-                element("h2", "Scores"),
-                table(
-                    f"Mean of 1 to 5 with its {percent} interval: {found['resamples']} draws of people and cases",
-                    ["Video", *(TITLES[c] for c in CRITERIA)],
-                    means,
-                ),
-            ),
-            element(
-                "section",
-                element("h2", "Preferences"),
-                element(
-                    "p",
-                    "Judgements of one person are not independent: the last two columns count each person once. "
-                    "p is not corrected for the number of pairs.",
-                ),
-                table(
-                    "Which video of a pair was scored higher, with exact two-sided sign tests",
-                    ["Pair", "Criterion", "Judgements", "p", "People", "p"],
-                    pairs,
-                ),
-            )
-            if pairs
-            else None,
-            element(
-                "section",
-                element("h2", "Agreement"),
-                table(
-                    "Krippendorff's α: 1 is full agreement, 0 chance", ["Criterion", "Ordinal", "Interval"], agreement
-                ),
-            ),
-        ),
-        element("footer", element("p", f"PhysGen {found['made_by']}")),
-    )
-    html = element("html", page_head("Questionnaire", page_style()), body, lang="en")
-    return str(join([html]).replace("<html", "<!DOCTYPE html>\n<html", 1)) + "\n"

@@ -21,7 +21,9 @@ from .footage import Footage, Frame, reduced
 STRIP = 8
 """Frames in the strip, evenly spaced, the first and the last among them."""
 STRIP_SIDE = 240
-WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 440.0, 190.0, 52.0, 34.0, 12.0
+WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 400.0, 190.0, 52.0, 36.0, 12.0
+SIZE = 12
+"""Of the text in a chart, pixels; 11 on a phone, which shows it smaller."""
 LINES = ("found", "nominal", "observed", "other")
 """Colours of a chart's curves, in their order; more curves share the last."""
 DASHES = (None, "6 3", "2 3", "8 3 2 3")
@@ -113,10 +115,10 @@ def chart(curves: Sequence[Curve]) -> Picture | None:
     for tick in scale.ticks(4):
         y = scale(tick)
         parts.append(element("line", x1=LEFT, x2=WIDTH - 8, y1=y, y2=y, class_="rule"))
-        parts.append(label(f"{tick:g}", LEFT - 6, y + 4, class_="quiet", anchor="end", size=11))
+        parts.append(label(f"{tick:g}", LEFT - 6, y + 4, class_="quiet", anchor="end", size=SIZE))
     for tick in time.ticks(5):
-        parts.append(label(f"{tick:g}", time(tick), HEIGHT - BOTTOM + 15, class_="quiet", anchor="middle", size=11))
-    parts.append(label("time, s", WIDTH - 8, HEIGHT - 4, class_="quiet", anchor="end", size=11))
+        parts.append(label(f"{tick:g}", time(tick), HEIGHT - BOTTOM + 15, class_="quiet", anchor="middle", size=SIZE))
+    parts.append(label("time, s", WIDTH - 8, HEIGHT - 4, class_="quiet", anchor="end", size=SIZE))
     for index, item in enumerate(known):
         colour = LINES[min(index, len(LINES) - 1)]
         xs, ys = [time(t) for t in item.times], [scale(v) if math.isfinite(v) else math.nan for v in item.values]
@@ -133,12 +135,12 @@ def chart(curves: Sequence[Curve]) -> Picture | None:
     named = [item for item in known if item.label]
     rows = -(-min(len(named), MOST_LABELS) // 2)
     for index, item in enumerate(named[:MOST_LABELS]):
-        x, y = LEFT + (index % 2) * 190, HEIGHT + 16 + 17 * (index // 2)
+        x, y = LEFT + (index % 2) * 175, HEIGHT + 16 + 17 * (index // 2)
         colour, dash = LINES[min(index, len(LINES) - 1)], DASHES[min(index, len(DASHES) - 1)]
         key = element(
             "path", d=f"M{x:.0f} {y - 7:.0f}h22", class_=f"line {colour}-line", stroke_width=2, stroke_dasharray=dash
         )
-        parts += [key, label(shortened(item.label, 24), x + 28, y - 3, size=11)]
+        parts += [key, label(shortened(item.label, 20), x + 28, y - 3, size=SIZE)]
     extra = f", {len(named) - MOST_LABELS} more not named" if len(named) > MOST_LABELS else ""
     unit = f", {known[0].unit}" if known[0].unit else ""
     described = f"{known[0].title} over time{unit}: {', '.join(i.label for i in named) or 'one curve'}{extra}"

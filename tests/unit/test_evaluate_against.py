@@ -3,6 +3,7 @@
 
 import csv
 import json
+import struct
 import subprocess
 import sys
 
@@ -226,6 +227,60 @@ def test_another_rate_and_shape_are_said(tmp_path):
     found = physgen.evaluate(a, against=[b], out=tmp_path / "o")
     assert any("brought to 12 by blending" in text for text in found.notices)
     assert any("stretched to the recording's shape" in text for text in found.notices)
+
+
+def test_another_size_and_one_take_given_twice_are_said(tmp_path):
+    a = write_video(tmp_path / "a.avi", [cv2.resize(frame, (320, 240)) for frame in square_frames(8)])
+    b = write_video(tmp_path / "b.avi", square_frames(8))
+    found = physgen.evaluate(a, against=[b, b], out=tmp_path / "o")
+    assert any("a.avi: has 320x240 pixels and b.avi 160x120; both" in text for text in found.notices)
+    assert any("b.avi: is given twice" in text for text in found.notices)
+    plain = physgen.evaluate(b, against=[b], out=tmp_path / "o")
+    assert plain.notices == ()
+
+
+def with_durations(path, runs):
+    """``path``, an MP4 whose index lies at its end, with ``runs`` of (frames, how many steps each is shown)."""
+    content, at, end, outer = bytearray(path.read_bytes()), 0, path.stat().st_size, []
+    for wanted in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
+        while content[at + 4 : at + 8] != wanted:
+            at += struct.unpack(">I", content[at : at + 4])[0]
+            assert at < end, f"no {wanted}"
+        outer.append(at)
+        end, at = at + struct.unpack(">I", content[at : at + 4])[0], at + 8
+    start = outer.pop()
+    (step,) = struct.unpack(">I", content[start + 20 : start + 24])
+    entries = b"".join(struct.pack(">II", frames, round(steps * step)) for frames, steps in runs)
+    box = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(runs)) + entries
+    longer = len(box) - (end - start)
+    content[start:end] = box
+    for place in outer:
+        content[place : place + 4] = struct.pack(">I", struct.unpack(">I", content[place : place + 4])[0] + longer)
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("runs", "fps", "seen", "words"),
+    [
+        ([(10, 0.6), (2, 3)], 40, [*range(11), 10, 10, 10, 10, 11], "4 frames repeated and 0 left out"),
+        ([(4, 0.5), (8, 1.25)], 19.2, [0, *range(3, 12)], "0 frames repeated and 2 left out"),
+    ],
+)
+def test_an_uneven_frame_rate_is_brought_to_what_a_player_shows_and_said(tmp_path, runs, fps, seen, words):
+    out = cv2.VideoWriter(str(tmp_path / "v.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 24.0, SIZE)
+    for i in range(12):
+        out.write(np.full((SIZE[1], SIZE[0], 3), 20 * i, np.uint8))
+    out.release()
+    even = open_footage(tmp_path / "v.mp4")
+    assert even.fps == 24 and not even.shown and not even.notices
+    uneven = open_footage(with_durations(tmp_path / "v.mp4", runs))
+    assert [round(float(frame.mean()) / 20) for frame in uneven.frames()] == seen
+    assert uneven.fps == pytest.approx(fps, rel=2e-3) and uneven.count() == len(seen) and uneven.count(5) == 5
+    assert [round(float(frame.mean()) / 20) for frame in uneven.frames(7)] == seen[:7]
+    assert "v.mp4: its frame rate is uneven" in uneven.notices[0] and words in uneven.notices[0]
+    # What the user says counts more than what the file says.
+    assert open_footage(tmp_path / "v.mp4", fps=12.0).shown == ()
 
 
 def test_a_folder_of_pictures_is_a_video_and_its_gaps_are_said(tmp_path):

@@ -110,6 +110,9 @@ def test_first_frame_and_background_are_compared_where_nothing_moves(tmp_path):
     assert 38 < found["background_psnr"] < 50
     without, _ = figures(tmp_path / "w", frames)
     assert without["first_frame_psnr"] is None
+    cv2.imwrite(str(tmp_path / "wide.png"), np.hstack([frames[0], frames[0]]))
+    _, evaluation = figures(tmp_path / "s", frames, photo=tmp_path / "wide.png")
+    assert "stretched to the frame's" in next(m.note for m in evaluation.measures if m.name == "first_frame_psnr")
     everywhere = [np.full((60, 60, 3), 255 * (i % 2), np.uint8) for i in range(4)]
     found, evaluation = figures(tmp_path / "x", everywhere)
     assert found["background_psnr"] is None

@@ -10,6 +10,8 @@ from physgen.batch.farm.planning.plan import Outcome
 from physgen.sim.diagnose.diagnosis import Estimate, Provenance, RankedEffect
 from physgen.sim.diagnose.report import write_report
 from physgen.sim.evaluate.evaluation import HIGHER, LOWER, Curve, Evaluation, Measure, Section
+from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.questionnaire_report import result_page
 from physgen.sim.evaluate.report import page
 from physgen.sim.html import page_head, page_style, prose, render
 from physgen.sim.reconstruct import reconstruction_report
@@ -78,6 +80,25 @@ def evaluation(folder):
     return path
 
 
+def questionnaire(folder):
+    videos = ("ours", "a long name of a method v1.5 with fifty-nine letters in it all")
+    values = {"mean": 2.37, "low": 1.78, "high": 2.93, "count": 27}
+    means = [{"video": video, "criterion": c, **values} for video in videos for c in CRITERIA]
+    means[-1] |= {"mean": None, "low": None, "high": None, "count": 0}
+    pair = {"wins": 12, "losses": 108, "ties": 36, "p": 0.0001, "people_for_first": 10, "people_for_second": 12}
+    found = {
+        "people": 12, "cases": 40, "confidence": 0.95, "resamples": 2000, "means": means, "made_by": "1",
+        "notes": ["left out: answers_person_with_a_rather_long_code_of_40_letters.json: answers another questionnaire"],
+        "preferences": [
+            {"first": videos[0], "second": videos[1], "criterion": c, **pair, "p_people": 0.8} for c in CRITERIA
+        ],
+        "agreement": [{"criterion": c, "ordinal": 0.34, "interval": None} for c in CRITERIA],
+    }  # fmt: skip
+    path = folder / "questionnaire.html"
+    path.write_text(result_page(found))
+    return path
+
+
 def farm(folder):
     states = ("done", "failed", "running")
     plan = plan_of(folder, states)
@@ -124,7 +145,7 @@ def browser(tmp_path_factory):
     found.close()
 
 
-@pytest.mark.parametrize("made", [diagnosis, evaluation, farm, reconstruction])
+@pytest.mark.parametrize("made", [diagnosis, evaluation, farm, questionnaire, reconstruction])
 def test_a_page_fits_a_screen_and_a_phone(made, browser, tmp_path):
     path = made(tmp_path)
     for width in (1280, 390):

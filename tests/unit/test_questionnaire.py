@@ -139,7 +139,7 @@ def test_a_person_answers_by_keyboard_and_the_page_saves_a_file_that_collect_rea
     assert values == [1, 2, 3, 4, 5, 4]
     found = collect_questionnaire([file], key=made, out=tmp_path / "result")
     assert sum(row["count"] for row in found["means"]) == 11
-    assert any("1 answers missing or unusable: cup" in note for note in found["notes"])
+    assert any("1 answer missing or unusable: cup" in note for note in found["notes"])
 
 
 def picture(browser, name):
@@ -183,11 +183,13 @@ def test_incomplete_repeated_and_foreign_answers_are_all_said(made, tmp_path):
         "2.json: holds the same answers of ann as 0.json; counted once",
         "3.json: 12 answers missing or unusable",
         "'7' is not on the scale of 1 to 5; left out",
-        "left out: ",
-        "answers another questionnaire than this key",
+        "nothing is left of bob, who is not counted",
+        "left out: 4.json: answers another questionnaire than this key",
     ):
         assert said in notes, notes
-    assert found["people"] == 2
+    # The page is passed on: no folder of this machine is in it.
+    assert str(tmp_path) not in (tmp_path / "result" / "report.html").read_text()
+    assert found["people"] == 1
     assert {row["mean"] for row in found["means"]} == {4.0} and {row["count"] for row in found["means"]} == {2}
     with pytest.raises(InputError, match="no usable answers in 1 files; left out"):
         collect_questionnaire([write(tmp_path / "b", foreign)], key=made, out=tmp_path / "other")

@@ -133,6 +133,13 @@ class Video:
                 yield Frame(index=index, time=time, grey=np.asarray(grey, np.uint8), colour=np.asarray(colour))
             index += 1
 
+    def times(self, most: int) -> list[float]:
+        """Return the times in s of the next ``most`` frames or of those that are left, NaN if unknown."""
+        found: list[float] = []
+        while len(found) < most and self._source.grab():
+            found.append(float(self._source.get(cv2.CAP_PROP_POS_MSEC)) / 1000.0)
+        return found
+
 
 def frame_times(
     path: Path, stamps: list[float], info: VideoInfo, fps_override: float | None
