@@ -20,6 +20,7 @@ from ..sim.app.reconstruct import Physics, reconstruct, require_physics
 from ..sim.app.stage_process import own_command, run_stage
 from ..sim.atomic import scratch_prefix
 from ..sim.cache.bake_folder import Bake, load_bake
+from ..sim.cache.folder_lock import lock_beside
 from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
 from ..sim.memory import RENDERING_RESERVED, available_memory, rendering_bytes, require_memory
@@ -241,6 +242,24 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
     check_overrides(object_names(request.objects), request.physics.overrides)
     load_quality(request.bake.quality)
     require_video_name(request.video)
+    with lock_beside(request.work / "scene"):
+        scene, options = _moving_scene(request, on_event, cancelled)
+    run_bake(scene, request.work / "bake", options, on_event, cancelled)
+    render(
+        scene,
+        load_bake(request.work / "bake"),
+        out=request.work / "frames",
+        options=request.render,
+        video=request.video,
+        on_event=on_event,
+        cancelled=cancelled,
+    )
+    return request.video
+
+
+def _moving_scene(request: RunRequest, on_event: OnEvent, cancelled: IsCancelled) -> tuple[Scene, BakeOptions]:
+    """Return the scene of ``request`` as it is to be baked, and the options of that; the caller holds its folder, so
+    that nothing changes it between the steps."""
     scene = reconstruct(
         request.photo,
         request.objects,
@@ -264,14 +283,4 @@ def photo_to_video(request: RunRequest, on_event: OnEvent, cancelled: IsCancelle
         scene, options = choose_motion(
             scene, options, request.choices, on_event, rehearsals=rehearsals, cancelled=cancelled
         )
-    run_bake(scene, request.work / "bake", options, on_event, cancelled)
-    render(
-        scene,
-        load_bake(request.work / "bake"),
-        out=request.work / "frames",
-        options=request.render,
-        video=request.video,
-        on_event=on_event,
-        cancelled=cancelled,
-    )
-    return request.video
+    return scene, options

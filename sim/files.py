@@ -7,11 +7,13 @@ without waiting, looked at through the open descriptor, and never read further t
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
 import stat
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +71,24 @@ def open_file(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | N
     except BaseException:
         os.close(number)
         raise
+
+
+@contextlib.contextmanager
+def same_file(path: Path, most: int, *, folder: Path | None = None) -> Iterator[Callable[[], bool]]:
+    """Yield a function: whether ``path`` is still the file that it is now, whatever its content, and no other.
+
+    It is held open meanwhile, so that its number in the file system cannot become another file's; times, which depend
+    on the clock, are not looked at. Raises as ``open_file`` does.
+    """
+    with open_file(path, most, folder=folder) as held:
+
+        def is_same() -> bool:
+            try:
+                return os.path.samestat(os.fstat(held.fileno()), path.stat())
+            except OSError:
+                return False
+
+        yield is_same
 
 
 def read_bytes(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | None = None) -> bytes:

@@ -203,21 +203,22 @@ def run_reconstruct(options: argparse.Namespace, terminal: Terminal, cancelled: 
     physics = physics_options(options)
     require_physics(len(requests), physics)
     check_overrides(object_names(requests), physics.overrides)
-    scene = reconstruct(
-        options.photo,
-        requests,
-        out=options.out,
-        options=settings,
-        physics=physics,
-        ask=ask,
-        on_event=terminal,
-        cancelled=cancelled,
-    )
     done: Event = {"event": "done", "scene": str(options.out)}
-    if options.default_motion and not tells_motion(physics.velocities, physics.spins, physics.overrides):
-        choices = stages.Choices(motion=True, frames=True, slow=True)
-        _, clip = stages.choose_motion(scene, BakeOptions(), choices, terminal)
-        done["clip"] = {"frames": clip.frames, "slow": clip.slow}
+    with lock_beside(options.out):
+        scene = reconstruct(
+            options.photo,
+            requests,
+            out=options.out,
+            options=settings,
+            physics=physics,
+            ask=ask,
+            on_event=terminal,
+            cancelled=cancelled,
+        )
+        if options.default_motion and not tells_motion(physics.velocities, physics.spins, physics.overrides):
+            choices = stages.Choices(motion=True, frames=True, slow=True)
+            _, clip = stages.choose_motion(scene, BakeOptions(), choices, terminal)
+            done["clip"] = {"frames": clip.frames, "slow": clip.slow}
     terminal(done)
     terminal.line(f"scene: {options.out}")
     return 0
@@ -310,10 +311,8 @@ def run_light(options: argparse.Namespace, terminal: Terminal, cancelled: IsCanc
     """Run ``physgen light``; the exit code."""
     from ...sim.app.set_light import set_light
 
-    root = load_scene(options.scene).root
-    with lock_beside(root):
-        # As it is now: a correction may have ended since.
-        light = set_light(load_scene(root), request=light_request(options), on_event=terminal).model.light
+    request = light_request(options)
+    light = set_light(load_scene(options.scene), request=request, on_event=terminal).model.light
     terminal({"event": "done", "scene": str(options.scene), "light": to_json(light)})
     terminal.line(f"scene: {options.scene}")
     return 0

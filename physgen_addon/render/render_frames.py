@@ -17,11 +17,11 @@ import numpy as np
 
 from ...sim.app.clip_check import Clip, clip_notices
 from ...sim.atomic import recover, replacing
-from ...sim.cache.bake_check import require_intact
+from ...sim.cache.bake_check import require_intact, unchanged_bake
 from ...sim.cache.bake_folder import Bake
 from ...sim.cache.folder_lock import folder_lock
 from ...sim.composite.compositing import FrameLayers
-from ...sim.errors import Cancelled, RenderError
+from ...sim.errors import Cancelled, InputError, RenderError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ...sim.scene.folder import Scene, file_hash, require_photo
 from ...sim.scene.meshes import load_object_mesh
@@ -244,6 +244,20 @@ def render_frames(
     """
     options = options or RenderOptions()
     require_photo(scene)
+    with unchanged_bake(bake) as require_bake:
+        return _render(scene, bake, out, options, frames, on_event, cancelled, require_bake)
+
+
+def _render(
+    scene: Scene,
+    bake: Bake,
+    out: Path,
+    options: RenderOptions,
+    frames: str | None,
+    on_event: OnEvent,
+    cancelled: IsCancelled,
+    require_bake: Callable[[], None],
+) -> list[Path]:
     opened = point_caches.open_bake(bake, scene)
     point_caches.require_world(opened)
     point_caches.require_scene(opened, scene)
@@ -260,6 +274,7 @@ def render_frames(
     rest = [cache.sample(0) for cache in opened.caches]
     count, fps = max(opened.manifest.frames, opened.last_frame - opened.first_frame + 1), opened.manifest.fps
     shot = make_camera_motion(scene, rest, options, first_frame=opened.first_frame, count=count, fps=fps)
+    base = _scene_hash(scene, options, blender)
     planned = plan_frames(scene, opened, numbers, options=options, shot=shot, blender=blender)
     suffix = options.frame_format.suffix
     FrameIndex(out, suffix=suffix)
@@ -276,7 +291,13 @@ def render_frames(
             )
         for notice in (*shot.notices, *_clip_notices(scene, opened, numbers, shot)):
             progress.notice(notice)
-        _make(scene, opened, planned, frame_index, options, shot, progress, cancelled)
+
+        def require_same(*, scene_too: bool) -> None:
+            require_bake()
+            if scene_too and _scene_hash(scene, options, blender) != base:
+                raise InputError(f"{scene.root}: was changed by another command meanwhile; run this one again")
+
+        _make(scene, opened, planned, frame_index, options, shot, progress, cancelled, require_same)
     return [frame_index.path(frame.number) for frame in planned]
 
 
@@ -299,12 +320,14 @@ def _make(
     shot: CameraMotion,
     progress: StageProgress,
     cancelled: IsCancelled,
+    require_same: Callable[..., None],
 ) -> None:
     missing = [frame for frame in planned if not frame_index.is_complete(frame.number, frame.inputs)]
     if len(missing) < len(planned):
         progress.notice(f"{len(planned) - len(missing)} of {len(planned)} frames are up to date")
     names = [item.name for item in scene.model.objects]
     renderer: OpenRenderer | None = None
+    seen = False
     try:
         for done, frame in enumerate(missing, start=len(planned) - len(missing)):
             if cancelled():
@@ -317,6 +340,9 @@ def _make(
             else:
                 renderer = renderer or OpenRenderer(scene, bake, options, shot, progress.notice)
                 layers, data = renderer.layers(frame)
+                # What Blender has read is what the frame is recorded to be of; the scene, all of it with the first one.
+                require_same(scene_too=not seen)
+                seen = True
                 frame_index.begin()
                 write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             frame_index.record(frame.number, frame.inputs)

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
-from ..scene.folder import Scene, save_scene
+from ..scene.folder import Scene
 from ..scene.material import load_preset
 from ..scene.meshes import read_mesh
 from ..scene.model import SceneObject, Vector
@@ -67,9 +68,14 @@ class Drop:
 def add_drops(scene: Scene, drops: Sequence[Drop]) -> Scene:
     """Return ``scene`` with ``drops``, saved; what was dropped under the same names before is replaced.
 
-    Raises InputError for a name that the scene's own objects have, an unknown preset or an unreadable mesh; nothing is
-    written then.
+    Raises InputError for a name that the scene's own objects have, an unknown preset, an unreadable mesh, or a scene
+    that another process is changing; nothing is written then.
     """
+    with lock_beside(scene.root):
+        return _dropped(scene, drops)
+
+
+def _dropped(scene: Scene, drops: Sequence[Drop]) -> Scene:
     names = [drop.name for drop in drops]
     own = [item for item in scene.objects if item.name not in names or item.mask is not None]
     if taken := [item.name for item in own if item.name in names] or sorted({n for n in names if names.count(n) > 1}):
@@ -102,7 +108,7 @@ def add_drops(scene: Scene, drops: Sequence[Drop]) -> Scene:
             else:
                 partial.write_bytes(content)
     model = dataclasses.replace(scene.model, objects=(*own, *items))
-    return scene.with_model(model) if model == scene.model else save_scene(scene.root, model)
+    return scene.with_model(model) if model == scene.model else scene.with_model(model).save()
 
 
 def _mesh(drop: Drop) -> tuple[NDArray[np.float64], bytes | Path]:

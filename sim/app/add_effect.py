@@ -5,16 +5,20 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import tempfile
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..atomic import scratch_prefix
+from ..cache.folder_lock import lock_beside
 from ..effects.registry import effect
-from ..errors import Cancelled, InputError, PhysGenError
+from ..errors import Cancelled, InputError
 from ..events import Event, IsCancelled, OnEvent, ignore, never
-from ..scene.folder import Scene
+from ..scene.folder import Scene, load_scene
 from ..scene.model import Effect, SceneModel
+from .scene_variant import save_variant
 
 FoundEffects = Mapping[str, Mapping[str, float]]
 """Effect → parameter → value, in the order in which the diagnosis found them."""
@@ -108,29 +112,32 @@ def add_and_bake(
     on_event: OnEvent = ignore,
     cancelled: IsCancelled = never,
 ) -> Event:
-    """Bake ``scene`` without the found effects if requested, add them, and bake it with them.
+    """Bake ``scene`` without the found effects if requested, then with them, and add them to it.
 
-    Returns ``{"event": "done", "scene", "before", "after"}``. A bake that fails leaves ``scene.json`` as it was before;
-    cancelling the second bake leaves the effects in, so that the same call resumes there.
+    Returns ``{"event": "done", "scene", "before", "after"}``. Both are variants in a temporary folder: the scene
+    changes once, at the end, whatever ends this call. A bake that fails leaves it as it was; cancelling the second adds
+    the effects, and the same call resumes there. What others changed in the scene meanwhile stays.
     """
-    changed = scene.with_model(with_effects(scene.model, request.found))
-    try:
+    changed, bare = with_effects(scene.model, request.found), without_effects(scene.model, request.found)
+    with tempfile.TemporaryDirectory(prefix=scratch_prefix(), ignore_cleanup_errors=True) as place:
         if request.bake_before:
-            bare = scene.with_model(without_effects(scene.model, request.found)).save()
-            run_bake(bare, request.before, _named(on_event, "before"), cancelled)
-    except BaseException:
-        scene.save()
-        raise
-    changed.save()
-    try:
-        run_bake(changed, request.after, _named(on_event, "after"), cancelled)
-    except Cancelled:
-        raise
-    except PhysGenError:
-        scene.save()
-        raise
+            before = save_variant(scene, bare, out=Path(place) / "before")
+            run_bake(before, request.before, _named(on_event, "before"), cancelled)
+        after = save_variant(scene, changed, out=Path(place) / "after")
+        try:
+            run_bake(after, request.after, _named(on_event, "after"), cancelled)
+        except Cancelled:
+            _add(scene.root, request.found)
+            raise
+    _add(scene.root, request.found)
     folders = {"scene": scene.root, "before": request.before, "after": request.after}
     return {"event": "done", **{name: str(path) for name, path in folders.items()}}
+
+
+def _add(root: Path, found: FoundEffects) -> None:
+    with lock_beside(root):
+        scene = load_scene(root)
+        scene.with_model(with_effects(scene.model, found)).save()
 
 
 def _named(on_event: OnEvent, which: str) -> OnEvent:

@@ -174,18 +174,22 @@ def _bake_locked(
 
     for name in changed_files(folder, [item.mesh for item in folder.model.objects]):
         progress.notice(f"{folder.root / name}: is not what was written when the scene was made: damaged, or edited")
+    inputs = inputs_hash(folder, options)
     progress.report(0, "sampling particles")
     meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
+    geometry = folder.geometry_hash()
     go_on()
     prepared = prepare_world(folder, meshes, options)
+    if inputs_hash(folder, options) != inputs:
+        raise InputError(f"{folder.root}: was changed by another command while it was read; run this one again")
     objects = baked_objects(folder, meshes, splats, prepared, options)
     require_disk_space(out, disk_bytes(objects, prepared.particle_count, options.frames))
     go_on()
     simulation = build_world(prepared, options.arch, progress)
     go_on()
     manifest = BakeManifest(
-        inputs_hash=inputs_hash(folder, options),
+        inputs_hash=inputs,
         fps=options.fps,
         slow=options.slow,
         frame_start=1,
@@ -195,7 +199,7 @@ def _bake_locked(
         engine=simulation.engine_name,
         version=VERSION,
         particles=simulation.particle_count,
-        geometry_hash=folder.geometry_hash(),
+        geometry_hash=geometry,
         objects=objects,
     )
     samplers = [

@@ -33,7 +33,7 @@ from ..gaussians.splats import Splats, joined, transform_splats
 from ..memory import COMPOSITION_RESERVED, available_memory, composition_bytes, require_memory
 from ..mpm.colliders import Surface
 from ..mpm.geometry.triangles import face_normals
-from ..scene.folder import Scene, inside, referenced_files, save_scene
+from ..scene.folder import Scene, inside, referenced_files, save_scene, unchanged_scene
 from ..scene.model import SceneModel, SceneObject
 from ..scene.scene_output import COMPOSE_FILE, PHYSICS_FILE, replacing_folder
 from ..scene.textured_mesh import moved_suffix, transformed, write_moved_mesh
@@ -76,19 +76,19 @@ class MovedObject:
 
 
 @contextmanager
-def composition_folder(root: Path, out: Path) -> Iterator[Path]:
+def composition_folder(scene: Scene, out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes ``out`` on success and is deleted otherwise.
 
-    Raises InputError where ``out`` is the scene ``root``, inside it or a parent of it, or holds anything but an earlier
-    composition, so that a scene with edits is never replaced.
+    Raises InputError where ``out`` is the folder of ``scene``, inside it or a parent of it, or holds anything but an
+    earlier composition, so that a scene with edits is never replaced, and where ``scene`` is changed meanwhile.
     """
-    ours, theirs = out.resolve(), root.resolve()
+    ours, theirs = out.resolve(), scene.root.resolve()
     if ours == theirs or theirs in ours.parents or ours in theirs.parents:
         raise InputError(f"{out}: is the scene, inside it or a parent of it; choose another folder for the composition")
     holds = out.is_dir() and any(out.iterdir())
     if holds and not (out / COMPOSE_FILE).is_file():
         raise InputError(f"{out}: holds something other than a composition; choose an empty or new folder")
-    with replacing_folder(out) as partial:
+    with replacing_folder(out) as partial, unchanged_scene(scene):
         yield partial
 
 
@@ -257,7 +257,7 @@ def compose(
     request = request or ComposeRequest()
     guidance = load_guidance(request.guidance, request.prompt, size=request.options.size)
     out = Path(out)
-    with composition_folder(scene.root, out) as partial:
+    with composition_folder(scene, out) as partial:
         if request.picture:
             require_photo(scene)
         found = contact_groups(scene, request.objects, cells=request.options.cells)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
+from ..cache.bake_check import unchanged_bake
 from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
 from ..cache.folder_lock import lock_beside
 from ..cache.pc2 import Pc2Reader
@@ -29,7 +30,7 @@ from ..memory import ran_out
 from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
 from ..rigid_alignment import nearest_pose
-from ..scene.folder import SCENE_FILE, Scene
+from ..scene.folder import SCENE_FILE, Scene, unchanged_scene
 from ..scene.scene_object import SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh
 from .export_patch import prim_name
@@ -107,7 +108,8 @@ def export_usd(
         stage.SetStartTimeCode(bake.first_frame)
         stage.SetEndTimeCode(bake.last_frame)
     writer = _Writer(stage, scene, bake, file, cancelled)
-    writer.write()
+    with unchanged_scene(scene), contextlib.nullcontext() if bake is None else unchanged_bake(bake):
+        writer.write()
     # Only now: a texture or a file is never left of an export that failed.
     with lock_beside(file), replacing(file) as partial, _written(writer.pictures):
         if file.exists():

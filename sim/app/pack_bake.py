@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import naming, replacing_tree, write_json
-from ..cache.bake_check import require_intact
+from ..cache.bake_check import require_intact, unchanged_bake
 from ..cache.bake_folder import METRICS_FILE, Bake, BakeManifest, load_bake, save_manifest
 from ..cache.checksums import Checksum, file_sum, span_for
 from ..cache.folder_lock import lock_beside
@@ -221,7 +221,7 @@ def pack_bake(bake: Bake, *, out: Path, cancelled: IsCancelled = never) -> int:
     if any(item.splats for item in manifest.objects):
         raise InputError(f"{bake.root}: has splats, which are not packed; copy the folder as it is")
     require_intact(bake)
-    with _new(out) as partial:
+    with _new(out) as partial, unchanged_bake(bake):
         sums: dict[str, str] = {}
         for name in manifest.files:
             if cancelled():

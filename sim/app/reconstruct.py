@@ -210,7 +210,7 @@ def require_physics(objects: int, physics: Physics) -> None:
 def set_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> Scene:
     """Return ``scene`` changed as ``with_all_physics`` does, saved."""
     model = with_all_physics(scene, physics, friction=friction)
-    return scene if model == scene.model else save_scene(scene.root, model)
+    return scene if model == scene.model else scene.with_model(model).save()
 
 
 def with_all_physics(scene: Scene, physics: Physics, *, friction: float | None = None) -> SceneModel:
@@ -247,7 +247,7 @@ def _as_reconstructed(folder: Scene, friction: float | None) -> SceneModel:
 def set_physics(scene: Scene, physics: Physics) -> Scene:
     """Return ``scene`` changed as ``with_physics`` does; ``scene.json`` is only written when something changes."""
     model = with_physics(scene.model, physics)
-    return scene if model == scene.model else save_scene(scene.root, model)
+    return scene if model == scene.model else scene.with_model(model).save()
 
 
 def with_physics(scene: SceneModel, physics: Physics) -> SceneModel:

@@ -24,6 +24,7 @@ from ..scene.folder import (
     referenced_files,
     save_scene,
     scene_to_json,
+    unchanged_scene,
 )
 from ..scene.model import SceneModel
 from ..scene.scene_output import COMPOSE_FILE, STAMP_FILE, folder_kind
@@ -74,8 +75,9 @@ def save_variant(source: Scene, scene: SceneModel, *, out: Path) -> Scene:
     # Held beside it, too, as by what replaces scenes: reconstruct, correct, light.
     with lock_beside(out), folder_lock(out):
         try:
-            for name in source.with_model(scene).files():
-                _link_or_copy(source.file(name), inside(out, name))
+            with unchanged_scene(source):
+                for name in source.with_model(scene).files():
+                    _link_or_copy(source.file(name), inside(out, name))
             with contextlib.suppress(InputError):
                 if load_scene(out).model == scene:
                     return Scene(root=out, model=scene)

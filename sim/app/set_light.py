@@ -23,7 +23,7 @@ from ..reconstruct.shape.inflate import inflate
 from ..reconstruct.shape.inflated_mesh import shadow_mesh
 from ..scene.environment import prepared, write_environment
 from ..scene.equirectangular import FRAMES, Radiance
-from ..scene.folder import Scene, require_photo, save_scene
+from ..scene.folder import Scene, load_scene, require_photo, save_scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import Ground, Light, Vector
 from ..scene.scene_output import STAMP_FILE
@@ -69,12 +69,14 @@ class LightRequest:
 
 
 def set_light(scene: Scene, *, request: LightRequest, on_event: OnEvent = ignore) -> Scene:
-    """Return ``scene`` relit as ``request`` says; its folder is changed completely or, on an error, not at all.
+    """Return ``scene``, as it is on disk, relit as ``request`` says; its folder is changed completely or, on an error,
+    not at all.
 
     Raises InputError for a scene, file or sun that cannot be used, and for a scene that another process is changing.
     """
     with lock_beside(scene.root):
-        return _relit(scene, request, on_event)
+        # Not as it was before: a correction may have ended since.
+        return _relit(load_scene(scene.root), request, on_event)
 
 
 def _relit(scene: Scene, request: LightRequest, on_event: OnEvent) -> Scene:

@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import open_file
+from ..files import open_file, same_file
 from ..scene.folder import inside
-from .bake_folder import METRICS_FILE, Bake, BakeManifest
+from .bake_folder import METRICS_FILE, Bake, BakeManifest, load_manifest
 from .checksums import (
     DAMAGED,
     MISSING,
@@ -61,6 +62,35 @@ def require_intact(bake: Bake, samples: Iterable[int] | None = None) -> None:
             f"{bake.root / found[0].file}: {found[0].text(bake.first_frame)}{more}; bake again: only that part is made "
             "anew"
         )
+
+
+@contextmanager
+def unchanged_bake(bake: Bake) -> Iterator[Callable[[], None]]:
+    """Yield a check that ``bake`` is still the one in its folder, and do it at the end, too: it raises InputError once
+    another command has begun to replace or free it. One that is still being written may go on."""
+    replaced = f"{bake.root}: was baked anew or freed by another command meanwhile; run this one again"
+    with ExitStack() as held:
+        files = []
+        # One that is missing is its reader's to report.
+        with suppress(FileNotFoundError):
+            for name in list(bake.manifest.files)[:1]:
+                files.append(held.enter_context(same_file(inside(bake.root, name), MAX_CACHE_BYTES)))
+
+        def require() -> None:
+            # Whoever replaces a bake removes all of its files first, then writes another manifest.
+            if not all(is_same() for is_same in files) or _inputs_now(bake) != bake.manifest.inputs_hash:
+                raise InputError(replaced)
+
+        require()
+        yield require
+        require()
+
+
+def _inputs_now(bake: Bake) -> str | None:
+    try:
+        return load_manifest(bake.root).inputs_hash
+    except InputError:
+        return None
 
 
 def check_bake(bake: Bake) -> list[FileState]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -14,9 +15,10 @@ from typing import Any
 from urllib.parse import unquote
 
 from ..atomic import recover, write_json
+from ..cache.folder_lock import lock_beside
 from ..errors import InputError
-from ..files import MOST_HASHED, is_file, open_file, read_bytes, shown
-from ..validation import parse, read_json, to_json
+from ..files import MOST_HASHED, is_file, open_file, read_bytes, same_file, shown
+from ..validation import MAX_JSON_BYTES, parse, read_json, to_json
 from .model import FORMAT, Ground, SceneModel
 from .scene_object import SceneObject
 
@@ -122,8 +124,26 @@ class Scene:
         return Scene(root=self.root, model=model)
 
     def save(self) -> Scene:
-        """Write ``scene.json`` whole or not at all; return the scene. The files it names are not written."""
-        return save_scene(self.root, self.model)
+        """Write ``scene.json`` whole or not at all; return the scene. The files it names are not written.
+
+        Raises InputError while another command changes the folder.
+        """
+        with lock_beside(self.root):
+            return save_scene(self.root, self.model)
+
+
+@contextlib.contextmanager
+def unchanged_scene(scene: Scene) -> Iterator[None]:
+    """Raise InputError at the end where another command has changed the folder of ``scene`` meanwhile, so that what was
+    read of it may be of two scenes. All that change one write ``scene.json`` anew, or exchange the folder."""
+    with contextlib.ExitStack() as held:
+        try:
+            is_same = held.enter_context(same_file(scene.root / SCENE_FILE, MAX_JSON_BYTES))
+        except FileNotFoundError:
+            raise InputError(f"{scene.root}: {SCENE_FILE} is missing; reconstruct the scene again") from None
+        yield
+        if not is_same():
+            raise InputError(f"{scene.root}: was changed by another command meanwhile; run this one again")
 
 
 MOST_NAME, MOST_PART = 1024, 255
@@ -235,7 +255,8 @@ def scene_to_json(scene: SceneModel) -> dict[str, Any]:
 
 
 def save_scene(root: Path, scene: SceneModel) -> Scene:
-    """Write ``scene.json`` into ``root`` atomically; the caller writes the files that it names."""
+    """Write ``scene.json`` into ``root`` atomically; the caller writes the files that it names, and holds the folder
+    where that is no new one (``Scene.save``)."""
     for name in referenced_files(scene):
         inside(root, name)
     write_json(root / SCENE_FILE, scene_to_json(scene))

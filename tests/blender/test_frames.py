@@ -3,8 +3,10 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +43,7 @@ def rendered(monkeypatch):
     return calls
 
 
-def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered):
+def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered, monkeypatch):
     folder, out = bake(SHIFTS), tmp_path / "out"
     paths = render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert [p.name for p in paths] == ["0001.png", "0002.png", "0003.png", "0004.png"]
@@ -52,7 +54,12 @@ def test_nothing_is_rendered_twice(world, bake, tmp_path, rendered):
     render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == []
 
+    # Whatever the clock says, and the times of frames, bake and scene.
     paths[3].unlink()
+    for moment, place in ((4e9, out), (1e6, folder), (3e9, world.folder.root)):
+        for path in place.rglob("*"):
+            os.utime(path, (moment, moment))
+    monkeypatch.setattr(time, "time", lambda: 3e7)
     render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == [3]
 
@@ -69,6 +76,48 @@ def test_cancelling_keeps_complete_frames(world, bake, tmp_path, rendered):
         render_frames(world.folder, load_bake(folder), out=out, options=QUICK, cancelled=lambda: len(rendered) >= 1)
     assert sorted(p.name for p in out.iterdir()) == ["0001.png", "frames.json"]
     assert read_rgb(out / "0001.png").shape == (60, 80, 3)
+
+
+def test_a_frame_of_two_bakes_or_scenes_is_not_kept(world, bake, tmp_path, rendered):
+    """Another command bakes anew, frees the bake, or corrects the scene, while Blender reads it."""
+    folder, other, out = (
+        bake(SHIFTS),
+        bake([(0, 0, 0), (0, 0, 0.03), (0, 0, 0.05), (0, 0, 0.06)], "other"),
+        tmp_path / "out",
+    )
+
+    def once(change):
+        changes = [change]
+
+        def heard(event):
+            if event.get("done") == 1 and changes:
+                changes.pop()()
+
+        return heard
+
+    def baked_anew():
+        for name in ("ball.pc2", "manifest.json"):
+            (folder / name).unlink()
+            shutil.copy(other / name, folder / name)
+
+    with pytest.raises(InputError, match="was baked anew or freed by another command"):
+        render_frames(world.folder, load_bake(folder), out=out, options=QUICK, on_event=once(baked_anew))
+    assert list(json.loads((out / "frames.json").read_text())["frames"]) == ["1"]
+    rendered.clear()
+    render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
+    assert rendered == [1, 2, 3]
+
+    fresh = tmp_path / "fresh"
+    photo = world.folder.file(world.folder.model.photo)
+
+    def corrected():
+        write_png(tmp_path / "new.png", 255 - read_rgb(photo))
+        (tmp_path / "new.png").replace(photo)
+
+    with pytest.raises(InputError, match="was changed by another command"):
+        whole = load_bake(folder)
+        render_frames(world.folder, whole, out=fresh, options=QUICK, cancelled=lambda: bool(corrected()) and False)
+    assert not (fresh / "0001.png").exists()
 
 
 def test_unusable_input_is_named(world, bake, tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a diagnosis found, put into a scene folder, and the two bakes around it."""
 
+import dataclasses
 import json
 import math
 
@@ -177,3 +178,22 @@ def test_cancelling_the_second_bake_keeps_the_effect_so_that_it_can_go_on(folder
             load_scene(folder), request=a_request(folder), run_bake=Bakes(None, Cancelled("no")), on_event=ignore
         )
     assert [e.name for e in load_scene(folder).model.effects] == ["air_drag"]
+
+
+def test_while_it_bakes_the_scene_is_whole_and_what_others_change_stays(folder):
+    """Killed in the first bake, it left a scene without an effect of the user's; a correction meanwhile was lost."""
+    own = a_scene(Effect(name="air_drag", parameters=(("drag_per_mass", 9.0),), objects=("cup",)))
+    save_scene(folder, own)
+    seen = []
+
+    def bake(scene, out, on_event, cancelled):
+        seen.append(load_scene(folder).model)
+        if out.name == "b":
+            save_scene(folder, dataclasses.replace(own, gravity=(0.0, 0.0, -1.62)))
+        return {"event": "done"}
+
+    add_and_bake(load_scene(folder), request=a_request(folder), run_bake=bake)
+    assert seen == [own, own]
+    found = load_scene(folder).model
+    assert found.gravity == (0.0, 0.0, -1.62) and found.effects[0].objects == ("cup",)
+    assert dict(found.effects[0].parameters) == DRAG["air_drag"]

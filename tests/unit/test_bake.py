@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -98,7 +99,21 @@ def test_unchanged_inputs_skip_the_bake(ball_scene, tmp_path):
     assert bake(load_scene(folder.root), out=out, options=SHORT).manifest.inputs_hash != first.inputs_hash
 
 
-def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
+def test_a_scene_that_is_corrected_while_it_is_read_is_not_baked(ball_scene, tmp_path):
+    """Its meshes were those of the one scene, the hash that the bake is named by that of the other."""
+    folder, other = ball_scene(), ball_scene(name="other", height=0.06)
+    mesh = folder.file("meshes/ball0.glb")
+
+    def corrected(event):
+        if event.get("message") == "sampling particles":
+            other.file("meshes/ball0.glb").replace(mesh)
+
+    with pytest.raises(InputError, match="was changed by another command while it was read"):
+        bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK, on_event=corrected)
+    assert not (tmp_path / "bake" / "manifest.json").exists()
+
+
+def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path, monkeypatch):
     folder = ball_scene(velocity=(0.0, 0.0, -1.0))
     bake(load_scene(folder.root), out=tmp_path / "whole", options=QUICK)
     asked = iter([False] * 14 + [True])
@@ -106,6 +121,10 @@ def test_a_cancelled_bake_goes_on_to_the_same_bytes(ball_scene, tmp_path):
         bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, cancelled=lambda: next(asked))
     stopped = load_manifest(tmp_path / "parts")
     assert stopped.state == "cancelled" and 0 < stopped.frames_done < 6
+    # The clock was set back by decades since, and its checkpoint is from the future.
+    for path in (tmp_path / "parts").rglob("*"):
+        os.utime(path, (4e9, 4e9))
+    monkeypatch.setattr(time, "time", lambda: 3e7)
     notices = []
     bake(load_scene(folder.root), out=tmp_path / "parts", options=QUICK, on_event=notices.append)
     assert any("continuing" in n.get("message", "") for n in notices)

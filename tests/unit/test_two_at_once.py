@@ -1,19 +1,32 @@
 # SPDX-License-Identifier: MIT
 """Two commands into one folder at once, and clocks that jump: the second is refused by name, and nothing is lost."""
 
+import dataclasses
+import json
 import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
-from physgen.batch import cli
+from physgen.batch import cli, stages
+from physgen.sim.app import set_light
+from physgen.sim.app.add_drops import Drop, add_drops
+from physgen.sim.app.compose_scene import composition_folder
+from physgen.sim.app.default_motion import DefaultMotion, Move
+from physgen.sim.app.export_usd import export_usd
 from physgen.sim.app.pack_bake import pack_bake
-from physgen.sim.cache.bake_folder import load_bake
+from physgen.sim.app.reconstruct import Physics, _inputs_hash, set_all_physics, set_physics
+from physgen.sim.app.reconstruct_record import Request, stamp_to_json
+from physgen.sim.cache.bake_check import unchanged_bake
+from physgen.sim.cache.bake_folder import load_bake, save_manifest
 from physgen.sim.diagnose.capture import load_capture, save_capture
-from physgen.sim.errors import InputError
+from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.processes import own_mark, parse_mark
+from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
+from physgen.sim.scene.folder import load_scene, scene_to_json
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="inputs are drawn with limits of Linux")
 
@@ -110,9 +123,7 @@ def test_what_was_finished_while_waiting_for_the_folder_is_not_replaced(work, mo
 
 def test_a_light_goes_on_from_the_scene_as_a_correction_left_it(work, monkeypatch):
     """It was read before the correction ended, and would have been written over it."""
-    from physgen.batch.commands import photo_commands
-
-    held = photo_commands.lock_beside
+    held = set_light.lock_beside
 
     def corrected_first(root):
         text = (root / "scene.json").read_text()
@@ -120,10 +131,102 @@ def test_a_light_goes_on_from_the_scene_as_a_correction_left_it(work, monkeypatc
         (root / "scene.json").write_text(text.replace('"size_m": 0.1', '"size_m": 0.125'))
         return held(root)
 
-    monkeypatch.setattr(photo_commands, "lock_beside", corrected_first)
+    monkeypatch.setattr(set_light, "lock_beside", corrected_first)
     assert cli.main(COMMANDS["light"].split()) == 0
     text = (work / "pair" / "scene.json").read_text()
     assert '"size_m": 0.125' in text and '"sun_direction": null' not in text
+
+
+def test_nothing_writes_a_scene_that_another_command_changes(work):
+    """The steps of `run` and of Python programs after a reconstruction: physics, motion, drops, a changed model."""
+    scene = load_scene(work / "pair")
+    jelly = Physics(presets=("jelly",))
+    move = Move(name="a", height=0.1, aside=(0, 0, 0), flight_s=1.0, start_s=0.0, velocity=(0, 0, 1), spin=(0, 0, 0))
+    drop = Drop(name="c")
+    command = [sys.executable, "-c", HOLDER, "pair"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"held\n"
+        before = contents(work / "pair")
+        for write in (
+            scene.save,
+            lambda: set_physics(scene, jelly),
+            lambda: set_all_physics(scene, jelly),
+            lambda: DefaultMotion(moves=(move,), frames=9, fps=24.0, slow=1.0, sentence="").applied(scene),
+            lambda: add_drops(scene, [drop]),
+        ):
+            with pytest.raises(InputError, match=f"in use by process {first.pid}"):
+                write()
+        assert contents(work / "pair") == before
+        first.kill()
+
+
+def test_a_run_holds_its_scene_from_its_reconstruction_to_its_motion(work):
+    """Between the two it was free, and what somebody changed there was lost."""
+    photo, out = work / "photo.png", work / "job" / "scene"
+    out.parent.mkdir()
+    shutil.copytree(work / "pair", out)
+    objects = (ObjectRequest(box=(30, 18, 48, 58)), ObjectRequest(box=(48, 18, 66, 58)))
+    options = ReconstructOptions()
+    made = Request(photo=photo, objects=objects, options=options)
+    record = stamp_to_json(
+        _inputs_hash(photo, objects, options, None, None), made, scene_to_json(load_scene(out).model)
+    )
+    (out / "reconstruct.json").write_text(json.dumps(record))
+    refused, said = [], []
+
+    def somebody_else():
+        with pytest.raises(InputError) as error:
+            load_scene(out).save()
+        refused.append(str(error.value))
+
+    def asked():
+        # Polled by the first rehearsal of the motion.
+        other = threading.Thread(target=somebody_else)
+        other.start()
+        other.join()
+        return True
+
+    request = stages.RunRequest(
+        photo=photo, objects=objects, video=work / "v.mp4", work=work / "job",
+        reconstruct=dataclasses.replace(options, segmenter="none"),
+        choices=stages.Choices(motion=True, frames=True, slow=True),
+    )  # fmt: skip
+    with pytest.raises(Cancelled):
+        stages.photo_to_video(request, said.append, asked)
+    assert "up to date" in said[0]["message"]
+    assert refused and "in use by another job" in refused[0]
+
+
+def test_what_was_read_of_two_scenes_or_bakes_is_not_written(work):
+    """Another command changes the scene, or bakes anew, while this one reads it."""
+    scene, bake = load_scene(work / "pair"), load_bake(work / "whole")
+    changed = pytest.raises(InputError, match="pair: was changed by another command")
+    with changed, composition_folder(scene, work / "fitted"):
+        scene.save()
+    assert not (work / "fitted").exists()
+
+    def baked_anew():
+        name = next(iter(bake.manifest.files))
+        content = (bake.root / name).read_bytes()
+        (bake.root / name).unlink()
+        (bake.root / name).write_bytes(content)
+        return False
+
+    with pytest.raises(InputError, match="whole: was baked anew or freed"):
+        pack_bake(bake, out=work / "packed", cancelled=baked_anew)
+    assert not (work / "packed").exists()
+    with pytest.raises(InputError, match="pair: was changed by another command"):
+        export_usd(scene, work / "moving.usda", bake=bake, cancelled=lambda: bool(scene.save()) and False)
+    with pytest.raises(InputError, match="whole: was baked anew or freed"):
+        export_usd(scene, work / "moving.usda", bake=bake, cancelled=baked_anew)
+    assert not (work / "moving.usda").exists()
+
+
+def test_a_bake_that_goes_on_may_be_read(work):
+    bake = load_bake(work / "whole")
+    with unchanged_bake(bake) as require:
+        save_manifest(bake.root, dataclasses.replace(bake.manifest, state="running"))
+        require()
 
 
 @pytest.mark.parametrize("year", [1971, 2100])
