@@ -127,6 +127,7 @@ def _plain_fit(fit: CandidateFit) -> dict[str, Any]:
         "heldout_rms_m": fit.heldout_rms_m,
         "heldout_chi": fit.heldout_chi,
         "heldout_trials": list(fit.heldout_trials),
+        "bending": fit.bending,
         "misfit": fit.misfit,
         "heldout_log_score": [float(s) for s in fit.heldout_log_score],
         "parameters": {
@@ -143,6 +144,7 @@ def _read_fit(value: Mapping[str, Any]) -> CandidateFit:
         heldout_rms_m=_number(value["heldout_rms_m"]),
         heldout_chi=_number(value.get("heldout_chi")),
         heldout_trials=tuple(_number(x) for x in value.get("heldout_trials") or ()),
+        bending=float(value.get("bending") or 0.0),
         misfit=_number(value["misfit"]),
         heldout_log_score=np.array([_number(s) for s in value["heldout_log_score"]]),
         parameters={

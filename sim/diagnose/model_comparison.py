@@ -11,10 +11,11 @@ the search), a temperature T > 1 because trials of one recording share model err
 a(m), the probability that the right candidate leaves a misfit of m (logistic in ln m). An effect that does not predict
 held-out trials better has no gain, whatever its evidence, but where bounces make them chaotic, and is never sure there;
 where one predicts them down to the noise, unknown yields to it, whatever its misfit. ``none`` is never said while the
-nominal model's held-out error is many times noise and grain (the simulator's own uncertainty): what it would get goes
-to ``unknown``. However large the evidence, a small share of every probability stays spread over all answers: for what
-no model of the errors knows of, in the search and in the models themselves. The constants were set on captures of known
-cause made by other simulators (docs/diagnosis.md).
+nominal model's held-out error is many times noise and grain (the simulator's own uncertainty), all trials together or
+each over its own, nor while what it leaves of whole trials bends as under a force that is missing: what it would get
+goes to ``unknown``. However large the evidence, a small share of every probability stays spread over all answers: for
+what no model of the errors knows of, in the search and in the models themselves. The constants were set on captures of
+known cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammainccinv
 
 from ..effects.registry import effects
 from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, FittedModels, Verdict
@@ -53,6 +55,9 @@ class ComparisonSettings:
         hardly shows it; held-out trials, predicted through their contacts, do.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
     many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
+    chance: probability, if noise and grain are all there is, of held-out trials so far off that they exclude ``none``.
+    bends: nats of ``CandidateFit.bending`` from which ``unknown`` is likelier than ``none``: odds of 100 to 1, because
+        a slow error of another memory bends a little, too.
     lapse: share that is spread evenly over the vocabulary, ``none`` and ``unknown``; what falls to effects that were
         not tested goes to ``unknown``. From Laplace's rule of succession on sure verdicts (docs/measurements.md).
     alternative: effects with at least this fraction of the verdict's probability are named as alternatives.
@@ -72,6 +77,8 @@ class ComparisonSettings:
     clearly: float = 0.5
     predicted: tuple[float, float] = (0.9, 0.98)
     many: float = 3.0
+    chance: float = 0.001
+    bends: float = math.log(100.0)
     lapse: float = 0.02
     alternative: float = 0.1
 
@@ -117,8 +124,7 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
     adequate = [
         _adequacy(c.misfit, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates
     ]
-    if _far_off(fits, weighing):
-        adequate[0] = 0.0
+    adequate[0] *= 0.0 if _far_off(fits, weighing) else _straight(fits, weighing)
     shares = [w * a for w, a in zip(weights, adequate, strict=True)]
     predicted = [_predicted(c, fits, weighing) for c in candidates]
     if max(predicted) > 0:
@@ -136,7 +142,7 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
             best[name] = (probability, fit)
     probabilities[UNKNOWN] = max(0.0, 1.0 - sum(probabilities.values()))
     total = sum(probabilities.values())
-    barred = {NONE} if _far_off(fits, weighing) else set()
+    barred = {NONE} if _objection(fits, weighing) else set()
     probabilities = _never_sure({name: p / total for name, p in probabilities.items()}, weighing.lapse, barred)
     found = {name: fit for name, (_, fit) in best.items()}
     verdict = _verdict(probabilities, found, weighing)
@@ -170,10 +176,46 @@ def closed_fraction(before: float, after: float, floor: float) -> float:
     return min(max((before - after) / (before - floor), -1.0), 1.0)
 
 
-def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> bool:
-    """Return whether the nominal model's held-out error is many times noise and grain, so that something is missing."""
-    error = min(fits.nominal.heldout_rms_m, nominal_or_refitted(fits).heldout_rms_m)
-    return error > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m)
+def _objection(fits: FittedModels, weighing: ComparisonSettings) -> str:
+    """Return what the nominal model leaves that speaks against ``none``, in a few words; "" if nothing does."""
+    far = _far_off(fits, weighing)
+    if far or _straight(fits, weighing) >= 0.5:
+        return far
+    return "what it leaves of whole trials bends as under a missing force, more than noise and tracking make"
+
+
+def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:
+    """Return, in a few words, that held-out trials are many times as far off as noise and grain make; "" if not."""
+    models = fits.nominal, nominal_or_refitted(fits)
+    if min(m.heldout_rms_m for m in models) > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m):
+        return f"its error is more than {weighing.many:g} times noise and the simulator's own uncertainty"
+    if min(_surprise(m.heldout_trials) for m in models) > _expected_surprise(models[0].heldout_trials, weighing):
+        chi = min(m.heldout_chi for m in models)
+        return f"held-out trials are {chi:.1f} times as far off as noise and the simulator's own uncertainty make each"
+    return ""
+
+
+OUTLYING = 3.0
+"""A trial counts at most as this many times the median one: one that came to lie on another face does not decide."""
+
+
+def _surprise(trials: Sequence[float]) -> float:
+    """Return the sum of squares of the held-out ``trials``, each over what noise and grain make of it."""
+    known = np.array([t for t in trials if math.isfinite(t)])
+    most = OUTLYING * float(np.median(known)) if len(known) > 2 else math.inf
+    return float(np.sum(np.minimum(known, most) ** 2))
+
+
+def _expected_surprise(trials: Sequence[float], weighing: ComparisonSettings) -> float:
+    """Return what ``_surprise`` exceeds with the probability ``chance``: the error of each trial is one number."""
+    known = sum(math.isfinite(t) for t in trials)
+    return 2.0 * float(gammainccinv(0.5 * known, weighing.chance)) if known else math.inf
+
+
+def _straight(fits: FittedModels, weighing: ComparisonSettings) -> float:
+    """Return the probability that what the models behind ``none`` leave is noise and tracking, by its ``bending``."""
+    least = min(fits.nominal.bending, nominal_or_refitted(fits).bending)
+    return 1.0 / (1.0 + math.exp(min(least - weighing.bends, 60.0)))
 
 
 def _predicted(fit: CandidateFit, fits: FittedModels, weighing: ComparisonSettings) -> float:
@@ -189,8 +231,9 @@ def _reason(
     """Return why ``fit`` is not the verdict, in a few words."""
     nominal = nominal_or_refitted(fits)
     if not fit.effects:
-        if _far_off(fits, weighing):
-            return f"its error is more than {weighing.many:g} times noise and the simulator's own uncertainty"
+        objection = _objection(fits, weighing)
+        if objection:
+            return objection
         return "an effect explains the trials far better"
     if not math.isfinite(fit.log_evidence) or not math.isfinite(fit.heldout_rms_m):
         return "its simulation failed"

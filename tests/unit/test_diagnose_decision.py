@@ -2,6 +2,7 @@
 """From fits to a verdict: evidence, misfit, alternatives, gap, places, words, files."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -42,7 +43,7 @@ class Found:
     grain_rms_m: float = 0.0
 
 
-def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan):
+def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), bending=0.0):
     parameters = {name: {"x": Estimate(value=1.0, unit="1", low=0.5, high=1.5)} for name in effects}
     return CandidateFit(
         effects=effects,
@@ -51,7 +52,9 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan):
         heldout_log_score=np.zeros(3),
         heldout_rms_m=(0.005 if effects else 0.01) if rms is None else rms,
         misfit=misfit,
-        heldout_chi=chi,
+        heldout_chi=float(np.sqrt(np.mean(np.square(trials)))) if trials else chi,
+        heldout_trials=tuple(trials),
+        bending=bending,
     )
 
 
@@ -225,6 +228,41 @@ def test_none_is_never_said_of_an_error_many_times_noise_and_grain(candidates, e
         assert found.verdict.effect != NONE and found.probabilities[NONE] == 0.0
         if not candidates:
             assert found.verdict.effect == UNKNOWN and "3 times" in found.reasons[NONE]
+
+
+def nothing_found(**held):
+    """The verdict without candidates, where noise and grain of all trials together excuse the error."""
+    nominal = fit(rms=0.02, **held)
+    fits = Found(nominal=nominal, refitted=nominal, candidates=(), floor_rms_m=0.001, grain_rms_m=0.012)
+    return compare_models(fits, ComparisonSettings())
+
+
+def test_none_is_never_said_where_trials_are_many_times_off_each():
+    """A rolling resistance that nothing offered: two trials 7 and 8 times as far off as they should be, beside the
+    grain of one that tumbles, were ``none`` at 0.91."""
+    found = nothing_found(trials=(1.4, 8.5, 1.4, 7.2, 1.4))
+    assert found.verdict.effect == UNKNOWN and found.probabilities[NONE] == 0.0
+    assert "5.1 times" in found.reasons[NONE]
+    # One trial that comes to lie on another face is no gap, nor is what noise makes of a single one.
+    assert nothing_found(trials=(0.5, 9.0, 0.6, 0.4, 0.8)).verdict.effect == NONE
+    assert nothing_found(trials=(2.0,)).verdict.effect == NONE and nothing_found().verdict.effect == NONE
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_noise_alone_hardly_ever_excludes_none(count):
+    drawn = np.abs(np.random.default_rng(count).normal(size=(400, count)))
+    false = sum(nothing_found(trials=tuple(map(float, trials))).verdict.effect != NONE for trials in drawn)
+    # One in a thousand is wanted; 4 of 400 or more have a chance of one in a thousand then.
+    assert false < 4
+    assert all(nothing_found(trials=tuple(map(float, 4 + trials))).verdict.effect == UNKNOWN for trials in drawn[:20])
+
+
+def test_none_yields_to_unknown_as_what_is_left_bends():
+    found = [nothing_found(bending=nats) for nats in (0.0, 3.0, 4.5, 4.7, 6.0, 24.0)]
+    said = [f.probabilities[NONE] for f in found]
+    assert all(a > b for a, b in itertools.pairwise(said)) and said[0] > 0.9 and said[-1] < 1e-6
+    assert [f.verdict.effect for f in found[1:]] == [NONE, NONE, UNKNOWN, UNKNOWN, UNKNOWN]
+    assert "bends" in nothing_found(bending=24.0).reasons[NONE]
 
 
 def test_the_simulators_own_grain_is_no_gap():

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
 from physgen.sim.diagnose.rigid import fit_rigid
+from physgen.sim.diagnose.rigid.bending import shape_scores
 from physgen.sim.diagnose.rigid.observed_poses import LEFT, observe_body
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, fit_candidates
 from physgen.sim.diagnose.work import Work
@@ -146,6 +147,35 @@ def test_a_slow_error_hides_no_drag_and_its_floor_is_what_scatters(seed, drag):
         assert verdict.effect == "none"
     # A slow error of 4 mm with a memory of 0.125 s moves the 0.34 s that follow by about that times two.
     assert 0.004 < fits.floor_rms_m < 0.013
+
+
+def test_what_bends_as_under_a_force_is_not_nothing():
+    """A clock that is off by 6 % was ``none`` at 0.98 where only wind was offered: the slow error excused all of it."""
+    capture = wandering_throw(0, 0.0, slow=0.0)
+    (trial,) = capture.trials
+    fast = dataclasses.replace(capture, trials=(dataclasses.replace(trial, times=trial.times / 1.06),))
+    options = DiagnoseOptions(effects=("wind",))
+    fits = fit_candidates(fast, options, Work())
+    found = compare_models(fits, ComparisonSettings())
+    assert found.verdict.effect == "unknown" and fits.nominal.bending > 10
+    assert compare_models(fit_candidates(capture, options, Work()), ComparisonSettings()).verdict.effect == "none"
+
+
+def test_slow_errors_wander_and_forces_bend():
+    rng, times = np.random.default_rng(0), np.linspace(0.0, 0.5, 40)
+    memory = np.linalg.cholesky(np.exp(-0.5 * ((times[:, None] - times) / 0.125) ** 2) + 1e-8 * np.eye(40))
+
+    def nats(slow, force):
+        off = slow * memory @ rng.normal(size=(40, 2)) + 5e-4 * rng.normal(size=(40, 2))
+        off[:, 1] += 0.5 * force * times**2
+        scores = shape_scores(times, off, 5e-4, 1.5, 0.5)
+        return float(scores.max() - scores[:, 0].max())
+
+    limit = ComparisonSettings().bends
+    for slow in (0.0, 0.0015, 0.0045):
+        assert sum(nats(slow, 0.0) > limit for _ in range(40)) <= 1
+        # A force of 2 m/s² bends the path by 31 mm.
+        assert all(nats(slow, 2.0) > limit for _ in range(10))
 
 
 @given(st.floats(1e-4, 0.05), st.integers(0, 99))

@@ -149,7 +149,11 @@ def meaning(diagnosis: Diagnosis) -> str:
             "may be off in a way that is not modelled, such as its scale, its view or a body that is not as assumed."
         )
     names = found_effects(verdict) or (verdict.effect,)
-    return " ".join(_MEANING[n] for n in names if n in _MEANING)
+    said = [_MEANING[n] for n in names if n in _MEANING]
+    if verdict.effect == UNKNOWN:
+        why = next((item.reason for item in diagnosis.effects if item.name == NONE), "")
+        said += [f"The nominal model is ruled out: {why}."] if why else []
+    return " ".join(said)
 
 
 def alternatives_sentence(verdict: Verdict) -> str | None:

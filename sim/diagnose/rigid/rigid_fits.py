@@ -17,6 +17,7 @@ from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, Trial
 from ..diagnosis import CandidateFit, Discrepancy, Estimate
 from ..work import Work
+from .bending import bending
 from .multiple_shooting import Fit
 from .pair_search import search_pairs
 from .rigid_candidates import (
@@ -216,6 +217,8 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
     held = {k: [score_held_out(b.fits[k], s) for b, s in zip(bodies, spreads, strict=True)] for k in shown}
     for k in shown:
         made[k] = _candidate(capture, bodies, k, held[k])
+    for k in ((), REFITS):
+        made[k] = dataclasses.replace(made[k], bending=sum(bending(b.fits[k]) for b in bodies))
     _level_twins(made)
     top = max(made, key=lambda k: made[k].log_evidence)
     floors = [noise_floor(b.fits[top]) for b in bodies]
