@@ -204,6 +204,15 @@ def number(value: float, unit: str) -> str:
     return f"{value:.3g}" if unit in ("", "1") else f"{value:.3g} {unit}"
 
 
+def interval(low: float, high: float) -> str:
+    """Return ``0.349 and 0.352``, with as many digits, three at least, as tell both ends apart by more than a digit."""
+    most = max(abs(low), abs(high))
+    digits = 3
+    if high > low:
+        digits = min(7, max(3, 1 + math.ceil(math.log10(most / (high - low)))))
+    return f"{low:.{digits}g} and {high:.{digits}g}"
+
+
 def percent(share: float) -> str:
     """Return three digits of ``share`` in per cent, or a dash if not finite."""
     return number(100 * share, "%")

@@ -401,7 +401,7 @@ border:1px solid var(--rule);border-radius:5px;padding:2px 7px;white-space:nowra
 ul.plain{padding-left:20px;max-width:72ch}
 ul.plain li{margin:5px 0}
 footer{margin-top:56px;padding-top:18px;padding-bottom:48px;color:var(--quiet);font-size:14px}
-@media (max-width:720px){
+@media screen and (max-width:720px){
 main,header,footer{padding-left:16px;padding-right:16px}
 header{padding-top:28px}
 h1{font-size:27px}
@@ -430,6 +430,10 @@ h1{font-size:22pt}
 header{padding-top:0}
 main,header,footer{max-width:none;padding-left:0;padding-right:0}
 section{margin-top:16pt;padding-top:8pt}
+table{font-size:9pt}
+th,td{padding:4pt 8pt 4pt 0}
+.mark{font-size:8pt}
+.ranking .numbers{min-width:0}
 h3{margin:12pt 0 4pt}
 h2,h3,figcaption{break-after:avoid}
 .tiles svg,.pair svg,tr,.facts div,pre{break-inside:avoid}

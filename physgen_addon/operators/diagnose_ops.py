@@ -22,7 +22,7 @@ from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
 from ..context import look_through_camera, turn_to, viewports
 from ..interpreter import cli_command, find_python
-from ..paths import bake_folder, folder_beside, free_folder, require_file, require_folder
+from ..paths import bake_folder, folder_beside, free_folder, require_file, require_folder, stored
 from ..playback import capture_scene, capture_view
 from ..playback import capture_view as overlay
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
@@ -134,7 +134,7 @@ class PHYSGEN_OT_load_capture(bpy.types.Operator):
         capture = show_capture(scene, folder)
         hidden = _show_first(scene) if is_first else ""
         if folder is not None:
-            state.report = str(folder)
+            state.report = stored(folder)
         turn_to(context, *capture_view.capture_bounds(state.root, state.trial))
         if capture.camera is not None:
             look_through_camera(context)
@@ -277,9 +277,9 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show the result, also if undo has meanwhile removed the capture from the scene."""
         state, out = scene.physgen_diagnose, Path(str(final["out"]))
-        state.capture = str(final["capture"])
+        state.capture = stored(Path(str(final["capture"])))
         show_capture(scene, out)
-        state.report = str(out)
+        state.report = stored(out)
         return str(state.summary)
 
 
@@ -317,10 +317,11 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show the capture with its diagnosis; the comparison can be played from the panel."""
         state = scene.physgen_diagnose
-        state.capture, state.report = str(final["capture"]), str(final["diagnosis"])
-        state.video.comparison = str(final["video"])
+        state.capture, state.report, state.video.comparison = (
+            stored(Path(str(final[name]))) for name in ("capture", "diagnosis", "video")
+        )
         is_first = state.root is None
-        show_capture(scene, Path(state.report))
+        show_capture(scene, Path(str(final["diagnosis"])))
         if is_first:
             _show_first(scene)
         turn_to(bpy.context, *capture_view.capture_bounds(state.root, state.trial))
@@ -374,8 +375,9 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
         """Show both bakes."""
         state = scene.physgen_diagnose
         # Undo may have cleared the property.
-        state.scene_folder = str(final["scene"])
-        state.before, state.after = str(final["before"]), str(final["after"])
+        state.scene_folder, state.before, state.after = (
+            stored(Path(str(final[name]))) for name in ("scene", "before", "after")
+        )
         show_overlay(scene)
         return "Effect added; the bakes before and after are overlaid"
 

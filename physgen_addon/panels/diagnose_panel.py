@@ -188,9 +188,10 @@ class PHYSGEN_PT_diagnose_causes(_Part, bpy.types.Panel):
 def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, state: Any) -> None:
     box = layout.box()
     text.sentences(box, context, state.summary)
-    if state.alternatives:
+    if state.alternatives and state.verdict == "none":
+        # Of other verdicts the summary names them.
         names = ", ".join(text.readable(name).lower() for name in state.alternatives.split(", "))
-        text.sentences(box, context, f"The data cannot distinguish it from {names}.", icon="QUESTION")
+        text.sentences(box, context, f"Too small for this recording to rule out: {names}.", icon="QUESTION")
     box.operator(PHYSGEN_OT_open_report.bl_idname, icon="URL")
 
 
@@ -206,7 +207,7 @@ def _draw_effect(layout: bpy.types.UILayout, effect: Any) -> None:
             split = column.split(factor=0.45)
             split.active = False
             split.label(text="95 % between")
-            split.label(text=f"{item.low:.3g} and {item.high:.3g}")
+            split.label(text=text.interval(item.low, item.high))
     if effect.has_closed:
         split = column.split(factor=0.45)
         split.label(text="Closes")

@@ -97,6 +97,16 @@ def test_diagnosing_from_a_script_blocks_and_shows_what_was_found(throw, tmp_pat
     assert len(shown_points("nominal")) == 8
 
 
+def test_a_diagnosis_beside_the_file_stays_beside_it(throw, tmp_path, interpreter):
+    """Not as a path of this machine: file and folders may be moved together."""
+    capture, folder = throw
+    interpreter(save_diagnosis(a_diagnosis(capture), tmp_path / "prepared"))
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder.parent / "a.blend"))
+    state = load("//throw")
+    assert bpy.ops.physgen.diagnose("EXEC_DEFAULT") == {"FINISHED"}
+    assert (state.capture, state.report) == ("//throw", "//throw_diagnosis")
+
+
 def test_a_video_without_a_body_in_it_is_refused_and_leaves_nothing(tmp_path):
     video = bpy.context.scene.physgen_diagnose.video
     for name, message in (("", "Video is empty: choose a file"), (str(tmp_path / "no.mp4"), "no.mp4 is no file")):

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen import physgen_addon
-from physgen.physgen_addon import background_jobs, bake_state
+from physgen.physgen_addon import background_jobs, bake_state, text
 from physgen.physgen_addon.panels import sidebar, simulate_panel
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS
 
@@ -228,6 +228,30 @@ def test_the_simulators_own_error_is_said_where_it_counts(error, is_said):
     state.numerics_m = error
     words = " ".join(draw_all("diagnose_causes")["PHYSGEN_PT_diagnose_causes"].words)
     assert ("simulator" in words) == is_said
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (0.3496, 0.3503, "0.3496 and 0.3503"),
+        (0.338, 0.364, "0.338 and 0.364"),
+        (-1.0, 1e6, "-1 and 1e+06"),
+        (2.0, 2.0, "2 and 2"),
+        (0.0, 0.0, "0 and 0"),
+    ],
+)
+def test_both_ends_of_a_narrow_interval_are_told_apart(low, high, words):
+    """Not "0.35 and 0.35"."""
+    assert text.interval(low, high) == words
+
+
+@pytest.mark.parametrize(("verdict", "is_said"), [("air_drag", False), ("none", True)])
+def test_alternatives_are_said_once(verdict, is_said):
+    state = bpy.context.scene.physgen_diagnose
+    state.root, state.has_report, state.verdict = bpy.data.collections.new("root"), True, verdict
+    state.summary, state.alternatives = "The cause is air drag; the data cannot rule out wind.", "wind"
+    words = " ".join(draw_all("diagnose")["PHYSGEN_PT_diagnose"].words)
+    assert ("Too small for this recording to rule out: wind." in words) == is_said
 
 
 def test_a_photo_is_drawn_with_its_boxes():

@@ -52,11 +52,16 @@ def until(condition: Callable[[], bool], seconds: float, what: str) -> Generator
     return longest
 
 
+def box(half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (8, 3) in m and triangles (12, 3) of a cube around the origin."""
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return corners, np.array([part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))])
+
+
 def a_capture(form: Any, folder: Path) -> None:
     """Save a recording of a box in flight, as points in space, in ``folder``; form: ``sim.diagnose.capture``."""
-    corners = 0.05 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))])
+    corners, faces = box(0.05)
     times = np.arange(12) / 50.0
     places = np.stack([times, 0 * times, 0.5 + times - 4.9 * times**2], axis=1)
     belief = form.ObjectBelief(

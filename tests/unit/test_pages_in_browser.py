@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pages as a browser lays them out: nothing runs out of a phone's or a screen's width, no picture is broken."""
+"""The pages as a browser lays them out: they fit a phone, a screen and paper, and no picture is broken."""
 
 import os
 
@@ -146,9 +146,11 @@ def browser(tmp_path_factory):
 
 
 @pytest.mark.parametrize("made", [diagnosis, evaluation, farm, questionnaire, reconstruction])
-def test_a_page_fits_a_screen_and_a_phone(made, browser, tmp_path):
+def test_a_page_fits_a_screen_a_phone_and_paper(made, browser, tmp_path):
     path = made(tmp_path)
-    for width in (1280, 390):
+    # The last is A4 without the margins of a browser.
+    for width, media in ((1280, "screen"), (390, "screen"), (717, "print")):
+        browser.call("Emulation.setEmulatedMedia", media=media)
         browser.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=844, deviceScaleFactor=1, mobile=width < 500
         )
@@ -157,5 +159,8 @@ def test_a_page_fits_a_screen_and_a_phone(made, browser, tmp_path):
         assert browser.run("document.documentElement.scrollWidth") <= width
         assert browser.run(WIDE) == []
         assert browser.run(BROKEN) == 0
+        # On paper a table is a table and no list.
+        hidden = "[...document.querySelectorAll('thead')].some((e) => getComputedStyle(e).position === 'absolute')"
+        assert width == 390 or not browser.run(hidden)
         # A flag that is torn at its hyphens cannot be read as one.
         assert browser.run("[...document.querySelectorAll('.flag')].every((f) => f.getClientRects().length === 1)")
