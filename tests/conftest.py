@@ -107,7 +107,7 @@ LONGEST = (
 NO_BYTECODE = sys.dont_write_bytecode
 
 ONE_THREAD = ("test_raster.py", "test_diagnose_rigid.py", "test_diagnose_rigid_resting.py", "test_diagnose_work.py")
-ONE_THREAD += ("test_soft_elements.py", "test_soft_fits.py")
+ONE_THREAD += ("test_soft_elements.py", "test_soft_fits.py", "test_rolling_disc.py")
 """Files that ask Taichi for another number of threads, at which its process drops all kernels: they come first."""
 
 
