@@ -2,6 +2,7 @@
 """Operators: open a photo, draw boxes around its objects, reconstruct."""
 
 import webbrowser
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -373,11 +374,12 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         blend_trust.require_agreed(context.scene)
         state = context.scene.physgen_photo
         given, out, preferred = arguments(state), scene_folder(state), python(context)
+        materials = chosen_materials(context.scene)
         write_masks(dict(mask_files(state, out).values()))
 
         def work(on_event: OnEvent, cancelled: IsCancelled) -> Event:
             command = cli_command(find_python(preferred), "reconstruct", *given, "--out", str(out))
-            return run_stage(command, on_event, cancelled)
+            return {**run_stage(command, on_event, cancelled), "materials": materials}
 
         return work
 
@@ -387,7 +389,8 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         changed = find_edits(scene, photo)
         sentence = show_scene(scene, root)
         close_beside(scene)
-        set_materials(scene)
+        # Undo may have cleared what was chosen at the start; what has been chosen since counts.
+        set_materials(scene, {**final["materials"], **chosen_materials(scene)})
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)
@@ -398,9 +401,13 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         return sentence
 
 
-def set_materials(scene: bpy.types.Scene) -> None:
-    """Give the imported objects of ``scene`` the materials that were chosen for their boxes."""
-    chosen = {name: box.preset for name, box in named_boxes(scene.physgen_photo) if box.preset != "auto"}
+def chosen_materials(scene: bpy.types.Scene) -> dict[str, str]:
+    """Return the presets that were chosen for boxes, by object name."""
+    return {name: str(box.preset) for name, box in named_boxes(scene.physgen_photo) if box.preset != "auto"}
+
+
+def set_materials(scene: bpy.types.Scene, chosen: Mapping[str, str]) -> None:
+    """Give the imported objects of ``scene`` their ``chosen`` presets, see ``chosen_materials``."""
     for item in bodies(scene):
         if preset := chosen.get(item.physgen.source):
             item.physgen.material.preset = preset

@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
+from mathutils import Matrix
 
 from ..context import redraw
 from ..interpreter import cli_command, find_python
@@ -156,6 +157,7 @@ class _Drawing:
         gpu.state.face_culling_set("BACK")
         gpu.state.blend_set("ALPHA")
         with gpu.matrix.push_pop():
+            gpu.matrix.load_matrix(nearer(gpu.matrix.get_model_view_matrix(), gpu.matrix.get_projection_matrix()))
             gpu.matrix.scale_uniform(1.0 / session.unit)
             for batch in self._batches[session.frame]:
                 batch.draw(shader)
@@ -163,6 +165,19 @@ class _Drawing:
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set(depth)
         gpu.state.blend_set(blend)
+
+
+NEARER = 0.01
+"""Share of its distance by which the preview is drawn nearer. Its first frame lies on the objects themselves: without
+this both show through each other in patches."""
+
+
+def nearer(model_view: Matrix, projection: Matrix) -> Matrix:
+    """Return ``model_view`` such that all that is drawn comes nearer by the share NEARER, and is seen where it was."""
+    if projection[3][3] == 0:
+        # Perspective: towards the eye, which is the origin.
+        return Matrix.Scale(1 - NEARER, 4) @ model_view
+    return Matrix.Translation((0, 0, 2 * NEARER / projection[1][1])) @ model_view
 
 
 def _batches(clip: Clip, frame: int, shader: Any) -> list[Any]:

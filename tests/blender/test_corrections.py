@@ -235,7 +235,10 @@ def command_here(command, on_event, cancelled, **_):
 
 @pytest.mark.long
 def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, monkeypatch):
-    """A mask and a horizon as told; then another back: nothing is cut out again, its mirror image is looked for."""
+    """A mask and a horizon as told; then another back: nothing is cut out again, its mirror image is looked for.
+
+    The material that was chosen before is the object's, also where undo has taken the choice back meanwhile.
+    """
     scene, box = bpy.context.scene, photo.boxes[0]
     mask = truth(world)
     mask[:, : extent(mask)[0] + 6] = False
@@ -256,8 +259,15 @@ def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, 
     assert bpy.ops.physgen.open_photo_report.poll()
     first, deep = stages(folder), volume(folder)
     scene.physgen.photo_root.objects["ball"].physgen.velocity = (0.0, 1.0, 2.0)
-    box.back = "flat"
+    box.back, box.preset = "flat", "jelly"
+
+    def undone_meanwhile(*given, **named):
+        photo.boxes[0].preset = "auto"
+        return command_here(*given, **named)
+
+    monkeypatch.setattr(photo_ops, "run_stage", undone_meanwhile)
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
+    assert scene.physgen.photo_root.objects["ball"].physgen.material.preset == "jelly"
     second = stages(folder)
     kept, new = first.keys() & second.keys(), second.keys() - first.keys()
     assert all(first[name] == second[name] for name in kept)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
+from mathutils import Matrix, Vector
 from physgen.physgen_addon import gizmos as maths
 from physgen.physgen_addon.gizmos import SHOW_ARROWS
 from physgen.physgen_addon.interpreter import cli_command
@@ -198,6 +199,28 @@ def look_down(distance=10.0):
     view = np.eye(4)
     view[2, 3] = -distance
     return np.array([[1, 0, 0, 0], [0, 1, 0, 0], *depth], dtype=np.float64) @ view
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        ((2.0, 0, 0, 0), (0, 3.0, 0, 0), (0, 0, -1.002, -0.2), (0, 0, -1, 0)),
+        ((0.2, 0, 0, 0), (0, 0.3, 0, 0), (0, 0, -0.01, 0), (0, 0, 0, 1)),
+    ],
+    ids=["perspective", "orthographic"],
+)
+def test_the_preview_lies_before_the_objects_and_nowhere_else(projection):
+    """Its first frame is theirs, and both showed through each other in patches."""
+    projection = Matrix(projection)
+    view = Matrix.Translation((0.3, -0.2, -5)) @ Matrix.Rotation(0.7, 4, "X")
+
+    def seen(matrix, place):
+        at = projection @ matrix @ Vector((*place, 1))
+        return np.array(at[:3]) / at[3]
+
+    for place in ((0, 0, 0), (0.5, -1, 2), (-1, 1, -0.5)):
+        before, drawn = seen(view, place), seen(live_preview.nearer(view, projection), place)
+        assert drawn[:2] == pytest.approx(before[:2], abs=1e-6) and drawn[2] < before[2] - 1e-5
 
 
 def test_pixels_and_places_agree():
