@@ -154,13 +154,18 @@ def explain(
     )
 
 
+REFITTED = 0.999
+"""Share of the error below which re-fitted contacts changed the motion."""
+
+
 def title_of_cause(diagnosis: Diagnosis) -> str:
     """Return the verdict with its numbers in a few words, in plain ASCII for drawing."""
     verdict = diagnosis.verdict
     if verdict.effect == NONE:
         return "no effect stands out" if remains(diagnosis.gap) else "nothing is missing"
     if verdict.effect == UNKNOWN:
-        return "no known effect; contacts re-fitted"
+        refitted = diagnosis.gap.after_rms_m < REFITTED * diagnosis.gap.before_rms_m
+        return "no known effect; contacts re-fitted" if refitted else "no known effect; the same motion"
     words = []
     for name in found_effects(verdict):
         numbers = next((item.parameters for item in diagnosis.effects if item.name == name), {})

@@ -181,7 +181,7 @@ def _objection(fits: FittedModels, weighing: ComparisonSettings) -> str:
     far = _far_off(fits, weighing)
     if far or _straight(fits, weighing) >= 0.5:
         return far
-    return "what it leaves of whole trials bends as under a missing force, more than noise and tracking make"
+    return "what it leaves of whole trials bends as under a missing force"
 
 
 def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:

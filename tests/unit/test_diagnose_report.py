@@ -403,6 +403,26 @@ def test_a_trial_in_which_no_force_is_missing_has_no_worst_moment():
     assert "nowhere above zero" in timeline_picture(diagnosis, capture, width=900.0).description
 
 
+def test_a_force_that_shows_at_no_moment_has_no_place_and_no_direction(tmp_path):
+    """A thrown ball: “25 % along the ground normal, 25 % along the motion …” of a force of 0 m/s² at any time."""
+    takes = [(n, dataclasses.replace(a, frame_score=np.zeros_like(a.frame_score))) for n, a in (take(), take("two"))]
+    reason = "what it leaves of whole trials bends as under a missing force"
+    diagnosis, capture = case(
+        *takes,
+        verdict=Verdict(effect="unknown", probability=0.86),
+        effects=(RankedEffect(name="none", kind="none", probability=0.14, reason=reason),),
+        gap=dataclasses.replace(_gap(0.021, 0.021, 0.020), closed_fraction=NAN, resolvable=False),
+    )
+    page = said(written(diagnosis, capture, tmp_path)[0])
+    assert "At no single moment" in page and "Direction of the missing force" not in page
+    assert f"The nominal model is ruled out: {reason}." in page and "and hardly in held-out motion" in page
+    # Contacts were re-fitted and moved nothing, or something.
+    assert title_of_cause(diagnosis) == "no known effect; the same motion"
+    moved = dataclasses.replace(diagnosis, gap=_gap(0.021, 0.015, 0.009))
+    assert title_of_cause(moved) == "no known effect; contacts re-fitted"
+    assert "Direction of the missing force" in said(written(*case(), tmp_path)[0])
+
+
 def test_scores_of_points_come_from_all_takes_of_their_object():
     (one, a), (two, b) = take(), take("take02", seed=1)
     b = dataclasses.replace(b, point_score=np.where(np.arange(8) == 3, NAN, 5.0) * np.ones((20, 1)))

@@ -188,12 +188,20 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 NO_DISCREPANCY = "No discrepancy above the noise was found"
 LEFT = "What is left is above the noise, and no candidate accounts for it."
+NOWHERE = (
+    "At no single moment does a missing force stand out from the noise, so that it has neither place nor direction."
+)
 
 
 def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
     """Return the localisation of the discrepancy in sentences."""
     if diagnosis.verdict.effect == NONE and not remains(diagnosis.gap):
         return [f"{NO_DISCREPANCY}: the figures below show mostly noise."]
+    opening = [LEFT] if diagnosis.verdict.effect == NONE else []
+    scores = [trial.frame_score for trial in diagnosis.trials.values()]
+    if scores and not any((s > 0).any() for s in scores):
+        # Shares of nothing are equal.
+        return [*opening, NOWHERE]
     where = diagnosis.where
     phases: dict[str, float] = {}
     for interval in where.intervals:
@@ -204,8 +212,7 @@ def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
         ("Discrepancy by object", ((shortened(o.name, 40), o.share) for o in where.objects if several)),
     )
     sentences = ((title, shares_sentence(shares)) for title, shares in groups)
-    found = [f"{title}: {shares}." for title, shares in sentences if shares]
-    return [LEFT, *found] if diagnosis.verdict.effect == NONE else found
+    return [*opening, *(f"{title}: {shares}." for title, shares in sentences if shares)]
 
 
 def _object_rows(pictures: Pictures) -> list[list[Any]]:

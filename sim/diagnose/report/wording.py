@@ -182,6 +182,12 @@ def closure_sentence(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict.effect == NONE:
         return f"No effect was added, so there is no gap to close.{_floor(gap)}"
+    if not gap.resolvable and diagnosis.verdict.effect == UNKNOWN:
+        return (
+            "Not resolvable: what is missing shows in the fit of whole trials and hardly in held-out motion. The "
+            f"nominal model's error there is {_length(gap.before_rms_m)}, and the noise floor "
+            f"{_length(gap.noise_floor_rms_m)}."
+        )
     if not gap.resolvable:
         return (
             "Not resolvable: the nominal model is already so close to the noise floor "
