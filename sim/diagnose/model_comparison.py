@@ -215,7 +215,7 @@ def _expected_surprise(trials: Sequence[float], weighing: ComparisonSettings) ->
 def _straight(fits: FittedModels, weighing: ComparisonSettings) -> float:
     """Return the probability that what the models behind ``none`` leave is noise and tracking, by its ``bending``."""
     least = min(fits.nominal.bending, nominal_or_refitted(fits).bending)
-    return 1.0 / (1.0 + math.exp(min(least - weighing.bends, 60.0)))
+    return 1.0 / (1.0 + math.expm1(min(least, 60.0)) * math.exp(-weighing.bends))
 
 
 def _predicted(fit: CandidateFit, fits: FittedModels, weighing: ComparisonSettings) -> float:

@@ -261,6 +261,7 @@ def test_none_yields_to_unknown_as_what_is_left_bends():
     found = [nothing_found(bending=nats) for nats in (0.0, 3.0, 4.5, 4.7, 6.0, 24.0)]
     said = [f.probabilities[NONE] for f in found]
     assert all(a > b for a, b in itertools.pairwise(said)) and said[0] > 0.9 and said[-1] < 1e-6
+    assert said[0] == nothing_found(trials=(1.0, 1.0)).probabilities[NONE] > 0.95
     assert [f.verdict.effect for f in found[1:]] == [NONE, NONE, UNKNOWN, UNKNOWN, UNKNOWN]
     assert "bends" in nothing_found(bending=24.0).reasons[NONE]
 
