@@ -294,10 +294,16 @@ def _scene_of(bake: Bake, scene: str | Path | Scene | None) -> Scene | None:
 
 
 def most_frames(footage: Footage, options: EvaluateOptions) -> int:
-    """Return how many frames of ``footage`` count."""
+    """Return how many frames of ``footage`` count. Raises InputError for fewer than two: motion needs as many."""
     if options.seconds is None:
         return MOST_FRAMES
-    return min(MOST_FRAMES, max(1, round(options.seconds * footage.fps)))
+    count = round(options.seconds * footage.fps)
+    if count < 2:
+        raise InputError(
+            f"seconds is {options.seconds:g}: {footage.name} has {footage.fps:g} frames per second; give "
+            f"{2 / footage.fps:.2g} or more, motion needs two"
+        )
+    return min(MOST_FRAMES, count)
 
 
 @contextmanager

@@ -93,11 +93,15 @@ def read_submission(folder: Path) -> Submission:
             problems.append(f"{path.name}: is no name of the benchmark's, such as 0001_perspective-left_trimmed-….mp4")
         elif number in videos:
             problems.append(f"{path.name}: {number:04d} comes twice; {videos[number].name} counts")
+        elif path.is_dir():
+            problems.append(f"{path.name}: is a folder; the benchmark takes MP4 files")
         else:
             try:
                 videos[number] = open_footage(path)
             except InputError as error:
-                problems.append(str(error))
+                # The page is passed on, so it names the file and not where it lies.
+                problems.append(str(error).replace(f"{path.parent}/", ""))
+    problems += [notice for video in videos.values() for notice in video.notices]
     if not videos:
         raise InputError(f"{folder}: holds no video such as 0001_perspective-left_trimmed-….mp4; name another folder")
     rates = [round(video.fps) for video in videos.values()]

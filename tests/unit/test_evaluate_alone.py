@@ -125,6 +125,9 @@ def test_a_video_of_one_frame_or_two_is_said(tmp_path):
     two, found = figures(tmp_path / "two", moving(2))
     assert two["motion_smoothness"] is None and two["motion_speed"] is None
     assert next(m.note for m in found.measures if m.name == "motion_smoothness") == "needs three frames"
+    short = physgen.EvaluateOptions(fps=24.0, seconds=0.04)
+    with pytest.raises(InputError, match=r"seconds is 0.04: two has 24 frames per second; give 0.083 or more"):
+        physgen.evaluate(tmp_path / "two", out=tmp_path / "short", options=short)
 
 
 @settings(max_examples=25, deadline=None)

@@ -96,6 +96,7 @@ def test_whatever_is_wrong_with_a_folder_is_said(folders, tmp_path, capsys):
     clip(ours / names[3], 10, seconds=4.0)
     (ours / "notes.txt").write_text("x")
     clip(ours / f"{names[4][:5]}again.mp4", 10)
+    (ours / "0001_folder.mp4").mkdir()
     found = evaluate_physics_iq(ours, benchmark=None, out=tmp_path / "o")
     said = "\n".join(found.notices)
     for words in (
@@ -103,13 +104,15 @@ def test_whatever_is_wrong_with_a_folder_is_said(folders, tmp_path, capsys):
         f"{names[2]}: has 12 frames per second and the others 8",
         f"{names[3]}: is 4 s long",
         "0005 comes twice",
-        "not a readable video",
+        "0001_folder.mp4: is a folder",
+        f"\n{names[1]}: not a readable video",
         "2 of 6 videos are missing: 0001, 0002",
     ):
         assert words in said, words
     assert not (tmp_path / "o" / "physics_iq.csv").exists()
     found = evaluate_physics_iq(ours, benchmark=benchmark, out=tmp_path / "o")
     assert any("of 4 of 6 views: not the benchmark's score" in text for text in found.notices)
+    (ours / "0001_folder.mp4").rmdir()
     for path in ours.iterdir():
         path.unlink()
     for bad, words in ((ours, "holds no video"), (tmp_path / "none", "is no folder")):
