@@ -65,6 +65,9 @@ EXPLANATIONS = {
 _SUFFIXES = {".mp4": b"ftyp", ".m4v": b"ftyp", ".webm": b"\x1a\x45\xdf\xa3"}
 """Formats that browsers play, with what such a file has among its first bytes."""
 
+_PLAYED = ("h264", "avc1", "avc3", "vp80", "vp90", "av01")
+"""Codecs that every present browser plays, as FFmpeg and containers name them; HEVC depends on the device."""
+
 _PAGE, _START = (Path(__file__).with_name(f"questionnaire_{name}.html") for name in ("page", "start"))
 _SCRIPT, _STYLE = (Path(__file__).with_name(f"questionnaire_page.{kind}") for kind in ("js", "css"))
 
@@ -257,7 +260,9 @@ def _check_video(path: Path) -> None:
         if _SUFFIXES[suffix] not in stream.read(16):
             raise InputError(f"{shown(path)}: is no {suffix[1:].upper()} file, whatever its name says; convert it")
     with Video(path) as video:
-        frames = sum(1 for _ in video.frames(0, 1))
+        codec, frames = video.info.codec, sum(1 for _ in video.frames(0, 1))
+    if codec and codec not in _PLAYED:
+        raise InputError(f"{shown(path)}: is encoded as {codec!r}; browsers play H.264, VP8, VP9 and AV1; convert it")
     if frames < 2:
         raise InputError(f"{shown(path)}: has {frames or 'no'} readable frame; give a video that shows motion")
 

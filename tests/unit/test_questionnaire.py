@@ -228,6 +228,15 @@ def test_other_bad_requests(tmp_path):
     with pytest.raises(InputError, match="1 readable frame"):
         make_questionnaire([a_case(tmp_path, "still", frames=1)], out=tmp_path / "out")
     assert load_case(case).videos["ours"].name == "ours.webm"
+    # MPEG-4 in an MP4: no browser shows more of it than a black box.
+    out = cv2.VideoWriter(str(case / "ours.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 8, (80, 60))
+    for level in (0, 100, 200):
+        out.write(np.full((60, 80, 3), level, np.uint8))
+    out.release()
+    (case / "case.toml").write_text('prompt = "x"\nimage = "photo.jpg"\n[videos]\nours = "ours.mp4"\n')
+    with pytest.raises(InputError, match=r"ours.mp4: is encoded as '\w+'; browsers play H.264"):
+        make_questionnaire([case], out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 KRIPPENDORFF_2011 = [

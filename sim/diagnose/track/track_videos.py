@@ -43,12 +43,16 @@ MAX_SIDE = 16384
 
 @dataclass(frozen=True, kw_only=True)
 class VideoInfo:
-    """Metadata of the container. fps: 0 if unknown; frames: 0 if unknown, and not reliable."""
+    """Metadata of the container. fps: 0 if unknown; frames: 0 if unknown, and not reliable.
+
+    codec: its four letters in lower case, such as ``h264`` or ``vp90``; empty if unknown.
+    """
 
     width: int
     height: int
     fps: float
     frames: int
+    codec: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,12 @@ def _quiet() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # In a module of its own since OpenCV 5.
     getattr(cv2.utils, "logging", cv2).setLogLevel(LOG_ERRORS)
+
+
+def _letters(code: int) -> str:
+    """Return the four letters of a codec's ``code``; empty unless all can be printed."""
+    letters = "".join(chr(code >> shift & 0xFF) for shift in (0, 8, 16, 24)).lower().strip()
+    return letters if letters.isascii() and letters.isprintable() else ""
 
 
 class Video:
@@ -100,6 +110,7 @@ class Video:
             height=height,
             fps=fps if np.isfinite(fps) and 0 < fps <= 1e5 else 0.0,
             frames=int(count) if np.isfinite(count) and 0 < count < 1e9 else 0,
+            codec=_letters(int(get(cv2.CAP_PROP_FOURCC))),
         )
 
     def __enter__(self) -> Video:
