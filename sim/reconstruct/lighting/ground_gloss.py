@@ -11,7 +11,7 @@ well anything correlates there by chance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -73,8 +73,8 @@ def estimate_gloss(
     none = GroundGloss(0.0, Ground().reflection_roughness, 0.0, 0.0, (np.zeros_like(covered),) * len(surfaces), pixels)
     extents = [np.ptp(camera.project(s.vertices)[:, :2], axis=0).max() for s in surfaces]
     scale = min(1.0, OBJECT_SIDE / max(float(max(extents)), 1.0))
-    mirrored = [mirror_image(camera, surface, scale) for surface in surfaces]
-    if not any(m.alpha.sum() >= FEWEST for m in mirrored):
+    mirrored = [_Kept.of(mirror_image(camera, surface, scale)) for surface in surfaces]
+    if not any(m.light.values[..., 3].sum() >= FEWEST for m in mirrored):
         return none
     comparison = _Comparison(pixels, covered, camera, mirrored)
     found = max((comparison.fit(r) for r in ROUGHNESSES), key=lambda fit: fit.correlation)
@@ -91,7 +91,7 @@ def estimate_gloss(
     share = comparison.fit(roughness).share
     reflectivity = min(max((share - grazing) / max(1.0 - grazing, 1e-6), LEAST), 1.0)
     gloss = Ground(reflectivity=reflectivity, reflection_roughness=roughness)
-    images, bare = _without(pixels, covered, camera, gloss, [mirror_image(camera, s, 1.0) for s in surfaces])
+    images, bare = _without(pixels, covered, camera, gloss, (mirror_image(camera, s, 1.0) for s in surfaces))
     return GroundGloss(reflectivity, roughness, found.correlation, by_chance, images, bare)
 
 
@@ -104,17 +104,62 @@ class _Fit:
     share: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Cropped:
+    """A picture (h, w, C) that is 0 outside ``values``, at ``top`` and ``left``: of many small things in a large photo,
+    each takes its own pixels and not all of the photo's."""
+
+    values: Image
+    top: int
+    left: int
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, image: Image) -> _Cropped:
+        """Return ``image`` without the rows and columns around it that are 0."""
+        there = image.any(axis=2)
+        rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+        top, left = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
+        end = (int(rows[-1]) + 1, int(columns[-1]) + 1) if len(rows) else (0, 0)
+        return cls(image[top : end[0], left : end[1]].copy(), top, left, (image.shape[0], image.shape[1]))
+
+    def whole(self) -> Image:
+        """Return the picture, the same to the bit."""
+        image = np.zeros((*self.size, self.values.shape[2]), np.float32)
+        height, width = self.values.shape[:2]
+        image[self.top : self.top + height, self.left : self.left + width] = self.values
+        return image
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """A mirror image while others are made. light: colour and alpha."""
+
+    light: _Cropped
+    sigma: Image
+    slant: float
+
+    @classmethod
+    def of(cls, image: MirrorImage) -> _Kept:
+        """Return what is kept of ``image``."""
+        return cls(_Cropped.of(np.dstack([image.colour, image.alpha])), image.sigma, image.slant)
+
+    def blurred(self, roughness: float) -> _Cropped:
+        """As of a ``MirrorImage``."""
+        light = self.light.whole()
+        colour, alpha = np.ascontiguousarray(light[..., :3]), np.ascontiguousarray(light[..., 3])
+        return _Cropped.of(MirrorImage(colour, alpha, self.sigma, self.slant).blurred(roughness))
+
+
 class _Comparison:
     """The photo's ground beside mirror images."""
 
-    def __init__(
-        self, pixels: NDArray[np.uint8], covered: Mask, camera: Camera, mirrored: Sequence[MirrorImage]
-    ) -> None:
-        height, width = mirrored[0].alpha.shape
+    def __init__(self, pixels: NDArray[np.uint8], covered: Mask, camera: Camera, mirrored: Sequence[_Kept]) -> None:
+        height, width = mirrored[0].light.size
         size = (width, height)
         light = cv2.resize(bytes_to_linear(pixels), size, interpolation=cv2.INTER_AREA)
         self._known, shares = open_ground(covered, camera, size)
-        self._boxes = [_extent(m.alpha) for m in mirrored]
+        self._boxes = [_extent(m.light.values[..., 3]) for m in mirrored]
         sides = [min(box) for box in self._boxes if min(box) > 1]
         self._sigma = max(3.0, LEVEL * min(sides, default=6))
         self._weight = cv2.GaussianBlur(self._known, (0, 0), self._sigma)
@@ -124,26 +169,28 @@ class _Comparison:
         # Glints must not decide whether there is an image; what it is worth is measured on all of it.
         self._seen, self._whole = np.clip(relative, -usual, usual), relative
         self._shares, self._mirrored = shares, mirrored
-        inside = np.maximum.reduce([m.alpha for m in mirrored]) > 0
+        inside = np.zeros((height, width), bool)
+        for one in mirrored:
+            inside |= one.light.whole()[..., 3] > 0
         self._mean_share = float(shares[inside].mean())
         self.grazing = max((self._mean_share - VARNISH) / (1.0 - VARNISH), 0.0)
-        self._blurred: dict[float, list[Image]] = {}
+        self._blurred: tuple[float, list[_Cropped]] = (-1.0, [])
 
     def fit(self, roughness: float, *, aside: float = 0.0, turned: bool = False) -> _Fit:
         """Return the best fit within ``SLACK``. aside: widths by which all are moved; turned: left to right."""
-        if roughness not in self._blurred:
-            self._blurred[roughness] = [m.blurred(roughness) for m in self._mirrored]
+        if roughness != self._blurred[0]:
+            self._blurred = roughness, [m.blurred(roughness) for m in self._mirrored]
         fits = [self._at(roughness, aside, up, turned) for up in SLACK]
         return max(fits, key=lambda fit: fit.correlation)
 
     def _at(self, roughness: float, aside: float, up: float, turned: bool) -> _Fit:
         expected, seen, whole = [], [], []
-        for image, (width, height) in zip(self._blurred[roughness], self._boxes, strict=True):
+        for cropped, (width, height) in zip(self._blurred[1], self._boxes, strict=True):
+            image = cropped.whole()
             columns = np.flatnonzero((image[..., 3] > VISIBLE).any(axis=0))
             if not len(columns):
                 continue
             if turned:
-                image = image.copy()
                 across = slice(columns[0], columns[-1] + 1)
                 image[:, across] = image[:, across][:, ::-1]
             shift = np.array([[1, 0, aside * width], [0, 1, up * height]], dtype=np.float32)
@@ -183,7 +230,7 @@ def _extent(alpha: Image) -> tuple[int, int]:
 
 
 def _without(
-    pixels: NDArray[np.uint8], covered: Mask, camera: Camera, ground: Ground, mirrored: Sequence[MirrorImage]
+    pixels: NDArray[np.uint8], covered: Mask, camera: Camera, ground: Ground, mirrored: Iterable[MirrorImage]
 ) -> tuple[tuple[Mask, ...], NDArray[np.uint8]]:
     """Where each mirror image is seen, and the photo without them."""
     height, width = pixels.shape[:2]
