@@ -273,10 +273,9 @@ def measure(
         # Asked ones are run again one in four times: it takes longer than all else, and the kills are about that.
         if not problem and not (signals and turn % 4):
             started = time.monotonic()
-            differs = difference(contents(place.work), whole[step.name])
             problem, _ = run(place, step)
-            if problem and REFUSED.search(problem) and differs is None:
-                # Killed after its result was whole: some commands then say that it is there already.
+            if problem and REFUSED.search(problem):
+                # Killed after its result was whole: some commands say that it is there already, and sweep the rest.
                 problem = None
             problem = problem or difference(contents(place.work), whole[step.name]) or ""
             left = sorted(path.name for path in place.scratch.iterdir())

@@ -78,7 +78,7 @@ def same_file(path: Path, most: int, *, folder: Path | None = None) -> Iterator[
     """Yield a function: whether ``path`` is still the file that it is now, whatever its content, and no other.
 
     It is held open meanwhile, so that its number in the file system cannot become another file's; times, which depend
-    on the clock, are not looked at. Raises as ``open_file`` does.
+    on the clock, are not looked at. (Windows lets nobody replace it then.) Raises as ``open_file`` does.
     """
     with open_file(path, most, folder=folder) as held:
 
