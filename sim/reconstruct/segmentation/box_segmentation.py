@@ -32,6 +32,7 @@ from .mask_proposals import (
     score,
     without_notches,
 )
+from .outer_rim import outer_rim
 from .strokes import Strokes, no_strokes
 
 Mask = NDArray[np.bool_]
@@ -187,6 +188,9 @@ def segment(
         gaps, rods = _details(crop, inner, found, taken, keep, drop)
         found = (found & ~gaps) | rods
         found = settle_outline(crop, drop_ground_shadow(crop, _kept_part(found & ~taken, taken, keep)))
+        rim = outer_rim(crop, found, taken | drop)
+        if rim.any():
+            found = settle_outline(crop, found | rim)
     found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep)) & ~gaps
     if keep.any():
         # Between what is kept and the rest their mixed colours look like a third one: bridge the groove.
