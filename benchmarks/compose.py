@@ -7,8 +7,9 @@
 Every method gets the same start (splats fitted to Cycles renderings, then distorted so that the objects intersect), the
 same input picture, guidance (the ideal denoiser of pictures of O1) and number of steps. Default: 256², 20,000 splats,
 500 steps, which takes hours for all assets; ``--small``: minutes; ``--quick``: one asset, a few steps. Pictures and
-fits are kept in ``--cache``. ``--stand`` instead drops the compositions by PSE-SDS, and the truth beside them, in
-MuJoCo. ``--out`` gets table.md, table.json, a contact sheet, and the composed splats as PLY; or standing.json.
+fits are kept in ``--cache``. ``--stand`` instead drops the compositions by PSE-SDS, seated as ``--seat`` says, and
+scenes of two to five things in MuJoCo; with ``--truth`` the assets' true shapes as well. ``--out`` gets table.md,
+table.json, a contact sheet, and the composed splats as PLY; or standing.json.
 """
 
 from __future__ import annotations
@@ -21,17 +22,36 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from physgen.benchmarks.common import QuickParser, benchmark_parser
 from physgen.benchmarks.compose_assets.catalogue import NAMES, asset
-from physgen.benchmarks.compose_assets.pictures import cache_name, rendered
+from physgen.benchmarks.compose_assets.pictures import rendered
 from physgen.benchmarks.compose_assets.results import Line, Row, contact_sheet, document, markdown, text
-from physgen.benchmarks.compose_assets.standing import SECONDS, Standing, drop, standing_json, standing_text
-from physgen.benchmarks.compose_assets.trial import SMALL, TINY, Budget, composed, judged, picture_of, start
+from physgen.benchmarks.compose_assets.standing import (
+    SECONDS,
+    Standing,
+    drop,
+    seats_text,
+    standing_json,
+    standing_text,
+)
+from physgen.benchmarks.compose_assets.tables import TABLES, composed_table
+from physgen.benchmarks.compose_assets.trial import (
+    SMALL,
+    TINY,
+    Budget,
+    composed,
+    judged,
+    kept_composition,
+    likeness,
+    picture_of,
+    start,
+)
 from physgen.sim.gaussians.compose.compose_options import METHODS, ComposeOptions
+from physgen.sim.gaussians.compose.composition_parts import seated_parts
 from physgen.sim.gaussians.guidance.pretrained_models import ClipScores
 from physgen.sim.gaussians.splat_ply import write_splats
 from physgen.sim.mpm.colliders import Surface
+from physgen.sim.scene.model import Ground
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace, cache: Path, out: Path) -> int:
     """Compose all assets with all methods, and print and write the table; return the exit code."""
+    if options.only is None:
+        options.only = [*NAMES, *TABLES] if options.stand else list(NAMES)
     budget = TINY if options.quick else SMALL if options.small else Budget()
     given = {"size": options.size, "splats": options.splats, "steps": options.steps}
     budget = dataclasses.replace(budget, **{name: value for name, value in given.items() if value is not None})
@@ -53,6 +75,9 @@ def run(options: argparse.Namespace, cache: Path, out: Path) -> int:
     if options.stand:
         return _stand(options, budget, cache, out)
     clip = ClipScores(options.clip) if options.clip else None
+    strange = [name for name in options.only if name not in NAMES]
+    if strange:
+        raise SystemExit(f"{strange[0]} has no pictures, so that methods cannot be compared: give --stand")
     pictures = rendered(options.only, budget.size, cache)
     rows: list[Row] = []
     lines: list[Line] = []
@@ -93,40 +118,34 @@ def run(options: argparse.Namespace, cache: Path, out: Path) -> int:
 
 
 def _stand(options: argparse.Namespace, budget: Budget, cache: Path, out: Path) -> int:
-    """Drop every composition and its truth, and print what becomes of them; return the exit code."""
+    """Drop every composition, and print what becomes of them; return the exit code."""
     rows: list[tuple[str, str, Standing]] = []
+    pictures: list[tuple[str, tuple[float, float], tuple[float, float]]] = []
     seconds = 0.1 if options.quick else SECONDS
-    for name in options.only:
+
+    def dropped(name: str, what: str, surfaces: Sequence[Surface], *, held: bool) -> None:
+        rows.append((name, what, drop(surfaces[0], surfaces[1:], held=held, seconds=seconds)))
+        print(standing_text(rows[-1:]).splitlines()[0], file=sys.stderr, flush=True)
+
+    for name in (item for item in options.only if item in TABLES):
+        chosen = ComposeOptions(method="ppps", steps=budget.table_steps, seat=options.seat, seed=options.seed)
+        dropped(name, "composed, free", composed_table(name, chosen), held=False)
+    for name in (item for item in options.only if item in NAMES):
         item = asset(name)
-        surfaces = _surfaces(name, budget, options.seed, cache)
-        true = [Surface(vertices=part.vertices, faces=part.faces) for part in item.parts]
-        for kind, pieces in (("composed", surfaces), ("truth", true)):
-            for held in (True, False):
-                found = drop(pieces[0], pieces[1:], held=held, seconds=seconds)
-                rows.append((name, f"{kind}, {'held' if held else 'free'}", found))
-                print(standing_text(rows[-1:]).splitlines()[0], file=sys.stderr, flush=True)
-    result = {"budget": dataclasses.asdict(budget), **standing_json(rows)}
-    (out / "standing.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
-    print(json.dumps(result) if options.json else standing_text(rows))
-    return 0
-
-
-def _surfaces(name: str, budget: Budget, seed: int, cache: Path) -> list[Surface]:
-    """The surfaces of the composition of an asset by PSE-SDS, O1 first, from ``cache`` if it was composed before."""
-    item = asset(name)
-    parts = f"{budget.splats}-{budget.fit_steps}-{budget.steps}-{seed}"
-    file = cache / f"{cache_name(item, budget.size)}-composed-{parts}.npz"
-    if not file.is_file():
+        begin = kept_composition(item, budget, options.seed, cache)
+        parts = seated_parts(begin, options.seat, Ground()) if options.seat else begin
         seen = rendered([name], budget.size, cache)[name]
-        begin = start(item, seen, budget, cache)
-        result, _ = composed(item, seen, begin, METHODS[0], budget, ComposeOptions(seed=seed))
-        pieces = [piece.surface for piece in (result.parts[-1], *result.parts[:-1])]
-        arrays = {f"vertices_{i}": piece.vertices for i, piece in enumerate(pieces)}
-        np.savez_compressed(file, **arrays, **{f"faces_{i}": piece.faces for i, piece in enumerate(pieces)})
-    with np.load(file, allow_pickle=False) as kept:
-        return [
-            Surface(vertices=kept[f"vertices_{i}"], faces=kept[f"faces_{i}"]) for i in range(1 + len(item.foregrounds))
-        ]
+        pictures.append((name, likeness(begin, seen), likeness(parts, seen)))
+        print(seats_text(pictures[-1:]), file=sys.stderr, flush=True)
+        surfaces = [part.surface for part in (parts[-1], *parts[:-1])]
+        true = [Surface(vertices=part.vertices, faces=part.faces) for part in item.parts]
+        for kind, pieces in (("composed", surfaces), ("truth", true))[: 1 + options.truth]:
+            for held in (True, False):
+                dropped(name, f"{kind}, {'held' if held else 'free'}", pieces, held=held)
+    result = {"budget": dataclasses.asdict(budget), "seat": options.seat, **standing_json(rows, pictures)}
+    (out / "standing.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+    print(json.dumps(result) if options.json else "\n".join((seats_text(pictures), standing_text(rows))).strip())
+    return 0
 
 
 def _parser() -> QuickParser:
@@ -135,7 +154,12 @@ def _parser() -> QuickParser:
         "--small", action="store_true", help=f"{SMALL.size}², {SMALL.splats} splats, {SMALL.steps} steps"
     )
     parser.add_argument("--stand", action="store_true", help="drop the compositions for 5 s in another engine, MuJoCo")
-    parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES), metavar="ASSET", help=", ".join(NAMES))
+    thickness = "thickness of the seats of what is dropped, over its size; 0: none (default: %(default)s)"
+    parser.add_argument("--seat", type=float, default=0.005, help=thickness)
+    parser.add_argument("--truth", action="store_true", help="drop the assets' true shapes, too")
+    every = (*NAMES, *TABLES)
+    some = f"assets {', '.join(NAMES)}; with --stand also scenes {', '.join(TABLES)} (default: all)"
+    parser.add_argument("--only", nargs="+", choices=every, metavar="NAME", help=some)
     parser.add_argument(
         "--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD", help=", ".join(METHODS)
     )

@@ -117,9 +117,31 @@ def standing_text(rows: Sequence[tuple[str, str, Standing]]) -> str:
     return "\n".join(lines)
 
 
-def standing_json(rows: Sequence[tuple[str, str, Standing]]) -> dict[str, Any]:
+Likeness = tuple[str, tuple[float, float], tuple[float, float]]
+"""Asset, and dB against the input picture and the held-out views: of its composition, and of the same with seats."""
+
+
+def seats_text(pictures: Sequence[Likeness]) -> str:
+    """For a terminal: what the seats cost in the picture."""
+    return "\n".join(
+        f"{name:8} input view {a[0]:.2f} dB, seated {b[0]:.2f}; held out {a[1]:.2f}, seated {b[1]:.2f}"
+        for name, a, b in pictures
+    )
+
+
+def standing_json(rows: Sequence[tuple[str, str, Standing]], pictures: Sequence[Likeness] = ()) -> dict[str, Any]:
     """The same for JSON; what is not finite becomes null."""
     return {
+        "pictures": [
+            {
+                "asset": name,
+                "reference_db": a[0],
+                "held_out_db": a[1],
+                "seated_reference_db": b[0],
+                "seated_held_out_db": b[1],
+            }
+            for name, a, b in pictures
+        ],
         "seconds": SECONDS,
         "wanted": {"drift": WANTED_DRIFT, "depth": WANTED_DEPTH, "share": WANTED_SHARE},
         "rows": [

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from physgen.sim.composite.image_metrics import psnr, ssim
-from physgen.sim.gaussians.compose.compose_options import ComposeOptions
+from physgen.sim.gaussians.compose.compose_options import METHODS, ComposeOptions
 from physgen.sim.gaussians.compose.composition import compose
 from physgen.sim.gaussians.compose.composition_parts import (
     Composition,
@@ -41,7 +41,7 @@ from physgen.sim.mpm.geometry.signed_distance import signed_distance
 from physgen.sim.mpm.geometry.triangles import face_normals, inside_lattice
 
 from .asset import Asset, Part
-from .pictures import AssetPictures, cache_name
+from .pictures import AssetPictures, cache_name, rendered
 from .results import Row
 from .sdf import Array
 
@@ -129,6 +129,8 @@ class Budget:
     splats: int = 20_000
     fit_steps: int = 400
     steps: int = 500
+    table_steps: int = 20
+    """Of each thing of a scene without pictures: none is inside another after ten."""
 
     def fit(self, count: int, *, free: bool) -> Fit:
         """A foreground's centres stay on its surface (eq. 16); those of O1 are ``free``."""
@@ -139,7 +141,7 @@ class Budget:
 SMALL = Budget(size=128, splats=5_000, fit_steps=300, steps=80)
 """Minutes for all assets."""
 
-TINY = Budget(size=48, splats=1_000, fit_steps=5, steps=2)
+TINY = Budget(size=48, splats=1_000, fit_steps=5, steps=2, table_steps=1)
 """Checks that everything runs; the results are meaningless."""
 
 
@@ -191,6 +193,33 @@ def composed(
         options=chosen,
     )
     return result, time.process_time() - before
+
+
+def kept_composition(item: Asset, budget: Budget, seed: int, cache: Path) -> tuple[CompositionPart, ...]:
+    """Return the composition of an asset by PSE-SDS, without seats, from ``cache`` if it was composed before."""
+    stem = f"{budget.splats}-{budget.fit_steps}-{budget.steps}-{seed}"
+    file = cache / f"{cache_name(item, budget.size)}-composed-{stem}.npz"
+    names = [part.name for part in (*item.foregrounds, item.background)]
+    if not file.is_file():
+        seen = rendered([item.name], budget.size, cache)[item.name]
+        result, _ = composed(
+            item, seen, start(item, seen, budget, cache), METHODS[0], budget, ComposeOptions(seed=seed)
+        )
+        for part in result.parts:
+            write_splats(file.with_suffix(f".{part.name}.ply"), part.splats)
+        surfaces = {part.name: part.surface for part in result.parts}
+        arrays = {f"vertices_{name}": surface.vertices for name, surface in surfaces.items()}
+        np.savez_compressed(file, **arrays, **{f"faces_{name}": surface.faces for name, surface in surfaces.items()})
+    with np.load(file, allow_pickle=False) as kept:
+        surfaces = {n: Surface(vertices=kept[f"vertices_{n}"], faces=kept[f"faces_{n}"]) for n in names}
+    splats = {name: read_splats(file.with_suffix(f".{name}.ply")) for name in names}
+    return tuple(CompositionPart(name=name, splats=splats[name], surface=surfaces[name]) for name in names)
+
+
+def likeness(pieces: tuple[CompositionPart, ...], pictures: AssetPictures) -> tuple[float, float]:
+    """PSNR in dB against the input picture, and the mean of that against the held-out views."""
+    held = [_quality(pieces, view)[0] for view in pictures.held_out]
+    return _quality(pieces, pictures.reference)[0], float(np.mean(held))
 
 
 def judged(

@@ -60,11 +60,13 @@ def test_a_benchmark_runs_quickly_and_prints_json(name):
 def test_compositions_are_dropped_quickly():
     for needed in ("bpy", "mujoco"):
         pytest.importorskip(needed)
-    command = [sys.executable, "-m", "physgen.benchmarks.compose", "--quick", "--stand", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "physgen.benchmarks.compose", "--quick", "--stand", "--truth", "--json"]
+    done = subprocess.run([*command, "--only", "ring", "loaf"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    rows = json.loads(done.stdout.strip().splitlines()[-1])["rows"]
-    assert [row["what"] for row in rows] == ["composed, held", "composed, free", "truth, held", "truth, free"]
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    every = ["composed, free", "composed, held", "composed, free", "truth, held", "truth, free"]
+    assert [row["what"] for row in found["rows"]] == every and found["rows"][0]["asset"] == "loaf"
+    assert found["seat"] == 0.005 and [row["asset"] for row in found["pictures"]] == ["ring"]
 
 
 def test_defaults_of_quick_yield_to_given_options():

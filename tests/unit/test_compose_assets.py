@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 from physgen.benchmarks.compose_assets import results, sdf
+from physgen.benchmarks.compose_assets.asset import Part
 from physgen.benchmarks.compose_assets.catalogue import NAMES, asset
 from physgen.benchmarks.compose_assets.pictures import (
     FITTING,
@@ -21,6 +22,7 @@ from physgen.benchmarks.compose_assets.pictures import (
     renderings,
 )
 from physgen.benchmarks.compose_assets.sdf import Bulge, Warp, mesh_of
+from physgen.benchmarks.compose_assets.tables import TABLES
 from physgen.benchmarks.compose_assets.trial import common_volume, overlap, volume
 from PIL import Image
 from scipy.sparse import coo_matrix
@@ -65,6 +67,20 @@ def test_parts_fit_at_the_truth_and_not_at_the_start(name):
 def test_there_are_eight_pairs_and_one_of_three():
     counts = [len(asset(name).parts) for name in NAMES]
     assert counts.count(2) >= 8 and counts.count(3) >= 1
+
+
+@pytest.mark.parametrize(("name", "count"), [("loaf", 2), ("burger", 3), ("cushions", 4), ("fruit", 5)])
+def test_things_on_a_table_start_in_each_other(name, count):
+    things = [
+        Part(name=str(i), vertices=t.vertices, faces=t.faces, colours=t.vertices) for i, t in enumerate(TABLES[name]())
+    ]
+    assert len(things) == count
+    size = np.ptp(np.concatenate([thing.vertices for thing in things]), axis=0).max()
+    assert -1e-6 * size < min(thing.vertices[:, 2].min() for thing in things) < 0.025 * size
+    for i, thing in enumerate(things):
+        check_closed_manifold(thing)
+        # Each of the others reaches into one that is composed before it.
+        assert i == 0 or max(common_volume(thing, other, cells=48) for other in things[:i]) > 1e-4 * volume(thing)
 
 
 def test_overlap_of_two_balls_is_the_lens_between_them():

@@ -83,3 +83,16 @@ def test_a_base_becomes_flat(parts, seats):
     assert np.ptp(parts[1].surface.vertices[base, 2]) > 2e-4
     assert seats[1].surface.vertices[base, 2] == pytest.approx(0.0, abs=1e-12)
     assert seats[1].surface.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("sunk", "flat"), [(0.015, True), (0.03, False)])
+def test_a_base_that_sank_while_composed_is_lifted_and_one_through_the_ground_is_not(parts, sunk, flat):
+    ring, pole = parts
+    vertices = pole.surface.vertices.copy()
+    low = vertices[:, 2] < 0.001
+    vertices[low, 2] -= sunk * HEIGHT
+    bent = piece("pole", Surface(vertices=vertices, faces=pole.surface.faces))
+    # Thin seats: the ground's reach does not come from them.
+    after = seated_parts((ring, bent), 0.002, Ground())[1].surface.vertices
+    assert (after[:, 2].min() == pytest.approx(0.0, abs=1e-12)) == flat
+    assert flat or np.array_equal(after[low], vertices[low])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from physgen.benchmarks.compose_assets.standing import FRICTION, drop, standing_json, standing_text
+from physgen.benchmarks.compose_assets.standing import FRICTION, drop, seats_text, standing_json, standing_text
 from physgen.sim.mpm.colliders import Surface
 
 pytest.importorskip("mujoco")
@@ -35,7 +35,11 @@ def test_a_block_on_a_table_stands_and_one_in_the_air_falls():
     assert free.stands
     rows = [("block", "free", free), ("gone", "held", above)]
     assert "yes  free: 1 of 1 stand" in standing_text(rows) and "NO   held: 0 of 1" in standing_text(rows)
-    assert [row["stands"] for row in json.loads(json.dumps(standing_json(rows)))["rows"]] == [True, False]
+    found = json.loads(json.dumps(standing_json(rows, [("ring", (40.0, 31.0), (39.5, 30.5))])))
+    assert [row["stands"] for row in found["rows"]] == [True, False]
+    assert found["pictures"][0]["seated_held_out_db"] == 30.5
+    words = seats_text([("ring", (40.0, 31.0), (39.5, 30.5))])
+    assert words == "ring     input view 40.00 dB, seated 39.50; held out 31.00, seated 30.50"
 
 
 @pytest.mark.parametrize("degrees", [15, 40])

@@ -391,13 +391,18 @@ def _least_distance(lattices: Sequence[DistanceLattice], points: Array) -> Array
     return np.asarray(np.min([lattice.at(points)[0] for lattice in lattices], axis=0), dtype=np.float64)
 
 
+SUNK = 0.02
+"""Share of its largest extent by which a part may have sunk into the ground, which is no obstacle while it is composed,
+and is still lifted onto it. What reaches deeper is not on the ground, but through it."""
+
+
 def _on_ground(surface: Surface, ground: Ground, thickness: float) -> Surface:
     """Return ``surface`` flat where it is lower than ``thickness``; heights up to twice that are stretched.
 
-    What reaches farther below the ground than twice that stays as it is: it is not on it, but through it.
+    What reaches deeper than ``SUNK`` stays as it is.
     """
     heights = ground.heights(surface.vertices)
-    if heights.min() < -2.0 * thickness:
+    if heights.min() < -max(2.0 * thickness, SUNK * float(np.ptp(surface.vertices, axis=0).max())):
         return surface
     wanted = np.where(heights < 2.0 * thickness, np.maximum(0.0, 2.0 * (heights - thickness)), heights)
     down = (wanted - heights)[:, None] * np.asarray(ground.unit_normal)
