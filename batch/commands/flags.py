@@ -206,7 +206,7 @@ def add_environment_flags(parser: argparse.ArgumentParser) -> None:
 def add_reasoning_flags(parser: argparse.ArgumentParser) -> None:
     """Add the chat endpoint that is asked for the objects' materials."""
     group = parser.add_argument_group("materials from a vision-language model")
-    text = "OpenAI-compatible chat endpoint about the objects, such as https://host/v1 (docs/reconstruction-stages.md)"
+    text = "OpenAI-compatible chat endpoint about the objects, such as https://host/v1 (docs/surface-and-light.md)"
     group.add_argument("--ask", metavar="URL", help=text)
     text = "name of the endpoint's model; it must accept images"
     group.add_argument("--model", metavar="NAME", help=text)
