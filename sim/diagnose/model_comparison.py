@@ -38,6 +38,8 @@ class ComparisonSettings:
 
     temperature: T above, at least 1. fee: d above, nats.
     predicts: fraction of the nominal model's held-out error that an effect must stay below.
+    worsens: factor on the nominal misfit, if that is above 1, from which an effect has no gain. It contains the nominal
+        model: what leaves so much more, as where its contacts are surer and wrong, explains nothing.
     enough: misfit at which a(m) is one half for a candidate that hardly lowers the nominal misfit; enough_explained:
         the same for one that removes most of it.
     sharpness: slope of a(m) in ln m.
@@ -66,6 +68,7 @@ class ComparisonSettings:
     temperature: float = 4.0
     fee: float = 8.0
     predicts: float = 0.97
+    worsens: float = 2.0
     enough: float = 1.7
     enough_explained: float = 3.0
     sharpness: float = 8.0
@@ -331,6 +334,8 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
     gain = fit.log_evidence - nominal.log_evidence
     if math.isnan(gain) or not math.isfinite(fit.log_evidence):
         return -math.inf
+    if fit.misfit > weighing.worsens * max(1.0, nominal.misfit):
+        gain = min(gain, 0.0)
     if _left(fit, nominal) >= weighing.predicts:
         # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.
         gain = min(gain, max(gain - weighing.unseen_fee, 0.0) if nominal.heldout_rms_m < grain else 0.0)

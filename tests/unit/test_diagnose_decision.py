@@ -296,6 +296,13 @@ def test_what_predicts_down_to_the_noise_is_not_unknown():
     assert found[2].reasons["wind"] == "leaves 9.0 times the noise unexplained"
 
 
+@pytest.mark.parametrize(("misfit", "found"), [(28.7, NONE), (2.3, UNKNOWN)])
+def test_an_effect_that_leaves_far_more_than_the_nominal_model_takes_nothing_from_none(misfit, found):
+    """A restitution whose contacts were surer, and wrong, made a recording of the nominal motion unknown."""
+    better = fit("restitution", evidence=128.0, misfit=misfit, rms=0.005)
+    assert weighed(better, nominal_misfit=1.2).verdict.effect == found
+
+
 def test_a_better_fit_never_loses_probability():
     probabilities = [
         weighed(fit("wind", evidence=e), fit("air_drag", evidence=50.0)).probabilities["wind"] for e in range(0, 200, 5)
