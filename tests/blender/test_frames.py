@@ -102,7 +102,7 @@ def test_a_frame_of_two_bakes_or_scenes_is_not_kept(world, bake, tmp_path, rende
 
     with pytest.raises(InputError, match="was baked anew or freed by another command"):
         render_frames(world.folder, load_bake(folder), out=out, options=QUICK, on_event=once(baked_anew))
-    assert list(json.loads((out / "frames.json").read_text())["frames"]) == ["1"]
+    assert list(json.loads((out / "frames.json").read_text())["frames"]) == ["0001.png"]
     rendered.clear()
     render_frames(world.folder, load_bake(folder), out=out, options=QUICK)
     assert rendered == [1, 2, 3]

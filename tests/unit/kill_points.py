@@ -170,7 +170,7 @@ def do_compose(folder, by=0.01):
     scene = load_scene(folder / "pair")
     mesh = load_object_mesh(scene, scene.objects[0])
     moved = MovedObject(vertices=mesh.vertices + by, faces=np.asarray(mesh.faces))
-    with composition_folder(scene.root, folder / "fitted") as partial:
+    with composition_folder(scene, folder / "fitted") as partial:
         write_composition(scene, partial, {scene.objects[0].name: moved}, {"format": "physgen-compose/1", "pairs": []})
 
 
