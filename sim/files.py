@@ -75,10 +75,10 @@ def open_file(path: Path, most: int, *, what: str = OF_PHYSGEN, folder: Path | N
 
 @contextlib.contextmanager
 def same_file(path: Path, most: int, *, folder: Path | None = None) -> Iterator[Callable[[], bool]]:
-    """Yield a function: whether ``path`` is still the file that it is now, whatever its content, and no other.
+    """Yield a function that returns whether ``path`` still names the same file, whatever its content.
 
-    It is held open meanwhile, so that its number in the file system cannot become another file's; times, which depend
-    on the clock, are not looked at. (Windows lets nobody replace it then.) Raises as ``open_file`` does.
+    The file is held open, so that its number in the file system is not given to another one; modification times, which
+    depend on the clock, are not compared. On Windows an open file cannot be replaced. Raises as ``open_file`` does.
     """
     with open_file(path, most, folder=folder) as held:
 
@@ -191,6 +191,12 @@ def shown(path: Path | str) -> str:
     """Return ``path`` for a message: at most 200 characters, printable, so that no name forges another line."""
     text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(path))
     return text if len(text) <= 200 else f"{text[:100]}…{text[-60:]}"
+
+
+def without_folder(error: Exception, folder: Path) -> str:
+    """Return the message of ``error`` with the files of ``folder`` named alone: for pages that are passed on, which
+    shall not tell where they lay."""
+    return str(error).replace(f"{shown(folder)}/", "").replace(f"{folder}/", "")
 
 
 def _reason(error: OSError) -> str:

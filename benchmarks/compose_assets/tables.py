@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Scenes of two to five things on a table that start in each other, for judging whether their compositions stand.
 
-A scene is composed by physics alone (method ppps): it has no picture, and what is asked is whether it stands. Things
-are at rest where they are but for how deep they reach into each other, a hundredth to a fortieth of the scene's size.
+A scene has no picture and is composed by physics alone (method ppps); only whether it stands is judged. Its things
+would be at rest, but they start in each other by 1 to 2.5 % of the scene's size.
 """
 
 from __future__ import annotations

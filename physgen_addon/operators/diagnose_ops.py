@@ -50,6 +50,11 @@ def report_folder(state: bpy.types.PropertyGroup) -> Path:
     return folder_beside(capture_folder(state.capture), "diagnosis")
 
 
+def _stored(final: Event, name: str) -> str:
+    """Return the path ``name`` of a job's last event as the scene stores it."""
+    return stored(Path(str(final[name])))
+
+
 def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
     """(Re)build the capture of ``scene`` with the diagnosis in the folder ``diagnosis``; keep the visible trial
     and layers.
@@ -277,7 +282,7 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show the result, also if undo has meanwhile removed the capture from the scene."""
         state, out = scene.physgen_diagnose, Path(str(final["out"]))
-        state.capture = stored(Path(str(final["capture"])))
+        state.capture = _stored(final, "capture")
         show_capture(scene, out)
         state.report = stored(out)
         return str(state.summary)
@@ -318,7 +323,7 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
         """Show the capture with its diagnosis; the comparison can be played from the panel."""
         state = scene.physgen_diagnose
         state.capture, state.report, state.video.comparison = (
-            stored(Path(str(final[name]))) for name in ("capture", "diagnosis", "video")
+            _stored(final, name) for name in ("capture", "diagnosis", "video")
         )
         is_first = state.root is None
         show_capture(scene, Path(str(final["diagnosis"])))
@@ -375,9 +380,7 @@ class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
         """Show both bakes."""
         state = scene.physgen_diagnose
         # Undo may have cleared the property.
-        state.scene_folder, state.before, state.after = (
-            stored(Path(str(final[name]))) for name in ("scene", "before", "after")
-        )
+        state.scene_folder, state.before, state.after = (_stored(final, name) for name in ("scene", "before", "after"))
         show_overlay(scene)
         return "Effect added; the bakes before and after are overlaid"
 

@@ -327,7 +327,6 @@ def _make(
         progress.notice(f"{len(planned) - len(missing)} of {len(planned)} frames are up to date")
     names = [item.name for item in scene.model.objects]
     renderer: OpenRenderer | None = None
-    seen = False
     try:
         for done, frame in enumerate(missing, start=len(planned) - len(missing)):
             if cancelled():
@@ -338,11 +337,11 @@ def _make(
                 with replacing(path) as partial:
                     shutil.copyfile(twin, partial)
             else:
+                is_first = renderer is None
                 renderer = renderer or OpenRenderer(scene, bake, options, shot, progress.notice)
                 layers, data = renderer.layers(frame)
                 # What Blender has read is what the frame is recorded to be of; the scene, all of it with the first one.
-                require_same(scene_too=not seen)
-                seen = True
+                require_same(scene_too=is_first)
                 frame_index.begin()
                 write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
             frame_index.record(frame.number, frame.inputs)

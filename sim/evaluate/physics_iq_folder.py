@@ -20,6 +20,7 @@ import numpy as np
 
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
+from ..files import without_folder
 from .evaluation import HIGHER, Measure, Section
 from .footage import Footage, at_rate, open_footage
 from .physics_iq import NAMES, TITLES, compare, original_score, quarter, take, verified_scores
@@ -99,8 +100,7 @@ def read_submission(folder: Path) -> Submission:
             try:
                 videos[number] = open_footage(path)
             except InputError as error:
-                # The page is passed on, so it names the file and not where it lies.
-                problems.append(str(error).replace(f"{path.parent}/", ""))
+                problems.append(without_folder(error, path.parent))
     problems += [notice for video in videos.values() for notice in video.notices]
     if not videos:
         raise InputError(f"{folder}: holds no video such as 0001_perspective-left_trimmed-….mp4; name another folder")
@@ -176,9 +176,8 @@ def score_views(
         try:
             rows.append(_score(submission, submission.videos[number], benchmark[number]))
         except InputError as error:
-            # The table and its page are passed on, so they name the file and not where it lies.
-            place = f"{benchmark[number].takes[0].parent}/"
-            failed.append(FailedView(view=benchmark[number], reason=str(error).replace(place, "")))
+            reason = without_folder(error, benchmark[number].takes[0].parent)
+            failed.append(FailedView(view=benchmark[number], reason=reason))
         on_row(len(rows) + len(failed))
     return rows, failed
 

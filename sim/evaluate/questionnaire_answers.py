@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..atomic import replacing_tree, write_bytes, write_json
 from ..cache.folder_lock import lock_beside
 from ..errors import InputError
-from ..files import shown
+from ..files import shown, without_folder
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .model_judge import CRITERIA, TITLES
@@ -173,8 +173,7 @@ def _sheets(paths: Sequence[Path], key: dict[str, Any]) -> tuple[list[Sheet], li
         try:
             sheet = read_answers(path, key)
         except InputError as error:
-            # The page is passed on, so it names the file and not where it lies.
-            notes.append(f"left out: {str(error).replace(f'{shown(path.parent)}/', '')}")
+            notes.append(f"left out: {without_folder(error, path.parent)}")
             continue
         if not any(values for of in sheet.scores.values() for values in of.values()):
             notes.append(

@@ -107,13 +107,11 @@ def throws(folder):
 
     26 points at 60 Hz with 1 mm of noise; drag slows the centre by 0.35/m times its speed squared.
     """
-    form = session.extension("sim.diagnose.capture")
     rng = np.random.default_rng(1)
     edges = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     marks = 0.05 * edges[np.abs(edges).max(axis=1) == 1]
-    corners, faces = session.box(0.05)
     times = np.arange(48) / 60.0
-    trials = []
+    trials = {}
     for name, velocity, turn in (
         ("throw 1", (3.5, 0.6, 3.4), (4.0, 2.0, 1.0)),
         ("throw 2", (4.2, -0.8, 2.6), (-1.0, 3.0, 2.0)),
@@ -128,23 +126,8 @@ def throws(folder):
         # A cube's inertia is the same about every axis, so it turns evenly.
         turned = [np.array(Quaternion(Vector(turn).normalized(), Vector(turn).length * t).to_matrix()) for t in times]
         points = np.stack([marks @ r.T + x for r, x in zip(turned, path, strict=True)])
-        noisy = points + 0.001 * rng.standard_normal(points.shape)
-        index = np.zeros(len(marks), dtype=np.int64)
-        trials.append(
-            form.Trial(
-                name=name, role="fit", times=times, points=noisy, pixels=None, object_index=index, rest_points=marks
-            )
-        )
-    belief = form.ObjectBelief(name="box", mesh="box.obj", density_kg_m3=60.0, stiffness="hard", youngs_modulus_pa=None)
-    capture = form.Capture(
-        gravity=(0.0, 0.0, -9.81),
-        ground=form.Ground(),
-        objects=(form.CaptureObject(belief=belief, vertices=corners, faces=faces),),
-        noise_sigma=0.001,
-        camera=None,
-        trials=tuple(trials),
-    )
-    form.save_capture(capture, folder)
+        trials[name] = times, points + 0.001 * rng.standard_normal(points.shape)
+    session.save_trials(session.extension("sim.diagnose.capture"), folder, trials, marks=marks, density=60.0)
 
 
 def diagnosis():

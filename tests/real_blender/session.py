@@ -8,7 +8,7 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,20 +61,28 @@ def box(half: float) -> tuple[np.ndarray, np.ndarray]:
 
 def a_capture(form: Any, folder: Path) -> None:
     """Save a recording of a box in flight, as points in space, in ``folder``; form: ``sim.diagnose.capture``."""
-    corners, faces = box(0.05)
+    corners, _ = box(0.05)
     times = np.arange(12) / 50.0
     places = np.stack([times, 0 * times, 0.5 + times - 4.9 * times**2], axis=1)
+    save_trials(form, folder, {"throw": (times, corners[None] + places[:, None])}, marks=corners, density=500.0)
+
+
+def save_trials(
+    form: Any,
+    folder: Path,
+    trials: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    marks: np.ndarray,
+    density: float,
+) -> None:
+    """Save recordings of a box of 10 cm in ``folder``; form: ``sim.diagnose.capture``.
+
+    trials: times (T,) in s and points (T, K, 3) in m by name. marks: (K, 3) places of the points on the box, m.
+    density: what it is believed to be, kg/m³.
+    """
+    corners, faces = box(0.05)
     belief = form.ObjectBelief(
-        name="box", mesh="box.obj", density_kg_m3=500.0, stiffness="hard", youngs_modulus_pa=None
-    )
-    take = form.Trial(
-        name="throw",
-        role="fit",
-        times=times,
-        points=corners[None] + places[:, None],
-        pixels=None,
-        object_index=np.zeros(len(corners), dtype=np.int64),
-        rest_points=corners,
+        name="box", mesh="box.obj", density_kg_m3=density, stiffness="hard", youngs_modulus_pa=None
     )
     capture = form.Capture(
         gravity=(0.0, 0.0, -9.81),
@@ -82,7 +90,18 @@ def a_capture(form: Any, folder: Path) -> None:
         objects=(form.CaptureObject(belief=belief, vertices=corners, faces=faces),),
         noise_sigma=0.001,
         camera=None,
-        trials=(take,),
+        trials=tuple(
+            form.Trial(
+                name=name,
+                role="fit",
+                times=times,
+                points=points,
+                pixels=None,
+                object_index=np.zeros(len(marks), dtype=np.int64),
+                rest_points=marks,
+            )
+            for name, (times, points) in trials.items()
+        ),
     )
     form.save_capture(capture, folder)
 

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 _GENERATION = 0
 _ASKED: tuple[str, int, str] | None = None
 _ARCH = "cpu"
-_ARRAYS: dict[int, weakref.ref[ti.Ndarray]] = {}
+_ARRAYS: weakref.WeakSet[ti.Ndarray] = weakref.WeakSet()
 
 
 def ensure_started(options: SolverOptions) -> tuple[str, int]:
@@ -141,21 +141,17 @@ def new_array(kind: Any, length: int) -> ti.Ndarray:
     until it is restarted. Whoever uses an array from before a restart gets RuntimeError.
     """
     array = ti.ndarray(kind, length)
-    _ARRAYS[id(array)] = weakref.ref(array)
-    weakref.finalize(
-        array, _forget, id(array), _GENERATION, array.arr, not hasattr(type(array), "__del__")
-    ).atexit = False
+    _ARRAYS.add(array)
+    if not hasattr(type(array), "__del__"):
+        weakref.finalize(array, _give_back, _GENERATION, array.arr).atexit = False
     return array
 
 
-def _forget(number: int, made: int, memory: Any, free: bool) -> None:
-    """Drop array ``number``, and let Taichi ``free`` its memory if it was ``made`` in this generation: a restart has
-    freed all before."""
+def _give_back(made: int, memory: Any) -> None:
+    """Let Taichi free ``memory`` of an array that was ``made`` in this generation; a restart has freed all before."""
     program = ti.lang.impl.get_runtime().prog
-    if made == _GENERATION:
-        _ARRAYS.pop(number, None)
-        if free and program is not None:
-            program.delete_ndarray(memory)
+    if made == _GENERATION and program is not None:
+        program.delete_ndarray(memory)
 
 
 def _let_go_of_arrays() -> None:
@@ -165,11 +161,9 @@ def _let_go_of_arrays() -> None:
     a new array may lie by then. That one was freed in its stead, and the next substep wrote to memory of others.
     """
     global _ASKED, _GENERATION
-    for reference in list(_ARRAYS.values()):
-        array = reference()
-        if array is not None:
-            del array.arr
-            array.__class__ = FreedArray
+    for array in _ARRAYS:
+        del array.arr
+        array.__class__ = FreedArray
     _ARRAYS.clear()
     _ASKED = None
     _GENERATION += 1

@@ -123,11 +123,16 @@ class _Cropped:
         end = (int(rows[-1]) + 1, int(columns[-1]) + 1) if len(rows) else (0, 0)
         return cls(image[top : end[0], left : end[1]].copy(), top, left, (image.shape[0], image.shape[1]))
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of ``values`` in the picture."""
+        height, width = self.values.shape[:2]
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
     def whole(self) -> Image:
         """Return the picture, the same to the bit."""
         image = np.zeros((*self.size, self.values.shape[2]), np.float32)
-        height, width = self.values.shape[:2]
-        image[self.top : self.top + height, self.left : self.left + width] = self.values
+        image[self.window] = self.values
         return image
 
 
@@ -171,7 +176,7 @@ class _Comparison:
         self._shares, self._mirrored = shares, mirrored
         inside = np.zeros((height, width), bool)
         for one in mirrored:
-            inside |= one.light.whole()[..., 3] > 0
+            inside[one.light.window] |= one.light.values[..., 3] > 0
         self._mean_share = float(shares[inside].mean())
         self.grazing = max((self._mean_share - VARNISH) / (1.0 - VARNISH), 0.0)
         self._blurred: tuple[float, list[_Cropped]] = (-1.0, [])
