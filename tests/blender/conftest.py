@@ -210,8 +210,8 @@ def _photograph(root: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def world(tmp_path_factory) -> World:
-    """The world, reconstructed perfectly."""
+def shared_world(tmp_path_factory) -> tuple[World, dict[Path, bytes]]:
+    """The world, reconstructed perfectly, and its files."""
     with np.load(made_once(tmp_path_factory, "truth", _photograph) / "truth.npz") as truth:
         photo, mask, background = truth["photo"], truth["mask"], truth["background"]
         moved, moved_mask = truth["moved"], truth["moved_mask"]
@@ -231,7 +231,26 @@ def world(tmp_path_factory) -> World:
     item = SceneObject(name="ball", mesh="meshes/ball.glb", size_m=2 * RADIUS, mask="masks/ball.png")
     light = Light(sun_direction=SUN, sun_strength=SUN_STRENGTH, sun_angle=SUN_ANGLE)
     folder = save_scene(root, SceneModel(camera=camera, objects=(item,), light=light))
-    return World(folder=folder, photo=photo, background=background, moved=moved, moved_mask=moved_mask)
+    world = World(folder=folder, photo=photo, background=background, moved=moved, moved_mask=moved_mask)
+    return world, _contents(root)
+
+
+def _contents(root: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def world(shared_world) -> Iterator[World]:
+    """The world that a worker's tests share; one that changes a file of it, instead of a copy's, fails."""
+    world, files = shared_world
+    yield world
+    now = _contents(world.folder.root)
+    changed = {path.name for path in files.keys() | now.keys() if files.get(path) != now.get(path)}
+    for path in now.keys() - files.keys():
+        path.unlink()
+    for path, content in files.items() if changed else ():
+        path.write_bytes(content)
+    assert not changed, f"the world of all tests was changed: {', '.join(sorted(changed))}"
 
 
 def _extended(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:

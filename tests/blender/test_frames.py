@@ -14,6 +14,7 @@ import pytest
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.srgb import bytes_to_linear, read_rgb
 from physgen.sim.errors import Cancelled, InputError
+from physgen.sim.scene.folder import load_scene
 
 bpy = pytest.importorskip("bpy")
 import cv2
@@ -108,15 +109,16 @@ def test_a_frame_of_two_bakes_or_scenes_is_not_kept(world, bake, tmp_path, rende
     assert rendered == [1, 2, 3]
 
     fresh = tmp_path / "fresh"
-    photo = world.folder.file(world.folder.model.photo)
+    # Not the world of the other tests.
+    scene = load_scene(shutil.copytree(world.folder.root, tmp_path / "corrected"))
+    photo = scene.file(scene.model.photo)
 
     def corrected():
         write_png(tmp_path / "new.png", 255 - read_rgb(photo))
         (tmp_path / "new.png").replace(photo)
 
     with pytest.raises(InputError, match="was changed by another command"):
-        whole = load_bake(folder)
-        render_frames(world.folder, whole, out=fresh, options=QUICK, cancelled=lambda: bool(corrected()) and False)
+        render_frames(scene, load_bake(folder), out=fresh, options=QUICK, cancelled=lambda: bool(corrected()) and False)
     assert not (fresh / "0001.png").exists()
 
 
