@@ -110,7 +110,7 @@ def settle_ground(scene: bpy.types.Scene, added: list[bpy.types.Object]) -> str:
     bounds = [rest_bounds(item) for item in added if item.physgen.role == "dynamic"]
     low, high = min(low.z for low, _ in bounds), max(high.z for _, high in bounds)
     world.ground_point = (0.0, 0.0, low - (high - low) / 2)
-    return f"The ground was at {', '.join(sunk)} and is below now (World > Ground)"
+    return f"The ground cut through {', '.join(sunk)} and is now below (World > Ground)"
 
 
 class OfSelected(OperatorMixin):

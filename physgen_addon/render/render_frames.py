@@ -242,22 +242,49 @@ def render_frames(
     Raises InputError for an unusable scene, bake, range or folder, RenderError if Blender fails, Cancelled when
     cancelled; complete frames are kept then.
     """
-    options = options or RenderOptions()
     require_photo(scene)
     with unchanged_bake(bake) as require_bake:
-        return _render(scene, bake, out, options, frames, on_event, cancelled, require_bake)
+        job = _plan_job(scene, bake, options or RenderOptions(), frames, require_bake)
+        suffix = job.options.frame_format.suffix
+        FrameIndex(out, suffix=suffix)
+        with folder_lock(out):
+            recover(out)
+            frame_index = FrameIndex(out, suffix=suffix, fps=job.bake.manifest.fps)
+            progress = StageProgress(on_event, "render", len(job.planned))
+            for notice in job.notices:
+                progress.notice(notice)
+            _make(job, frame_index, progress, cancelled)
+        return [frame_index.path(frame.number) for frame in job.planned]
 
 
-def _render(
-    scene: Scene,
-    bake: Bake,
-    out: Path,
-    options: RenderOptions,
-    frames: str | None,
-    on_event: OnEvent,
-    cancelled: IsCancelled,
-    require_bake: Callable[[], None],
-) -> list[Path]:
+@dataclass(frozen=True)
+class _Job:
+    """The frames ``planned`` of an opened bake in a scene, and what has to be said before they are rendered.
+
+    ``scene_hash`` is that of the scene as the plan was made, ``require_bake`` raises where the bake has changed since.
+    """
+
+    scene: Scene
+    bake: OpenedBake
+    options: RenderOptions
+    shot: CameraMotion
+    blender: str
+    planned: list[Frame]
+    notices: list[str]
+    scene_hash: str
+    require_bake: Callable[[], None]
+
+    def require_same(self, *, scene_too: bool) -> None:
+        """Raise InputError if another command has changed the bake, or with ``scene_too`` the scene, since the plan."""
+        self.require_bake()
+        if scene_too and _scene_hash(self.scene, self.options, self.blender) != self.scene_hash:
+            raise InputError(f"{self.scene.root}: was changed by another command meanwhile; run this one again")
+
+
+def _plan_job(
+    scene: Scene, bake: Bake, options: RenderOptions, frames: str | None, require_bake: Callable[[], None]
+) -> _Job:
+    """Return the job of rendering ``frames``. Raises InputError where bake and scene do not fit."""
     opened = point_caches.open_bake(bake, scene)
     point_caches.require_world(opened)
     point_caches.require_scene(opened, scene)
@@ -267,38 +294,33 @@ def _render(
     numbers = parse_frame_range(frames, opened.first_frame, opened.last_frame, there=f"baked; {remedy}")
     # Motion blur and flow look at the neighbours, and what stands still is looked for from the first frame on.
     require_intact(bake, range(max(numbers, default=0) - bake.first_frame + 2))
-    traces = options.engine == "cycles"
-    denoised = traces and options.denoise and compat.denoiser_available()
+    wanted = options.engine == "cycles" and options.denoise
+    denoised = wanted and compat.denoiser_available()
     blender = f"Blender {bpy.app.version[0]}.{bpy.app.version[1]} {'denoised' if denoised else 'noisy'}"
     opened = photo_particles.find_tears(opened, scene)
     rest = [cache.sample(0) for cache in opened.caches]
     count, fps = max(opened.manifest.frames, opened.last_frame - opened.first_frame + 1), opened.manifest.fps
     shot = make_camera_motion(scene, rest, options, first_frame=opened.first_frame, count=count, fps=fps)
-    base = _scene_hash(scene, options, blender)
-    planned = plan_frames(scene, opened, numbers, options=options, shot=shot, blender=blender)
-    suffix = options.frame_format.suffix
-    FrameIndex(out, suffix=suffix)
-    with folder_lock(out):
-        recover(out)
-        frame_index = FrameIndex(out, suffix=suffix, fps=fps)
-        progress = StageProgress(on_event, "render", len(planned))
-        if frames is None and opened.unfinished:
-            progress.notice(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
-        if traces and options.denoise and not denoised:
-            progress.notice(
-                "OpenImageDenoise is missing in this Blender or cannot be loaded now: frames are not denoised; raise "
-                "the samples, or free memory and run again, which renders them anew"
-            )
-        for notice in (*shot.notices, *_clip_notices(scene, opened, numbers, shot)):
-            progress.notice(notice)
-
-        def require_same(*, scene_too: bool) -> None:
-            require_bake()
-            if scene_too and _scene_hash(scene, options, blender) != base:
-                raise InputError(f"{scene.root}: was changed by another command meanwhile; run this one again")
-
-        _make(scene, opened, planned, frame_index, options, shot, progress, cancelled, require_same)
-    return [frame_index.path(frame.number) for frame in planned]
+    notices = []
+    if frames is None and opened.unfinished:
+        notices.append(f"frames {opened.first_frame} to {opened.last_frame} are rendered; {opened.unfinished}")
+    if wanted and not denoised:
+        notices.append(
+            "OpenImageDenoise is missing in this Blender or cannot be loaded now: frames are not denoised; raise the "
+            "samples, or free memory and run again, which renders them anew"
+        )
+    return _Job(
+        scene=scene,
+        bake=opened,
+        options=options,
+        shot=shot,
+        blender=blender,
+        # Before the frames' own hashes, so that a scene that changes in between is noticed.
+        scene_hash=_scene_hash(scene, options, blender),
+        planned=plan_frames(scene, opened, numbers, options=options, shot=shot, blender=blender),
+        notices=[*notices, *shot.notices, *_clip_notices(scene, opened, numbers, shot)],
+        require_bake=require_bake,
+    )
 
 
 def _clip_notices(scene: Scene, bake: point_caches.OpenedBake, numbers: Sequence[int], shot: CameraMotion) -> list[str]:
@@ -311,21 +333,12 @@ def _clip_notices(scene: Scene, bake: point_caches.OpenedBake, numbers: Sequence
     return clip_notices([item.name for item in scene.objects], poses, (shot.camera(n) for n in samples), clip)
 
 
-def _make(
-    scene: Scene,
-    bake: point_caches.OpenedBake,
-    planned: list[Frame],
-    frame_index: FrameIndex,
-    options: RenderOptions,
-    shot: CameraMotion,
-    progress: StageProgress,
-    cancelled: IsCancelled,
-    require_same: Callable[..., None],
-) -> None:
+def _make(job: _Job, frame_index: FrameIndex, progress: StageProgress, cancelled: IsCancelled) -> None:
+    planned = job.planned
     missing = [frame for frame in planned if not frame_index.is_complete(frame.number, frame.inputs)]
     if len(missing) < len(planned):
         progress.notice(f"{len(planned) - len(missing)} of {len(planned)} frames are up to date")
-    names = [item.name for item in scene.model.objects]
+    names = [item.name for item in job.scene.model.objects]
     renderer: OpenRenderer | None = None
     try:
         for done, frame in enumerate(missing, start=len(planned) - len(missing)):
@@ -338,12 +351,12 @@ def _make(
                     shutil.copyfile(twin, partial)
             else:
                 is_first = renderer is None
-                renderer = renderer or OpenRenderer(scene, bake, options, shot, progress.notice)
+                renderer = renderer or OpenRenderer(job.scene, job.bake, job.options, job.shot, progress.notice)
                 layers, data = renderer.layers(frame)
                 # What Blender has read is what the frame is recorded to be of; the scene, all of it with the first one.
-                require_same(scene_too=is_first)
+                job.require_same(scene_too=is_first)
                 frame_index.begin()
-                write_frame(path, layers, data, options.frame_format, fps=bake.manifest.fps, names=names)
+                write_frame(path, layers, data, job.options.frame_format, fps=job.bake.manifest.fps, names=names)
             frame_index.record(frame.number, frame.inputs)
         progress.report(len(planned))
     finally:
