@@ -16,7 +16,7 @@ from physgen.physgen_addon.playback.bake_record import read_record
 from physgen.sim.app import bake_resume
 from physgen.sim.app.bake_resume import find_mendable
 from physgen.sim.app.bake_samples import Tears
-from physgen.sim.app.pack_bake import PackedCache, pack_bake, unpack_bake
+from physgen.sim.app.pack_bake import pack_bake, unpack_bake
 from physgen.sim.cache.bake_check import check_bake
 from physgen.sim.cache.bake_folder import (
     MATTER_FILES,
@@ -25,6 +25,7 @@ from physgen.sim.cache.bake_folder import (
     listed_files,
     load_bake,
 )
+from physgen.sim.cache.packed_cache import PackedCache
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.cache.torn_skin_file import TornSkin, read_torn_skin, write_torn_skin
 from physgen.sim.reconstruct import stage_cache
