@@ -14,7 +14,14 @@ from physgen.sim.app import propose as propose_module
 from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, choose, propose
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.reconstruct_options import Proposal
-from physgen.sim.reconstruct.segmentation.object_proposals import proposals_from_alpha, with_model
+from physgen.sim.reconstruct.segmentation.object_proposals import (
+    LEFT_ASIDE,
+    candidates,
+    proposals_from_alpha,
+    propose_boxes,
+    with_model,
+    with_the_rest_aside,
+)
 from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width
 from PIL import Image
 from scipy import ndimage
@@ -193,6 +200,37 @@ def test_twenty_proposals_are_numbered_and_three_are_used():
     assert choose(found, [], 5) == [0, 1, 2, 3, 4]
     assert best_proposals([Proposal((0, 0, 9, 9), 0.5)]) == [0]
     assert best_proposals([]) == []
+
+
+def test_a_photo_is_of_a_toy_and_not_of_the_skirting_behind_it():
+    rows, columns = np.mgrid[:192, :256] + 0.5
+    image = np.full((192, 256, 3), (150.0, 150, 160)) + np.random.default_rng(3).normal(scale=2, size=(192, 256, 1))
+    image[40:54], image[54:] = (250, 250, 250), image[54:] - 30
+    image[((columns - 125) / 35) ** 2 + ((rows - 120) / 50) ** 2 < 1] = (200, 50, 40)
+    image = np.clip(ndimage.gaussian_filter(image, (0.6, 0.6, 0)), 0, 255).astype(np.uint8)
+    found = propose_boxes(image)
+    assert best_proposals(found) == [0] and iou(found[0].box, (90, 70, 160, 170)) > 0.5
+    reached = [np.flatnonzero(mask.any(axis=0))[[0, -1]] for mask in candidates(image)]
+    assert reached and not any(first == 0 and last == 255 for first, last in reached)
+
+
+def masks_of(*boxes):
+    masks = np.zeros((len(boxes), 100, 200), bool)
+    for mask, (x0, y0, x1, y1) in zip(masks, boxes, strict=True):
+        mask[y0:y1, x0:x1] = True
+    return list(masks)
+
+
+def test_what_is_cut_or_tiny_is_used_where_there_is_nothing_else():
+    whole, cut, speck = (60, 20, 110, 80), (150, 0, 200, 60), (20, 70, 28, 78)
+    scores = [0.95, 0.97, 0.99]
+    assert with_the_rest_aside(masks_of(whole, cut, speck), scores) == [0.95, LEFT_ASIDE, LEFT_ASIDE]
+    assert with_the_rest_aside(masks_of(cut, speck), scores[1:]) == [0.97, LEFT_ASIDE]
+    assert with_the_rest_aside(masks_of(speck), scores[2:]) == [0.99]
+    assert with_the_rest_aside([], []) == []
+    # A poor one neither makes others tiny nor is raised.
+    poor = (0, 0, 190, 99)
+    assert with_the_rest_aside(masks_of(poor, speck), [0.6, 0.99]) == [0.6, 0.99]
 
 
 def test_a_model_s_alpha_becomes_boxes():

@@ -54,6 +54,14 @@ ELSEWHERE = 0.4
 """Share of the smaller of two boxes in the other above which they hold the same object, or a part of it."""
 LEAST_SIDE = 0.035
 """Least side of an object's box over the photo's shorter side."""
+BESIDE = 0.03
+"""Area over the largest object's below which a thing is left aside: a pebble beside a toy."""
+CUT = 0.02
+"""Share of its box' outline on the photo's border from which a thing is cut."""
+SIDES = 0.02
+"""Strip along the photo's left and right border, over its width, that what goes through the photo reaches."""
+LEFT_ASIDE = 0.79
+"""Largest score of what is left aside, below that of objects that are used unless the user says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
 
     Each box holds one whole object, not a group, a part, or an object with ground (``whole_objects``). Where one is
-    sharp, those out of focus are left out. The list is empty where nothing stands out.
+    sharp, those out of focus are left out; specks beside it and what the photo cuts come last. The list is empty where
+    nothing stands out.
     """
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
@@ -83,11 +92,27 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     )
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
-    for item, value in sorted((found[i] for i in whole), key=lambda pair: -pair[1])[:most]:
+    listed = with_the_rest_aside([found[i][0].mask for i in whole], [found[i][1] for i in whole])
+    for item, value in sorted(zip((found[i][0] for i in whole), listed, strict=True), key=lambda pair: -pair[1])[:most]:
         x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
     return result
+
+
+def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float]) -> list[float]:
+    """Return the ``scores`` of the objects ``masks`` (h, w), at most ``LEFT_ASIDE`` for what a photo is not of.
+
+    That is what is tiny beside the largest object, and, where another is whole, what the photo's border cuts: nobody
+    sees how it goes on, so it cannot move.
+    """
+    areas = [int(mask.sum()) for mask in masks]
+    largest = max((area for area, score in zip(areas, scores, strict=True) if score > LEFT_ASIDE), default=0)
+    main = [area >= BESIDE * largest for area in areas]
+    cut = [cut_share(mask) > CUT for mask in masks]
+    if any(m and not c and score > LEFT_ASIDE for m, c, score in zip(main, cut, scores, strict=True)):
+        main = [m and not c for m, c in zip(main, cut, strict=True)]
+    return [score if m else min(score, LEFT_ASIDE) for m, score in zip(main, scores, strict=True)]
 
 
 def proposals_from_alpha(alpha: NDArray[np.floating], *, most: int = MOST) -> list[Proposal]:
@@ -262,8 +287,9 @@ def _plausible(mask: Mask, height: int, width: int) -> bool:
     x0, y0, x1, y1 = extent_of(mask)
     if min(x1 - x0, y1 - y0) < LEAST_SIDE * min(height, width) or (x1 - x0) * (y1 - y0) > 0.85 * mask.size:
         return False
-    # What touches three sides of the photo is its background.
-    return (x0 == 0) + (y0 == 0) + (x1 == width) + (y1 == height) <= 2
+    # What goes through the photo from side to side, as floors and shelves do, or touches three sides is its background.
+    through = x0 <= SIDES * width and x1 >= (1.0 - SIDES) * width
+    return not through and (x0 == 0) + (y0 == 0) + (x1 == width) + (y1 == height) <= 2
 
 
 def examined_candidates(pixels: Pixels) -> list[Examined]:
