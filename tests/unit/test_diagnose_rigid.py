@@ -19,6 +19,7 @@ from physgen.sim.diagnose.rigid.observed_poses import (
 )
 from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
+from physgen.sim.diagnose.rigid.rigid_localisation import _directions
 from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
 from physgen.sim.diagnose.rigid.start_numbers import MissingForces, tether_start
 from physgen.sim.effects.registry import effect
@@ -411,6 +412,13 @@ def test_no_effect_is_found_in_plain_motion():
     fits = fit_rigid(capture, ["magnus", "air_drag", "buoyancy"])
     assert fits.nominal.misfit < 1.4
     assert all(c.log_evidence < fits.nominal.log_evidence + 2 for c in fits.candidates)
+
+
+@pytest.mark.parametrize(("phase", "named"), [("impact", "normal"), ("contact", "normal"), ("flight", "along_gravity")])
+def test_an_upright_force_on_level_ground_is_the_grounds_where_it_touches(phase, named):
+    force, velocity = np.array([[0.0, 0.0, 50.0]]), np.array([[1.0, 0.0, 0.2]])
+    found = _directions(force, velocity, np.array([0, 0, -9.81]), np.array([0.0, 0.0, 1.0]), [phase])
+    assert found == {"normal": 0.0, "along_velocity": 0.0, "along_gravity": 0.0, "other": 0.0} | {named: 1.0}
 
 
 def test_the_force_is_placed_where_drag_is_strong():

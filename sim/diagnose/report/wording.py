@@ -72,7 +72,7 @@ DIRECTIONS = MappingProxyType(
     {
         "normal": "along the ground normal",
         "along_velocity": "along the motion",
-        "along_gravity": "vertical in flight",
+        "along_gravity": "vertical, off the ground",
         "other": "in other directions",
     }
 )

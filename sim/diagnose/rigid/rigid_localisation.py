@@ -58,7 +58,7 @@ def localise_discrepancies(capture: Capture, bodies: list[tuple[Fit, Fit | None]
             point_score=points,
             residual=residual,
             intervals=_intervals(trial.times, phases),
-            directions=_directions(force, velocity, np.asarray(capture.gravity), capture.ground.unit_normal),
+            directions=_directions(force, velocity, np.asarray(capture.gravity), capture.ground.unit_normal, phases),
         )
     return found
 
@@ -263,8 +263,11 @@ def _intervals(times: Array, phases: list[str]) -> tuple[PhaseInterval, ...]:
     return tuple(found)
 
 
-def _directions(force: Array, velocity: Array, gravity: Array, normal: Array) -> dict[str, float]:
-    """Return shares of the squared force by direction: assigned to the nearest axis within 45 degrees."""
+def _directions(force: Array, velocity: Array, gravity: Array, normal: Array, phases: list[str]) -> dict[str, float]:
+    """Return shares of the squared force (F, 3) by direction: assigned to the nearest axis within 45 degrees.
+
+    On level ground its normal is upright, too: what acts there is the ground's in frames of contact, gravity's else.
+    """
     size = np.linalg.norm(force, axis=1)
     shares = dict.fromkeys(DIRECTIONS, 0.0)
     total = float(np.sum(size**2))
@@ -276,7 +279,8 @@ def _directions(force: Array, velocity: Array, gravity: Array, normal: Array) ->
     along_g = np.abs(force @ down) / np.maximum(size, 1e-12)
     along_n = np.abs(force @ normal) / np.maximum(size, 1e-12)
     for f in range(len(force)):
-        best = {"along_velocity": along_v[f], "along_gravity": along_g[f], "normal": along_n[f] - 1e-6}
+        ground = along_n[f] + (-1e-6 if phases[f] == "flight" else 1e-6)
+        best = {"along_velocity": along_v[f], "along_gravity": along_g[f], "normal": ground}
         name = max(best, key=lambda k: best[k])
         shares[name if best[name] > 0.7 else "other"] += float(size[f] ** 2) / total
     return shares
