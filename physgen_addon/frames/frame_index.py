@@ -48,7 +48,8 @@ INDEX_FILE = "frames.json"
 FORMAT = "physgen-frames/1"
 MOST_RATE = 1e6
 """Frames per second; more were never recorded."""
-FRAME_NAME = re.compile(r"(\d{4,})\.(?:png|exr)")
+FRAME_NAME = re.compile(r"(\d{4,9})\.(?:png|exr)")
+"""Nine digits are more frames than any clip has, and fewer than a file system's longest name."""
 
 
 def frame_name(number: int, suffix: str = ".png") -> str:

@@ -195,6 +195,16 @@ def test_a_folder_holds_frames_of_one_kind(tmp_path):
         FrameIndex(folder, suffix=".exr")
 
 
+def test_a_recorded_name_that_no_frame_has_is_no_frame(tmp_path):
+    """No file system has room for it: looking whether it is there would raise."""
+    folder = frames(tmp_path / "out", [1])
+    content = json.loads((folder / "frames.json").read_text())
+    content["frames"]["1" * 400 + ".png"] = content["frames"]["0001.png"]
+    (folder / "frames.json").write_text(json.dumps(content))
+    assert [state.file for state in FrameIndex.of(folder).check()] == ["0001.png"]
+    assert FrameIndex(folder).find("other") is None
+
+
 @pytest.mark.parametrize("name", ["scene.json", "manifest.json", "capture.json"])
 def test_frames_do_not_go_into_a_folder_of_something_else(tmp_path, name):
     """A scene with frames in it could not be corrected again."""
