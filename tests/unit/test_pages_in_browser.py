@@ -17,7 +17,7 @@ from physgen.sim.html import page_head, page_style, prose, render
 from physgen.sim.reconstruct import reconstruction_report
 
 from .browser import PROGRAM, Browser
-from .test_diagnose_report import case
+from .report_cases import case
 from .test_farm_summary import plan_of
 
 pytestmark = [
